@@ -1,0 +1,30 @@
+"""Names and numbers that the recorder, the environments and the models agree on."""
+
+from typing import Final
+
+FPS: Final = 25
+"""Control and recording rate in Hz."""
+
+CAMERAS: Final = ("third_view", "wrist")
+
+STATE_NAMES: Final = ("tcp_x", "tcp_y", "tcp_z", "tcp_qw", "tcp_qx", "tcp_qy", "tcp_qz", "gripper_opening")
+"""`observation.state`: TCP position (m), TCP quaternion wxyz, gripper opening in [0, 1]."""
+
+ACTION_NAMES: Final = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")
+"""`action`: commanded TCP delta (m), rotation vector (rad) in base axes, gripper in [-1, 1] (+1 opens)."""
+
+ACTION_LOW: Final = (-0.05, -0.05, -0.05, -0.25, -0.25, -0.25, -1.0)
+ACTION_HIGH: Final = (0.05, 0.05, 0.05, 0.25, 0.25, 0.25, 1.0)
+"""The one action box: both environments clip to it, the recorder never exceeds it."""
+
+TASKS: Final = ("push", "pull", "pick_place", "move_to_aim")
+"""Vocabulary of the column `start.task`."""
+
+KINDS: Final = ("optimal", "waypoint", "interpolated", "disturbed", "near_miss", "policy")
+"""Vocabulary of the column `start.kind`: how an episode's actions were made."""
+
+START_COLUMNS: Final = ("start.task", "start.scene", "start.seed", "start.kind")
+"""int64 (1,) columns from which an episode's start can be rebuilt in the simulator."""
+
+EVALUATION_SEED: Final = 1_000_000
+"""Recording and training seeds are below this number, evaluation seeds at or above it."""

@@ -1,0 +1,1 @@
+"""The world-model environment and the ManiSkill environment, as LeRobot environments."""

@@ -1,0 +1,1 @@
+"""What exists in the simulator: objects, scenes, tasks, cameras."""

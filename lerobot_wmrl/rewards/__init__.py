@@ -1,0 +1,1 @@
+"""The general reward, as a LeRobot reward model."""

@@ -1,0 +1,1 @@
+"""Rollouts, advantage estimation, PPO and the trainer around them."""

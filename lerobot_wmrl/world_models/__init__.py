@@ -1,0 +1,1 @@
+"""Frame tokenizer, spatial-temporal transformer, action and text world model, and their training."""
