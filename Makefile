@@ -1,0 +1,24 @@
+.PHONY: setup demo test lint lock
+
+# What `lerobot-wmrl-demo` gets besides its preset, for example: make demo DEMO_FLAGS=--seed=1
+DEMO_FLAGS ?=
+PYTEST_FLAGS ?=
+
+setup:  ## an interpreter, .venv, the locked packages, this project, a renderer: does only what is missing
+	@tools/setup.sh
+
+demo: setup  ## the whole loop, then outputs/demo/report.html
+	.venv/bin/lerobot-wmrl-demo --preset=demo --output_dir=outputs/demo $(DEMO_FLAGS)
+
+test: setup
+	.venv/bin/python -m pytest $(PYTEST_FLAGS)
+
+lint: setup
+	.venv/bin/ruff check .
+	.venv/bin/ruff format --check .
+	.venv/bin/mypy
+	.venv/bin/lint-imports
+
+lock:  ## requirements.lock: every package pinned and hashed, no address, so any mirror serves it
+	uv pip compile pyproject.toml --extra dev --universal --python-version 3.12 \
+		--no-header --no-annotate --generate-hashes -o requirements.lock
