@@ -19,6 +19,8 @@ lint: setup
 	.venv/bin/mypy
 	.venv/bin/lint-imports
 
+UV ?= $(or $(wildcard .uv/bin/uv),uv)
+
 lock:  ## requirements.lock: every package pinned and hashed, no address, so any mirror serves it
-	uv pip compile pyproject.toml --extra dev --universal --python-version 3.12 \
+	$(UV) pip compile pyproject.toml --extra dev --universal --python-version 3.12 \
 		--no-header --no-annotate --generate-hashes -o requirements.lock
