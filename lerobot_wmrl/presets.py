@@ -10,30 +10,54 @@ from typing import Final
 Flags = Mapping[str, str | int | float | bool]
 
 PRESETS: Final[dict[str, dict[str, Flags]]] = {
-    "tiny": {},
-    "demo": {},
+    "tiny": {
+        "demo": {
+            "stage_preset": "tiny",
+            "sft_episodes": 3,
+            "eval_episodes": 4,
+            "rollout_episodes": 4,
+        },
+        "eval": {"eval.batch_size": 1, "eval.use_async_envs": False},
+        "eval-imagined": {"eval.batch_size": 4},
+    },
+    "demo": {
+        "demo": {
+            "stage_preset": "demo",
+            "sft_episodes": 12,
+            "eval_episodes": 100,
+            "rollout_episodes": 60,
+        },
+        "eval": {"eval.batch_size": 2, "eval.use_async_envs": True},
+        "eval-imagined": {"eval.batch_size": 50},
+    },
 }
+"""Size → command → flags. `train-world-model:frame_tokenizer` adds to `train-world-model` for that type."""
 
 
 def format_flags(flags: Flags) -> list[str]:
     """`{"a.b": 1, "c": True}` → `["--a.b=1", "--c=true"]`, the form draccus parses."""
-    return [f"--{name}={str(value).lower() if isinstance(value, bool) else value}" for name, value in flags.items()]
+    return [
+        f"--{name}={str(value).lower() if isinstance(value, bool) else value}"
+        for name, value in flags.items()
+    ]
 
 
-def preset_flags(preset: str, command: str) -> list[str]:
-    """The flags of `command` (for example `record`) at size `preset`. ValueError if there are none."""
+def preset_flags(preset: str, command: str, types: Sequence[str] = ()) -> list[str]:
+    """The flags of `command` at size `preset`, then those of `command:type`. ValueError if there are none."""
     if preset not in PRESETS:
         raise ValueError(f"--preset={preset}: unknown preset; choose one of {', '.join(PRESETS)}")
-    if command not in PRESETS[preset]:
-        sizes = ", ".join(name for name, commands in PRESETS.items() if command in commands)
+    keys = [command, *(f"{command}:{name}" for name in types)]
+    if not PRESETS[preset].keys() & set(keys):
+        sizes = ", ".join(name for name, commands in PRESETS.items() if commands.keys() & set(keys)) or "none"
         raise ValueError(f"--preset={preset}: {command} has no such preset; it has: {sizes}")
-    return format_flags(PRESETS[preset][command])
+    return [flag for key in keys for flag in format_flags(PRESETS[preset].get(key, {}))]
 
 
 def expand_preset(argv: Sequence[str], command: str) -> list[str]:
     """Replace `--preset=NAME` in `argv` by that preset's flags, which later flags override."""
+    split = [argument.partition("=") for argument in argv]
+    types = [value for name, _, value in split if name.endswith(".type")]
     expanded: list[str] = []
-    for argument in argv:
-        name, separator, value = argument.partition("=")
-        expanded += preset_flags(value, command) if name == "--preset" and separator else [argument]
+    for argument, (name, separator, value) in zip(argv, split, strict=True):
+        expanded += preset_flags(value, command, types) if name == "--preset" and separator else [argument]
     return expanded

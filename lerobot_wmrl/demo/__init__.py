@@ -1,0 +1,1 @@
+"""The demo: real commands one after another, measured and resumable."""

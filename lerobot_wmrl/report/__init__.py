@@ -1,0 +1,1 @@
+"""The demo's page: what was measured, with intervals, pictures and the commands that made it."""

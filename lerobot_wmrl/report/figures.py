@@ -1,0 +1,86 @@
+"""Numbers and frames → pictures as data URLs. Pure functions."""
+
+import base64
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from PIL import Image
+
+from lerobot_wmrl.report.sources import Curve
+from lerobot_wmrl.report.statistics import Proportion
+
+COLOURS = ("#2b6cb0", "#dd6b20", "#2f855a", "#805ad5")
+REAL, IMAGINED = COLOURS[:2]
+
+
+def data_url(content: bytes, kind: str) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def picture(path: Path) -> str:
+    """A PNG or GIF file as it is."""
+    return data_url(path.read_bytes(), path.suffix.lstrip("."))
+
+
+def drawn(figure: Figure) -> str:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110, bbox_inches="tight")
+    return data_url(buffer.getvalue(), "png")
+
+
+def success_bars(rates: Mapping[str, tuple[Proportion, Proportion]]) -> str:
+    """Real and imagined success of each policy with Wilson intervals: `{policy: (real, imagined)}`."""
+    figure = Figure(figsize=(6.4, 3.4))
+    axes = figure.subplots()
+    for side, (label, colour) in enumerate((("in ManiSkill", REAL), ("in the world model", IMAGINED))):
+        for place, pair in enumerate(rates.values()):
+            rate, x = pair[side], place + (side - 0.5) * 0.36
+            low, high = rate.interval
+            axes.bar(x, rate.share, width=0.33, color=colour, label=label if place == 0 else None)
+            axes.errorbar(x, rate.share, [[rate.share - low], [high - rate.share]], color="#333", capsize=4)
+            axes.annotate(
+                f"{100 * rate.share:.0f} %", (x, high), (0, 3), textcoords="offset points", ha="center"
+            )
+    axes.set_xticks(range(len(rates)), list(rates))
+    axes.set_ylim(0, 1.12)
+    axes.set_ylabel("success rate")
+    return drawn(tidy(figure))
+
+
+def curves(named: Mapping[str, Curve], title: str, ylabel: str = "", xlabel: str = "step") -> str:
+    """One panel with a line a name."""
+    figure = Figure(figsize=(4.6, 2.9))
+    axes = figure.subplots()
+    for colour, (name, (steps, values)) in zip(COLOURS * 4, named.items(), strict=False):
+        axes.plot(steps, values, color=colour, label=name, linewidth=1.4)
+    axes.set_title(title, fontsize=11)
+    axes.set_xlabel(xlabel)
+    axes.set_ylabel(ylabel)
+    return drawn(tidy(figure))
+
+
+def tidy(figure: Figure) -> Figure:
+    for axes in figure.axes:
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(axis="y", alpha=0.25)
+        if axes.get_legend_handles_labels()[0]:
+            axes.legend(frameon=False, fontsize=9)
+    return figure
+
+
+def film_strip(rows: Sequence[np.ndarray], scale: int = 2, gap: int = 4) -> str:
+    """Rows of frames, each (T, H, W, 3) uint8, as one picture; short rows are padded with white."""
+    height, width = rows[0].shape[1:3]
+    longest = max(len(row) for row in rows)
+    sheet = np.full((len(rows) * (height + gap) - gap, longest * (width + gap) - gap, 3), 255, dtype=np.uint8)
+    for y, row in enumerate(rows):
+        for x, frame in enumerate(row):
+            top, left = y * (height + gap), x * (width + gap)
+            sheet[top : top + height, left : left + width] = frame
+    image = Image.fromarray(sheet)
+    buffer = io.BytesIO()
+    image.resize((image.width * scale, image.height * scale), Image.Resampling.NEAREST).save(buffer, "PNG")
+    return data_url(buffer.getvalue(), "png")

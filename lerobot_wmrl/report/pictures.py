@@ -1,0 +1,39 @@
+"""The report's pictures: made by the replays, shown under headings that say what to look for."""
+
+from pathlib import Path
+from typing import Any
+
+from lerobot_wmrl.report.figures import picture
+
+SECTIONS = (
+    (
+        "comparison",
+        "Real beside imagined",
+        "The same episode twice, from the same first frame and with the same actions: above as it happened, "
+        "below as the world model imagined it.",
+    ),
+    (
+        "goal",
+        "Goal frames",
+        "What the text world model expects the scene to look like when the task is done. The reward measures "
+        "how close an imagined frame comes to it.",
+    ),
+    (
+        "reward",
+        "The reward along real episodes",
+        "A successful and a failed real episode, with the reward that the world models give each frame.",
+    ),
+)
+"""Start of the pictures' file names, heading, what to look for."""
+
+
+def picture_sections(output_dir: Path) -> list[dict[str, Any]]:
+    """Sections with at least one picture, from `replay_*/<section>*.png|gif`."""
+    sections = []
+    for stem, title, text in SECTIONS:
+        files = [path for folder in sorted(output_dir.glob("replay_*"), reverse=True)
+                 for path in sorted(folder.rglob(f"{stem}*")) if path.suffix in (".png", ".gif")]  # fmt: skip
+        images = [{"url": picture(path), "caption": path.stem.replace("_", " ")} for path in files]
+        if images:
+            sections.append({"title": title, "text": text, "images": images})
+    return sections

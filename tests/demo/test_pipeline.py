@@ -1,0 +1,132 @@
+"""The runner of the stages, on commands that take a moment: resuming, ending, refusing."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from lerobot_wmrl.demo import pipeline
+from lerobot_wmrl.demo.pipeline import StageError, claimed, run_stages
+from lerobot_wmrl.demo.process import run_measured, tree_memory
+from lerobot_wmrl.demo.stages import DemoConfig, Stage, demo_stages
+
+
+@pytest.fixture(autouse=True)
+def commands_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The test stages run the interpreter itself, not a console command beside it."""
+    monkeypatch.setattr(pipeline, "executable", lambda command: command)
+
+
+def python(name: str, code: str) -> Stage:
+    return Stage(name, name, lambda: [sys.executable, "-c", code])
+
+
+def appending(name: str, file: Path) -> Stage:
+    return python(name, f"open({str(file)!r}, 'a').write({name!r})")
+
+
+def test_finished_stages_are_not_repeated_and_a_failed_one_is(tmp_path: Path) -> None:
+    file, fails = tmp_path / "ran", python("b", "raise SystemExit(3)")
+    with pytest.raises(StageError, match=r"exit status 3.*b\.log"):
+        run_stages([appending("a", file), fails, appending("c", file)], tmp_path)
+    assert file.read_text() == "a"
+    run_stages([appending("a", file), appending("b", file), appending("c", file)], tmp_path)
+    assert file.read_text() == "abc"
+
+
+def test_time_of_interrupted_attempts_counts(tmp_path: Path) -> None:
+    stage = python("slow", "import time; time.sleep(0.5)")
+    with pytest.raises(StageError):
+        run_stages([python("slow", "import time; time.sleep(0.5); raise SystemExit(1)")], tmp_path)
+    run_stages([stage], tmp_path)
+    record = json.loads((tmp_path / "stages" / "slow.json").read_text())
+    assert record["finished"]
+    assert record["seconds"] > 1.0
+
+
+def test_output_and_memory_are_kept(tmp_path: Path, capfdbinary: pytest.CaptureFixture[bytes]) -> None:
+    code = "import time; block = bytearray(200_000_000); print('out'); time.sleep(1.5); print('end')"
+    reports: list[tuple[float, int]] = []
+    log = tmp_path / "log"
+    assert run_measured([sys.executable, "-c", code], log, lambda *report: reports.append(report)) == 0
+    assert log.read_text().split() == ["out", "end"]
+    assert b"out\nend\n" in capfdbinary.readouterr().out
+    assert 200e6 < reports[-1][1] < 400e6
+    assert reports[-1][0] > 1.5
+
+
+@pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGKILL])
+def test_a_stage_ends_when_the_demo_is_stopped(sign: signal.Signals, tmp_path: Path) -> None:
+    """By Ctrl-C, which it hears of, and by kill -9, which it does not."""
+    pid_file, log = tmp_path / "pid", tmp_path / "log"
+    stage = f"import os, time; open({str(pid_file)!r}, 'w').write(str(os.getpid())); time.sleep(60)"
+    runner = (
+        "import sys; from pathlib import Path; from lerobot_wmrl.demo.process import run_measured; "
+        f"run_measured([sys.executable, '-c', {stage!r}], Path({str(log)!r}), print)"
+    )
+    process = subprocess.Popen([sys.executable, "-c", runner], stdout=subprocess.DEVNULL)
+    wait_until(lambda: pid_file.exists() and pid_file.read_text() != "")
+    process.send_signal(sign)
+    process.wait(15)
+    wait_until(lambda: tree_memory(int(pid_file.read_text())) == 0)
+
+
+def wait_until(condition: Callable[[], bool], seconds: float = 20.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it did not happen in time"
+        time.sleep(0.05)
+
+
+def test_a_foreign_folder_is_refused_and_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "thesis.txt").write_text("mine")
+    with pytest.raises(ValueError, match="holds something that is not a demo"), claimed(DemoConfig(tmp_path)):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+def test_other_settings_are_refused_by_name(tmp_path: Path) -> None:
+    with claimed(DemoConfig(tmp_path, seed=1)):
+        pass
+    with (
+        pytest.raises(ValueError, match=r"--seed=2: .* was started with 1"),
+        claimed(DemoConfig(tmp_path, seed=2)),
+    ):
+        pass
+
+
+def test_two_demos_do_not_share_a_folder(tmp_path: Path) -> None:
+    with (
+        claimed(DemoConfig(tmp_path)),
+        pytest.raises(ValueError, match="another demo is running"),
+        claimed(DemoConfig(tmp_path)),
+    ):
+        pass
+
+
+@pytest.mark.parametrize("flags", [{"seed": -1}, {"seed": 10}, {"eval_episodes": 0}])
+def test_impossible_settings_are_named(flags: dict[str, int]) -> None:
+    with pytest.raises(ValueError, match=f"--{next(iter(flags))}="):
+        DemoConfig(**flags)
+
+
+def test_training_and_evaluation_seeds_are_disjoint() -> None:
+    """Whatever the demo's seed, at a distance that no stage's number of episodes bridges."""
+    trained, held_out = set(), set()
+    for seed in range(10):
+        for stage in demo_stages(DemoConfig(seed=seed)):
+            if stage.name != "sft":  # its command needs the dataset
+                seeds = {
+                    int(flag.partition("=")[2]) for flag in stage.command() if flag.startswith("--seed=")
+                }
+                (held_out if stage.name.startswith(("eval", "imagine", "rollouts")) else trained).update(
+                    seeds
+                )
+    assert len(trained) == 10
+    assert len(held_out) == 2
+    assert min(held_out) - max(trained) >= 100_000
