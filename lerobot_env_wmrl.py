@@ -7,13 +7,13 @@ never hides a policy: heavy imports (torch models, mani_skill) happen when somet
 import importlib
 
 CONFIGURATION_MODULES = (
-    "lerobot_policy_cnn.configuration_cnn",
-    "lerobot_wmrl.envs.configuration_wmrl_maniskill",
-    "lerobot_wmrl.envs.configuration_world_model",
-    "lerobot_wmrl.rewards.configuration_general",
-    "lerobot_wmrl.rl.configuration_ppo",
     "lerobot_wmrl.world_models.configuration_frame_tokenizer",
     "lerobot_wmrl.world_models.configuration_world_model",
+    "lerobot_wmrl.rewards.configuration_general",
+    "lerobot_wmrl.envs.configuration_world_model",
+    "lerobot_wmrl.envs.configuration_wmrl_maniskill",
+    "lerobot_wmrl.rl.configuration_ppo",
+    "lerobot_policy_cnn.configuration_cnn",
 )
 
 for _name in CONFIGURATION_MODULES:

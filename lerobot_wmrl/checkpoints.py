@@ -1,0 +1,33 @@
+"""Checkpoints that are either whole or absent, in LeRobot's layout."""
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+from lerobot.common.train_utils import get_step_checkpoint_dir
+from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK
+
+LAST_CHECKPOINT = f"{CHECKPOINTS_DIR}/{LAST_CHECKPOINT_LINK}"
+
+
+def write_checkpoint(output_dir: Path, total_steps: int, step: int, write: Callable[[Path], None]) -> Path:
+    """Let `write` fill a temporary folder, then move it to `checkpoints/<step>` and point `last` at it."""
+    target = get_step_checkpoint_dir(output_dir, total_steps, step)
+    partial = target.with_name(f".{target.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    write(partial)
+    shutil.rmtree(target, ignore_errors=True)
+    partial.rename(target)
+    link = target.with_name(f".{LAST_CHECKPOINT_LINK}.partial")
+    link.unlink(missing_ok=True)
+    link.symlink_to(target.name)
+    os.replace(link, target.with_name(LAST_CHECKPOINT_LINK))
+    return target
+
+
+def latest_checkpoint(output_dir: Path) -> Path | None:
+    """The whole checkpoint of the highest step, or None."""
+    folder = output_dir / CHECKPOINTS_DIR
+    steps = [path for path in folder.glob("*") if path.name.isdigit()] if folder.is_dir() else []
+    return max(steps, key=lambda path: int(path.name), default=None)

@@ -1,0 +1,89 @@
+"""Configuration of the world model as an environment."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+from lerobot.configs.rewards import RewardModelConfig
+from lerobot.configs.types import FeatureType, PolicyFeature
+from lerobot.envs.configs import EnvConfig
+from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
+
+from lerobot_wmrl.constants import FPS
+from lerobot_wmrl.rewards.configuration_general import GeneralConfig
+
+
+@dataclass
+class StartFrames:
+    """Where imagined episodes begin: the first frames of a LeRobotDataset's episodes.
+
+    Args:
+        root, repo_id: the dataset.
+        split: `train` (what the world model was trained on), `validation` (held out) or `all`.
+        max_starts: at most so many episodes, drawn evenly; each needs a goal frame.
+    """
+
+    root: str = ""
+    repo_id: str | None = None
+    split: str = "all"
+    max_starts: int = 256
+
+
+@EnvConfig.register_subclass("world_model")
+@dataclass
+class WorldModelEnv(EnvConfig):
+    """The action world model answers a policy; the text world model sets the goal (method: Algorithm 1).
+
+    Args:
+        world_model_path, text_world_model_path: checkpoints, or output folders of their trainings.
+        dataset: start frames and instructions.
+        reward: `--env.reward.type=general` and its settings.
+        episode_length: frames after which an episode is truncated.
+        done_threshold: θ_sps of eq. 7. done_frames: k, consecutive frames that must reach it.
+        device: where the models live.
+    """
+
+    task: str | None = "imagination"
+    fps: int = FPS
+    world_model_path: str = ""
+    text_world_model_path: str = ""
+    dataset: StartFrames = field(default_factory=StartFrames)
+    reward: RewardModelConfig = field(default_factory=GeneralConfig)
+    episode_length: int = 40
+    done_threshold: float = 0.5
+    done_frames: int = 3
+    device: str = "cpu"
+    features: dict[str, PolicyFeature] = field(
+        default_factory=lambda: {ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(7,))}
+    )
+    features_map: dict[str, str] = field(default_factory=lambda: {ACTION: ACTION, "agent_pos": OBS_STATE})
+
+    def __post_init__(self) -> None:
+        """Describe the observation as the world model's checkpoint has it."""
+        if not self.world_model_path:
+            return
+        from lerobot_wmrl.world_models.checkpoint import read_config
+
+        model: Any = read_config(self.world_model_path, "action_world_model")
+        if model.state_size:
+            self.features["agent_pos"] = PolicyFeature(type=FeatureType.STATE, shape=(model.state_size,))
+        for camera in model.cameras:
+            shape = (model.image_size, model.image_size, 3)
+            self.features[f"pixels/{camera}"] = PolicyFeature(type=FeatureType.VISUAL, shape=shape)
+            self.features_map[f"pixels/{camera}"] = f"{OBS_IMAGES}.{camera}"
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        return {}
+
+    def create_tensor_env(self, n_envs: int, device: str | None = None) -> gym.vector.VectorEnv:
+        """`n_envs` imaginations in one batch, tensors on the device: what PPO steps."""
+        from lerobot_wmrl.envs.world_model_env import make_world_model_env
+
+        return make_world_model_env(self, n_envs, device or self.device)
+
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
+        """The same behind numpy, for lerobot-eval. Batched natively, so `use_async_envs` changes nothing."""
+        from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
+
+        return {self.type: {0: EvaluationAdapter(self.create_tensor_env(n_envs))}}

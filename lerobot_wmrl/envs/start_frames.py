@@ -1,0 +1,63 @@
+"""First frames, states, instructions and goals from which imagined episodes begin."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lerobot_wmrl.envs.configuration_world_model import StartFrames
+from lerobot_wmrl.world_models.episode_table import EpisodeTable, open_dataset, read_episodes
+from lerobot_wmrl.world_models.frame_cache import cached_frames, frames_to_tensor
+from lerobot_wmrl.world_models.goal import imagine_goal
+from lerobot_wmrl.world_models.modeling_world_model import (
+    ActionWorldModelRewardModel,
+    TextWorldModelRewardModel,
+)
+
+GOAL_BATCH = 64
+
+
+class Starts(NamedTuple):
+    """K starts: tokens (K, S), proprioception (K, P), instructions, goal features [(K·N, C, h, w)], and
+    goal_reached (K,), False where the text model never reached θ."""
+
+    tokens: Tensor
+    proprioception: Tensor
+    instructions: list[str]
+    goal_features: list[Tensor]
+    goal_reached: Tensor
+
+
+def choose_episodes(table: EpisodeTable, source: StartFrames) -> np.ndarray:
+    """Indices of at most `max_starts` episodes of the split, evenly spread."""
+    masks = {"train": ~table.validation, "validation": table.validation, "all": table.length > 0}
+    if source.split not in masks:
+        raise ValueError(f"dataset.split={source.split!r}: choose one of {', '.join(masks)}")
+    episodes = masks[source.split].nonzero()[0]
+    if not len(episodes):
+        raise ValueError(f"dataset.root={source.root}: no episode in its {source.split} split")
+    count = min(len(episodes), source.max_starts)
+    return episodes[np.linspace(0, len(episodes) - 1, count).astype(int)]
+
+
+@torch.no_grad()
+def load_starts(
+    source: StartFrames, model: ActionWorldModelRewardModel, text_model: TextWorldModelRewardModel
+) -> Starts:
+    """Read the starts and imagine each one's goal frame once (eq. 6)."""
+    table = read_episodes(open_dataset(source.root, source.repo_id))
+    if table.state.shape[1] < model.config.state_size:
+        raise ValueError(f"dataset.root={source.root}: the world model needs observation.state, the dataset has none")
+    rows = table.start[choose_episodes(table, source)]
+    instructions = [table.instructions[episode] for episode in choose_episodes(table, source)]
+    device = model.state_mean.device
+    images = frames_to_tensor(cached_frames(table.dataset, model.config.camera_keys)[rows]).to(device)
+    state = torch.from_numpy(table.state[rows][:, : model.config.state_size]).to(device)
+    tokens = model.tokenizer.encode(images)
+    goals = [
+        imagine_goal(text_model, tokens[i : i + GOAL_BATCH], state[i : i + GOAL_BATCH], instructions[i : i + GOAL_BATCH])
+        for i in range(0, len(rows), GOAL_BATCH)
+    ]
+    features = model.tokenizer.decode_with_features(torch.cat([goal.tokens for goal in goals])).features
+    return Starts(tokens, state, instructions, features, torch.cat([goal.reached for goal in goals]))

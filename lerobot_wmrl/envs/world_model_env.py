@@ -1,0 +1,158 @@
+"""The world model as a natively batched environment: many imagined episodes, one forward pass a step."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from gymnasium.vector import AutoresetMode
+from lerobot.rewards.factory import make_reward_model
+from lerobot.rewards.pretrained import PreTrainedRewardModel
+from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
+from torch import Tensor
+
+from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, FPS
+from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
+from lerobot_wmrl.envs.start_frames import Starts, load_starts
+from lerobot_wmrl.rewards.general import consecutive_count, sparse_reward
+from lerobot_wmrl.world_models.checkpoint import load_model
+from lerobot_wmrl.world_models.goal import similarity
+from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel, Imagined
+
+Observation = dict[str, Any]
+
+
+class WorldModelVectorEnv(gym.vector.VectorEnv):
+    """Tensors in, tensors out, SAME_STEP autoreset with `final_obs` and `final_info`.
+
+    Observations: `observation.images.<camera>` (B, 3, H, W) in [0, 1], `observation.state` (B, P) if the
+    model predicts it, `task` (B strings). Actions (B, A) in metres, radians and gripper, clipped to the box.
+    """
+
+    metadata = {"render_fps": FPS, "autoreset_mode": AutoresetMode.SAME_STEP}
+
+    def __init__(
+        self, model: ActionWorldModelRewardModel, starts: Starts, reward: PreTrainedRewardModel,
+        config: WorldModelEnv, n_envs: int,
+    ) -> None:  # fmt: skip
+        self.model, self.starts, self.reward, self.config = model, starts, reward, config
+        self.num_envs, self.max_episode_steps = n_envs, config.episode_length
+        self.device = starts.tokens.device
+        self.action_low, self.action_high = (
+            torch.tensor(bound[: model.config.action_size], device=self.device) for bound in (ACTION_LOW, ACTION_HIGH)
+        )
+        self.single_action_space = gym.spaces.Box(self.action_low.cpu().numpy(), self.action_high.cpu().numpy())
+        self.action_space = gym.vector.utils.batch_space(self.single_action_space, n_envs)
+        self.single_observation_space = self._observation_space()
+        self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, n_envs)
+        self.generator = torch.Generator(self.device)
+        self._start_index = torch.zeros(n_envs, dtype=torch.long, device=self.device)
+
+    def _observation_space(self) -> gym.spaces.Dict:
+        size, config = self.model.config.image_size, self.model.config
+        spaces: dict[str, gym.Space] = {
+            f"{OBS_IMAGES}.{camera}": gym.spaces.Box(0.0, 1.0, (3, size, size), np.float32) for camera in config.cameras
+        }
+        if config.state_size:
+            spaces[OBS_STATE] = gym.spaces.Box(-np.inf, np.inf, (config.state_size,), np.float32)
+        return gym.spaces.Dict(spaces)
+
+    def reset(
+        self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin B episodes. An int seeds the draw of starts; a list names each environment's start."""
+        if isinstance(seed, int):
+            self.generator.manual_seed(seed)
+        drawn = self._draw_starts()
+        if isinstance(seed, list):
+            self.generator.manual_seed(seed[0])
+            drawn = torch.tensor(seed, device=self.device) % len(self.starts.tokens)
+        self._start_index = drawn
+        tokens, state = self.starts.tokens[drawn], self.starts.proprioception[drawn]
+        self._imagination = self.model.start(tokens, state)
+        self._elapsed = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
+        self._done_streak = torch.zeros_like(self._elapsed)
+        decoded = self.model.tokenizer.decode_with_features(tokens)
+        self._similarity = self._similarity_to_goal(decoded.features)
+        self._observation = self._observe(decoded.images, state)
+        return self._observation, {}
+
+    @torch.no_grad()
+    def step(self, actions: Tensor) -> tuple[Observation, Tensor, Tensor, Tensor, dict[str, Any]]:
+        """Imagine one frame in every environment; finished ones restart at once."""
+        clipped = actions.to(self.device).clamp(self.action_low, self.action_high)
+        imagined = self.model.step(self._imagination, clipped, self.generator)
+        terminated, truncated = self._advance(imagined)
+        decoded = self.model.tokenizer.decode_with_features(imagined.tokens)
+        closeness = self._similarity_to_goal(decoded.features)
+        parts = {"success": terminated.float(), "similarity": closeness, "previous.similarity": self._similarity}
+        reward = self.reward.compute_reward({**parts, "hidden": imagined.hidden})
+        self._similarity = closeness
+        observation = self._observe(decoded.images, imagined.proprioception)
+        info = {"reward_parts": {**parts, "entropy": imagined.entropy, "done_probability": imagined.done_logit.sigmoid()}}
+        finished = terminated | truncated
+        if bool(finished.any()):
+            info["final_obs"] = observation
+            info["final_info"] = {"is_success": terminated, "episode_length": self._elapsed.clone()}
+            observation = self._restart(finished, observation)
+        self._observation = observation
+        return observation, reward, terminated, truncated, info
+
+    def _advance(self, imagined: Imagined) -> tuple[Tensor, Tensor]:
+        """Count frames; terminated after k consecutive done frames, truncated at the horizon. → (B,), (B,)"""
+        fired = sparse_reward(imagined.done_logit, self.config.done_threshold) > 0
+        self._done_streak = consecutive_count(self._done_streak, fired)
+        self._elapsed = self._elapsed + 1
+        terminated = self._done_streak >= self.config.done_frames
+        return terminated, (self._elapsed >= self.max_episode_steps) & ~terminated
+
+    def _restart(self, mask: Tensor, observation: Observation) -> Observation:
+        """New starts where `mask` (B,) is True; other rows of the observation stay."""
+        self._start_index = torch.where(mask, self._draw_starts(), self._start_index)
+        tokens, state = self.starts.tokens[self._start_index], self.starts.proprioception[self._start_index]
+        self.model.restart(self._imagination, mask, tokens, state)
+        self._elapsed = self._elapsed.masked_fill(mask, 0)
+        self._done_streak = self._done_streak.masked_fill(mask, 0)
+        decoded = self.model.tokenizer.decode_with_features(tokens)
+        self._similarity = torch.where(mask, self._similarity_to_goal(decoded.features), self._similarity)
+        fresh = self._observe(decoded.images, state)
+        for key, value in observation.items():
+            if isinstance(value, Tensor):
+                fresh[key] = torch.where(mask.reshape(-1, *[1] * (value.ndim - 1)), fresh[key], value)
+        return fresh
+
+    def _draw_starts(self) -> Tensor:
+        count = len(self.starts.tokens)
+        return torch.randint(count, (self.num_envs,), generator=self.generator, device=self.device)
+
+    def _similarity_to_goal(self, features: list[Tensor]) -> Tensor:
+        cameras = self.model.tokenizer.num_cameras
+        rows = (self._start_index[:, None] * cameras + torch.arange(cameras, device=self.device)).flatten()
+        return similarity(features, [goal[rows] for goal in self.starts.goal_features], self.num_envs)
+
+    def _observe(self, images: Tensor, state: Tensor) -> Observation:
+        observation: Observation = {
+            f"{OBS_IMAGES}.{camera}": images[:, index] for index, camera in enumerate(self.model.config.cameras)
+        }
+        if self.model.config.state_size:
+            observation[OBS_STATE] = state
+        observation["task"] = [self.starts.instructions[index] for index in self._start_index.tolist()]
+        return observation
+
+
+def make_world_model_env(config: WorldModelEnv, n_envs: int, device: str) -> WorldModelVectorEnv:
+    """Load both world models and the start frames. ValueError says which of them does not fit."""
+    model = load_model(config.world_model_path, "action_world_model", device)
+    text_model = load_model(config.text_world_model_path, "text_world_model", device)
+    same = all(
+        torch.equal(a, b)
+        for a, b in zip(model.tokenizer.parameters(), text_model.tokenizer.parameters(), strict=True)
+        if a.shape == b.shape
+    )
+    if not same:
+        raise ValueError(
+            f"text_world_model_path={config.text_world_model_path}: trained on another tokenizer than "
+            f"{config.world_model_path}; train both with the same --model.tokenizer_path"
+        )
+    starts = load_starts(config.dataset, model, text_model)
+    return WorldModelVectorEnv(model, starts, make_reward_model(config.reward), config, n_envs)

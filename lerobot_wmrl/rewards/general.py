@@ -1,0 +1,31 @@
+"""The general reward (eqs. 5-8, Algorithm 1): success seen by the action model, progress towards the goal frame."""
+
+import torch
+from torch import Tensor
+
+FORMS = ("absolute", "potential")
+
+
+def sparse_reward(done_logit: Tensor, threshold: float) -> Tensor:
+    """Eq. 7: 1 where the done probability reaches θ. (B,) → (B,)"""
+    return (done_logit.sigmoid() >= threshold).float()
+
+
+def dense_reward(similarity: Tensor, previous: Tensor, form: str, gamma: float) -> Tensor:
+    """Eq. 5, as it stands (`absolute`) or as the potential difference γ·s_t − s_{t−1}. (B,), (B,) → (B,)
+
+    The potential form telescopes over an episode, so lingering near the goal earns nothing.
+    """
+    return similarity if form == "absolute" else gamma * similarity - previous
+
+
+def general_reward(
+    sparse: Tensor, similarity: Tensor, previous: Tensor, *, alpha: float, form: str, gamma: float
+) -> Tensor:
+    """Algorithm 1: α·R_sps + (1 − α)·R_den. All (B,)."""
+    return alpha * sparse + (1 - alpha) * dense_reward(similarity, previous, form, gamma)
+
+
+def consecutive_count(count: Tensor, fired: Tensor) -> Tensor:
+    """Length of the present run of frames on which done fired. count (B,) int, fired (B,) bool → (B,)"""
+    return torch.where(fired, count + 1, torch.zeros_like(count))

@@ -1,0 +1,78 @@
+"""What every console command shares: presets, parsing, claimed output folders, errors without tracebacks."""
+
+import json
+import logging
+import os
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, TypeVar
+
+import draccus
+from lerobot.configs import parser
+from lerobot.utils.import_utils import register_third_party_plugins
+from lerobot.utils.utils import init_logging
+
+from lerobot_wmrl.presets import expand_preset
+
+CONFIG_FILE = "train_config.json"
+Config = TypeVar("Config", bound="RunConfig")
+
+
+@dataclass
+class RunConfig:
+    """Base of the commands' configurations: parsed by draccus, saved beside what the run makes."""
+
+    path_fields: ClassVar[list[str]] = []
+
+    @classmethod
+    def __get_path_fields__(cls) -> list[str]:
+        """Fields that are loaded from a checkpoint given as `--<field>.path`."""
+        return cls.path_fields
+
+    def save_pretrained(self, folder: Path) -> None:
+        """Write the configuration as LeRobot does, `train_config.json`."""
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / CONFIG_FILE).write_text(json.dumps(draccus.encode(self), indent=4))
+
+
+def claim_output_dir(output_dir: Path, config: dict[str, Any]) -> None:
+    """Mark a new folder as this run's, or recognise it. ValueError if it holds something else.
+
+    `output_dir` and device may differ between the first call and its continuation; nothing else may.
+    """
+    marker = output_dir / CONFIG_FILE
+    if marker.is_file():
+        stored = json.loads(marker.read_text())
+        differing = [key for key in config if key != "output_dir" and stored.get(key) != config[key]]
+        if differing:
+            raise ValueError(
+                f"output_dir={output_dir} holds a run with other settings ({', '.join(differing)}); "
+                "choose another folder, or repeat the settings of the first run to continue it"
+            )
+        return
+    if output_dir.is_dir() and any(output_dir.iterdir()):
+        raise ValueError(f"output_dir={output_dir} holds something else; choose a new folder")
+    output_dir.mkdir(parents=True, exist_ok=True)
+    partial = marker.with_suffix(".partial")
+    partial.write_text(json.dumps(config, indent=4))
+    os.replace(partial, marker)
+
+
+def run_command(function: Callable[[Config], None], config_class: type[Config], command: str) -> None:
+    """Parse the command line for `function`, run it, and turn bad input into one clear line, exit code 1."""
+    register_third_party_plugins()
+    init_logging()
+    logging.getLogger("lerobot.configs").setLevel(logging.ERROR)
+    try:
+        sys.argv[1:] = expand_preset(sys.argv[1:], command)
+
+        @parser.wrap()
+        def parsed(cfg: config_class) -> None:  # type: ignore[valid-type]
+            function(cfg)
+
+        parsed()
+    except (ValueError, FileNotFoundError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(1)

@@ -1,0 +1,78 @@
+"""lerobot-wmrl-train-world-model: train a frame tokenizer or a world model on a LeRobotDataset.
+
+    lerobot-wmrl-train-world-model --model.type=frame_tokenizer --dataset.root=D --output_dir=outputs/tokenizer
+    lerobot-wmrl-train-world-model --model.type=action_world_model --model.tokenizer_path=outputs/tokenizer \\
+        --dataset.root=D --output_dir=outputs/action_world_model
+
+Running the same command again continues from the last checkpoint. `--preset=demo` sets the sizes.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import draccus
+from lerobot.configs.rewards import RewardModelConfig
+
+from lerobot_wmrl.scripts.command import RunConfig, claim_output_dir, run_command
+from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
+
+
+@dataclass
+class DatasetSource:
+    """Where the data is: `root`, the dataset's folder, and optionally its `repo_id` on the hub."""
+
+    root: str = ""
+    repo_id: str | None = None
+
+
+@dataclass
+class TrainWorldModelConfig(RunConfig):
+    """Train a tokenizer or world model.
+
+    Args:
+        model: `--model.type=frame_tokenizer|action_world_model|text_world_model` and its settings.
+        dataset: the LeRobotDataset to learn from.
+        output_dir: where checkpoints and metrics go; continues if it holds this run already.
+        steps, batch_size: optimiser steps, and frames (tokenizer) or clips (world models) a step.
+        save_freq, log_freq: steps between checkpoints and between lines of metrics.jsonl.
+        seed: of initial weights and batches.
+    """
+
+    model: RewardModelConfig = field(default_factory=FrameTokenizerConfig)
+    dataset: DatasetSource = field(default_factory=DatasetSource)
+    output_dir: Path = Path("outputs/world_model")
+    steps: int = 20_000
+    batch_size: int = 8
+    save_freq: int = 500
+    log_freq: int = 20
+    seed: int = 0
+
+
+def train_world_model(cfg: TrainWorldModelConfig) -> None:
+    """Build or reload the model, cache the data, train."""
+    from lerobot.utils.random_utils import set_seed
+
+    from lerobot_wmrl.checkpoints import latest_checkpoint
+    from lerobot_wmrl.world_models.episode_table import open_dataset, read_episodes
+    from lerobot_wmrl.world_models.training import build_model, make_sampler, train
+
+    table = read_episodes(open_dataset(cfg.dataset.root, cfg.dataset.repo_id))
+    set_seed(cfg.seed)
+    given = draccus.encode(cfg)
+    model = build_model(cfg.model, table, cfg.output_dir)
+    claim_output_dir(cfg.output_dir, given)
+    checkpoint = latest_checkpoint(cfg.output_dir)
+    if checkpoint is not None and int(checkpoint.name) >= cfg.steps:
+        print(f"{cfg.output_dir}: already trained for {cfg.steps} steps")
+        return
+    sampler = make_sampler(model, table, cfg.batch_size, cfg.seed)
+    train(model, sampler, cfg, cfg.save_pretrained)
+
+
+def main() -> None:
+    """Entry point of the console command."""
+    run_command(train_world_model, TrainWorldModelConfig, "train-world-model")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,84 @@
+"""Training batches as pure functions of (seed, step): resuming a training repeats no sample and skips none."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lerobot_wmrl.world_models.episode_table import EpisodeTable
+from lerobot_wmrl.world_models.frame_cache import frames_to_tensor
+from lerobot_wmrl.world_models.losses import Clip
+
+FROM_START = 0.75
+"""Share of training clips that begin with their episode. Success can depend on where the episode began
+(an object pushed 10 cm), so only these carry done labels."""
+
+
+@dataclass
+class ClipSampler:
+    """Clips of tokens for the world models.
+
+    tokens (rows, S) is the memory map; `episodes` the indices of the episodes to draw from.
+    """
+
+    table: EpisodeTable
+    tokens: np.ndarray
+    episodes: np.ndarray
+    clip_length: int
+    batch_size: int
+    seed: int
+    device: str
+
+    def __call__(self, step: int) -> Clip:
+        """The batch of one training step."""
+        rng = np.random.default_rng([self.seed, step])
+        episodes = rng.choice(self.episodes, self.batch_size)
+        room = np.maximum(self.table.length[episodes] - 2, 1)
+        offsets = np.where(rng.random(self.batch_size) < FROM_START, 0, rng.integers(0, room))
+        return self.clips(episodes, offsets)
+
+    def clips(self, episodes: np.ndarray, offsets: np.ndarray) -> Clip:
+        """Rows `offset … offset + clip_length − 1` of each episode, padded with its last row."""
+        rows = offsets[:, None] + np.arange(self.clip_length)
+        valid = rows < self.table.length[episodes][:, None]
+        rows = self.table.start[episodes][:, None] + np.minimum(rows, self.table.length[episodes][:, None] - 1)
+        known = valid & (offsets == 0)[:, None]
+        return Clip(
+            self._tensor(self.tokens[rows]).long(),
+            self._tensor(self.table.state[rows]),
+            self._tensor(self.table.action[rows]),
+            self._tensor(self.table.done[rows]).float(),
+            self._tensor(valid),
+            self._tensor(known),
+            [self.table.instructions[episode] for episode in episodes],
+        )
+
+    def _tensor(self, array: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array)).to(self.device)
+
+
+@dataclass
+class FrameSampler:
+    """Single frames with their episode's first frame, for the tokenizer."""
+
+    table: EpisodeTable
+    frames: np.ndarray
+    episodes: np.ndarray
+    cameras: list[str]
+    batch_size: int
+    seed: int
+    device: str
+
+    def __call__(self, step: int) -> dict[str, Tensor]:
+        """The batch of one training step: `observation.images.*` and `reference.*`, (B, 3, H, W)."""
+        rng = np.random.default_rng([self.seed, step])
+        episodes = rng.choice(self.episodes, self.batch_size)
+        start = self.table.start[episodes]
+        rows = start + rng.integers(0, self.table.length[episodes])
+        images, reference = (frames_to_tensor(self.frames[index]).to(self.device) for index in (rows, start))
+        batch = {}
+        for index, camera in enumerate(self.cameras):
+            batch[f"observation.images.{camera}"] = images[:, index]
+            batch[f"reference.{camera}"] = reference[:, index]
+        return batch

@@ -1,0 +1,98 @@
+"""Configurations of the action-conditioned and the text-conditioned world model."""
+
+from dataclasses import dataclass, field
+
+from lerobot.configs.rewards import RewardModelConfig
+from lerobot.optim.optimizers import AdamWConfig
+from lerobot.optim.schedulers import LRSchedulerConfig
+
+
+@dataclass
+class WorldModelConfig(RewardModelConfig):
+    """What both world models share.
+
+    Args:
+        tokenizer_path: frame tokenizer checkpoint to start from; a trained world model carries its own copy.
+        cameras, image_size, tokenizer_widths, levels: of that tokenizer, filled in from its checkpoint.
+        state_size: width of `observation.state`, 0 to do without proprioception; filled in from the dataset.
+        layers, width, heads: of the spatial-temporal transformer.
+        window: frames the model remembers. clip_length: frames of a training clip.
+        patch: side of the square of tokens that forms one transformer token.
+        code_width: channels of the convolutions on the token grid.
+        motion_weight: how much more a token counts in the loss when it changes.
+        done_weight, done_positive_weight, state_weight: of the other losses, beside the tokens' one.
+        self_forcing: share of input frames replaced by the model's own predictions in training.
+        token_noise: share of input code factors moved by one level in training.
+        temperature: of sampling in imagination; 0 takes the most likely code.
+    """
+
+    tokenizer_path: str | None = None
+    cameras: list[str] = field(default_factory=lambda: ["third_view"])
+    image_size: int = 128
+    tokenizer_widths: list[int] = field(default_factory=lambda: [48, 96])
+    levels: list[int] = field(default_factory=lambda: [5, 5, 5, 5, 5, 5])
+    state_size: int = 8
+
+    layers: int = 4
+    width: int = 160
+    heads: int = 4
+    window: int = 48
+    clip_length: int = 28
+    patch: int = 2
+    code_width: int = 48
+
+    motion_weight: float = 4.0
+    done_weight: float = 1.0
+    done_positive_weight: float = 2.0
+    state_weight: float = 4.0
+    self_forcing: float = 0.5
+    token_noise: float = 0.02
+    temperature: float = 0.0
+    learning_rate: float = 1e-3
+
+    def get_optimizer_preset(self) -> AdamWConfig:
+        return AdamWConfig(lr=self.learning_rate, weight_decay=1e-2, grad_clip_norm=1.0)
+
+    def get_scheduler_preset(self) -> LRSchedulerConfig | None:
+        return None
+
+    @property
+    def camera_keys(self) -> list[str]:
+        """The dataset's keys of the cameras."""
+        return [f"observation.images.{camera}" for camera in self.cameras]
+
+    @property
+    def observation_delta_indices(self) -> list[int]:
+        return list(range(1 - self.clip_length, 1))
+
+    @property
+    def action_delta_indices(self) -> list[int]:
+        return list(range(1 - self.clip_length, 1))
+
+
+@RewardModelConfig.register_subclass("action_world_model")
+@dataclass
+class ActionWorldModelConfig(WorldModelConfig):
+    """Answers a policy: c = a in eq. 1. Its reward is the probability that success holds.
+
+    Args:
+        action_size: width of `action`, filled in from the dataset.
+        condition_tokens: tokens the action is embedded into for cross-attention.
+    """
+
+    action_size: int = 7
+    condition_tokens: int = 4
+
+
+@RewardModelConfig.register_subclass("text_world_model")
+@dataclass
+class TextWorldModelConfig(WorldModelConfig):
+    """Imagines the golden trajectory of an instruction: c = i in eq. 1. Trained on successful optimal episodes.
+
+    Args:
+        goal_threshold: θ of eq. 6, the done probability at which a frame becomes the goal frame.
+        goal_horizon: frames imagined in search of it.
+    """
+
+    goal_threshold: float = 0.5
+    goal_horizon: int = 40

@@ -1,0 +1,71 @@
+"""A LeRobotDataset's numbers, without its pictures: what training and evaluation index episodes by."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.utils.constants import ACTION, OBS_STATE
+
+from lerobot_wmrl.constants import KINDS
+
+VALIDATION_EVERY = 20
+"""Every twentieth episode is held out from the training of tokenizers and world models."""
+
+
+@dataclass
+class EpisodeTable:
+    """Per frame (N rows): state (N, P), action (N, A), done (N,). Per episode (E): start, length, ….
+
+    `kind` holds indices into `constants.KINDS`, −1 where the dataset does not say.
+    """
+
+    dataset: LeRobotDataset
+    state: np.ndarray
+    action: np.ndarray
+    done: np.ndarray
+    start: np.ndarray
+    length: np.ndarray
+    kind: np.ndarray
+    instructions: list[str]
+
+    @property
+    def success(self) -> np.ndarray:
+        """Whether success was ever reached. (E,)"""
+        return np.array([self.done[a : a + n].any() for a, n in zip(self.start, self.length, strict=True)])
+
+    @property
+    def validation(self) -> np.ndarray:
+        """Held-out episodes. (E,)"""
+        return np.arange(len(self.start)) % VALIDATION_EVERY == VALIDATION_EVERY - 1
+
+
+def open_dataset(root: str | Path, repo_id: str | None = None) -> LeRobotDataset:
+    """Open a local LeRobotDataset. ValueError if there is none at `root`."""
+    if not (Path(root) / "meta" / "info.json").is_file():
+        raise ValueError(f"dataset.root={root}: no LeRobotDataset there (meta/info.json is missing); record one first")
+    return LeRobotDataset(repo_id or Path(root).name, root=root)
+
+
+def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
+    """Read the columns that models train on. ValueError names a missing column."""
+    columns = [ACTION, "episode_index"]
+    columns += [name for name in (OBS_STATE, "next.done", "start.kind") if name in dataset.features]
+    for needed in (ACTION,):
+        if needed not in dataset.features:
+            raise ValueError(f"dataset {dataset.repo_id}: the feature {needed!r} is missing")
+    rows = dataset.hf_dataset.with_format("numpy", columns=columns)[:]
+    frames = len(rows["episode_index"])
+    _, start, length = np.unique(rows["episode_index"], return_index=True, return_counts=True)
+    kind = np.asarray(rows["start.kind"]).reshape(-1)[start] if "start.kind" in rows else np.full(len(start), -1)
+    done = np.asarray(rows["next.done"]).reshape(-1) if "next.done" in rows else np.zeros(frames, bool)
+    state = np.asarray(rows[OBS_STATE], np.float32) if OBS_STATE in rows else np.zeros((frames, 0), np.float32)
+    instructions = [episode["tasks"][0] for episode in dataset.meta.episodes]
+    action = np.asarray(rows[ACTION], np.float32)
+    return EpisodeTable(dataset, state, action, done.astype(bool), start, length, kind, instructions)
+
+
+def golden_episodes(table: EpisodeTable) -> np.ndarray:
+    """Successful optimal episodes, from which the text world model learns. (E,) bool."""
+    optimal = (table.kind == KINDS.index("optimal")) | (table.kind == -1)
+    return table.success & optimal

@@ -1,0 +1,109 @@
+"""Frames decoded once, tokens encoded once, both in memory-mapped arrays.
+
+Reading random windows from video costs milliseconds an item; from these arrays it is a memory copy.
+The caches stand beside the dataset (`<root>.cache/`), never in it, and are rebuilt when absent.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.datasets.video_utils import decode_video_frames
+from tqdm import tqdm
+
+from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
+
+ENCODE_BATCH = 128
+
+
+def cache_dir(dataset: LeRobotDataset) -> Path:
+    """Where a dataset's caches stand."""
+    root = Path(dataset.root)
+    return root.with_name(root.name + ".cache")
+
+
+def cached_frames(dataset: LeRobotDataset, camera_keys: Sequence[str]) -> np.ndarray:
+    """All frames as a read-only memory map, uint8 (rows, N, H, W, 3); decoded on the first call."""
+    height, width = dataset.features[camera_keys[0]]["shape"][:2]
+    shape = (dataset.num_frames, len(camera_keys), height, width, 3)
+    key = _digest([dataset.num_episodes, dataset.num_frames, *camera_keys, *_file_stamps(dataset)])
+
+    def fill(target: np.ndarray) -> None:
+        for episode in tqdm(range(dataset.num_episodes), desc="Decoding frames", unit="episode"):
+            rows = dataset.meta.episodes[episode]
+            begin, end = rows["dataset_from_index"], rows["dataset_to_index"]
+            for camera, name in enumerate(camera_keys):
+                target[begin:end, camera] = _decode_episode(dataset, episode, name)
+
+    return _memory_map(cache_dir(dataset) / f"frames-{key}.npy", shape, np.uint8, fill)
+
+
+def cached_tokens(dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer: FrameTokenizer) -> np.ndarray:
+    """All frames' tokens as a read-only memory map, int32 (rows, S); encoded on the first call."""
+    frames = cached_frames(dataset, camera_keys)
+    weights = hashlib.sha256(b"".join(p.detach().cpu().numpy().tobytes() for p in tokenizer.parameters()))
+    key = _digest([weights.hexdigest(), *_file_stamps(dataset)])
+    device = next(tokenizer.parameters()).device
+
+    def fill(target: np.ndarray) -> None:
+        for begin in tqdm(range(0, len(frames), ENCODE_BATCH), desc="Encoding tokens", unit="batch"):
+            images = frames_to_tensor(frames[begin : begin + ENCODE_BATCH]).to(device)
+            with torch.no_grad():
+                target[begin : begin + ENCODE_BATCH] = tokenizer.encode(images).cpu().numpy()
+
+    shape = (len(frames), tokenizer.tokens_per_frame)
+    return _memory_map(cache_dir(dataset) / f"tokens-{key}.npy", shape, np.int32, fill)
+
+
+def frames_to_tensor(frames: np.ndarray) -> torch.Tensor:
+    """uint8 (B, N, H, W, 3) → float32 (B, N, 3, H, W) in [0, 1]."""
+    return torch.from_numpy(np.ascontiguousarray(frames)).permute(0, 1, 4, 2, 3).float() / 255
+
+
+def _decode_episode(dataset: LeRobotDataset, episode: int, key: str) -> np.ndarray:
+    """Frames of one episode and camera, uint8 (T, H, W, 3), from video or from stored images."""
+    rows = dataset.meta.episodes[episode]
+    indices = range(rows["dataset_from_index"], rows["dataset_to_index"])
+    if key not in dataset.meta.video_keys:
+        return np.stack([np.asarray(image.convert("RGB")) for image in dataset.hf_dataset.with_format(None)[indices][key]])
+    first = rows[f"videos/{key}/from_timestamp"]
+    times = [first + index / dataset.fps for index in range(len(indices))]
+    path = Path(dataset.root) / dataset.meta.get_video_file_path(episode, key)
+    try:
+        frames = decode_video_frames(path, times, dataset.tolerance_s, return_uint8=True)
+    except Exception as error:
+        raise ValueError(
+            f"dataset {dataset.root}: episode {episode}, camera {key}: {path.name} cannot be decoded ({error}); "
+            "delete the dataset and record it again with the same command"
+        ) from error
+    return frames.permute(0, 2, 3, 1).numpy()
+
+
+def _memory_map(path: Path, shape: tuple[int, ...], dtype: type, fill: Callable[[np.ndarray], None]) -> np.ndarray:
+    """The array at `path`, or a new one that `fill` writes; it appears only once it is whole."""
+    if not path.is_file():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_suffix(f".{os.getpid()}.partial")
+        target = np.lib.format.open_memmap(partial, mode="w+", dtype=dtype, shape=shape)
+        try:
+            fill(target)
+            target.flush()
+            os.replace(partial, path)
+        finally:
+            partial.unlink(missing_ok=True)
+    return np.load(path, mmap_mode="r")
+
+
+def _file_stamps(dataset: LeRobotDataset) -> list[object]:
+    """Size and time of the dataset's files: another recording in the same folder is another cache."""
+    files = sorted(path for pattern in ("*.mp4", "*.parquet") for path in Path(dataset.root).rglob(pattern))
+    return [item for path in files for item in (path.name, path.stat().st_size, path.stat().st_mtime_ns)]
+
+
+def _digest(parts: Sequence[object]) -> str:
+    return hashlib.sha256(json.dumps([str(part) for part in parts]).encode()).hexdigest()[:12]

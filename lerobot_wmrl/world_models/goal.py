@@ -1,0 +1,54 @@
+"""Goal frames (eq. 6) and the similarity to them (eq. 5)."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer, feature_distance
+
+if TYPE_CHECKING:
+    from lerobot_wmrl.world_models.modeling_world_model import TextWorldModelRewardModel
+
+
+class Goal(NamedTuple):
+    """tokens (B, S); features of the decoded frame; reached (B,), False where θ was never reached."""
+
+    tokens: Tensor
+    features: list[Tensor]
+    reached: Tensor
+
+
+@torch.no_grad()
+def imagine_goal(
+    model: "TextWorldModelRewardModel", tokens: Tensor, proprioception: Tensor, instructions: Sequence[str]
+) -> Goal:
+    """Eq. 6: the first imagined frame whose done probability reaches θ, else the one of the largest.
+
+    tokens (B, S) of the start frames, proprioception (B, P), one instruction each.
+    """
+    state = model.start(tokens, proprioception, instructions)
+    goal, best = tokens, torch.full((tokens.shape[0],), -1.0, device=tokens.device)
+    reached = torch.zeros_like(best, dtype=torch.bool)
+    for _ in range(model.config.goal_horizon):
+        imagined = model.step(state)
+        probability = imagined.done_logit.sigmoid()
+        better = (probability > best) & ~reached
+        goal = torch.where(better[:, None], imagined.tokens, goal)
+        best = torch.where(better, probability, best)
+        reached = reached | (probability >= model.config.goal_threshold)
+        if bool(reached.all()):
+            break
+    return Goal(goal, model.tokenizer.decode_with_features(goal).features, reached)
+
+
+def similarity_to_goal(tokenizer: FrameTokenizer, tokens: Tensor, goal_features: Sequence[Tensor]) -> Tensor:
+    """Eq. 5 with 1 − LPIPS's formula on tokenizer features: tokens (B, S) → similarity in [0, 1] (B,)."""
+    return similarity(tokenizer.decode_with_features(tokens).features, goal_features, tokens.shape[0])
+
+
+def similarity(features: Sequence[Tensor], goal_features: Sequence[Tensor], batch: int) -> Tensor:
+    """1 − feature distance, clipped to [0, 1], averaged over an environment's cameras. → (B,)"""
+    distance = feature_distance(features, goal_features).unflatten(0, (batch, -1)).mean(1)
+    return (1 - distance).clamp(0, 1)

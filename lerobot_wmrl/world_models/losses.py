@@ -1,0 +1,81 @@
+"""Training losses of the next-frame network, and the corruption of its inputs against drift."""
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from lerobot_wmrl.world_models.next_frame import STATE_STEP, CodeBook, Prediction
+
+
+class Clip(NamedTuple):
+    """Rows t = 0 … T − 1 of an episode: what is seen, what is done, and what that leads to.
+
+    tokens (B, T, S); state (B, T, P) in dataset units; action (B, T, A); done (B, T), success at frame
+    t + 1; valid (B, T), False where the episode is padded; done_known (B, T); one instruction an episode.
+    """
+
+    tokens: Tensor
+    state: Tensor
+    action: Tensor
+    done: Tensor
+    valid: Tensor
+    done_known: Tensor
+    instructions: list[str]
+
+
+def corrupt_digits(digits: Tensor, levels: Tensor, share: float) -> Tensor:
+    """Move a share of the code factors (…, C) by one level, so that small errors are met in training."""
+    if share <= 0:
+        return digits
+    shift = torch.randint_like(digits, 0, 2) * 2 - 1
+    hit = torch.rand(digits.shape, device=digits.device) < share
+    return (digits + shift * hit).clamp_min(0).minimum(levels - 1)
+
+
+def force_predictions(
+    guess: Prediction, codebook: CodeBook, digits: Tensor, state: Tensor, share: float
+) -> tuple[Tensor, Tensor]:
+    """Scheduled sampling in parallel: replace a share of the input frames by one-pass predictions of them."""
+    predicted = codebook.sample(guess.logits[:, :-1], 0.0, None)
+    swap = torch.rand(digits.shape[:2], device=digits.device)[:, 1:] < share
+    frames = torch.where(swap[..., None, None], predicted, digits[:, 1:])
+    states = torch.where(swap[..., None], guess.proprioception[:, :-1], state[:, 1:])
+    return torch.cat([digits[:, :1], frames], 1), torch.cat([state[:, :1], states], 1)
+
+
+def next_frame_loss(
+    prediction: Prediction, codebook: CodeBook, digits: Tensor, state: Tensor, clip: Clip, config: Any
+) -> tuple[Tensor, dict[str, float]]:
+    """Cross-entropy of the next tokens (eq. 2), done (eqs. 3, 4 with BCE) and the next state.
+
+    Tokens that change count `motion_weight` times more: most of a frame is still, and what moves decides.
+    """
+    target, valid = digits[:, 1:], clip.valid[:, 1:, None].float()
+    changed = (target != digits[:, :-1]).any(-1)
+    weight = (1 + config.motion_weight * changed) * valid
+    logits = prediction.logits[:, :-1]
+    token_loss = (codebook.cross_entropy(logits, target) * weight).sum() / weight.sum().clamp_min(1)
+    state_error = (prediction.proprioception[:, :-1] - state[:, 1:]) / STATE_STEP
+    state_loss = (F.smooth_l1_loss(state_error, torch.zeros_like(state_error), reduction="none") * valid).sum()
+    state_loss = state_loss / (valid.sum() * max(1, state.shape[-1])).clamp_min(1)
+    done_loss = masked_done_loss(prediction.done_logit, clip, config.done_positive_weight)
+    loss = token_loss + config.done_weight * done_loss + config.state_weight * state_loss
+    right = (codebook.sample(logits.detach(), 0.0, None) == target).all(-1) & clip.valid[:, 1:, None]
+    return loss, {
+        "token_loss": token_loss.item(),
+        "done_loss": done_loss.item(),
+        "state_loss": state_loss.item(),
+        "token_accuracy": (right.sum() / valid.expand_as(right).sum().clamp_min(1)).item(),
+        "changed_token_accuracy": (right & changed).sum().item() / max(1.0, (changed * valid).sum().item()),
+    }
+
+
+def masked_done_loss(done_logit: Tensor, clip: Clip, positive_weight: float) -> Tensor:
+    """BCE over the rows whose outcome is known; the rare class counts `positive_weight` times."""
+    known = (clip.done_known & clip.valid).float()
+    losses = F.binary_cross_entropy_with_logits(
+        done_logit, clip.done, reduction="none", pos_weight=torch.tensor(positive_weight, device=done_logit.device)
+    )
+    return (losses * known).sum() / known.sum().clamp_min(1)

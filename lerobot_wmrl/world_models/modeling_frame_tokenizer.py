@@ -1,0 +1,66 @@
+"""The frame tokenizer as a LeRobot reward model: trained, saved and published like one."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from lerobot.rewards.pretrained import PreTrainedRewardModel
+from torch import Tensor
+
+from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
+from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer, motion_weight
+from lerobot_wmrl.world_models.goal import similarity_to_goal
+
+
+def stack_cameras(batch: dict[str, Tensor], keys: Sequence[str]) -> Tensor:
+    """Camera images (…, 3, H, W) of a batch → (…, N, 3, H, W). KeyError names a missing camera."""
+    missing = [key for key in keys if key not in batch]
+    if missing:
+        present = [key for key in batch if "images" in key]
+        raise KeyError(f"the batch lacks the cameras {missing}; it has {present}. Train on a dataset with them.")
+    return torch.stack([batch[key] for key in keys], dim=-4)
+
+
+class FrameTokenizerRewardModel(PreTrainedRewardModel):
+    """Frames to tokens and back; its reward is 1 − distance to a goal frame in feature space (eq. 5)."""
+
+    config_class = FrameTokenizerConfig
+    name = "frame_tokenizer"
+
+    def __init__(self, config: FrameTokenizerConfig, dataset_meta: Any = None, **kwargs: Any) -> None:
+        super().__init__(config)
+        self.config: FrameTokenizerConfig = config
+        if dataset_meta is not None:
+            check_cameras(config, dataset_meta.features)
+        self.tokenizer = FrameTokenizer(config.image_size, config.widths, config.levels, len(config.cameras))
+
+    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
+        """Reconstruction loss of images (B, 3, H, W); `reference.*` are the episodes' first frames, if known."""
+        images = stack_cameras(batch, self.config.camera_keys)
+        weight = None
+        if f"reference.{self.config.cameras[0]}" in batch:
+            reference = stack_cameras(batch, [f"reference.{camera}" for camera in self.config.cameras])
+            weight = motion_weight(images, reference, self.config.motion_weight)
+        return self.tokenizer(images, weight)
+
+    @torch.no_grad()
+    def compute_reward(self, batch: dict[str, Tensor]) -> Tensor:
+        """Similarity in [0, 1] of `observation.images.*` (B, 3, H, W) to `goal.*`. → (B,)"""
+        images = stack_cameras(batch, self.config.camera_keys)
+        goal = stack_cameras(batch, [f"goal.{camera}" for camera in self.config.cameras])
+        goal_features = self.tokenizer.decode_with_features(self.tokenizer.encode(goal)).features
+        return similarity_to_goal(self.tokenizer, self.tokenizer.encode(images), goal_features)
+
+
+def check_cameras(config: Any, features: dict[str, Any]) -> None:
+    """ValueError unless the dataset has the config's cameras at its image size."""
+    for key in config.camera_keys:
+        if key not in features:
+            cameras = [name for name in features if name.startswith("observation.images.")]
+            raise ValueError(f"cameras: the dataset has no {key}, it has {cameras}; set --model.cameras to match")
+        height, width = features[key]["shape"][:2]
+        if (height, width) != (config.image_size, config.image_size):
+            raise ValueError(
+                f"image_size={config.image_size}: the dataset's {key} is {height}x{width}; "
+                f"train a tokenizer with --model.image_size={height} or record at {config.image_size}"
+            )

@@ -1,0 +1,262 @@
+"""The two world models (eq. 1) as LeRobot reward models: one architecture, two conditions.
+
+Trained from token clips (`loss`) or from a LeRobotDataset's batches (`forward`); unrolled by `start`,
+`restart` and `step`, which advance a preallocated state in place.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from lerobot.rewards.pretrained import PreTrainedRewardModel
+from lerobot.utils.constants import ACTION, OBS_STATE
+from torch import Tensor, nn
+
+from lerobot_wmrl.world_models.checkpoint import load_model
+from lerobot_wmrl.world_models.configuration_world_model import (
+    ActionWorldModelConfig,
+    TextWorldModelConfig,
+    WorldModelConfig,
+)
+from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
+from lerobot_wmrl.world_models.goal import imagine_goal, similarity_to_goal
+from lerobot_wmrl.world_models.losses import Clip, corrupt_digits, force_predictions, next_frame_loss
+from lerobot_wmrl.world_models.modeling_frame_tokenizer import check_cameras, stack_cameras
+from lerobot_wmrl.world_models.next_frame import NextFrameNetwork, Prediction
+from lerobot_wmrl.world_models.st_transformer import TemporalCache
+from lerobot_wmrl.world_models.text_encoder import ByteTextEncoder
+
+Condition = tuple[Tensor, Tensor | None]
+"""Condition tokens (B, T or 1, M, D) and their mask."""
+
+MIN_SPREAD = 1e-3
+"""Components that vary less than this are constants, and left alone by normalisation."""
+
+
+class Imagined(NamedTuple):
+    """One imagined frame of every environment.
+
+    tokens (B, S); done_logit (B,); proprioception (B, P) in the dataset's units; hidden (B, D);
+    entropy (B,), the mean over code factors of the predictive entropy in nats.
+    """
+
+    tokens: Tensor
+    done_logit: Tensor
+    proprioception: Tensor
+    hidden: Tensor
+    entropy: Tensor
+
+
+@dataclass
+class ImaginationState:
+    """Where B imaginations stand: digits (B, 1, S, C), normalised state (B, 1, P), the ring of past frames."""
+
+    digits: Tensor
+    proprioception: Tensor
+    cache: TemporalCache
+    condition: Condition | None = None
+
+
+class WorldModelRewardModel(PreTrainedRewardModel):
+    """Base of both: tokenizer, next-frame network and statistics in one checkpoint."""
+
+    config_class = WorldModelConfig
+    name = "world_model"
+    state_mean: Tensor
+    state_std: Tensor
+
+    def __init__(
+        self, config: WorldModelConfig, dataset_stats: Any = None, dataset_meta: Any = None, **kwargs: Any
+    ) -> None:
+        super().__init__(config)
+        self.config: Any = config
+        source = self._adopt_tokenizer() if config.tokenizer_path else None
+        if dataset_meta is not None:
+            self._adopt_features(dataset_meta.features)
+        self.tokenizer = FrameTokenizer(
+            config.image_size, config.tokenizer_widths, config.levels, len(config.cameras)
+        ).requires_grad_(False)
+        if source is not None:
+            self.tokenizer.load_state_dict(source.tokenizer.state_dict())
+        self.network = NextFrameNetwork(
+            levels=config.levels, grid=self.tokenizer.grid, num_cameras=len(config.cameras),
+            state_size=config.state_size, patch=config.patch, layers=config.layers, width=config.width,
+            heads=config.heads, window=config.window, code_width=config.code_width,
+        )  # fmt: skip
+        self._register_statistics("state", OBS_STATE, config.state_size, dataset_stats)
+
+    def _adopt_tokenizer(self) -> Any:
+        """Take the tokenizer's sizes into the config; a trained checkpoint no longer needs its path."""
+        source = load_model(self.config.tokenizer_path, "frame_tokenizer")
+        self.config.cameras, self.config.image_size = source.config.cameras, source.config.image_size
+        self.config.tokenizer_widths, self.config.levels = source.config.widths, source.config.levels
+        self.config.tokenizer_path = None
+        return source
+
+    def _adopt_features(self, features: dict[str, Any]) -> None:
+        check_cameras(self.config, features)
+        if self.config.state_size:
+            self.config.state_size = features[OBS_STATE]["shape"][0] if OBS_STATE in features else 0
+
+    def _register_statistics(self, name: str, key: str, size: int, stats: Any) -> None:
+        mean, std = torch.zeros(size), torch.ones(size)
+        if stats is not None and size:
+            mean = torch.as_tensor(stats[key]["mean"], dtype=torch.float32)
+            std = torch.as_tensor(stats[key]["std"], dtype=torch.float32)
+            std = torch.where(std < MIN_SPREAD, 1.0, std)
+        self.register_buffer(f"{name}_mean", mean)
+        self.register_buffer(f"{name}_std", std)
+
+    def normalize_state(self, state: Tensor) -> Tensor:
+        """Dataset units to zero mean and unit spread."""
+        return (state - self.state_mean) / self.state_std
+
+    def condition(self, clip: Clip) -> Condition:
+        """Eq. 1's c as tokens for cross-attention."""
+        raise NotImplementedError
+
+    def loss(self, clip: Clip) -> tuple[Tensor, dict[str, float]]:
+        """Eqs. 2-4 on a clip of tokens, with part of the inputs replaced by the model's own predictions."""
+        condition = self.condition(clip)
+        digits, state = self.network.codebook.digits(clip.tokens), self.normalize_state(clip.state)
+        seen, seen_state = corrupt_digits(digits, self.network.codebook.levels, self.config.token_noise), state
+        if self.config.self_forcing > 0:
+            with torch.no_grad():
+                guess = self.network(seen, seen_state, *condition)
+            seen, seen_state = force_predictions(
+                guess, self.network.codebook, seen, seen_state, self.config.self_forcing
+            )
+        prediction = self.network(seen, seen_state, *condition)
+        return next_frame_loss(prediction, self.network.codebook, digits, state, clip, self.config)
+
+    def forward(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, float]]:
+        """LeRobot's batch: images (B, T, 3, H, W), action (B, T, A), state (B, T, P), next.done (B,) of the last."""
+        return self.loss(self.clip_from_batch(batch))
+
+    @torch.no_grad()
+    def clip_from_batch(self, batch: dict[str, Any]) -> Clip:
+        """Tokenise a batch of windows. Only the last frame has a done label, if any."""
+        images = stack_cameras(batch, self.config.camera_keys)
+        tokens = self.tokenizer.encode(images.flatten(0, 1)).unflatten(0, images.shape[:2])
+        shape = tokens.shape[:2]
+        padded = batch.get(f"{self.config.camera_keys[0]}_is_pad", torch.zeros(shape, dtype=torch.bool))
+        done, known = torch.zeros(shape, device=tokens.device), torch.zeros(shape, dtype=torch.bool)
+        if "next.done" in batch:
+            done[:, -1], known[:, -1] = batch["next.done"].reshape(-1).float(), True
+        state = batch[OBS_STATE] if self.config.state_size else tokens.new_zeros((*shape, 0), dtype=torch.float32)
+        return Clip(
+            tokens, state, batch[ACTION], done, ~padded.to(tokens.device), known.to(tokens.device),
+            list(batch.get("task", [""] * shape[0])),
+        )  # fmt: skip
+
+    @torch.no_grad()
+    def predict(self, clip: Clip) -> Prediction:
+        """Teacher-forced predictions on a clip."""
+        digits = self.network.codebook.digits(clip.tokens)
+        return self.network(digits, self.normalize_state(clip.state), *self.condition(clip))
+
+    def start(
+        self, tokens: Tensor, proprioception: Tensor, instructions: Sequence[str] | None = None
+    ) -> ImaginationState:
+        """Imagination from one frame: tokens (B, S), proprioception (B, P) in dataset units."""
+        batch = tokens.shape[0]
+        cache = self.network.transformer.make_cache(
+            batch, self.network.transformer_tokens, tokens.device, torch.float32
+        )
+        condition = self.encode_instructions(instructions) if instructions is not None else None
+        digits = self.network.codebook.digits(tokens)[:, None]
+        return ImaginationState(digits, self.normalize_state(proprioception)[:, None], cache, condition)
+
+    def restart(self, state: ImaginationState, mask: Tensor, tokens: Tensor, proprioception: Tensor) -> None:
+        """Put the environments in `mask` (B,) back to a first frame; their past is masked, not moved."""
+        digits = self.network.codebook.digits(tokens)[:, None]
+        first = self.normalize_state(proprioception)[:, None]
+        state.digits = torch.where(mask[:, None, None, None], digits, state.digits)
+        state.proprioception = torch.where(mask[:, None, None], first, state.proprioception)
+        state.cache.started = torch.where(mask, state.cache.position, state.cache.started)
+
+    @torch.no_grad()
+    def step(
+        self, state: ImaginationState, action: Tensor | None = None, generator: torch.Generator | None = None
+    ) -> Imagined:
+        """Imagine the next frame of every environment: action (B, A) in the dataset's units."""
+        condition = state.condition if action is None else self.encode_actions(action[:, None])
+        if condition is None:
+            raise ValueError("this imagination needs an action each step, or an instruction at the start")
+        prediction = self.network.step(state.digits, state.proprioception, *condition, state.cache)
+        codebook = self.network.codebook
+        state.digits = codebook.sample(prediction.logits, self.config.temperature, generator)
+        state.proprioception = prediction.proprioception
+        return Imagined(
+            codebook.tokens(state.digits[:, 0]),
+            prediction.done_logit[:, 0],
+            prediction.proprioception[:, 0] * self.state_std + self.state_mean,
+            prediction.hidden[:, 0],
+            codebook.entropy(prediction.logits[:, 0]),
+        )
+
+    def encode_actions(self, actions: Tensor) -> Condition:
+        """Actions (B, T, A) in dataset units → condition tokens."""
+        raise NotImplementedError(f"{self.name} is not conditioned on actions")
+
+    def encode_instructions(self, instructions: Sequence[str]) -> Condition:
+        """Instructions → condition tokens."""
+        raise NotImplementedError(f"{self.name} is not conditioned on text")
+
+
+class ActionWorldModelRewardModel(WorldModelRewardModel):
+    """The world model that answers a policy."""
+
+    config_class = ActionWorldModelConfig
+    name = "action_world_model"
+    action_mean: Tensor
+    action_std: Tensor
+
+    def __init__(self, config: ActionWorldModelConfig, dataset_stats: Any = None, **kwargs: Any) -> None:
+        super().__init__(config, dataset_stats, **kwargs)
+        self._register_statistics("action", ACTION, config.action_size, dataset_stats)
+        width, count = config.width, config.condition_tokens
+        self.embed_action = nn.Sequential(
+            nn.Linear(config.action_size, width), nn.SiLU(), nn.Linear(width, count * width)
+        )
+
+    def _adopt_features(self, features: dict[str, Any]) -> None:
+        super()._adopt_features(features)
+        self.config.action_size = features[ACTION]["shape"][0]
+
+    def encode_actions(self, actions: Tensor) -> Condition:
+        normalised = (actions - self.action_mean) / self.action_std
+        return self.embed_action(normalised).unflatten(-1, (self.config.condition_tokens, -1)), None
+
+    def condition(self, clip: Clip) -> Condition:
+        return self.encode_actions(clip.action)
+
+    @torch.no_grad()
+    def compute_reward(self, batch: dict[str, Any]) -> Tensor:
+        """Probability that success holds after the window's last action. → (B,)"""
+        return self.predict(self.clip_from_batch(batch)).done_logit[:, -1].sigmoid()
+
+
+class TextWorldModelRewardModel(WorldModelRewardModel):
+    """The world model that imagines the golden trajectory of an instruction."""
+
+    config_class = TextWorldModelConfig
+    name = "text_world_model"
+
+    def __init__(self, config: TextWorldModelConfig, **kwargs: Any) -> None:
+        super().__init__(config, **kwargs)
+        self.text_encoder = ByteTextEncoder(config.width)
+
+    def encode_instructions(self, instructions: Sequence[str]) -> Condition:
+        return self.text_encoder(instructions)
+
+    def condition(self, clip: Clip) -> Condition:
+        return self.encode_instructions(clip.instructions)
+
+    @torch.no_grad()
+    def compute_reward(self, batch: dict[str, Any]) -> Tensor:
+        """Similarity of the window's last frame to the goal imagined from its first one. → (B,)"""
+        clip = self.clip_from_batch(batch)
+        goal = imagine_goal(self, clip.tokens[:, 0], clip.state[:, 0], clip.instructions)
+        return similarity_to_goal(self.tokenizer, clip.tokens[:, -1], goal.features)

@@ -1,0 +1,191 @@
+"""The network both world models share: tokens of frame t and a condition give frame t + 1 (eq. 1).
+
+One pass predicts every token of the next frame (shifted prediction), the next proprioceptive state and
+whether success holds there. Codes are handled factor by factor: a token of FSQ levels (8, 5, 5, 5) costs
+23 logits instead of 1000, and near misses of a level are near misses of the embedding.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from lerobot_wmrl.world_models.st_transformer import SpatialTemporalTransformer, TemporalCache
+
+
+STATE_STEP = 0.1
+"""The state head predicts changes in units of a tenth of the state's spread."""
+
+
+class Prediction(NamedTuple):
+    """About frame t + 1, given frames up to t. V is the sum of the levels of all factors.
+
+    logits (B, T, S, V); done_logit (B, T); proprioception (B, T, P) in normalised units; hidden (B, T, D).
+    """
+
+    logits: Tensor
+    done_logit: Tensor
+    proprioception: Tensor
+    hidden: Tensor
+
+
+class CodeBook(nn.Module):
+    """Arithmetic between tokens, their digits (one level index a factor) and grids of code values."""
+
+    factor_of_logit: Tensor
+    level_of_logit: Tensor
+    levels: Tensor
+    basis: Tensor
+
+    def __init__(self, levels: Sequence[int]) -> None:
+        super().__init__()
+        self.level_counts = tuple(levels)
+        factors = [factor for factor, count in enumerate(levels) for _ in range(count)]
+        within = [level for count in levels for level in range(count)]
+        basis = torch.tensor([1, *levels[:-1]]).cumprod(0)
+        for name, values in (("factor_of_logit", factors), ("level_of_logit", within), ("levels", list(levels))):
+            self.register_buffer(name, torch.tensor(values), persistent=False)
+        self.register_buffer("basis", basis, persistent=False)
+
+    def digits(self, tokens: Tensor) -> Tensor:
+        """Tokens (…) → level indices (…, C)."""
+        return tokens[..., None] // self.basis % self.levels
+
+    def tokens(self, digits: Tensor) -> Tensor:
+        """Level indices (…, C) → tokens (…)."""
+        return (digits * self.basis).sum(-1)
+
+    def values(self, digits: Tensor) -> Tensor:
+        """Level indices (…, C) → values in [−1, 1] (…, C)."""
+        return digits * 2.0 / (self.levels - 1) - 1.0
+
+    def one_hot(self, digits: Tensor) -> Tensor:
+        """Level indices (…, C) → (…, V), one 1 a factor."""
+        return (digits[..., self.factor_of_logit] == self.level_of_logit).float()
+
+    def cross_entropy(self, logits: Tensor, digits: Tensor) -> Tensor:
+        """Eq. 2 summed over factors: logits (…, V), digits (…, C) → nats a token (…)."""
+        losses = [
+            F.cross_entropy(part.movedim(-1, 1), digits[..., factor], reduction="none")
+            for factor, part in enumerate(logits.split(self.level_counts, -1))
+        ]
+        return torch.stack(losses).sum(0)
+
+    def entropy(self, logits: Tensor) -> Tensor:
+        """Mean entropy of a code factor's prediction in nats: logits (B, S, V) → (B,)."""
+        parts = [torch.special.entr(part.softmax(-1)).sum(-1) for part in logits.split(self.level_counts, -1)]
+        return torch.stack(parts).mean((0, 2))
+
+    def sample(self, logits: Tensor, temperature: float, generator: torch.Generator | None) -> Tensor:
+        """Gumbel-argmax at a temperature on the logits (0: the most likely level). (…, V) → digits (…, C)."""
+        if temperature > 0:
+            uniform = torch.rand(logits.shape, device=logits.device, generator=generator).clamp_min(1e-9)
+            logits = logits / temperature - (-uniform.log()).log()
+        return torch.stack([part.argmax(-1) for part in logits.split(self.level_counts, -1)], -1)
+
+
+class FrameEmbedding(nn.Module):
+    """Code grids to transformer tokens: a 3x3 convolution, then non-overlapping patches of the grid."""
+
+    def __init__(self, factors: int, grid: int, patch: int, code_width: int, width: int) -> None:
+        super().__init__()
+        self.local = nn.Conv2d(factors, code_width, 3, padding=1)
+        self.patches = nn.Conv2d(code_width, width, patch, stride=patch)
+        self.position = nn.Parameter(torch.randn((grid // patch) ** 2, width) * 0.02)
+
+    def forward(self, values: Tensor) -> tuple[Tensor, Tensor]:
+        """values (F, C, g, g) → tokens (F, (g/patch)², D) and the local features (F, code_width, g, g)."""
+        local = F.silu(self.local(values))
+        return self.patches(local).flatten(2).transpose(1, 2) + self.position, local
+
+
+class FrameHead(nn.Module):
+    """Transformer tokens back to the code grid: logits of each factor, biased towards staying the same."""
+
+    def __init__(self, factors: int, logits: int, patch: int, code_width: int, width: int) -> None:
+        super().__init__()
+        self.patch = patch
+        self.split = (logits, factors)
+        self.up = nn.Linear(width, patch**2 * code_width)
+        self.mix = nn.Conv2d(2 * code_width, code_width, 3, padding=1)
+        self.out = nn.Conv2d(code_width, logits + factors, 1)
+
+    def forward(self, hidden: Tensor, local: Tensor) -> tuple[Tensor, Tensor]:
+        """hidden (F, (g/patch)², D), local (F, code_width, g, g) → logits (F, V, g, g), gate (F, C, g, g)."""
+        size = local.shape[-1] // self.patch
+        up = F.pixel_shuffle(self.up(hidden).transpose(1, 2).unflatten(2, (size, size)), self.patch)
+        mixed = F.silu(self.mix(torch.cat([up, local], 1)))
+        logits, gate = self.out(mixed).split(self.split, 1)
+        return logits, F.softplus(gate)
+
+
+class NextFrameNetwork(nn.Module):
+    """Embeds frames, runs the transformer, reads the three predictions.
+
+    A register token a frame carries the proprioceptive state, looks at all visual tokens, and is where
+    done and the next state are read from.
+
+    Args:
+        levels: FSQ levels. grid: side of a camera's token grid. num_cameras: grids a frame.
+        state_size: P, 0 without proprioception. patch: side of the token patches that form one
+        transformer token.
+    """
+
+    def __init__(
+        self, *, levels: Sequence[int], grid: int, num_cameras: int, state_size: int, patch: int,
+        layers: int, width: int, heads: int, window: int, code_width: int,
+    ) -> None:  # fmt: skip
+        super().__init__()
+        self.codebook = CodeBook(levels)
+        self.grid, self.num_cameras, self.patch = grid, num_cameras, patch
+        self.embedding = FrameEmbedding(len(levels), grid, patch, code_width, width)
+        self.camera = nn.Parameter(torch.randn(num_cameras, 1, width) * 0.02)
+        self.register = nn.Parameter(torch.randn(width) * 0.02)
+        self.state_in = nn.Linear(state_size, width)
+        self.transformer = SpatialTemporalTransformer(layers, width, heads, window)
+        self.head = FrameHead(len(levels), sum(levels), patch, code_width, width)
+        self.done = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, 1))
+        self.state_out = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, state_size))
+
+    @property
+    def transformer_tokens(self) -> int:
+        """Tokens a frame inside the transformer, the register included."""
+        return self.num_cameras * (self.grid // self.patch) ** 2 + 1
+
+    def forward(self, digits: Tensor, state: Tensor, condition: Tensor, mask: Tensor | None = None) -> Prediction:
+        """Teacher-forced pass. digits (B, T, S, C), state (B, T, P), condition (B, T or 1, M, D)."""
+        x, local = self._embed(digits, state)
+        return self._read(self.transformer(x, condition, mask), local, digits, state)
+
+    def step(
+        self, digits: Tensor, state: Tensor, condition: Tensor, mask: Tensor | None, cache: TemporalCache
+    ) -> Prediction:
+        """The same for one new frame (T = 1) against the cache."""
+        x, local = self._embed(digits, state)
+        return self._read(self.transformer.step(x, condition, mask, cache), local, digits, state)
+
+    def _grids(self, per_token: Tensor) -> Tensor:
+        """(B, T, S, K) → (B·T·N, K, g, g)."""
+        grids = per_token.unflatten(2, (self.num_cameras, self.grid, self.grid))
+        return grids.flatten(0, 2).permute(0, 3, 1, 2)
+
+    def _embed(self, digits: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        batch, time = digits.shape[:2]
+        tokens, local = self.embedding(self._grids(self.codebook.values(digits)))
+        tokens = tokens.unflatten(0, (batch, time, self.num_cameras)) + self.camera
+        register = (self.register + self.state_in(state))[:, :, None]
+        return torch.cat([register, tokens.flatten(2, 3)], 2), local
+
+    def _read(self, x: Tensor, local: Tensor, digits: Tensor, state: Tensor) -> Prediction:
+        hidden, tokens = x[:, :, 0], x[:, :, 1:]
+        frames = tokens.unflatten(2, (self.num_cameras, -1)).flatten(0, 2)
+        logits, gate = (self._per_token(grids, digits) for grids in self.head(frames, local))
+        logits = logits + gate[..., self.codebook.factor_of_logit] * self.codebook.one_hot(digits)
+        next_state = state + STATE_STEP * self.state_out(hidden)
+        return Prediction(logits, self.done(hidden).squeeze(-1), next_state, hidden)
+
+    def _per_token(self, grids: Tensor, digits: Tensor) -> Tensor:
+        """(B·T·N, K, g, g) → (B, T, S, K)."""
+        return grids.permute(0, 2, 3, 1).reshape(*digits.shape[:3], -1)

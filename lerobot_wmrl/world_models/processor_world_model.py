@@ -1,0 +1,37 @@
+"""Processors of the world models: batches pass through, moved to the device.
+
+Statistics live in the models' buffers, because LeRobot does not reload reward processors on resume.
+"""
+
+from typing import Any
+
+from lerobot.configs.rewards import RewardModelConfig
+from lerobot.processor import (
+    AddBatchDimensionProcessorStep,
+    DeviceProcessorStep,
+    PolicyProcessorPipeline,
+    policy_action_to_transition,
+    transition_to_policy_action,
+)
+from lerobot.utils.constants import POLICY_POSTPROCESSOR_DEFAULT_NAME, POLICY_PREPROCESSOR_DEFAULT_NAME
+
+
+def make_pass_through_processors(
+    config: RewardModelConfig, dataset_stats: dict[str, dict[str, Any]] | None = None
+) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
+    """Pre- and postprocessor of any model of this package."""
+    preprocessor: PolicyProcessorPipeline = PolicyProcessorPipeline(
+        steps=[AddBatchDimensionProcessorStep(), DeviceProcessorStep(device=config.device or "cpu")],
+        name=POLICY_PREPROCESSOR_DEFAULT_NAME,
+    )
+    postprocessor: PolicyProcessorPipeline = PolicyProcessorPipeline(
+        steps=[DeviceProcessorStep(device="cpu")],
+        name=POLICY_POSTPROCESSOR_DEFAULT_NAME,
+        to_transition=policy_action_to_transition,
+        to_output=transition_to_policy_action,
+    )
+    return preprocessor, postprocessor
+
+
+make_action_world_model_pre_post_processors = make_pass_through_processors
+make_text_world_model_pre_post_processors = make_pass_through_processors
