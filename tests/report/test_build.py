@@ -1,0 +1,111 @@
+"""The page and the summary from a small made-up run, whose numbers are known."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from PIL import Image
+
+from lerobot_wmrl.constants import KINDS
+from lerobot_wmrl.demo.episodes import episode_table, optimal_episodes
+from lerobot_wmrl.demo.stages import DemoConfig, demo_stages
+from lerobot_wmrl.files import write_json
+from lerobot_wmrl.report.build import verdict, write_report
+from lerobot_wmrl.report.statistics import Proportion
+from lerobot_wmrl.tracking import append_metrics
+
+SUCCESSES = {"eval_sft": 4, "imagine_sft": 5, "eval_rl": 6, "imagine_rl": 9}
+
+
+@pytest.fixture
+def finished(tmp_path: Path) -> DemoConfig:
+    """An output folder as ten episodes of evaluation and four recorded episodes would leave it."""
+    config = DemoConfig(tmp_path)
+    write_dataset(tmp_path / "dataset")
+    for stage in demo_stages(config):
+        record: dict[str, object] = {"name": stage.name, "title": stage.title, "command": f"run-{stage.name}"}
+        record |= {"seconds": 3.0, "peak_memory_bytes": 2e9}
+        write_json(
+            tmp_path / "stages" / f"{stage.name}.json", {**record, "seconds": 3.0, "peak_memory_bytes": 2e9}
+        )
+    for folder, successes in SUCCESSES.items():
+        outcomes = [i < successes for i in range(10)]
+        write_json(tmp_path / folder / "eval_info.json", {"per_task": [{"metrics": {"successes": outcomes}}]})
+    for policy in ("sft", "rl"):
+        replay = {"false_successes": 2, "real_failures": 5, "recognised_successes": 3, "real_successes": 4}
+        write_json(tmp_path / f"replay_{policy}" / "metrics.json", replay)
+        Image.new("RGB", (8, 8)).save(tmp_path / f"replay_{policy}" / "comparison_0.png")
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "logs" / "sft.log").write_text("INFO step:1 loss:2.0 \nINFO step:2 loss:1.0 \n")
+    for folder in ("frame_tokenizer", "action_world_model", "text_world_model", "rl"):
+        (tmp_path / folder).mkdir()
+        append_metrics(tmp_path / folder, 1, {"loss": 1.0, "success_rate": 0.5})
+    return config
+
+
+def write_dataset(root: Path) -> None:
+    """Four episodes of three rows; the first and the last succeed, at their last row."""
+    kinds = [KINDS.index(kind) for kind in ("optimal", "optimal", "near_miss", "optimal")]
+    starts = {
+        "start.kind": kinds,
+        "start.seed": range(4),
+        "start.scene": [0, 0, 1, 1],
+        "episode_index": range(4),
+    }
+    success = np.zeros((4, 3), dtype=bool)
+    success[[0, 3], -1] = True
+    table = {name: np.repeat(values, 3) for name, values in starts.items()}
+    table["next.success"] = success.reshape(-1)
+    (root / "data" / "chunk-000").mkdir(parents=True)
+    pq.write_table(pa.table(table), root / "data" / "chunk-000" / "file-000.parquet")
+
+
+def test_page_is_self_contained_and_says_the_numbers(finished: DemoConfig) -> None:
+    stages = [stage.name for stage in demo_stages(finished)]
+    page = write_report(finished, stages).read_text()
+    assert not re.findall(r"""(?:src|href)=["'](?!data:)""", page), "the page needs other files"
+    assert "4 of 10; 95 %: 17–69 %" in page
+    assert "Real success went from 40 % to 60 % (+20 points)" in page
+    assert "40 % (2 of 5; 12–77 %)" in page
+    for name in stages:
+        assert f"<pre>run-{name}</pre>" in page
+    assert page.count("data:image/png;base64,") >= 8
+
+
+def test_summary_holds_every_headline_number(finished: DemoConfig) -> None:
+    write_report(finished, [stage.name for stage in demo_stages(finished)])
+    summary = json.loads((finished.output_dir / "summary.json").read_text())
+    assert summary["policies"]["rl"]["real"]["k"] == SUCCESSES["eval_rl"]
+    assert summary["policies"]["sft"]["false_success"]["share"] == 0.4
+    assert summary["dataset"] == {"episodes": 4, "frames": 12}
+    assert summary["seconds"] == 3.0 * len(demo_stages(finished))
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "words"),
+    [
+        (10, 90, "it helped in reality"),
+        (90, 10, "made the policy worse"),
+        (50, 55, "does not show"),
+    ],
+)
+def test_verdict_claims_no_more_than_the_intervals(before: int, after: int, words: str) -> None:
+    assert words in verdict(Proportion(before, 100), Proportion(after, 100))
+
+
+def test_episode_table_reads_outcomes_by_episode(tmp_path: Path) -> None:
+    write_dataset(tmp_path)
+    table = episode_table(tmp_path)
+    assert table["length"].tolist() == [3, 3, 3, 3]
+    assert table["success"].tolist() == [True, False, False, True]
+
+
+def test_cloning_takes_successful_optimal_episodes_only(tmp_path: Path) -> None:
+    write_dataset(tmp_path)
+    assert optimal_episodes(tmp_path, 2) == [0, 3]
+    with pytest.raises(ValueError, match="holds 2 successful optimal episodes, 3 are needed"):
+        optimal_episodes(tmp_path, 3)
