@@ -1,0 +1,119 @@
+"""One simulated episode at a time, in numpy: what the recorder and the environments drive."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW
+from lerobot_wmrl.maniskill.objects import OBJECTS
+from lerobot_wmrl.maniskill.renderer import render_backend
+from lerobot_wmrl.maniskill.scenes import Scene
+from lerobot_wmrl.maniskill.tabletop import TabletopEnv
+from lerobot_wmrl.maniskill.tasks import Situation, Start, Task
+
+GRIPPER_OPEN = 0.04
+"""Finger joint position (m) of the open gripper."""
+
+ROBOT_MESH_DETAIL = 0.04
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What is known at one control step.
+
+    Args:
+        images: camera → (H, W, 3) uint8.
+        state: (8,) float32, `constants.STATE_NAMES`.
+        reward: the task's rule-based reward of being here.
+        success: whether the task is solved here.
+    """
+
+    images: dict[str, np.ndarray]
+    state: np.ndarray
+    reward: float
+    success: bool
+
+
+class Simulation:
+    """A ManiSkill table that plays episodes of one task in some scenes.
+
+    Args:
+        task: what succeeds and what pays.
+        scenes: the scenes that may be asked for.
+        cameras: names from `constants.CAMERAS`.
+        image_size: pixels of each side.
+        robot_mesh_detail: share of the robot's triangles that are drawn; 1 draws ManiSkill's own meshes.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        scenes: Sequence[Scene],
+        cameras: Sequence[str] = ("third_view",),
+        image_size: int = 64,
+        robot_mesh_detail: float = ROBOT_MESH_DETAIL,
+    ) -> None:
+        self.task, self.cameras = task, tuple(cameras)
+        self.env = TabletopEnv(scenes, cameras, image_size, robot_mesh_detail, render_backend=render_backend())
+        self.env.reset(seed=0)
+        self._low, self._high = np.array(ACTION_LOW, np.float32), np.array(ACTION_HIGH, np.float32)
+
+    def start(self, scene: Scene, seed: int) -> Start:
+        """The start of this scene and seed, as a plan: nothing is moved."""
+        return self.task.start(scene, OBJECTS[scene.object].label, seed)
+
+    def reset(self, scene: Scene, seed: int) -> Frame:
+        """Rebuild the start of (task, scene, seed). The same arguments give the same frame."""
+        self.scene = scene
+        self.current_start = self.start(scene, seed)
+        self.env.place(scene, self.current_start)
+        self.object_start = self.object_position
+        return self._frame()
+
+    def step(self, action: np.ndarray) -> Frame:
+        """Apply one action (7,), clipped to the action box, for one control step."""
+        clipped = np.clip(np.asarray(action, np.float32), self._low, self._high)
+        self.env.step(torch.from_numpy(clipped)[None])
+        return self._frame()
+
+    @property
+    def instruction(self) -> str:
+        return self.current_start.instruction
+
+    @property
+    def object_position(self) -> np.ndarray:
+        """(3,) centre of the object."""
+        return np.asarray(self.env.active._objs[0].pose.p, np.float64)
+
+    @property
+    def tcp_position(self) -> np.ndarray:
+        """(3,)"""
+        return np.asarray(self.env.agent.tcp._objs[0].entity.pose.p, np.float64)
+
+    def situation(self) -> Situation:
+        """What the task judges now."""
+        height = OBJECTS[self.scene.object].half_size[2]
+        return Situation(self.object_start, self.object_position, self.tcp_position, height)
+
+    def close(self) -> None:
+        self.env.close()
+
+    def _frame(self) -> Frame:
+        situation = self.situation()
+        return Frame(self._images(), self._state(), self.task.reward(situation), self.task.success(situation))
+
+    def _state(self) -> np.ndarray:
+        pose = self.env.agent.tcp._objs[0].entity.pose
+        opening = self.env.agent.robot._objs[0].qpos[-1] / GRIPPER_OPEN
+        return np.array([*pose.p, *pose.q, np.clip(opening, 0.0, 1.0)], np.float32)
+
+    def _images(self) -> dict[str, np.ndarray]:
+        self.env.scene.sub_scenes[0].update_render()
+        images = {}
+        for name in self.cameras:
+            camera = self.env._sensors[name].camera._render_cameras[0]
+            camera.take_picture()
+            images[name] = np.ascontiguousarray(camera.get_picture("Color")[..., :3])
+        return images
