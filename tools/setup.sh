@@ -81,7 +81,8 @@ install_once() {
 }
 
 install_locked_packages() {
-    "$(find_uv)" pip sync --python "$venv_python" --require-hashes requirements.lock
+    # Compiled once here: a command imports thousands of modules, and some machines keep Python from caching them.
+    "$(find_uv)" pip sync --python "$venv_python" --compile-bytecode --require-hashes requirements.lock
     rm -f .venv/.installed-project # uv removed it: it is not in the lock
 }
 
