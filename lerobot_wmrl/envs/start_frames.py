@@ -2,12 +2,11 @@
 
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
-from lerobot_wmrl.world_models.episode_table import EpisodeTable, open_dataset, read_episodes
+from lerobot_wmrl.world_models.episode_table import choose_episodes, open_dataset, read_episodes
 from lerobot_wmrl.world_models.frame_cache import cached_frames, frames_to_tensor
 from lerobot_wmrl.world_models.goal import imagine_goal
 from lerobot_wmrl.world_models.modeling_world_model import (
@@ -29,18 +28,6 @@ class Starts(NamedTuple):
     goal_reached: Tensor
 
 
-def choose_episodes(table: EpisodeTable, source: StartFrames) -> np.ndarray:
-    """Indices of at most `max_starts` episodes of the split, evenly spread."""
-    masks = {"train": ~table.validation, "validation": table.validation, "all": table.length > 0}
-    if source.split not in masks:
-        raise ValueError(f"dataset.split={source.split!r}: choose one of {', '.join(masks)}")
-    episodes = masks[source.split].nonzero()[0]
-    if not len(episodes):
-        raise ValueError(f"dataset.root={source.root}: no episode in its {source.split} split")
-    count = min(len(episodes), source.max_starts)
-    return episodes[np.linspace(0, len(episodes) - 1, count).astype(int)]
-
-
 @torch.no_grad()
 def load_starts(
     source: StartFrames, model: ActionWorldModelRewardModel, text_model: TextWorldModelRewardModel
@@ -49,8 +36,9 @@ def load_starts(
     table = read_episodes(open_dataset(source.root, source.repo_id))
     if table.state.shape[1] < model.config.state_size:
         raise ValueError(f"dataset.root={source.root}: the world model needs observation.state, the dataset has none")
-    rows = table.start[choose_episodes(table, source)]
-    instructions = [table.instructions[episode] for episode in choose_episodes(table, source)]
+    episodes = choose_episodes(table, source.split, source.max_starts)
+    rows = table.start[episodes]
+    instructions = [table.instructions[episode] for episode in episodes]
     device = model.state_mean.device
     images = frames_to_tensor(cached_frames(table.dataset, model.config.camera_keys)[rows]).to(device)
     state = torch.from_numpy(table.state[rows][:, : model.config.state_size]).to(device)

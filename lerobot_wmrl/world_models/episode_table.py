@@ -69,3 +69,14 @@ def golden_episodes(table: EpisodeTable) -> np.ndarray:
     """Successful optimal episodes, from which the text world model learns. (E,) bool."""
     optimal = (table.kind == KINDS.index("optimal")) | (table.kind == -1)
     return table.success & optimal
+
+
+def choose_episodes(table: EpisodeTable, split: str, at_most: int) -> np.ndarray:
+    """Indices of at most `at_most` episodes of the split `train`, `validation` or `all`, evenly spread."""
+    masks = {"train": ~table.validation, "validation": table.validation, "all": table.length > 0}
+    if split not in masks:
+        raise ValueError(f"split={split!r}: choose one of {', '.join(masks)}")
+    episodes = masks[split].nonzero()[0]
+    if not len(episodes):
+        raise ValueError(f"dataset {table.dataset.root}: no episode in its {split} split")
+    return episodes[np.linspace(0, len(episodes) - 1, min(len(episodes), at_most)).astype(int)]

@@ -62,7 +62,7 @@ def cached_tokens(dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer
 
 def frames_to_tensor(frames: np.ndarray) -> torch.Tensor:
     """uint8 (B, N, H, W, 3) → float32 (B, N, 3, H, W) in [0, 1]."""
-    return torch.from_numpy(np.ascontiguousarray(frames)).permute(0, 1, 4, 2, 3).float() / 255
+    return torch.from_numpy(np.array(frames)).permute(0, 1, 4, 2, 3).float() / 255
 
 
 def _decode_episode(dataset: LeRobotDataset, episode: int, key: str) -> np.ndarray:

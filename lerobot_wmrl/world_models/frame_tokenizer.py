@@ -97,6 +97,7 @@ class FrameTokenizer(nn.Module):
         self.encoder = Encoder(widths, len(levels))
         self.decoder = Decoder(widths, len(levels))
         self.quantizer = FSQ(list(levels))
+        self.whiten = nn.ModuleList(nn.BatchNorm2d(channels, affine=False) for channels in (widths[-1], widths[0]))
 
     @property
     def tokens_per_frame(self) -> int:
@@ -109,24 +110,27 @@ class FrameTokenizer(nn.Module):
         return indices.reshape(images.shape[0], -1).long()
 
     def decode_with_features(self, tokens: Tensor) -> Decoded:
-        """Tokens (B, S) → images and the feature maps from which similarity is measured."""
-        codes = self.quantizer.indices_to_codes(tokens.reshape(-1, self.grid, self.grid))
-        return self._decode_codes(codes, tokens.shape[0])
+        """Tokens (B, S) → images and the whitened feature maps from which similarity is measured."""
+        pixels, features = self.decoder(self.quantizer.indices_to_codes(tokens.reshape(-1, self.grid, self.grid)))
+        images = ((pixels + 1) / 2).clamp(0, 1).unflatten(0, (len(tokens), self.num_cameras))
+        return Decoded(images, self._whitened(features))
 
     def decode(self, tokens: Tensor) -> Tensor:
         """Tokens (B, S) → images (B, N, 3, H, W) in [0, 1]."""
         return self.decode_with_features(tokens).images
 
-    def _decode_codes(self, codes: Tensor, batch: int) -> Decoded:
-        pixels, features = self.decoder(codes)
-        images = ((pixels + 1) / 2).clamp(0, 1)
-        return Decoded(images.unflatten(0, (batch, self.num_cameras)), features)
+    def _whitened(self, features: list[Tensor]) -> list[Tensor]:
+        """Zero mean and unit variance a channel over the training frames: without it what all frames share
+        hides how they differ. The statistics are learnt in training and fixed afterwards."""
+        return [whiten(feature) for whiten, feature in zip(self.whiten, features, strict=True)]
 
     def forward(self, images: Tensor, weight: Tensor | None = None) -> tuple[Tensor, dict[str, float]]:
         """Reconstruction loss: weighted L1 plus L2, images (B, N, 3, H, W), weight (B, N, 1, H, W)."""
         flat = images.flatten(0, 1) * 2 - 1
         codes, _ = self.quantizer(self.encoder(flat))
-        pixels, _ = self.decoder(codes)
+        pixels, features = self.decoder(codes)
+        if self.training:
+            self._whitened([feature.detach() for feature in features])
         error = pixels - flat
         weighted = error.abs() + error.square()
         if weight is not None:

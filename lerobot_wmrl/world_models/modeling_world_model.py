@@ -86,6 +86,12 @@ class WorldModelRewardModel(PreTrainedRewardModel):
         )  # fmt: skip
         self._register_statistics("state", OBS_STATE, config.state_size, dataset_stats)
 
+    def train(self, mode: bool = True) -> "WorldModelRewardModel":
+        """The tokenizer is fixed: it stays in evaluation mode."""
+        super().train(mode)
+        self.tokenizer.eval()
+        return self
+
     def _adopt_tokenizer(self) -> Any:
         """Take the tokenizer's sizes into the config; a trained checkpoint no longer needs its path."""
         source = load_model(self.config.tokenizer_path, "frame_tokenizer")

@@ -1,0 +1,123 @@
+"""lerobot-wmrl-eval-world-model: replay real episodes in a world model and measure how far it can be trusted.
+
+    lerobot-wmrl-eval-world-model --model.path=outputs/action_world_model --dataset.root=D --output_dir=outputs/check
+
+Each episode is imagined from its first frame with its own actions. `metrics.json` gets the accuracy by
+step and the false-success rate: of the episodes that failed in reality, how many the model believes in.
+Add `--text_model.path=…` for goal frames and the reward along a successful and a failed episode.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lerobot_wmrl.scripts.command import RunConfig, run_command
+from lerobot_wmrl.scripts.train_world_model import DatasetSource
+
+if TYPE_CHECKING:
+    from lerobot_wmrl.world_models.evaluation import Replay
+    from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
+
+
+@dataclass
+class Checkpoint:
+    """A trained model: the output folder of its training, or one of its checkpoints."""
+
+    path: str = ""
+
+
+@dataclass
+class EvalWorldModelConfig(RunConfig):
+    """Replay real episodes in a world model.
+
+    Args:
+        model: `--model.path=…`, an action world model.
+        text_model: `--text_model.path=…`, for goal frames and reward curves.
+        dataset: real episodes.
+        split: `all`, or `train` / `validation` of the dataset the model was trained on.
+        max_episodes: at most so many, evenly spread.
+        done_threshold, done_frames: when an imagined episode counts as a success; as in the environment.
+        alpha, form, gamma: of the general reward in the curves; as in the environment.
+        output_dir: where metrics.json and the pictures go.
+    """
+
+    model: Checkpoint = field(default_factory=Checkpoint)
+    text_model: Checkpoint = field(default_factory=Checkpoint)
+    dataset: DatasetSource = field(default_factory=DatasetSource)
+    split: str = "all"
+    max_episodes: int = 200
+    done_threshold: float = 0.5
+    done_frames: int = 3
+    alpha: float = 0.9
+    form: str = "potential"
+    gamma: float = 0.97
+    output_dir: Path = Path("outputs/eval_world_model")
+
+
+def eval_world_model(cfg: EvalWorldModelConfig) -> None:
+    """Replay, measure, draw."""
+    from lerobot_wmrl.files import write_json
+    from lerobot_wmrl.world_models.checkpoint import load_model
+    from lerobot_wmrl.world_models.episode_table import choose_episodes, open_dataset, read_episodes
+    from lerobot_wmrl.world_models.evaluation import accuracy_by_step, replay, success_agreement
+    from lerobot_wmrl.world_models.frame_cache import cached_frames
+
+    model = load_model(cfg.model.path, "action_world_model")
+    table = read_episodes(open_dataset(cfg.dataset.root, cfg.dataset.repo_id))
+    episodes = choose_episodes(table, cfg.split, cfg.max_episodes)
+    frames = cached_frames(table.dataset, model.config.camera_keys)
+    run = replay(model, table, frames, episodes)
+    agreement = success_agreement(run, cfg.done_threshold, cfg.done_frames)
+    accuracy = accuracy_by_step(model, run)
+    cfg.output_dir.mkdir(parents=True, exist_ok=True)
+    draw(cfg, model, run, accuracy)
+    write_json(cfg.output_dir / "metrics.json", {**agreement, **accuracy, "dataset": cfg.dataset.root})
+    print(
+        f"{len(episodes)} real episodes replayed: {agreement['false_successes']} of {agreement['real_failures']} "
+        f"failures were called successes, {agreement['recognised_successes']} of {agreement['real_successes']} "
+        f"successes were recognised. Written to {cfg.output_dir}"
+    )
+
+
+def draw(cfg: EvalWorldModelConfig, model: "ActionWorldModelRewardModel", run: "Replay", accuracy: dict[str, Any]) -> None:
+    """Side-by-side animations and strips, accuracy, and with a text model goals and reward curves."""
+    from lerobot_wmrl.world_models import pictures
+
+    pictures.save_accuracy(accuracy, cfg.output_dir / "accuracy.png")
+    shown = run.one_of_each()
+    for name, index in shown.items():
+        frames = pictures.side_by_side(model, run, index)
+        pictures.save_animation(frames, cfg.output_dir / f"comparison_{name}.gif")
+        pictures.save_strip(frames, cfg.output_dir / f"comparison_{name}_strip.png")
+    if cfg.text_model.path:
+        curves = reward_curves(cfg, model, run, shown)
+        pictures.save_goals(curves, cfg.output_dir / "goal_frames.png")
+        pictures.save_reward_curves(curves, cfg.output_dir / "reward_along_episodes.png")
+
+
+def reward_curves(
+    cfg: EvalWorldModelConfig, model: "ActionWorldModelRewardModel", run: "Replay", shown: dict[str, int]
+) -> dict[str, dict[str, Any]]:
+    """Per shown episode: done probability, similarity and the return so far."""
+    from lerobot_wmrl.rewards.configuration_general import GeneralConfig
+    from lerobot_wmrl.rewards.curves import reward_along_episode
+    from lerobot_wmrl.world_models.checkpoint import load_model
+
+    text_model = load_model(cfg.text_model.path, "text_world_model")
+    reward = GeneralConfig(alpha=cfg.alpha, form=cfg.form, gamma=cfg.gamma, device="cpu")
+    return {
+        name: reward_along_episode(
+            model, text_model, reward, run.table, run.frames, int(run.episodes[index]),
+            threshold=cfg.done_threshold, frames=cfg.done_frames,
+        )
+        for name, index in shown.items()
+    }  # fmt: skip
+
+
+def main() -> None:
+    """Entry point of the console command."""
+    run_command(eval_world_model, EvalWorldModelConfig, "eval-world-model")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,164 @@
+"""How far an action world model can be trusted: real episodes replayed open loop from their first frame."""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import trange
+
+from lerobot_wmrl.statistics import Proportion
+from lerobot_wmrl.world_models.episode_table import EpisodeTable
+from lerobot_wmrl.world_models.frame_cache import frames_to_tensor
+from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
+
+DELTA_PSNR_STEP = 15
+BATCH = 64
+MOTION_THRESHOLD = 0.08
+
+
+class OpenLoop(NamedTuple):
+    """Imagined frames after each real action of E episodes, T steps.
+
+    tokens (E, T, S); done_probability (E, T); proprioception (E, T, P).
+    """
+
+    tokens: Tensor
+    done_probability: Tensor
+    proprioception: Tensor
+
+
+@dataclass
+class Replay:
+    """Real episodes and what the model made of them; row t of `imagined` belongs to real frame t + 1.
+
+    valid (E, T): real frame t + 1 exists; acted (E, T): action t exists; done (E, T): real success.
+    """
+
+    table: EpisodeTable
+    frames: np.ndarray
+    episodes: np.ndarray
+    imagined: OpenLoop
+    shuffled: OpenLoop
+    valid: np.ndarray
+    acted: np.ndarray
+    done: np.ndarray
+
+    def real_frames(self, step: int) -> np.ndarray:
+        """Real frames `step` rows after the start (the last one where the episode is over), (E, N, H, W, 3)."""
+        return self.frames[self.rows(step)]
+
+    def one_of_each(self) -> dict[str, int]:
+        """The first episode that succeeded and the first that failed, by position."""
+        success = self.done.any(1)
+        first = {"success": success, "failure": ~success}
+        return {name: int(mask.argmax()) for name, mask in first.items() if mask.any()}
+
+    def rows(self, step: int) -> np.ndarray:
+        """Dataset rows of that step. (E,)"""
+        return self.table.start[self.episodes] + np.minimum(step, self.table.length[self.episodes] - 1)
+
+
+@torch.no_grad()
+def open_loop(model: ActionWorldModelRewardModel, tokens: Tensor, state: Tensor, actions: Tensor) -> OpenLoop:
+    """Imagine from tokens (E, S), state (E, P) with real actions (E, T, A)."""
+    imagination = model.start(tokens, state)
+    steps = [model.step(imagination, actions[:, step]) for step in range(actions.shape[1])]
+    return OpenLoop(
+        torch.stack([step.tokens for step in steps], 1),
+        torch.stack([step.done_logit.sigmoid() for step in steps], 1),
+        torch.stack([step.proprioception for step in steps], 1),
+    )
+
+
+def replay(
+    model: ActionWorldModelRewardModel, table: EpisodeTable, frames: np.ndarray, episodes: np.ndarray
+) -> Replay:
+    """Replay the episodes with their own actions, and with those of another episode for delta-PSNR."""
+    length = table.length[episodes]
+    steps = np.arange(length.max())
+    rows = table.start[episodes][:, None] + np.minimum(steps, length[:, None] - 1)
+    acted = steps < length[:, None]
+    first = frames_to_tensor(frames[table.start[episodes]]).to(model.state_mean.device)
+    state = torch.from_numpy(table.state[table.start[episodes]]).to(first.device)
+    actions = torch.from_numpy(table.action[rows]).to(first.device)
+    runs: list[list[OpenLoop]] = [[], []]
+    for begin in trange(0, len(episodes), BATCH, desc="Replaying episodes", unit="batch"):
+        part = slice(begin, begin + BATCH)
+        tokens = model.tokenizer.encode(first[part])
+        for run, given in zip(runs, (actions, actions.roll(1, 0)), strict=True):
+            run.append(open_loop(model, tokens, state[part], given[part]))
+    own, other = (OpenLoop(*map(torch.cat, zip(*run, strict=True))) for run in runs)
+    valid = steps + 1 < length[:, None]
+    return Replay(table, frames, episodes, own, other, valid, acted, table.done[rows] & acted)
+
+
+def accuracy_by_step(model: ActionWorldModelRewardModel, run: Replay) -> dict[str, Any]:
+    """PSNR (dB) of whole frames and of what moved, delta-PSNR at 15 frames, TCP error (mm), all by step."""
+    psnr, moving, delta, tcp = [], [], [], []
+    start = run.real_frames(0).astype(np.float32) / 255
+    for step in range(run.valid.shape[1]):
+        keep = run.valid[:, step]
+        if not keep.any():
+            break
+        real = run.real_frames(step + 1)[keep].astype(np.float32) / 255
+        error = (decode(model, run.imagined.tokens[keep, step]) - real) ** 2
+        moved = (np.abs(real - start[keep]).max(-1) > MOTION_THRESHOLD)[..., None]
+        psnr.append(_db(error.mean((1, 2, 3, 4))).mean())
+        moving.append(float(_db((error * moved).sum() / max(1, 3 * moved.sum()))))
+        if step + 1 == DELTA_PSNR_STEP:
+            other = (decode(model, run.shuffled.tokens[keep, step]) - real) ** 2
+            delta.append((_db(error.mean((1, 2, 3, 4))) - _db(other.mean((1, 2, 3, 4)))).mean())
+        if run.table.state.shape[1]:
+            imagined = run.imagined.proprioception[keep, step, :3].cpu().numpy()
+            tcp.append(1000 * np.linalg.norm(imagined - run.table.state[run.rows(step + 1)[keep], :3], axis=-1).mean())
+    return {
+        "psnr_by_step": [round(float(value), 3) for value in psnr],
+        "moving_psnr_by_step": [round(value, 3) for value in moving],
+        "delta_psnr_15": float(delta[0]) if delta else None,
+        "tcp_error_mm_by_step": [round(float(value), 2) for value in tcp],
+    }
+
+
+def longest_run(fired: np.ndarray) -> np.ndarray:
+    """Longest run of consecutive True along the last axis. (E, T) → (E,)"""
+    longest = current = np.zeros(fired.shape[0], int)
+    for column in fired.T:
+        current = np.where(column, current + 1, 0)
+        longest = np.maximum(longest, current)
+    return longest
+
+
+def success_agreement(run: Replay, threshold: float, frames: int) -> dict[str, Any]:
+    """The gate: of real failures, the share that the model, replayed open loop, calls successes.
+
+    An episode is called a success as the environment would: `frames` consecutive frames at `threshold`.
+    """
+    fired = (run.imagined.done_probability.cpu().numpy() >= threshold) & run.acted
+    called, real = longest_run(fired) >= frames, run.done.any(1)
+    both = called & real
+    delay = fired.argmax(1)[both] - run.done.argmax(1)[both]
+    counts = {
+        "real_failures": ~real, "false_successes": called & ~real,
+        "real_successes": real, "recognised_successes": both,
+    }  # fmt: skip
+    return {
+        **{name: int(mask.sum()) for name, mask in counts.items()},
+        "false_success_rate": Proportion(int((called & ~real).sum()), int((~real).sum())).as_json(),
+        "recognised_rate": Proportion(int(both.sum()), int(real.sum())).as_json(),
+        "done_delay_frames": float(delay.mean()) if len(delay) else None,
+        "episodes": run.episodes.tolist(),
+        "called_success": called.tolist(),
+        "real_success": real.tolist(),
+    }
+
+
+@torch.no_grad()
+def decode(model: ActionWorldModelRewardModel, tokens: Tensor) -> np.ndarray:
+    """Tokens (E, S) → frames (E, N, H, W, 3) float in [0, 1]."""
+    return model.tokenizer.decode(tokens).permute(0, 1, 3, 4, 2).cpu().numpy()
+
+
+def _db(mse: np.ndarray) -> np.ndarray:
+    return -10 * np.log10(np.maximum(mse, 1e-10))
