@@ -9,8 +9,8 @@ from mani_skill.utils import sapien_utils
 from lerobot_wmrl.constants import CAMERAS
 
 THIRD_VIEW_EYE = (0.55, 0.42, 0.50)
-THIRD_VIEW_TARGET = (-0.04, 0.0, 0.055)
-THIRD_VIEW_FOV = 0.48
+THIRD_VIEW_TARGET = (-0.02, -0.005, 0.05)
+THIRD_VIEW_FOV = 0.53
 WRIST_POSITION = (0.08, 0.0, 0.0)
 WRIST_QUATERNION = (0.5736, 0.0, -0.8192, 0.0)
 """In the hand's axes: along the fingers, leaning 20 degrees towards them."""

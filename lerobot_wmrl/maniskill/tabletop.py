@@ -69,7 +69,10 @@ class TabletopEnv(BaseEnv):
 
     def _load_lighting(self, options: dict) -> None:
         self.scene.set_ambient_light([0.45, 0.45, 0.45])
-        self.scene.add_directional_light([-0.6, 0.4, -1.0], [1.6, 1.6, 1.6], shadow=False)
+        self.scene.add_directional_light(
+            [-0.15, 0.1, -1.0], [1.5, 1.5, 1.5], shadow=True, shadow_scale=0.4, shadow_near=-1.5, shadow_far=1.5,
+            shadow_map_size=256,
+        )  # fmt: skip
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         """Nothing to draw here: `place` puts everything where the task's start says."""

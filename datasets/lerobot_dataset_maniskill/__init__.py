@@ -1,0 +1,1 @@
+"""Records manipulation trajectories in ManiSkill as a LeRobotDataset."""
