@@ -1,0 +1,128 @@
+"""The policy's networks: plain torch, no LeRobot. B batch, C channels, H height, W width."""
+
+import zlib
+from collections.abc import Sequence
+from functools import lru_cache
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+GRID = 8
+"""Cells a side of the pooled feature map."""
+
+GRID_CHANNELS = 16
+
+
+def coordinates(height: int, width: int, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Row and column positions in [-1, 1]. → (H, W), (H, W)"""
+    rows = torch.linspace(-1, 1, height, device=like.device, dtype=like.dtype)
+    columns = torch.linspace(-1, 1, width, device=like.device, dtype=like.dtype)
+    return torch.meshgrid(rows, columns, indexing="ij")  # type: ignore[return-value]
+
+
+def soft_positions(maps: Tensor) -> Tensor:
+    """Spatial softmax: where each channel looks (Levine et al. 2016). (B, C, H, W) → (B, 2C)"""
+    rows, columns = coordinates(maps.shape[2], maps.shape[3], maps)
+    attention = maps.flatten(2).softmax(dim=-1)
+    return torch.cat([attention @ rows.flatten(), attention @ columns.flatten()], dim=1)
+
+
+class ImageEncoder(nn.Module):
+    """An image of any size → features that keep where things are: soft positions and a coarse map."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        wide = 2 * width
+        self.stem = nn.Conv2d(3, width, 5, stride=2, padding=2)
+        self.stem_position = nn.Conv2d(2, width, 5, stride=2, padding=2, bias=False)
+        self.down = nn.Conv2d(width, wide, 3, stride=2, padding=1)
+        self.fine = nn.Conv2d(wide, wide, 3, padding=1)
+        self.coarse = nn.Conv2d(wide, wide, 3, stride=2, padding=1)
+        self.grid = nn.Conv2d(wide, GRID_CHANNELS, 1)
+        self.size = 2 * wide + GRID_CHANNELS * GRID * GRID
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Images in [0, 1]. (B, 3, H, W) → (B, self.size)"""
+        position = torch.stack(coordinates(images.shape[2], images.shape[3], images))[None]
+        centred = (images - 0.5).contiguous(memory_format=torch.channels_last)
+        x = F.relu(self.stem(centred) + self.stem_position(position))
+        x = F.relu(self.down(x))
+        fine = self.fine(x)
+        coarse = self.grid(F.relu(self.coarse(F.relu(fine))))
+        return torch.cat([soft_positions(fine), F.adaptive_avg_pool2d(coarse, GRID).flatten(1)], dim=1)
+
+
+@lru_cache(maxsize=4096)
+def ngram_counts(text: str, buckets: int) -> tuple[float, ...]:
+    """Normalised counts of hashed words and character trigrams: defined for every string, no download."""
+    counts = [0.0] * buckets
+    words = text.lower().split()
+    for word in words:
+        padded = f"<{word}>"
+        for gram in (padded, *(padded[i : i + 3] for i in range(len(padded) - 2))):
+            counts[zlib.crc32(gram.encode()) % buckets] += 1.0
+    norm = max(1.0, sum(count * count for count in counts) ** 0.5)
+    return tuple(count / norm for count in counts)
+
+
+class InstructionEncoder(nn.Module):
+    """Instructions → embeddings."""
+
+    def __init__(self, buckets: int, size: int) -> None:
+        super().__init__()
+        self.buckets = buckets
+        self.project = nn.Linear(buckets, size)
+
+    def forward(self, instructions: Sequence[str]) -> Tensor:
+        """B strings → (B, size). Each distinct string is encoded once."""
+        distinct = list(dict.fromkeys(instructions))
+        device = self.project.weight.device
+        counts = torch.tensor([ngram_counts(text, self.buckets) for text in distinct], device=device)
+        row = {text: index for index, text in enumerate(distinct)}
+        rows = torch.tensor([row[text] for text in instructions], device=device)
+        return self.project(counts).tanh()[rows]
+
+
+class Trunk(nn.Module):
+    """Images, state and instruction → `outputs` numbers. Used once for the action and once for the value."""
+
+    def __init__(
+        self,
+        cameras: int,
+        state_size: int,
+        width: int,
+        hidden: int,
+        buckets: int,
+        language: int,
+        outputs: int,
+    ) -> None:
+        super().__init__()
+        self.encoders = nn.ModuleList(ImageEncoder(width) for _ in range(cameras))
+        self.instruction = InstructionEncoder(buckets, language)
+        image_size = sum(encoder.size for encoder in self.encoders)  # type: ignore[misc]
+        self.mix = nn.Sequential(
+            nn.Linear(image_size + state_size + language, hidden), nn.LayerNorm(hidden), nn.SiLU(),
+            nn.Linear(hidden, hidden), nn.SiLU(),
+        )  # fmt: skip
+        self.head = nn.Linear(hidden, outputs)
+        nn.init.orthogonal_(self.head.weight, 0.01)
+        nn.init.zeros_(self.head.bias)
+
+    def forward(self, images: Sequence[Tensor], state: Tensor | None, instructions: Sequence[str]) -> Tensor:
+        """One (B, 3, H, W) a camera, (B, P) or None, B strings → (B, outputs)"""
+        seen = [encoder(image) for encoder, image in zip(self.encoders, images, strict=True)]
+        parts = [*seen, *([] if state is None else [state]), self.instruction(instructions)]
+        return self.head(self.mix(torch.cat(parts, dim=1)))
+
+
+def random_shift(images: Tensor, pixels: int) -> Tensor:
+    """Each image moved by up to `pixels` along both axes, edges repeated. (B, 3, H, W) → (B, 3, H, W)"""
+    batch, _, height, width = images.shape
+    padded = F.pad(images, (pixels,) * 4, mode="replicate")
+    top, left = (torch.randint(0, 2 * pixels + 1, (batch, 1), device=images.device) for _ in range(2))
+    rows = (top + torch.arange(height, device=images.device))[:, None, :, None]
+    columns = (left + torch.arange(width, device=images.device))[:, None, None, :]
+    batch_index = torch.arange(batch, device=images.device)[:, None, None, None]
+    channel_index = torch.arange(images.shape[1], device=images.device)[None, :, None, None]
+    return padded[batch_index, channel_index, rows, columns]
