@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from lerobot_wmrl.files import write_json
 from lerobot_wmrl.report.figures import IMAGINED, REAL, tidy
-from lerobot_wmrl.report.statistics import Proportion
+from lerobot_wmrl.statistics import Proportion
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
 

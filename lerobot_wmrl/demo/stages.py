@@ -72,6 +72,11 @@ def demo_stages(config: DemoConfig) -> list[Stage]:
         Stage(
             "text_world_model", "Train the text world model", lambda: train_model(config, "text_world_model")
         ),
+        Stage(
+            "replay_held_out",
+            "Replay held-out recordings in it",
+            lambda: replay(config, "dataset", "held_out"),
+        ),
         Stage("sft", "Clone a policy from a few optimal episodes", lambda: clone(config)),
         *measurements(config, "sft", "cloned policy"),
         Stage("rl", "Improve it by PPO inside the world model", lambda: reinforce(config)),
@@ -91,7 +96,11 @@ def measurements(config: DemoConfig, policy: str, title: str) -> list[Stage]:
             f"Record real episodes of the {title}",
             lambda: record_policy(config, policy),
         ),
-        Stage(f"replay_{policy}", "Replay those in the world model", lambda: replay(config, policy)),
+        Stage(
+            f"replay_{policy}",
+            "Replay those in the world model",
+            lambda: replay(config, f"rollouts_{policy}", policy),
+        ),
     ]
 
 
@@ -200,12 +209,15 @@ def record_policy(config: DemoConfig, policy: str) -> list[str]:
     return ours(config, "lerobot-wmrl-record", flags)
 
 
-def replay(config: DemoConfig, policy: str) -> list[str]:
+def replay(config: DemoConfig, dataset: str, name: str) -> list[str]:
+    """Real episodes from their first frame on with their own actions; of the training data, those held out."""
     out = config.output_dir
     flags: Flags = {
         "model.path": str(checkpoint(out / "action_world_model")),
-        "dataset.root": str(out / f"rollouts_{policy}"),
-        "output_dir": str(out / f"replay_{policy}"),
+        "text_model.path": str(checkpoint(out / "text_world_model")),
+        "dataset.root": str(out / dataset),
+        "split": "validation" if dataset == "dataset" else "all",
+        "output_dir": str(out / f"replay_{name}"),
     }
     return ours(config, "lerobot-wmrl-eval-world-model", flags)
 

@@ -12,8 +12,8 @@ from lerobot_wmrl.demo.episodes import episode_table
 from lerobot_wmrl.demo.stages import DemoConfig
 from lerobot_wmrl.files import write_json, write_text
 from lerobot_wmrl.report import figures, sources
-from lerobot_wmrl.report.pictures import picture_sections
-from lerobot_wmrl.report.statistics import Proportion
+from lerobot_wmrl.report.pictures import EPISODES, picture_sections
+from lerobot_wmrl.statistics import Proportion
 from lerobot_wmrl.tracking import read_metrics
 
 POLICIES = {"sft": "cloned policy", "rl": "PPO policy"}
@@ -40,6 +40,15 @@ def measure(output_dir: Path) -> dict[str, dict[str, Proportion]]:
         }
         for policy in POLICIES
     }
+
+
+def trust_rows(output_dir: Path) -> list[dict[str, str]]:
+    """What the world model says of real episodes, for each source of them."""
+    rows = []
+    for suffix, whose in EPISODES.items():
+        replayed = sources.replayed(output_dir / f"replay_{suffix}")
+        rows.append({"episodes": whose, **{key: str(rate) for key, rate in replayed.items()}})
+    return rows
 
 
 def summary(
@@ -136,10 +145,8 @@ def render(
         peak_memory=f"{max(record['peak_memory_bytes'] for record in records) / 1e9:.1f}",
         cards=headline_cards(measured),
         verdict=verdict(measured["sft"]["real"], measured["rl"]["real"]),
-        bars=figures.success_bars(
-            {POLICIES[p]: (row["real"], row["imagined"]) for p, row in measured.items()}
-        ),
-        trust=[{"policy": POLICIES[p], **{k: str(v) for k, v in row.items()}} for p, row in measured.items()],
+        bars=figures.success_bars({POLICIES[p]: (r["real"], r["imagined"]) for p, r in measured.items()}),
+        trust=trust_rows(config.output_dir),
         pictures=picture_sections(config.output_dir),
         curves=training_curves(config.output_dir),
         kinds=kind_rows(table),

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from lerobot_wmrl.report.sources import Curve
-from lerobot_wmrl.report.statistics import Proportion
+from lerobot_wmrl.statistics import Proportion
 
 COLOURS = ("#2b6cb0", "#dd6b20", "#2f855a", "#805ad5")
 REAL, IMAGINED = COLOURS[:2]

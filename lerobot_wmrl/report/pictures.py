@@ -23,17 +23,28 @@ SECTIONS = (
         "The reward along real episodes",
         "A successful and a failed real episode, with the reward that the world models give each frame.",
     ),
+    (
+        "accuracy",
+        "How long the imagination stays true",
+        "The distance between imagined and real frames, by the number of frames imagined since the last real one.",
+    ),
 )
 """Start of the pictures' file names, heading, what to look for."""
 
+EPISODES = {"rl": "PPO policy", "sft": "cloned policy", "held_out": "recorded, held out from training"}
+"""Whose real episodes were replayed, by the suffix of the folder."""
+
 
 def picture_sections(output_dir: Path) -> list[dict[str, Any]]:
-    """Sections with at least one picture, from `replay_*/<section>*.png|gif`."""
+    """Sections with at least one picture, from `replay_<whose>/<section>*.png|gif`."""
     sections = []
     for stem, title, text in SECTIONS:
-        files = [path for folder in sorted(output_dir.glob("replay_*"), reverse=True)
-                 for path in sorted(folder.rglob(f"{stem}*")) if path.suffix in (".png", ".gif")]  # fmt: skip
-        images = [{"url": picture(path), "caption": path.stem.replace("_", " ")} for path in files]
+        images = [
+            {"url": picture(path), "caption": f"{whose}: {path.stem.replace('_', ' ')}"}
+            for suffix, whose in EPISODES.items()
+            for path in sorted((output_dir / f"replay_{suffix}").glob(f"{stem}*"))
+            if path.suffix in (".png", ".gif")
+        ]
         if images:
             sections.append({"title": title, "text": text, "images": images})
     return sections

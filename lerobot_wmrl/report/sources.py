@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from lerobot_wmrl.report.statistics import Proportion
+from lerobot_wmrl.statistics import Proportion
 
 Curve = tuple[list[float], list[float]]
 """Steps and values."""

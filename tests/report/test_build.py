@@ -15,7 +15,7 @@ from lerobot_wmrl.demo.episodes import episode_table, optimal_episodes
 from lerobot_wmrl.demo.stages import DemoConfig, demo_stages
 from lerobot_wmrl.files import write_json
 from lerobot_wmrl.report.build import verdict, write_report
-from lerobot_wmrl.report.statistics import Proportion
+from lerobot_wmrl.statistics import Proportion
 from lerobot_wmrl.tracking import append_metrics
 
 SUCCESSES = {"eval_sft": 4, "imagine_sft": 5, "eval_rl": 6, "imagine_rl": 9}
@@ -35,7 +35,7 @@ def finished(tmp_path: Path) -> DemoConfig:
     for folder, successes in SUCCESSES.items():
         outcomes = [i < successes for i in range(10)]
         write_json(tmp_path / folder / "eval_info.json", {"per_task": [{"metrics": {"successes": outcomes}}]})
-    for policy in ("sft", "rl"):
+    for policy in ("sft", "rl", "held_out"):
         replay = {"false_successes": 2, "real_failures": 5, "recognised_successes": 3, "real_successes": 4}
         write_json(tmp_path / f"replay_{policy}" / "metrics.json", replay)
         Image.new("RGB", (8, 8)).save(tmp_path / f"replay_{policy}" / "comparison_0.png")

@@ -2,7 +2,7 @@ import math
 
 import pytest
 
-from lerobot_wmrl.report.statistics import Z_95, Proportion, wilson_interval
+from lerobot_wmrl.statistics import Z_95, Proportion, wilson_interval
 
 
 @pytest.mark.parametrize(("k", "n"), [(0, 20), (7, 20), (53, 100), (100, 100)])
