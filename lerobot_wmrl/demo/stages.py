@@ -4,6 +4,7 @@ import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from lerobot_wmrl.constants import EVALUATION_SEED
@@ -62,44 +63,34 @@ class Stage:
 def demo_stages(config: DemoConfig) -> list[Stage]:
     """Every stage in order. Paths are relative to where the demo runs, so that each line can be copied."""
     return [
-        Stage("record", "Record trajectories in ManiSkill", lambda: record(config)),
-        Stage("frame_tokenizer", "Train the frame tokenizer", lambda: train_model(config, "frame_tokenizer")),
-        Stage(
-            "action_world_model",
-            "Train the action world model",
-            lambda: train_model(config, "action_world_model"),
-        ),
-        Stage(
-            "text_world_model", "Train the text world model", lambda: train_model(config, "text_world_model")
+        Stage("record", "Record trajectories in ManiSkill", partial(record, config)),
+        *(
+            Stage(model, f"Train the {model.replace('_', ' ')}", partial(train_model, config, model))
+            for model in ("frame_tokenizer", "action_world_model", "text_world_model")
         ),
         Stage(
             "replay_held_out",
             "Replay held-out recordings in it",
-            lambda: replay(config, "dataset", "held_out"),
+            partial(replay, config, "dataset", "held_out"),
         ),
-        Stage("sft", "Clone a policy from a few optimal episodes", lambda: clone(config)),
+        Stage("sft", "Clone a policy from a few optimal episodes", partial(clone, config)),
         *measurements(config, "sft", "cloned policy"),
-        Stage("rl", "Improve it by PPO inside the world model", lambda: reinforce(config)),
+        Stage("rl", "Improve it by PPO inside the world model", partial(reinforce, config)),
         *measurements(config, "rl", "PPO policy"),
     ]
 
 
 def measurements(config: DemoConfig, policy: str, title: str) -> list[Stage]:
     """For a policy: its real and its imagined success, and its real episodes replayed in the world model."""
+    rollouts = f"rollouts_{policy}"
     return [
-        Stage(f"eval_{policy}", f"Success of the {title} in ManiSkill", lambda: evaluate(config, policy)),
+        Stage(f"eval_{policy}", f"Success of the {title} in ManiSkill", partial(evaluate, config, policy)),
         Stage(
-            f"imagine_{policy}", f"Success of the {title} in the world model", lambda: imagine(config, policy)
+            f"imagine_{policy}", f"Success of the {title} in imagination", partial(imagine, config, policy)
         ),
+        Stage(rollouts, f"Record real episodes of the {title}", partial(record_policy, config, policy)),
         Stage(
-            f"rollouts_{policy}",
-            f"Record real episodes of the {title}",
-            lambda: record_policy(config, policy),
-        ),
-        Stage(
-            f"replay_{policy}",
-            "Replay those in the world model",
-            lambda: replay(config, f"rollouts_{policy}", policy),
+            f"replay_{policy}", "Replay those in the world model", partial(replay, config, rollouts, policy)
         ),
     ]
 
@@ -210,7 +201,7 @@ def record_policy(config: DemoConfig, policy: str) -> list[str]:
 
 
 def replay(config: DemoConfig, dataset: str, name: str) -> list[str]:
-    """Real episodes from their first frame on with their own actions; of the training data, those held out."""
+    """Imagine real episodes from their first frame and actions; of the training data, those held out."""
     out = config.output_dir
     flags: Flags = {
         "model.path": str(checkpoint(out / "action_world_model")),

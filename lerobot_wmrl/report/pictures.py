@@ -26,7 +26,7 @@ SECTIONS = (
     (
         "accuracy",
         "How long the imagination stays true",
-        "The distance between imagined and real frames, by the number of frames imagined since the last real one.",
+        "The distance between imagined and real frames, by the number of frames imagined so far.",
     ),
 )
 """Start of the pictures' file names, heading, what to look for."""
