@@ -1,6 +1,5 @@
 """Checkpoints that are either whole or absent, in LeRobot's layout."""
 
-import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -22,7 +21,7 @@ def write_checkpoint(output_dir: Path, total_steps: int, step: int, write: Calla
     link = target.with_name(f".{LAST_CHECKPOINT_LINK}.partial")
     link.unlink(missing_ok=True)
     link.symlink_to(target.name)
-    os.replace(link, target.with_name(LAST_CHECKPOINT_LINK))
+    link.replace(target.with_name(LAST_CHECKPOINT_LINK))
     return target
 
 

@@ -10,7 +10,7 @@ METRICS_FILE = "metrics.jsonl"
 
 def append_metrics(output_dir: Path, step: int, metrics: Mapping[str, float]) -> None:
     """Add one line `{"step": step, name: value, …}` to the run's metrics file."""
-    with open(output_dir / METRICS_FILE, "a") as file:
+    with (output_dir / METRICS_FILE).open("a") as file:
         file.write(json.dumps({"step": step, **metrics}) + "\n")
 
 

@@ -40,7 +40,8 @@ class DemoConfig:
     eval_episodes: int = 100
     rollout_episodes: int = 60
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
+        """ValueError names a setting that cannot be."""
         last = EVALUATION_SEED // SEED_STRIDE - 1
         if not 0 <= self.seed <= last:
             raise ValueError(

@@ -82,7 +82,9 @@ class WorldModelEnv(EnvConfig):
 
         return make_world_model_env(self, n_envs, device or self.device)
 
-    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
+    def create_envs(
+        self, n_envs: int, use_async_envs: bool = False
+    ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """The same behind numpy, for lerobot-eval. Batched natively, so `use_async_envs` changes nothing."""
         from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
 

@@ -22,35 +22,47 @@ class EvaluationAdapter(gym.vector.VectorEnv):
         self.single_action_space, self.action_space = env.single_action_space, env.action_space
         self._max_episode_steps = self.env.max_episode_steps
 
-    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
         """Thaw and restart all; `seed` may be an int or one a sub-environment."""
-        self._last, info = self.env.reset(seed=list(seed) if seed is not None and not isinstance(seed, int) else seed)
+        self._last, info = self.env.reset(
+            seed=list(seed) if seed is not None and not isinstance(seed, int) else seed
+        )
         self._frozen = torch.zeros(self.num_envs, dtype=torch.bool, device=self.env.device)
         self._success = torch.zeros_like(self._frozen)
         return self._to_numpy(self._last), info
 
-    def step(self, actions: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Step all, then hold back what was frozen before."""
-        observation, reward, terminated, truncated, info = self.env.step(torch.from_numpy(np.asarray(actions)))
+        observation, reward, terminated, truncated, info = self.env.step(
+            torch.from_numpy(np.asarray(actions))
+        )
         ended = (terminated | truncated) & ~self._frozen
         self._last = self._hold(self._last, info.get("final_obs", observation))
         if "final_info" in info:
             self._success = torch.where(ended, info["final_info"]["is_success"], self._success)
         reward = reward.masked_fill(self._frozen, 0.0)
         self._frozen = self._frozen | ended
-        result = {"final_info": {"is_success": self._success.cpu().numpy()}} if bool(self._frozen.any()) else {}
+        result = (
+            {"final_info": {"is_success": self._success.cpu().numpy()}} if bool(self._frozen.any()) else {}
+        )
         flags = (terminated & ended).cpu().numpy(), (truncated & ended).cpu().numpy()
         return self._to_numpy(self._last), reward.cpu().numpy(), *flags, result
 
     def _hold(self, held: Observation, new: Observation) -> Observation:
         """Rows of frozen sub-environments from `held`, the others from `new`."""
-        kept = {}
+        kept: Observation = {}
         for key, value in new.items():
             if isinstance(value, Tensor):
                 kept[key] = torch.where(self._frozen.reshape(-1, *[1] * (value.ndim - 1)), held[key], value)
             else:
                 frozen = self._frozen.tolist()
-                kept[key] = [old if stop else now for old, now, stop in zip(held[key], value, frozen, strict=True)]
+                kept[key] = [
+                    old if stop else now for old, now, stop in zip(held[key], value, frozen, strict=True)
+                ]
         return kept
 
     def _to_numpy(self, observation: Observation) -> Observation:

@@ -35,7 +35,9 @@ def load_starts(
     """Read the starts and imagine each one's goal frame once (eq. 6)."""
     table = read_episodes(open_dataset(source.root, source.repo_id))
     if table.state.shape[1] < model.config.state_size:
-        raise ValueError(f"dataset.root={source.root}: the world model needs observation.state, the dataset has none")
+        raise ValueError(
+            f"dataset.root={source.root}: the world model needs observation.state, the dataset has none"
+        )
     episodes = choose_episodes(table, source.split, source.max_starts)
     rows = table.start[episodes]
     instructions = [table.instructions[episode] for episode in episodes]
@@ -44,7 +46,12 @@ def load_starts(
     state = torch.from_numpy(table.state[rows][:, : model.config.state_size]).to(device)
     tokens = model.tokenizer.encode(images)
     goals = [
-        imagine_goal(text_model, tokens[i : i + GOAL_BATCH], state[i : i + GOAL_BATCH], instructions[i : i + GOAL_BATCH])
+        imagine_goal(
+            text_model,
+            tokens[i : i + GOAL_BATCH],
+            state[i : i + GOAL_BATCH],
+            instructions[i : i + GOAL_BATCH],
+        )
         for i in range(0, len(rows), GOAL_BATCH)
     ]
     features = model.tokenizer.decode_with_features(torch.cat([goal.tokens for goal in goals])).features

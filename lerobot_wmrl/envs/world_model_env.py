@@ -1,6 +1,6 @@
 """The world model as a natively batched environment: many imagined episodes, one forward pass a step."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -29,7 +29,7 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
     model predicts it, `task` (B strings). Actions (B, A) in metres, radians and gripper, clipped to the box.
     """
 
-    metadata = {"render_fps": FPS, "autoreset_mode": AutoresetMode.SAME_STEP}
+    metadata: ClassVar[dict[str, Any]] = {"render_fps": FPS, "autoreset_mode": AutoresetMode.SAME_STEP}
 
     def __init__(
         self, model: ActionWorldModelRewardModel, starts: Starts, reward: PreTrainedRewardModel,
@@ -39,9 +39,12 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         self.num_envs, self.max_episode_steps = n_envs, config.episode_length
         self.device = starts.tokens.device
         self.action_low, self.action_high = (
-            torch.tensor(bound[: model.config.action_size], device=self.device) for bound in (ACTION_LOW, ACTION_HIGH)
+            torch.tensor(bound[: model.config.action_size], device=self.device)
+            for bound in (ACTION_LOW, ACTION_HIGH)
         )
-        self.single_action_space = gym.spaces.Box(self.action_low.cpu().numpy(), self.action_high.cpu().numpy())
+        self.single_action_space = gym.spaces.Box(
+            self.action_low.cpu().numpy(), self.action_high.cpu().numpy()
+        )
         self.action_space = gym.vector.utils.batch_space(self.single_action_space, n_envs)
         self.single_observation_space = self._observation_space()
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, n_envs)
@@ -51,7 +54,8 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
     def _observation_space(self) -> gym.spaces.Dict:
         size, config = self.model.config.image_size, self.model.config
         spaces: dict[str, gym.Space] = {
-            f"{OBS_IMAGES}.{camera}": gym.spaces.Box(0.0, 1.0, (3, size, size), np.float32) for camera in config.cameras
+            f"{OBS_IMAGES}.{camera}": gym.spaces.Box(0.0, 1.0, (3, size, size), np.float32)
+            for camera in config.cameras
         }
         if config.state_size:
             spaces[OBS_STATE] = gym.spaces.Box(-np.inf, np.inf, (config.state_size,), np.float32)
@@ -85,11 +89,21 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         terminated, truncated = self._advance(imagined)
         decoded = self.model.tokenizer.decode_with_features(imagined.tokens)
         closeness = self._similarity_to_goal(decoded.features)
-        parts = {"success": terminated.float(), "similarity": closeness, "previous.similarity": self._similarity}
+        parts = {
+            "success": terminated.float(),
+            "similarity": closeness,
+            "previous.similarity": self._similarity,
+        }
         reward = self.reward.compute_reward({**parts, "hidden": imagined.hidden})
         self._similarity = closeness
         observation = self._observe(decoded.images, imagined.proprioception)
-        info = {"reward_parts": {**parts, "entropy": imagined.entropy, "done_probability": imagined.done_logit.sigmoid()}}
+        info = {
+            "reward_parts": {
+                **parts,
+                "entropy": imagined.entropy,
+                "done_probability": imagined.done_logit.sigmoid(),
+            }
+        }
         finished = terminated | truncated
         if bool(finished.any()):
             info["final_obs"] = observation
@@ -132,7 +146,8 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
 
     def _observe(self, images: Tensor, state: Tensor) -> Observation:
         observation: Observation = {
-            f"{OBS_IMAGES}.{camera}": images[:, index] for index, camera in enumerate(self.model.config.cameras)
+            f"{OBS_IMAGES}.{camera}": images[:, index]
+            for index, camera in enumerate(self.model.config.cameras)
         }
         if self.model.config.state_size:
             observation[OBS_STATE] = state

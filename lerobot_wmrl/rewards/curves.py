@@ -53,7 +53,7 @@ def reward_along_episode(
 
 
 def success_once(done_logit: torch.Tensor, threshold: float, frames: int) -> torch.Tensor:
-    """1 on the frame at which done has fired `frames` times in a row for the first time, else 0. (T,) → (T,)"""
+    """1 on the frame that completes the first run of `frames` done frames, else 0. (T,) → (T,)"""
     count, paid = torch.zeros((), dtype=torch.long), torch.zeros_like(done_logit)
     for step, logit in enumerate(done_logit):
         count = consecutive_count(count, sparse_reward(logit, threshold) > 0)

@@ -1,4 +1,4 @@
-"""The general reward (eqs. 5-8, Algorithm 1): success seen by the action model, progress towards the goal frame."""
+"""The general reward (eqs. 5-8, Algorithm 1): success in the action model, progress to the goal frame."""
 
 import torch
 from torch import Tensor

@@ -2,7 +2,6 @@
 
 import json
 import logging
-import os
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -57,10 +56,10 @@ def claim_output_dir(output_dir: Path, config: dict[str, Any]) -> None:
     output_dir.mkdir(parents=True, exist_ok=True)
     partial = marker.with_suffix(".partial")
     partial.write_text(json.dumps(config, indent=4))
-    os.replace(partial, marker)
+    partial.replace(marker)
 
 
-def run_command(function: Callable[[Config], None], config_class: type[Config], command: str) -> None:
+def run_command[Config: "RunConfig"](function: Callable[[Config], None], config_class: type[Config], command: str) -> None:
     """Parse the command line for `function`, run it, and turn bad input into one clear line, exit code 1."""
     register_third_party_plugins()
     init_logging()

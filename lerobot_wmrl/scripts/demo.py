@@ -7,45 +7,45 @@ Running the same command again continues after the last finished piece of work.
 
 import signal
 import sys
-from dataclasses import dataclass
 from typing import NoReturn
+
+import draccus
+from draccus.utils import DraccusException
 
 from lerobot_wmrl.demo.pipeline import StageError, claimed, run_stages
 from lerobot_wmrl.demo.stages import DemoConfig, demo_stages
-from lerobot_wmrl.scripts.command import RunConfig, run_command
+from lerobot_wmrl.presets import expand_preset
 
 
-@dataclass
-class DemoCommand(DemoConfig, RunConfig):
-    __doc__ = DemoConfig.__doc__
-
-
-def run_demo(cfg: DemoCommand) -> None:
+def run_demo(cfg: DemoConfig) -> None:
     """Every stage, then the report."""
+    cfg.check()
     stages = demo_stages(cfg)
     with claimed(cfg):
-        try:
-            run_stages(stages, cfg.output_dir)
-        except StageError as error:
-            raise SystemExit(f"error: {error}") from None
-        except KeyboardInterrupt:
-            raise SystemExit("\nstopped: run the same command again to continue where it stopped") from None
+        run_stages(stages, cfg.output_dir)
         from lerobot_wmrl.report.build import write_report
 
         page = write_report(cfg, [stage.name for stage in stages])
     print(f"\nreport: {page}")
 
 
-def interrupted(signal_number: int, frame: object) -> NoReturn:
+def interrupt(signal_number: int, frame: object) -> NoReturn:
+    """`kill` ends the demo as Ctrl-C does: with its stage, and with a word on how to go on."""
     raise KeyboardInterrupt
 
 
 def main() -> None:
     """Entry point of the console command; without a preset it is the demo's."""
-    signal.signal(signal.SIGTERM, interrupted)
-    if not any(argument.startswith("--preset") for argument in sys.argv[1:]):
-        sys.argv.insert(1, "--preset=demo")
-    run_command(run_demo, DemoCommand, "demo")
+    signal.signal(signal.SIGTERM, interrupt)
+    arguments = sys.argv[1:]
+    if not any(argument.startswith("--preset") for argument in arguments):
+        arguments = ["--preset=demo", *arguments]
+    try:
+        run_demo(draccus.parse(config_class=DemoConfig, args=expand_preset(arguments, "demo")))
+    except (ValueError, StageError, DraccusException) as error:
+        sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        sys.exit("\nstopped: run the same command again to continue where it stopped")
 
 
 if __name__ == "__main__":

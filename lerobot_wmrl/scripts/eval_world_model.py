@@ -1,6 +1,7 @@
 """lerobot-wmrl-eval-world-model: replay real episodes in a world model and measure how far it can be trusted.
 
-    lerobot-wmrl-eval-world-model --model.path=outputs/action_world_model --dataset.root=D --output_dir=outputs/check
+    lerobot-wmrl-eval-world-model --model.path=outputs/action_world_model --dataset.root=D \\
+        --output_dir=outputs/check
 
 Each episode is imagined from its first frame with its own actions. `metrics.json` gets the accuracy by
 step and the false-success rate: of the episodes that failed in reality, how many the model believes in.
@@ -73,13 +74,15 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     draw(cfg, model, run, accuracy)
     write_json(cfg.output_dir / "metrics.json", {**agreement, **accuracy, "dataset": cfg.dataset.root})
     print(
-        f"{len(episodes)} real episodes replayed: {agreement['false_successes']} of {agreement['real_failures']} "
-        f"failures were called successes, {agreement['recognised_successes']} of {agreement['real_successes']} "
-        f"successes were recognised. Written to {cfg.output_dir}"
+        f"{len(episodes)} real episodes replayed: {agreement['false_successes']} of "
+        f"{agreement['real_failures']} failures were called successes, {agreement['recognised_successes']} of "
+        f"{agreement['real_successes']} successes were recognised. Written to {cfg.output_dir}"
     )
 
 
-def draw(cfg: EvalWorldModelConfig, model: "ActionWorldModelRewardModel", run: "Replay", accuracy: dict[str, Any]) -> None:
+def draw(
+    cfg: EvalWorldModelConfig, model: "ActionWorldModelRewardModel", run: "Replay", accuracy: dict[str, Any]
+) -> None:
     """Side-by-side animations and strips, accuracy, and with a text model goals and reward curves."""
     from lerobot_wmrl.world_models import pictures
 

@@ -1,6 +1,7 @@
 """lerobot-wmrl-train-world-model: train a frame tokenizer or a world model on a LeRobotDataset.
 
-    lerobot-wmrl-train-world-model --model.type=frame_tokenizer --dataset.root=D --output_dir=outputs/tokenizer
+    lerobot-wmrl-train-world-model --model.type=frame_tokenizer --dataset.root=D \\
+        --output_dir=outputs/tokenizer
     lerobot-wmrl-train-world-model --model.type=action_world_model --model.tokenizer_path=outputs/tokenizer \\
         --dataset.root=D --output_dir=outputs/action_world_model
 

@@ -22,15 +22,19 @@ def resolve_checkpoint(path: str | Path) -> Path:
 
 
 def read_config(path: str | Path, expected_type: str, device: str = "cpu") -> RewardModelConfig:
-    """The configuration of a checkpoint of exactly `expected_type`. ValueError if it is not there or another."""
+    """The configuration of a checkpoint of exactly `expected_type`, else ValueError."""
     folder = resolve_checkpoint(path)
     if not (folder / "config.json").is_file():
         if folder.is_dir() or str(path).startswith((".", "/", "outputs")) or str(path).count("/") != 1:
-            raise ValueError(f"{path!r}: no {expected_type} there; give the output folder of its training, or a hub id")
+            raise ValueError(
+                f"{path!r}: no {expected_type} there; give the output folder of its training, or a hub id"
+            )
     else:
         found = json.loads((folder / "config.json").read_text()).get("type")
         if found != expected_type:
-            raise ValueError(f"{path}: is a checkpoint of type {found!r}, but {expected_type!r} is needed here")
+            raise ValueError(
+                f"{path}: is a checkpoint of type {found!r}, but {expected_type!r} is needed here"
+            )
     return RewardModelConfig.from_pretrained(str(folder), cli_overrides=[f"--device={device}"])
 
 

@@ -1,4 +1,4 @@
-"""Training batches as pure functions of (seed, step): resuming a training repeats no sample and skips none."""
+"""Training batches as pure functions of (seed, step): a resumed training repeats and skips no sample."""
 
 from dataclasses import dataclass
 
@@ -42,7 +42,9 @@ class ClipSampler:
         """Rows `offset … offset + clip_length − 1` of each episode, padded with its last row."""
         rows = offsets[:, None] + np.arange(self.clip_length)
         valid = rows < self.table.length[episodes][:, None]
-        rows = self.table.start[episodes][:, None] + np.minimum(rows, self.table.length[episodes][:, None] - 1)
+        rows = self.table.start[episodes][:, None] + np.minimum(
+            rows, self.table.length[episodes][:, None] - 1
+        )
         known = valid & (offsets == 0)[:, None]
         return Clip(
             self._tensor(self.tokens[rows]).long(),

@@ -42,5 +42,8 @@ class FrameTokenizerConfig(RewardModelConfig):
 def cosine_schedule(learning_rate: float, steps: int) -> CosineDecayWithWarmupSchedulerConfig:
     """Warm up over 5 % of the steps, then decay to a twentieth."""
     return CosineDecayWithWarmupSchedulerConfig(
-        num_warmup_steps=max(1, steps // 20), num_decay_steps=steps, peak_lr=learning_rate, decay_lr=learning_rate / 20
+        num_warmup_steps=max(1, steps // 20),
+        num_decay_steps=steps,
+        peak_lr=learning_rate,
+        decay_lr=learning_rate / 20,
     )

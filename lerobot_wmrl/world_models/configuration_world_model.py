@@ -87,7 +87,7 @@ class ActionWorldModelConfig(WorldModelConfig):
 @RewardModelConfig.register_subclass("text_world_model")
 @dataclass
 class TextWorldModelConfig(WorldModelConfig):
-    """Imagines the golden trajectory of an instruction: c = i in eq. 1. Trained on successful optimal episodes.
+    """Imagines the golden trajectory of an instruction: c = i in eq. 1. Learns from optimal successes.
 
     Args:
         goal_threshold: θ of eq. 6, the done probability at which a frame becomes the goal frame.

@@ -43,7 +43,9 @@ class EpisodeTable:
 def open_dataset(root: str | Path, repo_id: str | None = None) -> LeRobotDataset:
     """Open a local LeRobotDataset. ValueError if there is none at `root`."""
     if not (Path(root) / "meta" / "info.json").is_file():
-        raise ValueError(f"dataset.root={root}: no LeRobotDataset there (meta/info.json is missing); record one first")
+        raise ValueError(
+            f"dataset.root={root}: no LeRobotDataset there (meta/info.json is missing); record one first"
+        )
     return LeRobotDataset(repo_id or Path(root).name, root=root)
 
 
@@ -57,9 +59,13 @@ def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
     rows = dataset.hf_dataset.with_format("numpy", columns=columns)[:]
     frames = len(rows["episode_index"])
     _, start, length = np.unique(rows["episode_index"], return_index=True, return_counts=True)
-    kind = np.asarray(rows["start.kind"]).reshape(-1)[start] if "start.kind" in rows else np.full(len(start), -1)
+    kind = (
+        np.asarray(rows["start.kind"]).reshape(-1)[start] if "start.kind" in rows else np.full(len(start), -1)
+    )
     done = np.asarray(rows["next.done"]).reshape(-1) if "next.done" in rows else np.zeros(frames, bool)
-    state = np.asarray(rows[OBS_STATE], np.float32) if OBS_STATE in rows else np.zeros((frames, 0), np.float32)
+    state = (
+        np.asarray(rows[OBS_STATE], np.float32) if OBS_STATE in rows else np.zeros((frames, 0), np.float32)
+    )
     instructions = [episode["tasks"][0] for episode in dataset.meta.episodes]
     action = np.asarray(rows[ACTION], np.float32)
     return EpisodeTable(dataset, state, action, done.astype(bool), start, length, kind, instructions)

@@ -46,7 +46,7 @@ class Replay:
     done: np.ndarray
 
     def real_frames(self, step: int) -> np.ndarray:
-        """Real frames `step` rows after the start (the last one where the episode is over), (E, N, H, W, 3)."""
+        """Real frames `step` rows after the start (the last one when it is over), (E, N, H, W, 3)."""
         return self.frames[self.rows(step)]
 
     def one_of_each(self) -> dict[str, int]:
@@ -112,7 +112,10 @@ def accuracy_by_step(model: ActionWorldModelRewardModel, run: Replay) -> dict[st
             delta.append((_db(error.mean((1, 2, 3, 4))) - _db(other.mean((1, 2, 3, 4)))).mean())
         if run.table.state.shape[1]:
             imagined = run.imagined.proprioception[keep, step, :3].cpu().numpy()
-            tcp.append(1000 * np.linalg.norm(imagined - run.table.state[run.rows(step + 1)[keep], :3], axis=-1).mean())
+            tcp.append(
+                1000
+                * np.linalg.norm(imagined - run.table.state[run.rows(step + 1)[keep], :3], axis=-1).mean()
+            )
     return {
         "psnr_by_step": [round(float(value), 3) for value in psnr],
         "moving_psnr_by_step": [round(value, 3) for value in moving],

@@ -43,7 +43,9 @@ def cached_frames(dataset: LeRobotDataset, camera_keys: Sequence[str]) -> np.nda
     return _memory_map(cache_dir(dataset) / f"frames-{key}.npy", shape, np.uint8, fill)
 
 
-def cached_tokens(dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer: FrameTokenizer) -> np.ndarray:
+def cached_tokens(
+    dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer: FrameTokenizer
+) -> np.ndarray:
     """All frames' tokens as a read-only memory map, int32 (rows, S); encoded on the first call."""
     frames = cached_frames(dataset, camera_keys)
     weights = hashlib.sha256(b"".join(p.detach().cpu().numpy().tobytes() for p in tokenizer.parameters()))
@@ -70,7 +72,9 @@ def _decode_episode(dataset: LeRobotDataset, episode: int, key: str) -> np.ndarr
     rows = dataset.meta.episodes[episode]
     indices = range(rows["dataset_from_index"], rows["dataset_to_index"])
     if key not in dataset.meta.video_keys:
-        return np.stack([np.asarray(image.convert("RGB")) for image in dataset.hf_dataset.with_format(None)[indices][key]])
+        return np.stack(
+            [np.asarray(image.convert("RGB")) for image in dataset.hf_dataset.with_format(None)[indices][key]]
+        )
     first = rows[f"videos/{key}/from_timestamp"]
     times = [first + index / dataset.fps for index in range(len(indices))]
     path = Path(dataset.root) / dataset.meta.get_video_file_path(episode, key)
@@ -78,13 +82,15 @@ def _decode_episode(dataset: LeRobotDataset, episode: int, key: str) -> np.ndarr
         frames = decode_video_frames(path, times, dataset.tolerance_s, return_uint8=True)
     except Exception as error:
         raise ValueError(
-            f"dataset {dataset.root}: episode {episode}, camera {key}: {path.name} cannot be decoded ({error}); "
+            f"dataset {dataset.root}: episode {episode}: {key}: {path.name} cannot be decoded ({error}); "
             "delete the dataset and record it again with the same command"
         ) from error
     return frames.permute(0, 2, 3, 1).numpy()
 
 
-def _memory_map(path: Path, shape: tuple[int, ...], dtype: type, fill: Callable[[np.ndarray], None]) -> np.ndarray:
+def _memory_map(
+    path: Path, shape: tuple[int, ...], dtype: type, fill: Callable[[np.ndarray], None]
+) -> np.ndarray:
     """The array at `path`, or a new one that `fill` writes; it appears only once it is whole."""
     if not path.is_file():
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -93,7 +99,7 @@ def _memory_map(path: Path, shape: tuple[int, ...], dtype: type, fill: Callable[
         try:
             fill(target)
             target.flush()
-            os.replace(partial, path)
+            partial.replace(path)
         finally:
             partial.unlink(missing_ok=True)
     return np.load(path, mmap_mode="r")

@@ -4,6 +4,7 @@ A token is the index of one finite-scalar-quantised vector (Mentzer et al. 2023,
 losses and no dead codes. Several cameras share the weights; their grids are concatenated.
 """
 
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -41,7 +42,9 @@ class Encoder(nn.Module):
     def __init__(self, widths: Sequence[int], code_size: int) -> None:
         super().__init__()
         self.stem = nn.Conv2d(3 * PATCH**2, widths[0], 3, padding=1)
-        self.downs = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in zip(widths, widths[1:], strict=False))
+        self.downs = nn.ModuleList(
+            nn.Conv2d(a, b, 2, stride=2) for a, b in itertools.pairwise(widths)
+        )
         self.block = ResidualBlock(widths[-1])
         self.head = nn.Conv2d(widths[-1], code_size, 1)
 
@@ -61,7 +64,7 @@ class Decoder(nn.Module):
         self.stem = nn.Conv2d(code_size, coarse_to_fine[0], 3, padding=1)
         self.block = ResidualBlock(coarse_to_fine[0])
         self.ups = nn.ModuleList(
-            nn.Conv2d(a, 4 * b, 1) for a, b in zip(coarse_to_fine, coarse_to_fine[1:], strict=False)
+            nn.Conv2d(a, 4 * b, 1) for a, b in itertools.pairwise(coarse_to_fine)
         )
         self.smooth = nn.Conv2d(widths[0], widths[0], 3, padding=1)
         self.head = nn.Conv2d(widths[0], 3 * PATCH**2, 3, padding=1)
@@ -86,18 +89,24 @@ class FrameTokenizer(nn.Module):
         num_cameras: frames a time step, N.
     """
 
-    def __init__(self, image_size: int, widths: Sequence[int], levels: Sequence[int], num_cameras: int = 1) -> None:
+    def __init__(
+        self, image_size: int, widths: Sequence[int], levels: Sequence[int], num_cameras: int = 1
+    ) -> None:
         super().__init__()
         self.downsample = PATCH * 2 ** (len(widths) - 1)
         if image_size % self.downsample:
-            raise ValueError(f"image_size={image_size} is not a multiple of the tokenizer's grid {self.downsample}")
+            raise ValueError(
+                f"image_size={image_size} is not a multiple of the tokenizer's grid {self.downsample}"
+            )
         self.image_size = image_size
         self.grid = image_size // self.downsample
         self.num_cameras = num_cameras
         self.encoder = Encoder(widths, len(levels))
         self.decoder = Decoder(widths, len(levels))
         self.quantizer = FSQ(list(levels))
-        self.whiten = nn.ModuleList(nn.BatchNorm2d(channels, affine=False) for channels in (widths[-1], widths[0]))
+        self.whiten = nn.ModuleList(
+            nn.BatchNorm2d(channels, affine=False) for channels in (widths[-1], widths[0])
+        )
 
     @property
     def tokens_per_frame(self) -> int:
@@ -111,7 +120,9 @@ class FrameTokenizer(nn.Module):
 
     def decode_with_features(self, tokens: Tensor) -> Decoded:
         """Tokens (B, S) → images and the whitened feature maps from which similarity is measured."""
-        pixels, features = self.decoder(self.quantizer.indices_to_codes(tokens.reshape(-1, self.grid, self.grid)))
+        pixels, features = self.decoder(
+            self.quantizer.indices_to_codes(tokens.reshape(-1, self.grid, self.grid))
+        )
         images = ((pixels + 1) / 2).clamp(0, 1).unflatten(0, (len(tokens), self.num_cameras))
         return Decoded(images, self._whitened(features))
 
@@ -151,7 +162,7 @@ def motion_weight(images: Tensor, reference: Tensor, strength: float) -> Tensor:
 
 
 def feature_distance(features: Sequence[Tensor], goal: Sequence[Tensor]) -> Tensor:
-    """LPIPS's formula (Zhang et al. 2018, eq. 1, unit weights) on tokenizer features. [(B·N, C, h, w)] → (B·N,).
+    """LPIPS's formula (Zhang et al. 2018, eq. 1, unit weights) on tokenizer features: [(F, C, h, w)] → (F,).
 
     Each map is normalised over channels at every position; squared differences are summed over channels,
     averaged over positions and layers.

@@ -58,7 +58,9 @@ def next_frame_loss(
     logits = prediction.logits[:, :-1]
     token_loss = (codebook.cross_entropy(logits, target) * weight).sum() / weight.sum().clamp_min(1)
     state_error = (prediction.proprioception[:, :-1] - state[:, 1:]) / STATE_STEP
-    state_loss = (F.smooth_l1_loss(state_error, torch.zeros_like(state_error), reduction="none") * valid).sum()
+    state_loss = (
+        F.smooth_l1_loss(state_error, torch.zeros_like(state_error), reduction="none") * valid
+    ).sum()
     state_loss = state_loss / (valid.sum() * max(1, state.shape[-1])).clamp_min(1)
     done_loss = masked_done_loss(prediction.done_logit, clip, config.done_positive_weight)
     loss = token_loss + config.done_weight * done_loss + config.state_weight * state_loss
@@ -76,6 +78,9 @@ def masked_done_loss(done_logit: Tensor, clip: Clip, positive_weight: float) -> 
     """BCE over the rows whose outcome is known; the rare class counts `positive_weight` times."""
     known = (clip.done_known & clip.valid).float()
     losses = F.binary_cross_entropy_with_logits(
-        done_logit, clip.done, reduction="none", pos_weight=torch.tensor(positive_weight, device=done_logit.device)
+        done_logit,
+        clip.done,
+        reduction="none",
+        pos_weight=torch.tensor(positive_weight, device=done_logit.device),
     )
     return (losses * known).sum() / known.sum().clamp_min(1)

@@ -17,7 +17,9 @@ def stack_cameras(batch: dict[str, Tensor], keys: Sequence[str]) -> Tensor:
     missing = [key for key in keys if key not in batch]
     if missing:
         present = [key for key in batch if "images" in key]
-        raise KeyError(f"the batch lacks the cameras {missing}; it has {present}. Train on a dataset with them.")
+        raise KeyError(
+            f"the batch lacks the cameras {missing}; it has {present}. Train on a dataset with them."
+        )
     return torch.stack([batch[key] for key in keys], dim=-4)
 
 
@@ -35,7 +37,7 @@ class FrameTokenizerRewardModel(PreTrainedRewardModel):
         self.tokenizer = FrameTokenizer(config.image_size, config.widths, config.levels, len(config.cameras))
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
-        """Reconstruction loss of images (B, 3, H, W); `reference.*` are the episodes' first frames, if known."""
+        """Reconstruction loss of images (B, 3, H, W); `reference.*`: the episodes' first frames, if known."""
         images = stack_cameras(batch, self.config.camera_keys)
         weight = None
         if f"reference.{self.config.cameras[0]}" in batch:
@@ -57,7 +59,9 @@ def check_cameras(config: Any, features: dict[str, Any]) -> None:
     for key in config.camera_keys:
         if key not in features:
             cameras = [name for name in features if name.startswith("observation.images.")]
-            raise ValueError(f"cameras: the dataset has no {key}, it has {cameras}; set --model.cameras to match")
+            raise ValueError(
+                f"cameras: the dataset has no {key}, it has {cameras}; set --model.cameras to match"
+            )
         height, width = features[key]["shape"][:2]
         if (height, width) != (config.image_size, config.image_size):
             raise ValueError(

@@ -50,7 +50,7 @@ class Imagined(NamedTuple):
 
 @dataclass
 class ImaginationState:
-    """Where B imaginations stand: digits (B, 1, S, C), normalised state (B, 1, P), the ring of past frames."""
+    """Where B imaginations stand: digits (B, 1, S, C), normalised state (B, 1, P), ring of past frames."""
 
     digits: Tensor
     proprioception: Tensor
@@ -126,7 +126,10 @@ class WorldModelRewardModel(PreTrainedRewardModel):
         """Eqs. 2-4 on a clip of tokens, with part of the inputs replaced by the model's own predictions."""
         condition = self.condition(clip)
         digits, state = self.network.codebook.digits(clip.tokens), self.normalize_state(clip.state)
-        seen, seen_state = corrupt_digits(digits, self.network.codebook.levels, self.config.token_noise), state
+        seen, seen_state = (
+            corrupt_digits(digits, self.network.codebook.levels, self.config.token_noise),
+            state,
+        )
         if self.config.self_forcing > 0:
             with torch.no_grad():
                 guess = self.network(seen, seen_state, *condition)
@@ -137,7 +140,7 @@ class WorldModelRewardModel(PreTrainedRewardModel):
         return next_frame_loss(prediction, self.network.codebook, digits, state, clip, self.config)
 
     def forward(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, float]]:
-        """LeRobot's batch: images (B, T, 3, H, W), action (B, T, A), state (B, T, P), next.done (B,) of the last."""
+        """LeRobot's batch: images (B, T, 3, H, W), action (B, T, A), state (B, T, P), next.done (B,)."""
         return self.loss(self.clip_from_batch(batch))
 
     @torch.no_grad()
@@ -150,7 +153,9 @@ class WorldModelRewardModel(PreTrainedRewardModel):
         done, known = torch.zeros(shape, device=tokens.device), torch.zeros(shape, dtype=torch.bool)
         if "next.done" in batch:
             done[:, -1], known[:, -1] = batch["next.done"].reshape(-1).float(), True
-        state = batch[OBS_STATE] if self.config.state_size else tokens.new_zeros((*shape, 0), dtype=torch.float32)
+        state = (
+            batch[OBS_STATE] if self.config.state_size else tokens.new_zeros((*shape, 0), dtype=torch.float32)
+        )
         return Clip(
             tokens, state, batch[ACTION], done, ~padded.to(tokens.device), known.to(tokens.device),
             list(batch.get("task", [""] * shape[0])),

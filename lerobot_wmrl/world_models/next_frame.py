@@ -14,7 +14,6 @@ from torch.nn import functional as F
 
 from lerobot_wmrl.world_models.st_transformer import SpatialTemporalTransformer, TemporalCache
 
-
 STATE_STEP = 0.1
 """The state head predicts changes in units of a tenth of the state's spread."""
 
@@ -45,7 +44,11 @@ class CodeBook(nn.Module):
         factors = [factor for factor, count in enumerate(levels) for _ in range(count)]
         within = [level for count in levels for level in range(count)]
         basis = torch.tensor([1, *levels[:-1]]).cumprod(0)
-        for name, values in (("factor_of_logit", factors), ("level_of_logit", within), ("levels", list(levels))):
+        for name, values in (
+            ("factor_of_logit", factors),
+            ("level_of_logit", within),
+            ("levels", list(levels)),
+        ):
             self.register_buffer(name, torch.tensor(values), persistent=False)
         self.register_buffer("basis", basis, persistent=False)
 
@@ -154,7 +157,9 @@ class NextFrameNetwork(nn.Module):
         """Tokens a frame inside the transformer, the register included."""
         return self.num_cameras * (self.grid // self.patch) ** 2 + 1
 
-    def forward(self, digits: Tensor, state: Tensor, condition: Tensor, mask: Tensor | None = None) -> Prediction:
+    def forward(
+        self, digits: Tensor, state: Tensor, condition: Tensor, mask: Tensor | None = None
+    ) -> Prediction:
         """Teacher-forced pass. digits (B, T, S, C), state (B, T, P), condition (B, T or 1, M, D)."""
         x, local = self._embed(digits, state)
         return self._read(self.transformer(x, condition, mask), local, digits, state)

@@ -25,7 +25,10 @@ def side_by_side(model: ActionWorldModelRewardModel, run: Replay, index: int) ->
     real = np.stack([run.real_frames(step)[index] for step in range(length)])
     imagined = (decode(model, run.imagined.tokens[index, : length - 1]) * 255).round().astype(np.uint8)
     start = (decode(model, model.tokenizer.encode(frames_to_tensor(real[:1]))) * 255).round().astype(np.uint8)
-    rows = [np.concatenate(list(cameras.swapaxes(0, 1)), 2) for cameras in (real, np.concatenate([start, imagined]))]
+    rows = [
+        np.concatenate(list(cameras.swapaxes(0, 1)), 2)
+        for cameras in (real, np.concatenate([start, imagined]))
+    ]
     gap = np.full((length, GAP, *rows[0].shape[2:]), 255, np.uint8)
     return np.concatenate([rows[0], gap, rows[1]], 1)
 
@@ -57,7 +60,11 @@ def save_goals(curves: dict[str, dict[str, Any]], path: Path) -> None:
 
 def save_reward_curves(curves: dict[str, dict[str, Any]], path: Path) -> None:
     """The general reward, summed so far, and its two parts along real episodes."""
-    panels = (("done_probability", "done probability"), ("similarity", "similarity to the goal"), ("return", "return"))
+    panels = (
+        ("done_probability", "done probability"),
+        ("similarity", "similarity to the goal"),
+        ("return", "return"),
+    )
     figure, axes = plt.subplots(1, len(panels), figsize=(10, 2.8))
     for axis, (key, title) in zip(axes, panels, strict=True):
         for name, curve in curves.items():
@@ -89,7 +96,3 @@ def _save(figure: Any, path: Path) -> None:
 def _enlarge(frame: np.ndarray) -> Image.Image:
     image = Image.fromarray(frame)
     return image.resize((SCALE * image.width, SCALE * image.height), Image.Resampling.NEAREST)
-
-
-
-

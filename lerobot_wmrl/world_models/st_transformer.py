@@ -5,10 +5,10 @@ values of past frames live in a preallocated ring, so an imagined frame costs on
 """
 
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 
 def attention(query: Tensor, key: Tensor, value: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -122,7 +122,9 @@ class SpatialTemporalBlock(nn.Module):
         """Every token of a frame sees the whole frame. (B, T, S, D) → same."""
         return x + self.space.merge_heads(attention(*self.space.split_heads(x)))
 
-    def forward(self, x: Tensor, condition: Tensor, condition_mask: Tensor | None, time_mask: Tensor) -> Tensor:
+    def forward(
+        self, x: Tensor, condition: Tensor, condition_mask: Tensor | None, time_mask: Tensor
+    ) -> Tensor:
         """Training pass over whole clips: x (B, T, S, D), time_mask (T, T)."""
         x = self.attend_space(x)
         query, key, value = self.time.split_heads(x.transpose(1, 2))
@@ -131,7 +133,9 @@ class SpatialTemporalBlock(nn.Module):
         x = x + self.time.merge_heads(attention(query, key, value, time_mask)).transpose(1, 2)
         return self._condition_and_mlp(x, condition, condition_mask)
 
-    def step(self, x: Tensor, condition: Tensor, condition_mask: Tensor | None, cache: TemporalCache, layer: int) -> Tensor:
+    def step(
+        self, x: Tensor, condition: Tensor, condition_mask: Tensor | None, cache: TemporalCache, layer: int
+    ) -> Tensor:
         """One new frame x (B, 1, S, D) against the ring; writes its own keys and values first."""
         x = self.attend_space(x)
         query, key, value = self.time.split_heads(x.transpose(1, 2))
@@ -174,9 +178,11 @@ class SpatialTemporalTransformer(nn.Module):
         keys, values = (torch.zeros(shape, device=device, dtype=dtype) for _ in range(2))
         return TemporalCache(keys, values, torch.zeros(batch, dtype=torch.long, device=device))
 
-    def step(self, x: Tensor, condition: Tensor, condition_mask: Tensor | None, cache: TemporalCache) -> Tensor:
+    def step(
+        self, x: Tensor, condition: Tensor, condition_mask: Tensor | None, cache: TemporalCache
+    ) -> Tensor:
         """One frame x (B, 1, S, D) → (B, 1, S, D), in one pass; advances the ring."""
         for layer, block in enumerate(self.blocks):
-            x = block.step(x, condition, condition_mask, cache, layer)
+            x = cast(SpatialTemporalBlock, block).step(x, condition, condition_mask, cache, layer)
         cache.position += 1
         return self.norm(x)

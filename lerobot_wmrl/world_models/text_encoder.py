@@ -22,6 +22,10 @@ class ByteTextEncoder(nn.Module):
 
     def forward(self, instructions: Sequence[str]) -> tuple[Tensor, Tensor]:
         """→ condition (B, 1, M, D) and its mask (B, 1, 1, 1, M), True where there is a byte."""
-        batch = self.tokenizer(list(instructions), padding=True, return_tensors="pt").to(self.project.weight.device)
-        hidden = self.encoder(input_ids=batch["input_ids"], attention_mask=batch["attention_mask"]).last_hidden_state
+        batch = self.tokenizer(list(instructions), padding=True, return_tensors="pt").to(
+            self.project.weight.device
+        )
+        hidden = self.encoder(
+            input_ids=batch["input_ids"], attention_mask=batch["attention_mask"]
+        ).last_hidden_state
         return self.project(hidden)[:, None], batch["attention_mask"].to(torch.bool)[:, None, None, None]

@@ -54,7 +54,9 @@ def make_sampler(
     if isinstance(config, TextWorldModelConfig):
         episodes = episodes & golden_episodes(table)
         if not episodes.any():
-            raise ValueError("the text world model learns from successful optimal episodes; the dataset has none")
+            raise ValueError(
+                "the text world model learns from successful optimal episodes; the dataset has none"
+            )
     tokenizer: Any = model.tokenizer
     tokens = cached_tokens(table.dataset, config.camera_keys, tokenizer)
     return ClipSampler(
@@ -63,7 +65,10 @@ def make_sampler(
 
 
 def train(
-    model: PreTrainedRewardModel, sampler: ClipSampler | FrameSampler, cfg: Any, save_config: Callable[[Path], None]
+    model: PreTrainedRewardModel,
+    sampler: ClipSampler | FrameSampler,
+    cfg: Any,
+    save_config: Callable[[Path], None],
 ) -> None:
     """Optimise from the last checkpoint to `cfg.steps`. ValueError (and no new checkpoint) on a NaN loss."""
     set_seed(cfg.seed)
@@ -72,7 +77,7 @@ def train(
     scheduler = cosine_schedule(preset.lr, cfg.steps).build(optimizer, cfg.steps)
     checkpoint = latest_checkpoint(cfg.output_dir)
     step = load_training_state(checkpoint, optimizer, scheduler)[0] if checkpoint else 0
-    loss_function: LossFunction = model.loss if isinstance(sampler, ClipSampler) else model  # type: ignore[assignment]
+    loss_function: LossFunction = model.loss if isinstance(sampler, ClipSampler) else model
 
     def save(folder: Path) -> None:
         model.save_pretrained(folder / PRETRAINED_MODEL_DIR)
@@ -81,11 +86,15 @@ def train(
 
     model.train()
     began, first = time.monotonic(), step
-    progress = tqdm(range(step, cfg.steps), initial=step, total=cfg.steps, desc=f"Training {model.name}", unit="step")
+    progress = tqdm(
+        range(step, cfg.steps), initial=step, total=cfg.steps, desc=f"Training {model.name}", unit="step"
+    )
     for _ in progress:
         loss, metrics = loss_function(sampler(step))
         if not torch.isfinite(loss):
-            raise ValueError(f"step {step}: the loss is {loss.item()}; the last checkpoint is kept. Lower learning_rate")
+            raise ValueError(
+                f"step {step}: the loss is {loss.item()}; the last checkpoint is kept. Lower learning_rate"
+            )
         optimizer.zero_grad()
         loss.backward()
         grad_norm = torch.nn.utils.clip_grad_norm_(model.parameters(), preset.grad_clip_norm)

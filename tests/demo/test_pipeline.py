@@ -112,7 +112,7 @@ def test_two_demos_do_not_share_a_folder(tmp_path: Path) -> None:
 @pytest.mark.parametrize("flags", [{"seed": -1}, {"seed": 10}, {"eval_episodes": 0}])
 def test_impossible_settings_are_named(flags: dict[str, int]) -> None:
     with pytest.raises(ValueError, match=f"--{next(iter(flags))}="):
-        DemoConfig(**flags)
+        DemoConfig(**flags).check()
 
 
 def test_training_and_evaluation_seeds_are_disjoint() -> None:
