@@ -59,7 +59,9 @@ def claim_output_dir(output_dir: Path, config: dict[str, Any]) -> None:
     partial.replace(marker)
 
 
-def run_command[Config: "RunConfig"](function: Callable[[Config], None], config_class: type[Config], command: str) -> None:
+def run_command[Config: "RunConfig"](
+    function: Callable[[Config], None], config_class: type[Config], command: str
+) -> None:
     """Parse the command line for `function`, run it, and turn bad input into one clear line, exit code 1."""
     register_third_party_plugins()
     init_logging()

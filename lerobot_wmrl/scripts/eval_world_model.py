@@ -75,8 +75,9 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     write_json(cfg.output_dir / "metrics.json", {**agreement, **accuracy, "dataset": cfg.dataset.root})
     print(
         f"{len(episodes)} real episodes replayed: {agreement['false_successes']} of "
-        f"{agreement['real_failures']} failures were called successes, {agreement['recognised_successes']} of "
-        f"{agreement['real_successes']} successes were recognised. Written to {cfg.output_dir}"
+        f"{agreement['real_failures']} failures were called successes, "
+        f"{agreement['recognised_successes']} of {agreement['real_successes']} successes were recognised. "
+        f"Written to {cfg.output_dir}"
     )
 
 

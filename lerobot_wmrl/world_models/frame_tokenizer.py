@@ -42,9 +42,7 @@ class Encoder(nn.Module):
     def __init__(self, widths: Sequence[int], code_size: int) -> None:
         super().__init__()
         self.stem = nn.Conv2d(3 * PATCH**2, widths[0], 3, padding=1)
-        self.downs = nn.ModuleList(
-            nn.Conv2d(a, b, 2, stride=2) for a, b in itertools.pairwise(widths)
-        )
+        self.downs = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in itertools.pairwise(widths))
         self.block = ResidualBlock(widths[-1])
         self.head = nn.Conv2d(widths[-1], code_size, 1)
 
@@ -63,9 +61,7 @@ class Decoder(nn.Module):
         coarse_to_fine = list(reversed(widths))
         self.stem = nn.Conv2d(code_size, coarse_to_fine[0], 3, padding=1)
         self.block = ResidualBlock(coarse_to_fine[0])
-        self.ups = nn.ModuleList(
-            nn.Conv2d(a, 4 * b, 1) for a, b in itertools.pairwise(coarse_to_fine)
-        )
+        self.ups = nn.ModuleList(nn.Conv2d(a, 4 * b, 1) for a, b in itertools.pairwise(coarse_to_fine))
         self.smooth = nn.Conv2d(widths[0], widths[0], 3, padding=1)
         self.head = nn.Conv2d(widths[0], 3 * PATCH**2, 3, padding=1)
 

@@ -1,0 +1,48 @@
+import pytest
+import torch
+
+from lerobot_wmrl.rewards.configuration_general import GeneralConfig
+from lerobot_wmrl.rewards.curves import success_once
+from lerobot_wmrl.rewards.general import consecutive_count, general_reward, sparse_reward
+from lerobot_wmrl.rewards.modeling_general import GeneralRewardModel
+
+
+def test_the_sparse_part_pays_at_the_threshold():
+    logits = torch.logit(torch.tensor([0.49, 0.51]))
+    assert sparse_reward(logits, 0.5).tolist() == [0, 1]
+
+
+def test_the_potential_form_pays_nothing_for_lingering_and_for_going_in_circles():
+    path = torch.tensor([0.2, 0.5, 0.9, 0.5, 0.2])
+    zero = torch.zeros(4)
+    earned = general_reward(zero, path[1:], path[:-1], alpha=0.0, form="potential", gamma=1.0)
+    assert earned.sum().item() == pytest.approx(0, abs=1e-6)
+
+
+def test_success_is_worth_more_than_any_lingering_with_the_default_weights():
+    config = GeneralConfig(device="cpu")
+    reward = GeneralRewardModel(config)
+    still = torch.ones(1)
+    linger = reward.compute_reward({"success": 0 * still, "similarity": still, "previous.similarity": still})
+    finish = reward.compute_reward({"success": still, "similarity": still, "previous.similarity": still})
+    assert finish.item() > 40 * linger.item()
+
+
+def test_done_must_fire_in_a_row():
+    count = torch.zeros(1, dtype=torch.long)
+    runs = [
+        (count := consecutive_count(count, torch.tensor([fired == 1]))).item() for fired in (1, 1, 0, 1, 1, 1)
+    ]
+    assert runs == [1, 2, 0, 1, 2, 3]
+
+
+def test_success_is_paid_once():
+    logits = torch.tensor([-9.0, 9, 9, -9, 9, 9, 9, 9, 9, 9])
+    assert success_once(logits, 0.5, 3).tolist() == [0, 0, 0, 0, 0, 0, 1, 0, 0, 0]
+
+
+def test_bad_settings_name_the_field():
+    with pytest.raises(ValueError, match="form='relative'"):
+        GeneralConfig(device="cpu", form="relative")
+    with pytest.raises(ValueError, match=r"alpha=1\.5"):
+        GeneralConfig(device="cpu", alpha=1.5)

@@ -1,0 +1,67 @@
+from types import SimpleNamespace
+
+import torch
+
+from lerobot_wmrl.world_models.losses import Clip, corrupt_digits, force_predictions, next_frame_loss
+from lerobot_wmrl.world_models.next_frame import CodeBook, Prediction
+
+CONFIG = SimpleNamespace(motion_weight=3.0, done_weight=1.0, done_positive_weight=2.0, state_weight=1.0)
+CODEBOOK = CodeBook((4, 3))
+
+
+def clip_and_prediction(valid: torch.Tensor) -> tuple[Clip, Prediction, torch.Tensor]:
+    torch.manual_seed(0)
+    tokens = torch.randint(0, 12, (2, 5, 6))
+    flags = torch.ones(2, 5, dtype=torch.bool)
+    clip = Clip(tokens, torch.randn(2, 5, 3), torch.zeros(2, 5, 7), torch.zeros(2, 5), valid, flags, ["", ""])
+    prediction = Prediction(
+        torch.randn(2, 5, 6, 7), torch.randn(2, 5), torch.randn(2, 5, 3), torch.zeros(2, 5, 8)
+    )
+    return clip, prediction, CODEBOOK.digits(tokens)
+
+
+def test_padding_does_not_count():
+    valid = torch.tensor([[True] * 5, [True] * 3 + [False] * 2])
+    clip, prediction, digits = clip_and_prediction(valid)
+    loss, _ = next_frame_loss(prediction, CODEBOOK, digits, clip.state, clip, CONFIG)
+    for tensor in prediction[:3]:
+        tensor[1, 3:] += 100
+    prediction.logits[1, 2] += torch.randn(6, 7)
+    prediction.proprioception[1, 2] += 5
+    digits[1, 3:] = 0
+    again, _ = next_frame_loss(prediction, CODEBOOK, digits, clip.state, clip, CONFIG)
+    torch.testing.assert_close(loss, again)
+
+
+def test_perfect_predictions_cost_nothing_and_are_for_the_next_frame():
+    clip, prediction, digits = clip_and_prediction(torch.ones(2, 5, dtype=torch.bool))
+    logits = torch.roll(CODEBOOK.one_hot(digits), -1, 1) * 100
+    state = torch.roll(clip.state, -1, 1)
+    perfect = Prediction(logits, torch.full((2, 5), -50.0), state, prediction.hidden)
+    loss, metrics = next_frame_loss(perfect, CODEBOOK, digits, clip.state, clip, CONFIG)
+    assert loss.item() < 1e-6
+    assert metrics["token_accuracy"] == 1
+    assert metrics["changed_token_accuracy"] == 1
+
+
+def test_unknown_outcomes_do_not_train_done():
+    clip, prediction, digits = clip_and_prediction(torch.ones(2, 5, dtype=torch.bool))
+    clip = clip._replace(done_known=torch.zeros(2, 5, dtype=torch.bool))
+    _, metrics = next_frame_loss(prediction, CODEBOOK, digits, clip.state, clip, CONFIG)
+    assert metrics["done_loss"] == 0
+
+
+def test_forcing_replaces_later_frames_only_and_only_by_predictions():
+    clip, prediction, digits = clip_and_prediction(torch.ones(2, 5, dtype=torch.bool))
+    seen, state = force_predictions(prediction, CODEBOOK, digits, clip.state, share=1.0)
+    assert torch.equal(seen[:, 0], digits[:, 0])
+    assert torch.equal(state[:, 0], clip.state[:, 0])
+    assert torch.equal(seen[:, 1:], CODEBOOK.sample(prediction.logits[:, :-1], 0.0, None))
+    assert torch.equal(state[:, 1:], prediction.proprioception[:, :-1])
+
+
+def test_corruption_moves_a_share_of_the_factors_by_one_level():
+    digits = torch.randint(1, 3, (20_000, 2))
+    noisy = corrupt_digits(digits, torch.tensor([4, 4]), 0.1)
+    assert (noisy - digits).abs().max() == 1
+    assert 0.09 < (noisy != digits).float().mean() < 0.11

@@ -1,0 +1,64 @@
+import torch
+from torch.nn import functional as F
+from vector_quantize_pytorch import FSQ
+
+from lerobot_wmrl.world_models.next_frame import CodeBook, NextFrameNetwork
+
+LEVELS = (8, 5, 3)
+
+
+def network() -> NextFrameNetwork:
+    torch.manual_seed(0)
+    return NextFrameNetwork(
+        levels=LEVELS, grid=4, num_cameras=2, state_size=3, patch=2, layers=2, width=16, heads=2, window=4,
+        code_width=8,
+    )  # fmt: skip
+
+
+def test_digits_are_those_of_the_quantizer_and_make_the_token_again():
+    codebook, quantizer = CodeBook(LEVELS), FSQ(list(LEVELS))
+    tokens = torch.arange(8 * 5 * 3)
+    digits = codebook.digits(tokens)
+    assert torch.equal(digits, quantizer.indices_to_level_indices(tokens).long())
+    assert torch.equal(codebook.tokens(digits), tokens)
+
+
+def test_factorised_cross_entropy_equals_that_of_the_product_distribution():
+    codebook = CodeBook(LEVELS)
+    tokens = torch.arange(8 * 5 * 3)
+    logits = torch.randn(1, sum(LEVELS), dtype=torch.float64).expand(len(tokens), -1)
+    every = codebook.cross_entropy(logits, codebook.digits(tokens))
+    torch.testing.assert_close(every.neg().exp().sum(), torch.ones((), dtype=torch.float64))
+    first = F.log_softmax(logits[0, :8], 0)[3] + F.log_softmax(logits[0, 8:13], 0)[1]
+    first = first + F.log_softmax(logits[0, 13:], 0)[2]
+    token = codebook.tokens(torch.tensor([3, 1, 2]))
+    torch.testing.assert_close(every[token], -first)
+
+
+def test_sampling_follows_the_distribution_at_the_temperature():
+    codebook, generator = CodeBook((4,)), torch.Generator().manual_seed(0)
+    logits = torch.tensor([0.0, 1.0, 2.0, -1.0])
+    drawn = codebook.sample(logits.expand(40_000, 4), 2.0, generator)[:, 0]
+    shares = torch.bincount(drawn, minlength=4) / 40_000
+    torch.testing.assert_close(shares, (logits / 2).softmax(0), atol=0.01, rtol=0)
+    assert (codebook.sample(logits.expand(9, 4), 0.0, None) == 2).all()
+
+
+def test_an_untrained_network_prefers_to_leave_the_frame_as_it_is():
+    model = network()
+    digits = model.codebook.digits(torch.randint(0, 8 * 5 * 3, (2, 3, 32)))
+    prediction = model(digits, torch.zeros(2, 3, 3), torch.zeros(2, 3, 1, 16))
+    kept = model.codebook.sample(prediction.logits, 0.0, None) == digits
+    assert kept.float().mean() > 0.6
+
+
+def test_every_input_reaches_the_prediction():
+    model = network()
+    for parameter in model.parameters():
+        torch.nn.init.normal_(parameter, std=0.3)
+    state = torch.randn(1, 2, 3, requires_grad=True)
+    condition = torch.randn(1, 2, 1, 16, requires_grad=True)
+    prediction = model(model.codebook.digits(torch.randint(0, 120, (1, 2, 32))), state, condition)
+    for output in (prediction.logits, prediction.done_logit, prediction.proprioception):
+        gradients = torch.autograd.grad(output[:, 1].sum(), (state, condition), retain_graph=True)
+        assert all(gradient[:, 0].abs().sum() > 0 for gradient in gradients)
