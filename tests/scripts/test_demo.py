@@ -1,0 +1,139 @@
+"""The whole loop at the size `tiny`: real commands, killed once on the way, and what they leave behind."""
+
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from lerobot_wmrl.constants import EVALUATION_SEED
+from lerobot_wmrl.demo.episodes import episode_table
+from lerobot_wmrl.demo.stages import DemoConfig, demo_stages
+from lerobot_wmrl.presets import PRESETS
+from lerobot_wmrl.tracking import read_metrics
+
+KILLED_STAGE = "frame_tokenizer"
+STAGES = [stage.name for stage in demo_stages(DemoConfig())]
+
+
+def start_demo(folder: Path) -> subprocess.Popen[str]:
+    command = [Path(sys.executable).with_name("lerobot-wmrl-demo"), "--preset=tiny", "--output_dir=demo"]
+    return subprocess.Popen(command, cwd=folder, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+
+
+def stage_record(demo: Path, name: str) -> dict[str, object]:
+    path = demo / "stages" / f"{name}.json"
+    return json.loads(path.read_text()) if path.exists() else {}
+
+
+@pytest.fixture(scope="module")
+def outputs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """The finished folder, and what the second of two calls printed: the first was killed in a stage."""
+    folder = tmp_path_factory.mktemp("loop")
+    first = start_demo(folder)
+    end = time.monotonic() + 120
+    while stage_record(folder / "demo", KILLED_STAGE).get("seconds", 0) < 2:
+        assert first.poll() is None, first.communicate()[0][-3000:]
+        assert time.monotonic() < end, "the stage did not start in time"
+        time.sleep(0.2)
+    first.send_signal(signal.SIGKILL)
+    first.communicate()
+    printed, _ = (second := start_demo(folder)).communicate()
+    assert second.returncode == 0, printed[-5000:]
+    return folder / "demo", printed
+
+
+def test_a_killed_run_continues_after_its_last_finished_stage(outputs: tuple[Path, str]) -> None:
+    demo, printed = outputs
+    number = STAGES.index(KILLED_STAGE) + 1
+    assert re.search(rf"^\[{number - 1}/{len(STAGES)}\] .*: done in \d+ s$", printed, re.MULTILINE)
+    assert re.search(rf"^\[{number}/{len(STAGES)}\] [^:]*$", printed, re.MULTILINE)
+    assert all(stage_record(demo, name)["finished"] for name in STAGES)
+
+
+def test_a_finished_run_does_nothing_again(outputs: tuple[Path, str]) -> None:
+    demo, _ = outputs
+    before = {
+        path: path.stat().st_mtime_ns
+        for path in demo.rglob("*")
+        if path.suffix in (".safetensors", ".parquet")
+    }
+    printed, _ = start_demo(demo.parent).communicate()
+    after = {
+        path: path.stat().st_mtime_ns
+        for path in demo.rglob("*")
+        if path.suffix in (".safetensors", ".parquet")
+    }
+    assert printed.count(": done in") == len(STAGES)
+    assert "$ lerobot" not in printed
+    assert before == after
+
+
+def test_the_dataset_reopens_and_holds_successes_and_failures(outputs: tuple[Path, str]) -> None:
+    demo, _ = outputs
+    dataset = LeRobotDataset("local/demo", root=demo / "dataset")
+    frame = dataset[len(dataset) - 1]
+    assert frame["observation.images.third_view"].shape[0] == 3
+    assert frame["observation.state"].shape == (8,)
+    assert frame["action"].shape == (7,)
+    success = episode_table(demo / "dataset")["success"]
+    assert len(success) == dataset.num_episodes
+    assert 0 < success.sum() < len(success)
+
+
+def test_no_held_out_seed_is_trained_on(outputs: tuple[Path, str]) -> None:
+    demo, _ = outputs
+    assert episode_table(demo / "dataset")["seed"].max() < EVALUATION_SEED
+    for policy in ("sft", "rl"):
+        rollouts = episode_table(demo / f"rollouts_{policy}")["seed"]
+        evaluated = range(EVALUATION_SEED, EVALUATION_SEED + int(PRESETS["tiny"]["demo"]["eval_episodes"]))
+        assert rollouts.min() >= EVALUATION_SEED
+        assert not set(rollouts.tolist()) & set(evaluated)
+
+
+def test_both_policies_meet_the_same_held_out_starts(outputs: tuple[Path, str]) -> None:
+    demo, _ = outputs
+    commands = [str(stage_record(demo, f"eval_{policy}")["command"]).split() for policy in ("sft", "rl")]
+    different = set(commands[0]) ^ set(commands[1])
+    assert {flag.partition("=")[0] for flag in different} == {"--policy.path", "--output_dir"}
+
+
+def test_the_summary_counts_what_was_evaluated(outputs: tuple[Path, str]) -> None:
+    demo, _ = outputs
+    summary = json.loads((demo / "summary.json").read_text())
+    n = PRESETS["tiny"]["demo"]["eval_episodes"]
+    for policy in ("sft", "rl"):
+        assert [summary["policies"][policy][key]["n"] for key in ("real", "imagined")] == [n, n]
+        replayed = summary["policies"][policy]
+        assert replayed["false_success"]["n"] + replayed["recognised"]["n"] == len(
+            episode_table(demo / f"rollouts_{policy}")["episode"]
+        )
+    assert summary["peak_memory_bytes"] < 8e9
+
+
+def test_training_left_metrics_and_whole_checkpoints(outputs: tuple[Path, str]) -> None:
+    demo, _ = outputs
+    for folder in ("frame_tokenizer", "action_world_model", "text_world_model", "rl"):
+        assert read_metrics(demo / folder), f"{folder} has no metrics"
+    for folder in ("frame_tokenizer", "action_world_model", "text_world_model", "sft", "rl"):
+        checkpoint = demo / folder / "checkpoints" / "last" / "pretrained_model"
+        assert {"config.json", "model.safetensors", "train_config.json"} <= {
+            p.name for p in checkpoint.iterdir()
+        }
+
+
+def test_the_page_stands_alone_and_shows_every_part(outputs: tuple[Path, str]) -> None:
+    demo, _ = outputs
+    page = (demo / "report.html").read_text()
+    assert not re.findall(r"""(?:src|href)=["'](?!data:)""", page), "the page needs other files"
+    for heading in ("Success, before and after", "Can the world model be trusted?", "Real beside imagined",
+                    "Goal frames", "The reward along real episodes", "Training", "Time and memory", "The commands"):  # fmt: skip
+        assert f"<h2>{heading}</h2>" in page
+    assert page.count("data:image/") >= 12
+    for name in STAGES:
+        assert str(stage_record(demo, name)["title"]) in page
