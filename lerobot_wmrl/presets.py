@@ -11,6 +11,7 @@ Flags = Mapping[str, str | int | float | bool]
 
 PRESETS: Final[dict[str, dict[str, Flags]]] = {
     "tiny": {
+        "record": {"num_episodes": 24, "part_episodes": 8, "num_workers": 2},
         "demo": {
             "stage_preset": "tiny",
             "sft_episodes": 3,
@@ -21,6 +22,7 @@ PRESETS: Final[dict[str, dict[str, Flags]]] = {
         "eval-imagined": {"eval.batch_size": 4},
     },
     "demo": {
+        "record": {"num_episodes": 900, "part_episodes": 25, "num_workers": 2},
         "demo": {
             "stage_preset": "demo",
             "sft_episodes": 12,

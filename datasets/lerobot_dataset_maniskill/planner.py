@@ -22,6 +22,7 @@ GAIN: Final = 2.0
 """Commanded delta over remaining distance; the arm achieves about a third of a command in one step."""
 
 TOP_SPEED: Final = ACTION_HIGH[0]
+OPTIMAL_SPEED: Final = 0.8 * TOP_SPEED
 CLOSED: Final = -1.0
 LOWEST: Final = 0.012
 """The fingertips stay this far above the table (m)."""
@@ -111,7 +112,7 @@ def plan_push(kind: str, spec: ObjectSpec, start: Start, rng: np.random.Generato
     """A plan of the given kind (`constants.KINDS` without "policy") for an episode of push."""
     geometry = PushGeometry(spec, start)
     if kind == "optimal":
-        return Plan(essential_push(geometry))
+        return Plan(essential_push(geometry), speed=OPTIMAL_SPEED)
     noise = Noise(rng.uniform(0.0, 0.015), rng.uniform(0.0, 0.06), rng.uniform(0.0, 0.4))
     plan = Plan((), rng.uniform(0.55, 1.0) * TOP_SPEED, noise)
     return replace(plan, waypoints=SUBOPTIMAL[kind](geometry, rng))
@@ -136,7 +137,7 @@ def interpolated_push(geometry: PushGeometry, rng: np.random.Generator) -> tuple
 
 def disturbed_push(geometry: PushGeometry, rng: np.random.Generator) -> tuple[Waypoint, ...]:
     """The essential waypoints, each a little off: some pushes slip, turn the object or pass over it."""
-    return _jittered(essential_push(geometry), rng, rng.uniform(0.008, 0.022))
+    return _jittered(essential_push(geometry), rng, rng.uniform(0.008, 0.03))
 
 
 def near_miss_push(geometry: PushGeometry, rng: np.random.Generator) -> tuple[Waypoint, ...]:

@@ -52,6 +52,11 @@ def scenes_of(split: str, scenes: Sequence[int] | None = None) -> tuple[Scene, .
     return tuple(members[index] for index in scenes)
 
 
+def scene_for_seed(scenes: Sequence[Scene], seed: int) -> Scene:
+    """The scene of an episode seed: consecutive seeds visit `scenes` in turn."""
+    return scenes[seed % len(scenes)]
+
+
 def describe_scenes() -> str:
     """The table as text, one scene a line."""
     rows = [("index", "object", "container", "table", "split")]

@@ -1,0 +1,123 @@
+"""What to record: the flags of `lerobot-wmrl-record`."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from lerobot.configs import parser
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.envs.configs import EnvConfig
+
+from lerobot_wmrl.constants import EVALUATION_SEED, KINDS
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+
+POLICY_KIND = "policy"
+
+
+def default_kinds() -> dict[str, float]:
+    """Shares of the trajectory kinds; they need not sum to 1."""
+    return {"optimal": 0.35, "waypoint": 0.10, "interpolated": 0.07, "disturbed": 0.13, "near_miss": 0.35}
+
+
+@dataclass
+class RecordConfig:
+    """Record trajectories in ManiSkill as a LeRobotDataset.
+
+    Planned trajectories by default; with --policy.path=… the real rollouts of that policy. The same command
+    again continues an interrupted recording, or reports that it is complete.
+
+    Args:
+        output_dir: root of the dataset; it appears when everything is recorded.
+        repo_id: name of the dataset; local/<folder> by default.
+        num_episodes: how many to record.
+        seed: of the first episode; episode i has seed + i.
+        env: task, scenes, cameras and image size (--env.type=wmrl_maniskill --env.task=push …).
+        kinds: share of each trajectory kind (planned trajectories only).
+        num_workers: simulating processes.
+        part_episodes: episodes a sub-dataset, the piece of work an interruption can cost each worker.
+        policy: a LeRobot policy to roll out, given as --policy.path=….
+        stochastic: sample from the policy where it can be sampled, instead of its best action.
+        push_to_hub: publish the dataset as repo_id when it is complete.
+        private: publish it privately.
+        list_scenes: print the table of scenes and stop.
+    """
+
+    output_dir: Path | None = None
+    repo_id: str | None = None
+    num_episodes: int = 100
+    seed: int = 0
+    env: EnvConfig = field(default_factory=WmrlManiSkillEnv)
+    kinds: dict[str, float] = field(default_factory=default_kinds)
+    num_workers: int = 2
+    part_episodes: int = 20
+    policy: PreTrainedConfig | None = None
+    stochastic: bool = False
+    push_to_hub: bool = False
+    private: bool = False
+    list_scenes: bool = False
+
+    def __post_init__(self) -> None:
+        path = parser.get_path_arg("policy")
+        if path:
+            if not (Path(path) / "config.json").is_file() and (path.startswith((".", "/")) or Path(path).exists()):
+                raise ValueError(f"--policy.path={path}: there is no config.json; give a folder `pretrained_model`")
+            overrides = parser.get_cli_overrides("policy") or []
+            self.policy = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
+            self.policy.pretrained_path = Path(path)
+
+    @classmethod
+    def __get_path_fields__(cls) -> list[str]:
+        """Lets LeRobot's parser accept --policy.path=…."""
+        return ["policy"]
+
+    def validate(self) -> None:
+        """ValueError that names the field, its value and the remedy."""
+        if self.output_dir is None:
+            raise ValueError("--output_dir is missing: give the folder in which the dataset is to appear")
+        if not isinstance(self.env, WmrlManiSkillEnv):
+            raise ValueError(f"--env.type={self.env.type}: only wmrl_maniskill can be recorded so far")
+        for name in ("num_episodes", "num_workers", "part_episodes"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"--{name}={getattr(self, name)}: must be at least 1")
+        if self.seed < 0 or (self.policy is None and self.seed + self.num_episodes > EVALUATION_SEED):
+            raise ValueError(
+                f"--seed={self.seed}: the seeds of planned trajectories are from 0 to {EVALUATION_SEED - 1}; "
+                "those above are for evaluation"
+            )
+        self._validate_kinds()
+        self.env.selected_scenes()
+
+    def _validate_kinds(self) -> None:
+        planned = [kind for kind in KINDS if kind != POLICY_KIND]
+        unknown = [kind for kind in self.kinds if kind not in planned]
+        if unknown or min(self.kinds.values(), default=0) < 0 or sum(self.kinds.values()) <= 0:
+            raise ValueError(f"--kinds={self.kinds}: give shares of {', '.join(planned)}, at least one above 0")
+
+    @property
+    def maniskill(self) -> WmrlManiSkillEnv:
+        """The environment, once `validate` has made sure of its type."""
+        assert isinstance(self.env, WmrlManiSkillEnv)
+        return self.env
+
+    @property
+    def dataset_id(self) -> str:
+        assert self.output_dir is not None
+        return self.repo_id or f"local/{self.output_dir.name}"
+
+    def recorded_content(self) -> dict[str, Any]:
+        """What decides the episodes, and so whether a folder continues this recording. JSON values only."""
+        env = self.maniskill
+        return {
+            "task": env.task,
+            "scenes": [scene.index for scene in env.selected_scenes()],
+            "cameras": list(env.cameras),
+            "image_size": env.image_size,
+            "episode_length": env.horizon,
+            "robot_mesh_detail": env.robot_mesh_detail,
+            "num_episodes": self.num_episodes,
+            "part_episodes": self.part_episodes,
+            "seed": self.seed,
+            "kinds": self.kinds if self.policy is None else {POLICY_KIND: 1.0},
+            "policy": None if self.policy is None else str(self.policy.pretrained_path),
+            "stochastic": self.stochastic,
+        }

@@ -1,0 +1,89 @@
+"""What chooses the actions of an episode: a planner or a policy."""
+
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from lerobot.configs.policies import PreTrainedConfig
+
+from lerobot_dataset_maniskill.manifest import EpisodePlan
+from lerobot_dataset_maniskill.planner import PLANNERS, Follower
+from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, KINDS
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.maniskill.objects import OBJECTS
+from lerobot_wmrl.maniskill.simulation import Frame, Simulation
+
+
+class Driver(Protocol):
+    """Chooses actions (7,) float32 inside the action box."""
+
+    def begin(self, simulation: Simulation, plan: EpisodePlan) -> None:
+        """A new episode has just been reset."""
+
+    def act(self, simulation: Simulation, frame: Frame) -> np.ndarray:
+        """The action for this frame."""
+
+
+class PlannerDriver:
+    """Follows a scripted plan that depends on the episode's seed and kind only."""
+
+    def begin(self, simulation: Simulation, plan: EpisodePlan) -> None:
+        rng = np.random.default_rng((plan.seed, KINDS.index(plan.kind), simulation.task.index))
+        planner = PLANNERS[simulation.task.name]
+        waypoints = planner(plan.kind, OBJECTS[plan.scene.object], simulation.current_start, rng)
+        self.follower = Follower(waypoints, rng)
+
+    def act(self, simulation: Simulation, frame: Frame) -> np.ndarray:
+        return self.follower.act(simulation.tcp_position)
+
+
+class PolicyDriver:
+    """A LeRobot policy with its own pre- and postprocessors; samples where the policy offers `sample`."""
+
+    def __init__(self, config: PreTrainedConfig, env: WmrlManiSkillEnv, stochastic: bool) -> None:
+        from lerobot.policies.factory import make_policy, make_pre_post_processors
+
+        self.policy: Any = make_policy(cfg=config, env_cfg=env).eval()
+        self.preprocess, self.postprocess = make_pre_post_processors(
+            config, pretrained_path=str(config.pretrained_path),
+            preprocessor_overrides={"device_processor": {"device": str(config.device)}},
+        )  # fmt: skip
+        self.stochastic = stochastic
+        if stochastic and not hasattr(self.policy, "sample"):
+            raise ValueError(f"--stochastic=true: the policy {config.type} cannot be sampled; leave the flag out")
+
+    def begin(self, simulation: Simulation, plan: EpisodePlan) -> None:
+        torch.manual_seed(plan.seed)
+        self.policy.reset()
+        self.preprocess.reset()
+        self.postprocess.reset()
+
+    @torch.no_grad()
+    def act(self, simulation: Simulation, frame: Frame) -> np.ndarray:
+        batch = self.preprocess(policy_observation(frame, simulation.instruction))
+        raw = self.policy.sample(batch).raw_action if self.stochastic else self.policy.select_action(batch)
+        action = self.postprocess(raw).squeeze(0).cpu().numpy()
+        return np.clip(action, ACTION_LOW, ACTION_HIGH).astype(np.float32)
+
+
+def policy_observation(frame: Frame, instruction: str) -> dict[str, Any]:
+    """A batch of one in LeRobot's names: images (1, 3, H, W) in [0, 1], state (1, 8), task."""
+    images = {
+        f"observation.images.{camera}": torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255.0
+        for camera, image in frame.images.items()
+    }
+    return {**images, "observation.state": torch.from_numpy(frame.state)[None], "task": [instruction]}
+
+
+def check_policy(config: PreTrainedConfig, env: WmrlManiSkillEnv) -> None:
+    """ValueError if the policy wants cameras, or a frame size, that the environment does not have."""
+    offered = {f"observation.images.{camera}" for camera in env.cameras}
+    missing = [name for name in config.image_features if name not in offered]
+    if missing:
+        raise ValueError(
+            f"--policy.path={config.pretrained_path} wants {', '.join(missing)}, the environment has "
+            f"{', '.join(sorted(offered))}: set --env.cameras"
+        )
+    if not (Path(str(config.pretrained_path)) / "model.safetensors").exists() and Path(str(config.pretrained_path)).exists():
+        raise ValueError(f"--policy.path={config.pretrained_path}: there is no model.safetensors in this folder")

@@ -1,0 +1,51 @@
+"""Whether a dataset on disk is whole, without decoding its pictures."""
+
+import json
+from pathlib import Path
+
+import av
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+
+def whole_dataset(root: Path, episodes: int) -> str | None:
+    """What is wrong with the dataset at `root`, or None if it has `episodes` whole episodes."""
+    try:
+        info = json.loads((root / "meta" / "info.json").read_text())
+        if info["total_episodes"] != episodes:
+            return f"it has {info['total_episodes']} of {episodes} episodes"
+        rows = sum(len(pq.read_table(path, columns=["index"])) for path in parquet_files(root))
+        if rows != info["total_frames"]:
+            return f"it has {rows} of {info['total_frames']} rows"
+        cameras = [name for name, feature in info["features"].items() if feature["dtype"] == "video"]
+        for camera in cameras:
+            frames = sum(video_frames(path) for path in sorted((root / "videos" / camera).rglob("*.mp4")))
+            if frames != rows:
+                return f"{camera} has {frames} of {rows} frames"
+    except (OSError, ValueError, KeyError, pa.ArrowException, av.FFmpegError) as error:
+        return f"corrupted: {error}"
+    return None
+
+
+def parquet_files(root: Path) -> list[Path]:
+    return sorted((root / "data").rglob("*.parquet"))
+
+
+def video_frames(path: Path) -> int:
+    """Frames in a video file, counted by its packets, so that a truncated file shows."""
+    with av.open(str(path)) as container:
+        return sum(packet.size > 0 for packet in container.demux(video=0))
+
+
+def episode_outcomes(root: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Of each episode its kind (E,) and whether success held at any row (E,)."""
+    columns = ["episode_index", "start.kind", "next.success"]
+    tables = [pq.read_table(path, columns=columns).to_pydict() for path in parquet_files(root)]
+    episode, kind, success = (
+        np.concatenate([np.asarray(table[name]).reshape(-1) for table in tables]) for name in columns
+    )
+    kinds, wins = np.zeros(episode.max() + 1, np.int64), np.zeros(episode.max() + 1, bool)
+    kinds[episode] = kind
+    np.logical_or.at(wins, episode, success.astype(bool))
+    return kinds, wins

@@ -1,0 +1,58 @@
+"""Which episodes a recording consists of: a pure function of its configuration, so it can be resumed."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lerobot_dataset_maniskill.configuration import POLICY_KIND, RecordConfig
+from lerobot_wmrl.maniskill.scenes import Scene, scene_for_seed
+
+
+@dataclass(frozen=True)
+class EpisodePlan:
+    """One episode to record: with its task, this rebuilds its start."""
+
+    kind: str
+    scene: Scene
+    seed: int
+
+
+@dataclass(frozen=True)
+class Part:
+    """A sub-dataset: the piece of work of one worker."""
+
+    index: int
+    episodes: tuple[EpisodePlan, ...]
+
+    @property
+    def name(self) -> str:
+        return f"part-{self.index:05d}"
+
+
+def planned_parts(config: RecordConfig) -> list[Part]:
+    """All parts in order; episode i has the seed `config.seed + i`."""
+    scenes = config.maniskill.selected_scenes()
+    seeds = range(config.seed, config.seed + config.num_episodes)
+    kinds = planned_kinds(config)
+    episodes = [
+        EpisodePlan(kind, scene_for_seed(scenes, seed), seed) for kind, seed in zip(kinds, seeds, strict=True)
+    ]
+    size = config.part_episodes
+    return [
+        Part(index, tuple(episodes[first : first + size]))
+        for index, first in enumerate(range(0, len(episodes), size))
+    ]
+
+
+def planned_kinds(config: RecordConfig) -> list[str]:
+    """The kind of each episode: the configured shares, exactly (largest remainders), in random order."""
+    if config.policy is not None:
+        return [POLICY_KIND] * config.num_episodes
+    names = list(config.kinds)
+    shares = np.array([config.kinds[name] for name in names], dtype=np.float64)
+    ideal = shares / shares.sum() * config.num_episodes
+    counts = np.floor(ideal).astype(int)
+    for most in np.argsort(counts - ideal, kind="stable")[: config.num_episodes - counts.sum()]:
+        counts[most] += 1
+    order = np.random.default_rng((config.seed, config.num_episodes)).permutation(np.repeat(names, counts))
+    return [str(kind) for kind in order]

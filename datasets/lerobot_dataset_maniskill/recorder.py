@@ -1,0 +1,184 @@
+"""Runs the workers, resumes after an interruption, and merges the sub-datasets into one dataset."""
+
+import fcntl
+import json
+import logging
+import multiprocessing
+import os
+import queue
+import shutil
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from lerobot.datasets.aggregate import aggregate_datasets
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from tqdm import tqdm
+
+from lerobot_dataset_maniskill.configuration import RecordConfig
+from lerobot_dataset_maniskill.drivers import check_policy
+from lerobot_dataset_maniskill.integrity import episode_outcomes, whole_dataset
+from lerobot_dataset_maniskill.manifest import Part, planned_parts
+from lerobot_dataset_maniskill.worker import EpisodeResult, serve_parts
+from lerobot_dataset_maniskill.writer import VOCABULARY_FILE, write_card, write_vocabulary
+from lerobot_wmrl.constants import KINDS
+from lerobot_wmrl.files import write_json
+from lerobot_wmrl.maniskill.renderer import render_backend
+
+CONTENT_FILE = "recording.json"
+POLL_SECONDS = 1.0
+
+
+def record(config: RecordConfig) -> None:
+    """Record everything that is missing, then merge. Complete already: says so."""
+    config.validate()
+    assert config.output_dir is not None
+    output_dir = config.output_dir
+    if not already_recorded(output_dir, config.recorded_content()):
+        render_backend()
+        if config.policy is not None:
+            check_policy(config.policy, config.maniskill)
+        work = output_dir.parent / f".{output_dir.name}.recording"
+        with claimed(work, config.recorded_content()):
+            parts = planned_parts(config)
+            record_parts(config, work, parts)
+            merge(config, work, parts)
+        shutil.rmtree(work, ignore_errors=True)
+    if config.push_to_hub:
+        LeRobotDataset(config.dataset_id, root=output_dir).push_to_hub(private=config.private)
+
+
+def already_recorded(output_dir: Path, content: Mapping[str, Any]) -> bool:
+    """Whether `output_dir` holds exactly this recording. ValueError if it holds anything else."""
+    if not output_dir.exists() or (output_dir.is_dir() and not any(output_dir.iterdir())):
+        return False
+    vocabulary = output_dir / VOCABULARY_FILE
+    if not vocabulary.is_file():
+        raise ValueError(f"--output_dir={output_dir} holds something else; choose a new folder")
+    require_same(json.loads(vocabulary.read_text())["recording"], content, output_dir)
+    problem = whole_dataset(output_dir, content["num_episodes"])
+    if problem:
+        raise ValueError(f"--output_dir={output_dir}: {problem}; remove the folder and record again")
+    print(f"{output_dir} is already recorded: {content['num_episodes']} episodes")
+    return True
+
+
+def require_same(stored: Mapping[str, Any], content: Mapping[str, Any], folder: Path) -> None:
+    """ValueError unless both describe the same episodes."""
+    differing = [f"{key} {stored.get(key)!r} → {value!r}" for key, value in content.items() if stored.get(key) != value]
+    if differing:
+        raise ValueError(
+            f"--output_dir={folder} holds a recording with other settings ({'; '.join(differing)}): "
+            "choose another folder, or repeat the first settings to continue it"
+        )
+
+
+@contextmanager
+def claimed(work: Path, content: Mapping[str, Any]) -> Iterator[None]:
+    """Hold the folder of unfinished work, which belongs to one configuration and one running command."""
+    work.mkdir(parents=True, exist_ok=True)
+    with (work / "lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise ValueError(f"{work}: another command is recording into this folder; wait for it") from error
+        stored = work / CONTENT_FILE
+        if stored.is_file():
+            require_same(json.loads(stored.read_text()), content, work)
+        else:
+            write_json(stored, dict(content))
+        yield
+
+
+def missing_parts(work: Path, parts: list[Part]) -> list[Part]:
+    """The parts without a whole sub-dataset; torn and corrupted ones are dropped."""
+    for torn in work.glob(".part-*.partial"):
+        shutil.rmtree(torn, ignore_errors=True)
+    missing = []
+    for part in parts:
+        folder = work / part.name
+        problem = whole_dataset(folder, len(part.episodes)) if folder.exists() else "not recorded yet"
+        if problem and folder.exists():
+            logging.warning("%s is recorded again: %s", part.name, problem)
+            shutil.rmtree(folder)
+        if problem:
+            missing.append(part)
+    return missing
+
+
+def record_parts(config: RecordConfig, work: Path, parts: list[Part]) -> None:
+    """Let the workers record the missing parts, with a progress bar."""
+    missing = missing_parts(work, parts)
+    if not missing:
+        return
+    context = multiprocessing.get_context("spawn")  # fork hangs once a renderer exists
+    jobs, results = context.Queue(), context.Queue()
+    count = min(config.num_workers, len(missing))
+    for item in [*missing, *[None] * count]:
+        jobs.put(item)
+    arguments = (config, work, jobs, results, os.getpid())
+    workers = [context.Process(target=serve_parts, args=arguments, daemon=True) for _ in range(count)]
+    for worker in workers:
+        worker.start()
+    try:
+        follow_progress(config, missing, results, workers)
+    finally:
+        for worker in workers:
+            worker.terminate()
+            worker.join()
+
+
+def follow_progress(config: RecordConfig, missing: list[Part], results: Any, workers: list[Any]) -> None:
+    """Until every missing part is whole. A worker's error is raised here."""
+    open_parts = {part.index for part in missing}
+    todo = sum(len(part.episodes) for part in missing)
+    seen: Counter[str] = Counter()
+    with tqdm(total=config.num_episodes, initial=config.num_episodes - todo, unit="episode", desc="record") as bar:
+        while open_parts:
+            try:
+                result = results.get(timeout=POLL_SECONDS)
+            except queue.Empty:
+                if not any(worker.is_alive() for worker in workers):
+                    raise RuntimeError("the recording processes died; run the same command to continue") from None
+                continue
+            if isinstance(result, Exception):
+                raise result
+            if isinstance(result, EpisodeResult):
+                seen.update(episodes=1, success=int(result.success), frames=result.frames)
+                bar.update()
+                bar.set_postfix(success=f"{seen['success'] / seen['episodes']:.0%}", frames=seen["frames"])
+            else:
+                open_parts.discard(result)
+
+
+def merge(config: RecordConfig, work: Path, parts: list[Part]) -> None:
+    """Merge with LeRobot's own tool, add vocabulary and card, and move the whole into place at once."""
+    assert config.output_dir is not None
+    merged = work / "merged"
+    shutil.rmtree(merged, ignore_errors=True)
+    aggregate_datasets(
+        repo_ids=[config.dataset_id] * len(parts), aggr_repo_id=config.dataset_id,
+        roots=[work / part.name for part in parts], aggr_root=merged,
+    )  # fmt: skip
+    problem = whole_dataset(merged, config.num_episodes)
+    if problem:
+        raise ValueError(f"{work}: merging failed: {problem}; remove the folder and record again")
+    write_vocabulary(merged, config.recorded_content())
+    rates = success_by_kind(merged)
+    write_card(merged, config.dataset_id, config.recorded_content(), rates)
+    os.replace(merged, config.output_dir)
+    summary = ", ".join(f"{kind} {wins}/{total}" for kind, (wins, total) in rates.items())
+    print(f"{config.output_dir}: {config.num_episodes} episodes; successful: {summary}")
+
+
+def success_by_kind(root: Path) -> dict[str, tuple[int, int]]:
+    """Kind → (successful episodes, episodes)."""
+    kinds, success = episode_outcomes(root)
+    return {
+        name: (int(success[kinds == index].sum()), int(np.sum(kinds == index)))
+        for index, name in enumerate(KINDS)
+        if np.any(kinds == index)
+    }

@@ -1,0 +1,93 @@
+"""What a recording process does: simulate the episodes of a part into a sub-dataset, and rename it when whole."""
+
+import logging
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from lerobot_dataset_maniskill.configuration import RecordConfig
+from lerobot_dataset_maniskill.drivers import Driver, PlannerDriver, PolicyDriver
+from lerobot_dataset_maniskill.manifest import EpisodePlan, Part
+from lerobot_dataset_maniskill.writer import HOLD_FRAMES, add_step, create_dataset
+from lerobot_wmrl.maniskill.simulation import Simulation
+
+
+@dataclass(frozen=True)
+class EpisodeResult:
+    """What the progress bar and the card need of an episode."""
+
+    part: int
+    kind: str
+    success: bool
+    frames: int
+
+
+Report = Callable[[EpisodeResult], None]
+
+
+class PartRecorder:
+    """A simulation and a driver that record parts one after the other."""
+
+    def __init__(self, config: RecordConfig, folder: Path) -> None:
+        env = config.maniskill
+        self.config, self.folder, self.horizon = config, folder, env.horizon
+        self.simulation = env.create_simulation()
+        self.driver: Driver = (
+            PlannerDriver() if config.policy is None else PolicyDriver(config.policy, env, config.stochastic)
+        )
+
+    def record(self, part: Part, report: Report) -> None:
+        """Record `part`; its folder appears under its final name only when it is whole."""
+        partial = self.folder / f".{part.name}.{os.getpid()}.partial"
+        shutil.rmtree(partial, ignore_errors=True)
+        env = self.config.maniskill
+        dataset = create_dataset(partial, self.config.dataset_id, env.cameras, env.image_size)
+        for plan in part.episodes:
+            success, frames = self._record_episode(dataset, plan)
+            report(EpisodeResult(part.index, plan.kind, success, frames))
+        dataset.finalize()
+        os.replace(partial, self.folder / part.name)
+
+    def _record_episode(self, dataset: object, plan: EpisodePlan) -> tuple[bool, int]:
+        """Simulate and store one episode: to HOLD_FRAMES after success first holds, or to the horizon."""
+        simulation = self.simulation
+        frame = simulation.reset(plan.scene, plan.seed)
+        self.driver.begin(simulation, plan)
+        steps_left, succeeded, frames = self.horizon, False, 0
+        while steps_left > 0:
+            action = self.driver.act(simulation, frame)
+            following = simulation.step(action)
+            steps_left, frames = steps_left - 1, frames + 1
+            if following.success and not succeeded:
+                succeeded, steps_left = True, HOLD_FRAMES
+            truncated = steps_left == 0 and not succeeded
+            add_step(
+                dataset, plan, simulation.instruction, simulation.task.index, frame, action, following, truncated
+            )  # fmt: skip
+            frame = following
+        dataset.save_episode()
+        return succeeded, frames
+
+
+def serve_parts(config: RecordConfig, folder: Path, parts: object, results: object, parent: int) -> None:
+    """A worker process: take parts from the queue until None comes, or until the parent is gone."""
+    import torch
+
+    torch.set_num_threads(1)
+    logging.disable(logging.WARNING)
+
+    def report(result: EpisodeResult) -> None:
+        if os.getppid() != parent:
+            os._exit(1)
+        results.put(result)
+
+    try:
+        recorder = PartRecorder(config, folder)
+        while (part := parts.get()) is not None:
+            recorder.record(part, report)
+            results.put(part.index)
+    except Exception as error:
+        results.put(error)
+        raise

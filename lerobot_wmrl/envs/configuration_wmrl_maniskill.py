@@ -1,0 +1,110 @@
+"""`--env.type=wmrl_maniskill`: the real simulator, for lerobot-eval, recording and reinforcement learning.
+
+Imports neither the simulator nor torch networks: those come when an environment is built.
+"""
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from lerobot.configs.types import FeatureType, PolicyFeature
+from lerobot.envs.configs import EnvConfig
+from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
+
+from lerobot_wmrl.constants import ACTION_NAMES, CAMERAS, FPS, STATE_NAMES
+from lerobot_wmrl.maniskill.scenes import Scene, scenes_of
+
+if TYPE_CHECKING:
+    import gymnasium as gym
+
+    from lerobot_wmrl.maniskill.simulation import Simulation
+
+
+@EnvConfig.register_subclass("wmrl_maniskill")
+@dataclass
+class WmrlManiSkillEnv(EnvConfig):
+    """ManiSkill with this project's tasks and scenes.
+
+    Args:
+        task: what to do; `lerobot_wmrl.maniskill.tasks.TASKS`.
+        split: "ind" (scenes that training may see) or "ood" (held out).
+        scenes: indices of some scenes of the split; all of them by default.
+        cameras: which cameras the policy sees.
+        image_size: pixels of each side of a picture.
+        episode_length: steps after which an episode is truncated; the task's own horizon by default.
+        robot_mesh_detail: share of the robot's triangles that are drawn; 1 draws ManiSkill's own, three times slower.
+    """
+
+    task: str | None = "push"
+    split: str = "ind"
+    scenes: list[int] | None = None
+    cameras: list[str] = field(default_factory=lambda: ["third_view"])
+    image_size: int = 64
+    episode_length: int | None = None
+    robot_mesh_detail: float = 0.04
+    fps: int = FPS
+    features: dict[str, PolicyFeature] = field(default_factory=dict)
+    features_map: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._validate()
+        picture = PolicyFeature(type=FeatureType.VISUAL, shape=(self.image_size, self.image_size, 3))
+        self.features = {
+            ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(len(ACTION_NAMES),)),
+            "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(len(STATE_NAMES),)),
+            **{f"pixels/{camera}": picture for camera in self.cameras},
+        }
+        self.features_map = {
+            ACTION: ACTION,
+            "agent_pos": OBS_STATE,
+            **{f"pixels/{camera}": f"{OBS_IMAGES}.{camera}" for camera in self.cameras},
+        }
+
+    def _validate(self) -> None:
+        unknown = [camera for camera in self.cameras if camera not in CAMERAS]
+        if unknown or not self.cameras:
+            raise ValueError(f"--env.cameras={self.cameras}: choose from {', '.join(CAMERAS)}")
+        if self.image_size < 16:
+            raise ValueError(f"--env.image_size={self.image_size}: must be at least 16")
+        if self.episode_length is not None and self.episode_length < 1:
+            raise ValueError(f"--env.episode_length={self.episode_length}: must be at least 1")
+        if not 0.0 < self.robot_mesh_detail <= 1.0:
+            raise ValueError(f"--env.robot_mesh_detail={self.robot_mesh_detail}: must be above 0 and at most 1")
+
+    def selected_scenes(self) -> tuple[Scene, ...]:
+        """The scenes episodes take place in. ValueError if task, split or scenes are unknown."""
+        self._task()
+        return scenes_of(self.split, self.scenes)
+
+    def _task(self) -> Any:
+        from lerobot_wmrl.maniskill.tasks import task_of
+
+        return task_of(self.task)
+
+    @property
+    def horizon(self) -> int:
+        """Steps after which an episode is truncated."""
+        return self.episode_length or self._task().horizon
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        return {"config": self}
+
+    def create_simulation(self) -> "Simulation":
+        """A simulator for these scenes and cameras, in this process."""
+        from lerobot_wmrl.maniskill.simulation import Simulation
+
+        return Simulation(
+            self._task(), self.selected_scenes(), self.cameras, self.image_size, self.robot_mesh_detail
+        )
+
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, "gym.vector.VectorEnv"]]:
+        """What lerobot-eval asks for: {suite: {task id: environment}}."""
+        from lerobot_wmrl.envs.maniskill_env import make_vector_env
+
+        return {self.type: {0: make_vector_env(self, n_envs, use_async_envs, freeze=True)}}
+
+    def create_tensor_env(self, n_envs: int, device: str) -> "gym.vector.VectorEnv":
+        """The same world with tensors inside, for reinforcement learning."""
+        from lerobot_wmrl.envs.maniskill_tensor_env import ManiSkillTensorEnv
+
+        return ManiSkillTensorEnv(self, n_envs, device)
