@@ -19,6 +19,16 @@ from lerobot_wmrl.tracking import read_metrics
 
 KILLED_STAGE = "frame_tokenizer"
 STAGES = [stage.name for stage in demo_stages(DemoConfig())]
+HEADINGS = (
+    "Success, before and after",
+    "Can the world model be trusted?",
+    "Real beside imagined",
+    "Goal frames",
+    "The reward along real episodes",
+    "Training",
+    "Time and memory",
+    "The commands",
+)
 
 
 def start_demo(folder: Path) -> subprocess.Popen[str]:
@@ -58,20 +68,17 @@ def test_a_killed_run_continues_after_its_last_finished_stage(outputs: tuple[Pat
 
 def test_a_finished_run_does_nothing_again(outputs: tuple[Path, str]) -> None:
     demo, _ = outputs
-    before = {
-        path: path.stat().st_mtime_ns
-        for path in demo.rglob("*")
-        if path.suffix in (".safetensors", ".parquet")
-    }
+    before = written(demo)
     printed, _ = start_demo(demo.parent).communicate()
-    after = {
-        path: path.stat().st_mtime_ns
-        for path in demo.rglob("*")
-        if path.suffix in (".safetensors", ".parquet")
-    }
     assert printed.count(": done in") == len(STAGES)
     assert "$ lerobot" not in printed
-    assert before == after
+    assert written(demo) == before
+
+
+def written(demo: Path) -> dict[Path, int]:
+    """When each model and each part of the data was last written (ns)."""
+    kept = (".safetensors", ".parquet", ".mp4")
+    return {path: path.stat().st_mtime_ns for path in demo.rglob("*") if path.suffix in kept}
 
 
 def test_the_dataset_reopens_and_holds_successes_and_failures(outputs: tuple[Path, str]) -> None:
@@ -120,19 +127,17 @@ def test_training_left_metrics_and_whole_checkpoints(outputs: tuple[Path, str]) 
     demo, _ = outputs
     for folder in ("frame_tokenizer", "action_world_model", "text_world_model", "rl"):
         assert read_metrics(demo / folder), f"{folder} has no metrics"
+    whole = {"config.json", "model.safetensors", "train_config.json"}
     for folder in ("frame_tokenizer", "action_world_model", "text_world_model", "sft", "rl"):
         checkpoint = demo / folder / "checkpoints" / "last" / "pretrained_model"
-        assert {"config.json", "model.safetensors", "train_config.json"} <= {
-            p.name for p in checkpoint.iterdir()
-        }
+        assert whole <= {path.name for path in checkpoint.iterdir()}
 
 
 def test_the_page_stands_alone_and_shows_every_part(outputs: tuple[Path, str]) -> None:
     demo, _ = outputs
     page = (demo / "report.html").read_text()
     assert not re.findall(r"""(?:src|href)=["'](?!data:)""", page), "the page needs other files"
-    for heading in ("Success, before and after", "Can the world model be trusted?", "Real beside imagined",
-                    "Goal frames", "The reward along real episodes", "Training", "Time and memory", "The commands"):  # fmt: skip
+    for heading in HEADINGS:
         assert f"<h2>{heading}</h2>" in page
     assert page.count("data:image/") >= 12
     for name in STAGES:
