@@ -117,3 +117,19 @@ def make_synthetic_dataset() -> Callable[..., LeRobotDataset]:
 def small_dataset(tmp_path_factory: pytest.TempPathFactory) -> LeRobotDataset:
     """Six short episodes of 32x32 images, shared: do not change it."""
     return synthetic_dataset(tmp_path_factory.mktemp("synthetic") / "dataset")
+
+
+@pytest.fixture(scope="session")
+def trained_models(
+    small_dataset: LeRobotDataset, tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, Path]:
+    """Output folders of a tokenizer and both world models, three steps each, by name."""
+    from tests.trained import action_config, run_training, text_config, train_tokenizer
+
+    folder, root = tmp_path_factory.mktemp("models"), Path(small_dataset.root)
+    tokenizer = train_tokenizer(root, folder / "frame_tokenizer")
+    return {
+        "frame_tokenizer": tokenizer,
+        "action_world_model": run_training(action_config(tokenizer), root, folder / "action_world_model"),
+        "text_world_model": run_training(text_config(tokenizer), root, folder / "text_world_model"),
+    }

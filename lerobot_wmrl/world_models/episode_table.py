@@ -9,6 +9,9 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 
 from lerobot_wmrl.constants import KINDS
 
+VIDEO_BACKEND = "pyav"
+"""Ships its own FFmpeg; torchcodec needs the system's, and frames are decoded only once anyway."""
+
 VALIDATION_EVERY = 20
 """Every twentieth episode is held out from the training of tokenizers and world models."""
 
@@ -46,7 +49,7 @@ def open_dataset(root: str | Path, repo_id: str | None = None) -> LeRobotDataset
         raise ValueError(
             f"dataset.root={root}: no LeRobotDataset there (meta/info.json is missing); record one first"
         )
-    return LeRobotDataset(repo_id or Path(root).name, root=root)
+    return LeRobotDataset(repo_id or Path(root).name, root=root, video_backend=VIDEO_BACKEND)
 
 
 def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:

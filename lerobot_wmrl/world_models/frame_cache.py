@@ -16,6 +16,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.video_utils import decode_video_frames
 from tqdm import tqdm
 
+from lerobot_wmrl.world_models.episode_table import VIDEO_BACKEND
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
 
 ENCODE_BATCH = 128
@@ -79,7 +80,7 @@ def _decode_episode(dataset: LeRobotDataset, episode: int, key: str) -> np.ndarr
     times = [first + index / dataset.fps for index in range(len(indices))]
     path = Path(dataset.root) / dataset.meta.get_video_file_path(episode, key)
     try:
-        frames = decode_video_frames(path, times, dataset.tolerance_s, return_uint8=True)
+        frames = decode_video_frames(path, times, dataset.tolerance_s, VIDEO_BACKEND, return_uint8=True)
     except Exception as error:
         raise ValueError(
             f"dataset {dataset.root}: episode {episode}: {key}: {path.name} cannot be decoded ({error}); "

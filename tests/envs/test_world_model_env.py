@@ -1,0 +1,140 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from gymnasium.vector import AutoresetMode
+
+from lerobot_wmrl.constants import ACTION_HIGH
+from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
+from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
+
+B = 4
+IMAGE, STATE = "observation.images.third_view", "observation.state"
+
+
+@pytest.fixture(scope="module")
+def config(small_dataset, trained_models) -> WorldModelEnv:
+    return WorldModelEnv(
+        world_model_path=str(trained_models["action_world_model"]),
+        text_world_model_path=str(trained_models["text_world_model"]),
+        dataset=StartFrames(root=str(Path(small_dataset.root))),
+        episode_length=5,
+        done_threshold=0.999,
+    )
+
+
+@pytest.fixture
+def env(config):
+    return config.create_tensor_env(B)
+
+
+def always_done(env, flags: torch.Tensor) -> None:
+    """Make the model's done logit +20 where `flags` (B,) and −20 elsewhere."""
+    step = env.model.step
+    env.model.step = lambda *args: step(*args)._replace(done_logit=torch.where(flags, 20.0, -20.0))
+
+
+def test_the_observation_is_what_the_config_announces(config, env):
+    observation, _ = env.reset(seed=0)
+    assert observation[IMAGE].shape == (B, 3, 32, 32)
+    assert observation[STATE].shape == (B, 8)
+    assert len(observation["task"]) == B
+    assert config.features["pixels/third_view"].shape == (32, 32, 3)
+    assert config.features["agent_pos"].shape == (8,)
+
+
+def test_the_same_seed_and_actions_give_the_same_episode(env):
+    def roll() -> tuple[torch.Tensor, torch.Tensor]:
+        env.reset(seed=7)
+        steps = [env.step(torch.full((B, 7), 0.01)) for _ in range(7)]
+        return torch.stack([step[0][IMAGE] for step in steps]), torch.stack([step[1] for step in steps])
+
+    for a, b in zip(roll(), roll(), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_truncated_at_the_horizon_with_the_final_observation_kept(env):
+    env.reset(seed=0)
+    always_done(env, torch.zeros(B, dtype=torch.bool))
+    for _ in range(4):
+        *_, terminated, truncated, info = env.step(torch.zeros(B, 7))
+        assert not (terminated | truncated).any()
+        assert "final_obs" not in info
+    observation, _, terminated, truncated, info = env.step(torch.zeros(B, 7))
+    assert truncated.all()
+    assert not terminated.any()
+    assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    assert not info["final_info"]["is_success"].any()
+    assert info["final_info"]["episode_length"].tolist() == [5] * B
+    starts = env.starts.proprioception[env._start_index]
+    assert torch.equal(observation[STATE], starts)
+    assert not torch.equal(info["final_obs"][STATE], starts)
+
+
+def test_done_must_hold_for_k_frames_and_is_paid_once(env):
+    env.reset(seed=0)
+    flags = torch.tensor([True, False, True, False])
+    always_done(env, flags)
+    for step in range(3):
+        _, reward, terminated, _, info = env.step(torch.zeros(B, 7))
+        assert torch.equal(terminated, flags & (step == 2))
+        assert torch.equal(info["reward_parts"]["success"] > 0, terminated)
+        assert torch.equal(reward > 0.5, terminated)
+    assert torch.equal(info["final_info"]["is_success"], flags)
+
+
+def test_an_episode_that_restarts_forgets_what_came_before(env):
+    always_done(env, torch.tensor([True, False, False, False]))
+    env.reset(seed=0)
+    for _ in range(3):
+        observation, *_ = env.step(torch.full((B, 7), 0.02))
+    index = env._start_index.tolist()
+    after, *_ = env.step(torch.full((B, 7), 0.01))
+    fresh, _ = env.reset(seed=index)
+    torch.testing.assert_close(fresh[IMAGE][0], observation[IMAGE][0])
+    alone, *_ = env.step(torch.full((B, 7), 0.01))
+    torch.testing.assert_close(alone[STATE][0], after[STATE][0], atol=1e-5, rtol=1e-4)
+    assert not torch.allclose(alone[STATE][1], after[STATE][1], atol=1e-5)
+
+
+def test_actions_are_clipped_to_the_box(env):
+    env.reset(seed=1)
+    far = env.step(torch.full((B, 7), 9.0))[0][STATE]
+    env.reset(seed=1)
+    edge = env.step(torch.tensor(ACTION_HIGH).expand(B, 7))[0][STATE]
+    assert torch.equal(far, edge)
+
+
+def test_lerobot_eval_gets_numpy_and_frozen_episodes(config):
+    adapter = config.create_envs(B)["world_model"][0]
+    assert isinstance(adapter, EvaluationAdapter)
+    observation, _ = adapter.reset(seed=[3, 4, 5, 6], options={"lerobot_new_rollout": True})
+    assert observation["pixels"]["third_view"].dtype == np.uint8
+    assert observation["pixels"]["third_view"].shape == (B, 32, 32, 3)
+    assert adapter.call("_max_episode_steps") == (5,) * B
+    assert len(adapter.call("task_description")) == B
+    always_done(adapter.env, torch.tensor([True, False, False, False]))
+    for _ in range(3):
+        ended, _, terminated, _, info = adapter.step(np.zeros((B, 7), np.float32))
+    assert terminated.tolist() == [True, False, False, False]
+    assert info["final_info"]["is_success"].tolist() == [True, False, False, False]
+    later, reward, terminated, truncated, info = adapter.step(np.ones((B, 7), np.float32))
+    assert reward[0] == 0
+    assert not terminated[0]
+    assert np.array_equal(later["pixels"]["third_view"][0], ended["pixels"]["third_view"][0])
+    assert info["final_info"]["is_success"][0]
+
+
+def test_models_that_do_not_fit_together_are_refused(config, small_dataset, trained_models, tmp_path):
+    from dataclasses import replace
+
+    from tests.trained import run_training, text_config, train_tokenizer
+
+    root = Path(small_dataset.root)
+    other = train_tokenizer(root, tmp_path / "tokenizer", steps=1, seed=9)
+    text = run_training(text_config(other), root, tmp_path / "text", steps=1)
+    with pytest.raises(ValueError, match="another tokenizer"):
+        replace(config, text_world_model_path=str(text)).create_tensor_env(1)
+    with pytest.raises(ValueError, match="'text_world_model' is needed"):
+        replace(config, text_world_model_path=str(trained_models["action_world_model"])).create_tensor_env(1)

@@ -1,0 +1,46 @@
+"""Small models trained for a few steps by the real training code, for tests that need trained ones."""
+
+from pathlib import Path
+from typing import Any
+
+from lerobot_wmrl.scripts.train_world_model import DatasetSource, TrainWorldModelConfig, train_world_model
+from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
+from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig, TextWorldModelConfig
+
+TINY: dict[str, Any] = {
+    "layers": 1,
+    "width": 32,
+    "heads": 2,
+    "window": 24,
+    "clip_length": 10,
+    "code_width": 8,
+}
+
+
+def run_training(config: Any, root: Path, output_dir: Path, steps: int = 3, **settings: Any) -> Path:
+    """Train `config`'s model on the dataset at `root`; returns the output folder."""
+    options = {"batch_size": 2, "save_freq": 1, "log_freq": 1, **settings}
+    train_world_model(
+        TrainWorldModelConfig(
+            model=config, dataset=DatasetSource(str(root)), output_dir=output_dir, steps=steps, **options
+        )
+    )
+    return output_dir
+
+
+def train_tokenizer(root: Path, output_dir: Path, **settings: Any) -> Path:
+    """A small frame tokenizer for 32x32 images."""
+    config = FrameTokenizerConfig(image_size=32, widths=[8, 16], levels=[5, 4], device="cpu")
+    return run_training(config, root, output_dir, **settings)
+
+
+def action_config(tokenizer: Path, **settings: Any) -> ActionWorldModelConfig:
+    """A small action world model."""
+    return ActionWorldModelConfig(tokenizer_path=str(tokenizer), device="cpu", **{**TINY, **settings})
+
+
+def text_config(tokenizer: Path, **settings: Any) -> TextWorldModelConfig:
+    """A small text world model."""
+    return TextWorldModelConfig(
+        tokenizer_path=str(tokenizer), device="cpu", goal_horizon=6, **{**TINY, **settings}
+    )
