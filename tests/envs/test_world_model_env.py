@@ -119,7 +119,7 @@ def test_lerobot_eval_gets_numpy_and_frozen_episodes(config):
         ended, _, terminated, _, info = adapter.step(np.zeros((B, 7), np.float32))
     assert terminated.tolist() == [True, False, False, False]
     assert info["final_info"]["is_success"].tolist() == [True, False, False, False]
-    later, reward, terminated, truncated, info = adapter.step(np.ones((B, 7), np.float32))
+    later, reward, terminated, _, info = adapter.step(np.ones((B, 7), np.float32))
     assert reward[0] == 0
     assert not terminated[0]
     assert np.array_equal(later["pixels"]["third_view"][0], ended["pixels"]["third_view"][0])
