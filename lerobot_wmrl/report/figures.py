@@ -1,13 +1,11 @@
-"""Numbers and frames → pictures as data URLs. Pure functions."""
+"""Numbers → pictures as data URLs. Pure functions."""
 
 import base64
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
 from matplotlib.figure import Figure
-from PIL import Image
 
 from lerobot_wmrl.report.sources import Curve
 from lerobot_wmrl.statistics import Proportion
@@ -69,18 +67,3 @@ def tidy(figure: Figure) -> Figure:
         if axes.get_legend_handles_labels()[0]:
             axes.legend(frameon=False, fontsize=9)
     return figure
-
-
-def film_strip(rows: Sequence[np.ndarray], scale: int = 2, gap: int = 4) -> str:
-    """Rows of frames, each (T, H, W, 3) uint8, as one picture; short rows are padded with white."""
-    height, width = rows[0].shape[1:3]
-    longest = max(len(row) for row in rows)
-    sheet = np.full((len(rows) * (height + gap) - gap, longest * (width + gap) - gap, 3), 255, dtype=np.uint8)
-    for y, row in enumerate(rows):
-        for x, frame in enumerate(row):
-            top, left = y * (height + gap), x * (width + gap)
-            sheet[top : top + height, left : left + width] = frame
-    image = Image.fromarray(sheet)
-    buffer = io.BytesIO()
-    image.resize((image.width * scale, image.height * scale), Image.Resampling.NEAREST).save(buffer, "PNG")
-    return data_url(buffer.getvalue(), "png")
