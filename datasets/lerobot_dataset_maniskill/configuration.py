@@ -59,8 +59,12 @@ class RecordConfig:
     def __post_init__(self) -> None:
         path = parser.get_path_arg("policy")
         if path:
-            if not (Path(path) / "config.json").is_file() and (path.startswith((".", "/")) or Path(path).exists()):
-                raise ValueError(f"--policy.path={path}: there is no config.json; give a folder `pretrained_model`")
+            if not (Path(path) / "config.json").is_file() and (
+                path.startswith((".", "/")) or Path(path).exists()
+            ):
+                raise ValueError(
+                    f"--policy.path={path}: there is no config.json; give a folder `pretrained_model`"
+                )
             overrides = parser.get_cli_overrides("policy") or []
             self.policy = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
             self.policy.pretrained_path = Path(path)
@@ -91,7 +95,9 @@ class RecordConfig:
         planned = [kind for kind in KINDS if kind != POLICY_KIND]
         unknown = [kind for kind in self.kinds if kind not in planned]
         if unknown or min(self.kinds.values(), default=0) < 0 or sum(self.kinds.values()) <= 0:
-            raise ValueError(f"--kinds={self.kinds}: give shares of {', '.join(planned)}, at least one above 0")
+            raise ValueError(
+                f"--kinds={self.kinds}: give shares of {', '.join(planned)}, at least one above 0"
+            )
 
     @property
     def maniskill(self) -> WmrlManiSkillEnv:

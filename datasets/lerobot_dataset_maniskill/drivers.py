@@ -51,7 +51,9 @@ class PolicyDriver:
         )  # fmt: skip
         self.stochastic = stochastic
         if stochastic and not hasattr(self.policy, "sample"):
-            raise ValueError(f"--stochastic=true: the policy {config.type} cannot be sampled; leave the flag out")
+            raise ValueError(
+                f"--stochastic=true: the policy {config.type} cannot be sampled; leave the flag out"
+            )
 
     def begin(self, simulation: Simulation, plan: EpisodePlan) -> None:
         torch.manual_seed(plan.seed)
@@ -85,5 +87,10 @@ def check_policy(config: PreTrainedConfig, env: WmrlManiSkillEnv) -> None:
             f"--policy.path={config.pretrained_path} wants {', '.join(missing)}, the environment has "
             f"{', '.join(sorted(offered))}: set --env.cameras"
         )
-    if not (Path(str(config.pretrained_path)) / "model.safetensors").exists() and Path(str(config.pretrained_path)).exists():
-        raise ValueError(f"--policy.path={config.pretrained_path}: there is no model.safetensors in this folder")
+    if (
+        not (Path(str(config.pretrained_path)) / "model.safetensors").exists()
+        and Path(str(config.pretrained_path)).exists()
+    ):
+        raise ValueError(
+            f"--policy.path={config.pretrained_path}: there is no model.safetensors in this folder"
+        )

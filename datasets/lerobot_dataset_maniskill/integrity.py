@@ -12,19 +12,23 @@ import pyarrow.parquet as pq
 def whole_dataset(root: Path, episodes: int) -> str | None:
     """What is wrong with the dataset at `root`, or None if it has `episodes` whole episodes."""
     try:
-        info = json.loads((root / "meta" / "info.json").read_text())
-        if info["total_episodes"] != episodes:
-            return f"it has {info['total_episodes']} of {episodes} episodes"
-        rows = sum(len(pq.read_table(path, columns=["index"])) for path in parquet_files(root))
-        if rows != info["total_frames"]:
-            return f"it has {rows} of {info['total_frames']} rows"
-        cameras = [name for name, feature in info["features"].items() if feature["dtype"] == "video"]
-        for camera in cameras:
-            frames = sum(video_frames(path) for path in sorted((root / "videos" / camera).rglob("*.mp4")))
-            if frames != rows:
-                return f"{camera} has {frames} of {rows} frames"
+        return _first_problem(root, episodes)
     except (OSError, ValueError, KeyError, pa.ArrowException, av.FFmpegError) as error:
         return f"corrupted: {error}"
+
+
+def _first_problem(root: Path, episodes: int) -> str | None:
+    """Raises where a file is missing or unreadable."""
+    info = json.loads((root / "meta" / "info.json").read_text())
+    if info["total_episodes"] != episodes:
+        return f"it has {info['total_episodes']} of {episodes} episodes"
+    rows = sum(len(pq.read_table(path, columns=["index"])) for path in parquet_files(root))
+    if rows != info["total_frames"]:
+        return f"it has {rows} of {info['total_frames']} rows"
+    for camera in (name for name, feature in info["features"].items() if feature["dtype"] == "video"):
+        frames = sum(video_frames(path) for path in sorted((root / "videos" / camera).rglob("*.mp4")))
+        if frames != rows:
+            return f"{camera} has {frames} of {rows} frames"
     return None
 
 
@@ -35,7 +39,8 @@ def parquet_files(root: Path) -> list[Path]:
 def video_frames(path: Path) -> int:
     """Frames in a video file, counted by its packets, so that a truncated file shows."""
     with av.open(str(path)) as container:
-        return sum(packet.size > 0 for packet in container.demux(video=0))
+        frames = sum(packet.size > 0 for packet in container.demux(video=0))
+    return frames
 
 
 def episode_outcomes(root: Path) -> tuple[np.ndarray, np.ndarray]:

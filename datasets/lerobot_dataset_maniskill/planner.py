@@ -7,6 +7,7 @@ around a good trajectory is in the data as well.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -61,7 +62,7 @@ class Follower:
         self.plan, self.rng, self.current = plan, rng, 0
 
     def act(self, tcp: np.ndarray) -> np.ndarray:
-        """The action (7,) float32 for the TCP position (3,): towards the current waypoint, inside the action box."""
+        """The action (7,) float32 for the TCP at `tcp` (3,): towards the current waypoint, inside the box."""
         waypoints = self.plan.waypoints
         while self.current < len(waypoints) - 1 and _reached(waypoints[self.current], tcp):
             self.current += 1
@@ -128,7 +129,7 @@ def interpolated_push(geometry: PushGeometry, rng: np.random.Generator) -> tuple
     """New points between the start and the essential waypoints, each moved off the straight line."""
     corners = [geometry.start.tcp, *(waypoint.position for waypoint in essential_push(geometry))]
     points: list[Waypoint] = []
-    for first, second in zip(corners[:-1], corners[1:], strict=True):
+    for first, second in pairwise(corners):
         share = rng.uniform(0.3, 0.7)
         between = first + share * (second - first) + rng.normal(0.0, 0.013, 3)
         points += [Waypoint(_above_table(between), 0.02), Waypoint(second, 0.016)]
@@ -149,10 +150,15 @@ def near_miss_push(geometry: PushGeometry, rng: np.random.Generator) -> tuple[Wa
 
 def pass_over(geometry: PushGeometry, rng: np.random.Generator) -> tuple[Waypoint, ...]:
     """Over the object: from scraping its top to well above it, with a push's path in x and y."""
-    height = 2.0 * geometry.spec.half_size[2] + rng.choice([rng.uniform(-0.008, 0.012), rng.uniform(0.01, 0.05)])
+    height = 2.0 * geometry.spec.half_size[2] + rng.choice(
+        [rng.uniform(-0.008, 0.012), rng.uniform(0.01, 0.05)]
+    )
     sideways = rng.normal(0.0, 0.012)
     far = Push.distance + rng.uniform(-0.02, 0.03)
-    return (Waypoint(geometry.at(-0.025, sideways, height), 0.014), Waypoint(geometry.at(far, sideways, height)))
+    return (
+        Waypoint(geometry.at(-0.025, sideways, height), 0.014),
+        Waypoint(geometry.at(far, sideways, height)),
+    )
 
 
 def pass_beside(geometry: PushGeometry, rng: np.random.Generator) -> tuple[Waypoint, ...]:
@@ -180,10 +186,15 @@ def push_diagonally(geometry: PushGeometry, rng: np.random.Generator) -> tuple[W
     """Far enough forward, but at least 5 cm to one side."""
     side = rng.choice((-1.0, 1.0))
     behind = geometry.at(-0.02, -side * rng.uniform(0.0, 0.015))
-    return (Waypoint(behind, 0.014), Waypoint(geometry.at(Push.distance + 0.01, side * rng.uniform(0.05, 0.10))))
+    return (
+        Waypoint(behind, 0.014),
+        Waypoint(geometry.at(Push.distance + 0.01, side * rng.uniform(0.05, 0.10))),
+    )
 
 
-def _jittered(waypoints: tuple[Waypoint, ...], rng: np.random.Generator, sigma: float) -> tuple[Waypoint, ...]:
+def _jittered(
+    waypoints: tuple[Waypoint, ...], rng: np.random.Generator, sigma: float
+) -> tuple[Waypoint, ...]:
     return tuple(replace(w, position=_above_table(w.position + rng.normal(0.0, sigma, 3))) for w in waypoints)
 
 

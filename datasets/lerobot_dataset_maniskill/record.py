@@ -1,6 +1,5 @@
 """`lerobot-wmrl-record`: trajectories in ManiSkill → a LeRobotDataset."""
 
-import logging
 import sys
 
 from lerobot.configs import parser
@@ -17,8 +16,10 @@ def run(config: RecordConfig) -> None:
     if config.list_scenes:
         print(describe_scenes())
         return
+    from lerobot_dataset_maniskill.quiet import silence_libraries
     from lerobot_dataset_maniskill.recorder import record
 
+    silence_libraries()
     record(config)
 
 
@@ -26,7 +27,6 @@ def main() -> None:
     """Entry point. Bad input: one clear line, exit code 1."""
     register_third_party_plugins()
     init_logging()
-    logging.getLogger("lerobot").setLevel(logging.ERROR)
     try:
         sys.argv[1:] = expand_preset(sys.argv[1:], "record")
         run()

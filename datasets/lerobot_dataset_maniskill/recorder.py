@@ -68,7 +68,9 @@ def already_recorded(output_dir: Path, content: Mapping[str, Any]) -> bool:
 
 def require_same(stored: Mapping[str, Any], content: Mapping[str, Any], folder: Path) -> None:
     """ValueError unless both describe the same episodes."""
-    differing = [f"{key} {stored.get(key)!r} → {value!r}" for key, value in content.items() if stored.get(key) != value]
+    differing = [
+        f"{key} {stored.get(key)!r} → {value!r}" for key, value in content.items() if stored.get(key) != value
+    ]
     if differing:
         raise ValueError(
             f"--output_dir={folder} holds a recording with other settings ({'; '.join(differing)}): "
@@ -136,13 +138,17 @@ def follow_progress(config: RecordConfig, missing: list[Part], results: Any, wor
     open_parts = {part.index for part in missing}
     todo = sum(len(part.episodes) for part in missing)
     seen: Counter[str] = Counter()
-    with tqdm(total=config.num_episodes, initial=config.num_episodes - todo, unit="episode", desc="record") as bar:
+    with tqdm(
+        total=config.num_episodes, initial=config.num_episodes - todo, unit="episode", desc="record"
+    ) as bar:
         while open_parts:
             try:
                 result = results.get(timeout=POLL_SECONDS)
             except queue.Empty:
                 if not any(worker.is_alive() for worker in workers):
-                    raise RuntimeError("the recording processes died; run the same command to continue") from None
+                    raise RuntimeError(
+                        "the recording processes died; run the same command to continue"
+                    ) from None
                 continue
             if isinstance(result, Exception):
                 raise result
@@ -169,7 +175,7 @@ def merge(config: RecordConfig, work: Path, parts: list[Part]) -> None:
     write_vocabulary(merged, config.recorded_content())
     rates = success_by_kind(merged)
     write_card(merged, config.dataset_id, config.recorded_content(), rates)
-    os.replace(merged, config.output_dir)
+    merged.replace(config.output_dir)
     summary = ", ".join(f"{kind} {wins}/{total}" for kind, (wins, total) in rates.items())
     print(f"{config.output_dir}: {config.num_episodes} episodes; successful: {summary}")
 

@@ -1,17 +1,19 @@
-"""What a recording process does: simulate the episodes of a part into a sub-dataset, and rename it when whole."""
+"""What a recording process does: simulate a part's episodes into a sub-dataset, renamed when it is whole."""
 
-import logging
 import os
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.drivers import Driver, PlannerDriver, PolicyDriver
 from lerobot_dataset_maniskill.manifest import EpisodePlan, Part
-from lerobot_dataset_maniskill.writer import HOLD_FRAMES, add_step, create_dataset
-from lerobot_wmrl.maniskill.simulation import Simulation
+from lerobot_dataset_maniskill.quiet import silence_libraries
+from lerobot_dataset_maniskill.writer import HOLD_FRAMES, Outcome, StartColumns, add_step, create_dataset
 
 
 @dataclass(frozen=True)
@@ -48,13 +50,14 @@ class PartRecorder:
             success, frames = self._record_episode(dataset, plan)
             report(EpisodeResult(part.index, plan.kind, success, frames))
         dataset.finalize()
-        os.replace(partial, self.folder / part.name)
+        partial.replace(self.folder / part.name)
 
-    def _record_episode(self, dataset: object, plan: EpisodePlan) -> tuple[bool, int]:
+    def _record_episode(self, dataset: LeRobotDataset, plan: EpisodePlan) -> tuple[bool, int]:
         """Simulate and store one episode: to HOLD_FRAMES after success first holds, or to the horizon."""
         simulation = self.simulation
         frame = simulation.reset(plan.scene, plan.seed)
         self.driver.begin(simulation, plan)
+        start = StartColumns(simulation.instruction, simulation.task.index, plan)
         steps_left, succeeded, frames = self.horizon, False, 0
         while steps_left > 0:
             action = self.driver.act(simulation, frame)
@@ -62,21 +65,19 @@ class PartRecorder:
             steps_left, frames = steps_left - 1, frames + 1
             if following.success and not succeeded:
                 succeeded, steps_left = True, HOLD_FRAMES
-            truncated = steps_left == 0 and not succeeded
-            add_step(
-                dataset, plan, simulation.instruction, simulation.task.index, frame, action, following, truncated
-            )  # fmt: skip
+            outcome = Outcome(following, truncated=steps_left == 0 and not succeeded)
+            add_step(dataset, start, frame, action, outcome)
             frame = following
         dataset.save_episode()
         return succeeded, frames
 
 
-def serve_parts(config: RecordConfig, folder: Path, parts: object, results: object, parent: int) -> None:
+def serve_parts(config: RecordConfig, folder: Path, parts: Any, results: Any, parent: int) -> None:
     """A worker process: take parts from the queue until None comes, or until the parent is gone."""
     import torch
 
     torch.set_num_threads(1)
-    logging.disable(logging.WARNING)
+    silence_libraries()
 
     def report(result: EpisodeResult) -> None:
         if os.getppid() != parent:

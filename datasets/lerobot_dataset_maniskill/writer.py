@@ -1,6 +1,7 @@
 """The LeRobotDataset side: features, one row a control step, vocabulary and card."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -36,8 +37,17 @@ def video_encoder() -> RGBEncoderConfig:
 
 def dataset_features(cameras: Sequence[str], image_size: int) -> dict[str, dict[str, Any]]:
     """LeRobot's description of the columns."""
-    picture = {"dtype": "video", "shape": (image_size, image_size, 3), "names": ["height", "width", "channels"]}
-    scalars = {"next.reward": "float32", "next.done": "bool", "next.success": "bool", "next.truncated": "bool"}
+    picture = {
+        "dtype": "video",
+        "shape": (image_size, image_size, 3),
+        "names": ["height", "width", "channels"],
+    }
+    scalars = {
+        "next.reward": "float32",
+        "next.done": "bool",
+        "next.success": "bool",
+        "next.truncated": "bool",
+    }
     scalars |= dict.fromkeys(START_COLUMNS, "int64")
     return {
         **{f"observation.images.{camera}": dict(picture) for camera in cameras},
@@ -55,29 +65,44 @@ def create_dataset(root: Path, repo_id: str, cameras: Sequence[str], image_size:
     )  # fmt: skip
 
 
+@dataclass(frozen=True)
+class StartColumns:
+    """What is the same in every row of an episode."""
+
+    instruction: str
+    task_index: int
+    plan: EpisodePlan
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """The columns of `constants.START_COLUMNS`, each (1,) int64."""
+        plan = self.plan
+        values = (self.task_index, plan.scene.index, plan.seed, KINDS.index(plan.kind))
+        return {name: np.array([value], np.int64) for name, value in zip(START_COLUMNS, values, strict=True)}
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The frame an action led to, and whether the episode was cut there."""
+
+    frame: Frame
+    truncated: bool
+
+
 def add_step(
-    dataset: LeRobotDataset,
-    plan: EpisodePlan,
-    instruction: str,
-    task_index: int,
-    before: Frame,
-    action: np.ndarray,
-    after: Frame,
-    truncated: bool,
+    dataset: LeRobotDataset, start: StartColumns, before: Frame, action: np.ndarray, outcome: Outcome
 ) -> None:
     """One row: what was seen, the commanded action, and the outcome in the frame it led to."""
-    start = (task_index, plan.scene.index, plan.seed, KINDS.index(plan.kind))
     dataset.add_frame(
         {
             **{f"observation.images.{camera}": image for camera, image in before.images.items()},
             "observation.state": before.state,
             "action": np.asarray(action, np.float32),
-            "next.reward": np.array([after.reward], np.float32),
-            "next.done": np.array([after.success]),
-            "next.success": np.array([after.success]),
-            "next.truncated": np.array([truncated]),
-            **{name: np.array([value], np.int64) for name, value in zip(START_COLUMNS, start, strict=True)},
-            "task": instruction,
+            "next.reward": np.array([outcome.frame.reward], np.float32),
+            "next.done": np.array([outcome.frame.success]),
+            "next.success": np.array([outcome.frame.success]),
+            "next.truncated": np.array([outcome.truncated]),
+            **start.columns(),
+            "task": start.instruction,
         }
     )
 
@@ -100,14 +125,26 @@ def write_vocabulary(root: Path, recording: Mapping[str, Any]) -> None:
     )
 
 
-def write_card(root: Path, repo_id: str, recording: Mapping[str, Any], rates: Mapping[str, tuple[int, int]]) -> None:
+def write_card(
+    root: Path, repo_id: str, recording: Mapping[str, Any], rates: Mapping[str, tuple[int, int]]
+) -> None:
     """README.md: what the dataset holds. `rates`: kind → (successes, episodes)."""
     rows = "\n".join(f"| {kind} | {total} | {wins} |" for kind, (wins, total) in rates.items())
     scenes = "\n".join(f"| {s.index} | {s.object} | {s.container} | {s.table} | {s.split} |" for s in SCENES)
-    write_text(root / "README.md", CARD.format(
-        name=repo_id, task=recording["task"], fps=FPS, rows=rows, scenes=scenes, recorded=recording["scenes"],
-        low=list(ACTION_LOW), high=list(ACTION_HIGH), hold=HOLD_FRAMES, tasks=", ".join(TASKS), kinds=", ".join(KINDS),
-    ))  # fmt: skip
+    card = CARD.format(
+        name=repo_id,
+        task=recording["task"],
+        fps=FPS,
+        rows=rows,
+        scenes=scenes,
+        recorded=recording["scenes"],
+        low=list(ACTION_LOW),
+        high=list(ACTION_HIGH),
+        hold=HOLD_FRAMES,
+        tasks=", ".join(TASKS),
+        kinds=", ".join(KINDS),
+    )
+    write_text(root / "README.md", card)
 
 
 CARD = """---
@@ -123,9 +160,9 @@ ManiSkill trajectories of the task `{task}`, {fps} Hz, recorded by `lerobot-wmrl
 {rows}
 
 `action`: commanded TCP delta (m), rotation (rad) in base axes, gripper in [-1, 1] (+1 opens), inside the box
-{low} to {high}.
-`next.done` and `next.success` say whether success holds in the frame the row's action led to; an episode goes on
-{hold} rows after success. A failed episode ends with `next.truncated`.
+from {low} to {high}.
+`next.done` and `next.success` say whether success holds in the frame the row's action led to; an episode
+goes on {hold} rows after success. A failed episode ends with `next.truncated`.
 `start.task` ({tasks}), `start.scene`, `start.seed` and `start.kind` ({kinds}) rebuild an episode's start.
 
 Scenes (recorded: {recorded}):

@@ -31,7 +31,7 @@ class WmrlManiSkillEnv(EnvConfig):
         cameras: which cameras the policy sees.
         image_size: pixels of each side of a picture.
         episode_length: steps after which an episode is truncated; the task's own horizon by default.
-        robot_mesh_detail: share of the robot's triangles that are drawn; 1 draws ManiSkill's own, three times slower.
+        robot_mesh_detail: share of the robot's triangles that are drawn; 1 draws all, three times slower.
     """
 
     task: str | None = "push"
@@ -68,7 +68,9 @@ class WmrlManiSkillEnv(EnvConfig):
         if self.episode_length is not None and self.episode_length < 1:
             raise ValueError(f"--env.episode_length={self.episode_length}: must be at least 1")
         if not 0.0 < self.robot_mesh_detail <= 1.0:
-            raise ValueError(f"--env.robot_mesh_detail={self.robot_mesh_detail}: must be above 0 and at most 1")
+            raise ValueError(
+                f"--env.robot_mesh_detail={self.robot_mesh_detail}: must be above 0 and at most 1"
+            )
 
     def selected_scenes(self) -> tuple[Scene, ...]:
         """The scenes episodes take place in. ValueError if task, split or scenes are unknown."""
@@ -97,7 +99,9 @@ class WmrlManiSkillEnv(EnvConfig):
             self._task(), self.selected_scenes(), self.cameras, self.image_size, self.robot_mesh_detail
         )
 
-    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, "gym.vector.VectorEnv"]]:
+    def create_envs(
+        self, n_envs: int, use_async_envs: bool = False
+    ) -> dict[str, dict[int, "gym.vector.VectorEnv"]]:
         """What lerobot-eval asks for: {suite: {task id: environment}}."""
         from lerobot_wmrl.envs.maniskill_env import make_vector_env
 

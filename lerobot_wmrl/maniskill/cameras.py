@@ -1,4 +1,4 @@
-"""Cameras. Chosen so that the gripper's height, its lateral offset and contact can be read from one small picture."""
+"""Cameras, chosen so that the gripper's height, lateral offset and contact show in one small picture."""
 
 from typing import Any
 

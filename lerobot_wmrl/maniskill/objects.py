@@ -1,4 +1,4 @@
-"""Objects, containers and tables made by code: no asset is downloaded. Lengths in metres, z up, table top at z = 0."""
+"""Objects, containers and tables made by code: nothing is downloaded. Metres, z up, table top at z = 0."""
 
 import tempfile
 from dataclasses import dataclass
@@ -131,5 +131,12 @@ def _container_profile(spec: ContainerSpec) -> np.ndarray:
     radius, height = spec.radius, spec.height
     wall = 0.006
     return np.array(
-        [(0.0, 0.0), (0.6 * radius, 0.0), (radius, height), (radius - wall, height), (0.55 * radius, wall), (0.0, wall)]
+        [
+            (0.0, 0.0),
+            (0.6 * radius, 0.0),
+            (radius, height),
+            (radius - wall, height),
+            (0.55 * radius, wall),
+            (0.0, wall),
+        ]
     )

@@ -1,7 +1,7 @@
 """Whether SAPIEN can render here, asked of SAPIEN itself, with the remedy if it cannot."""
 
 REMEDY = (
-    "SAPIEN finds no device to render with. It needs a GPU with Vulkan, or a software driver from Mesa 24 or newer: "
+    "SAPIEN finds no device to render with. It needs a GPU with Vulkan, or Mesa's software driver (24+): "
     "run `make setup`, which installs one where it may, or install the package mesa-vulkan-drivers "
     "(on Debian 12 from bookworm-backports) together with libvulkan1"
 )
@@ -12,7 +12,7 @@ class NoRendererError(ValueError):
 
 
 def render_backend() -> str:
-    """ "gpu" if SAPIEN can render on one, else "cpu" (software). NoRendererError with the remedy if neither."""
+    """`gpu` if SAPIEN can render on one, else `cpu` (software). NoRendererError with the remedy."""
     import sapien
 
     try:

@@ -20,8 +20,8 @@ FINE_LINKS = ("panda_hand", "panda_leftfinger", "panda_rightfinger")
 class BaseAxesPanda(Panda):
     """Panda whose rotation actions turn the way they say.
 
-    ManiSkill's own `pd_ee_delta_pose` scales rotations by its (negative) lower bound. Without normalisation the
-    action is metres and radians, and nothing is clipped: the caller clips to the action box.
+    ManiSkill's own `pd_ee_delta_pose` scales rotations by its (negative) lower bound. Without normalisation
+    the action is metres and radians, and nothing is clipped: the caller clips to the action box.
     """
 
     uid = "wmrl_panda"
@@ -40,13 +40,16 @@ class BaseAxesPanda(Panda):
             frame="root_translation:root_aligned_body_rotation",
             normalize_action=False,
         )
-        return {CONTROL_MODE: {"arm": arm, "gripper": super()._controller_configs["pd_ee_delta_pose"]["gripper"]}}
+        return {
+            CONTROL_MODE: {"arm": arm, "gripper": super()._controller_configs["pd_ee_delta_pose"]["gripper"]}
+        }
 
 
 def lighten_meshes(robot: Any, detail: float) -> int:
-    """Replace the robot's visual meshes by decimated ones, `detail` of their triangles. Returns triangles left.
+    """Replace the robot's visual meshes by decimated ones, `detail` of their triangles. Returns what is left.
 
-    Software rendering is bound by vertices: 3 % of the triangles draw three times as fast and look the same at 64 px.
+    Software rendering is bound by vertices: 4 % of the triangles draw several times faster and look the same
+    at 64 px.
     """
     total = 0
     for name, body in _render_bodies(robot):

@@ -1,4 +1,4 @@
-"""The table of scenes: object x container x table, and which of them training may see. Imports no simulator."""
+"""The table of scenes: object x container x table, and which training may see. Imports no simulator."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,23 +22,19 @@ class Scene:
     split: Split
 
 
-SCENES: Final = tuple(
-    Scene(index, *row)
-    for index, row in enumerate(
-        (
-            ("sponge", "plate", "wood", "ind"),
-            ("tomato_can", "bowl", "slate", "ind"),
-            ("blue_box", "plate", "wood", "ind"),
-            ("lime", "bowl", "slate", "ood"),
-            ("tomato_can", "plate", "wood", "ood"),
-        )
-    )
+_ROWS: Final[tuple[tuple[str, str, str, Split], ...]] = (
+    ("sponge", "plate", "wood", "ind"),
+    ("tomato_can", "bowl", "slate", "ind"),
+    ("blue_box", "plate", "wood", "ind"),
+    ("lime", "bowl", "slate", "ood"),
+    ("tomato_can", "plate", "wood", "ood"),
 )
+SCENES: Final = tuple(Scene(index, *row) for index, row in enumerate(_ROWS))
 """Append only: the index is stored in datasets as `start.scene`."""
 
 
 def scenes_of(split: str, scenes: Sequence[int] | None = None) -> tuple[Scene, ...]:
-    """The scenes of a split, or those of `scenes` (indices), which must belong to it. ValueError otherwise."""
+    """The scenes of a split, or those of `scenes` (indices), all of that split. ValueError otherwise."""
     if split not in SPLITS:
         raise ValueError(f"split={split!r} is unknown; choose one of {', '.join(SPLITS)}")
     members = {scene.index: scene for scene in SCENES if scene.split == split}
@@ -47,7 +43,7 @@ def scenes_of(split: str, scenes: Sequence[int] | None = None) -> tuple[Scene, .
     unknown = [index for index in scenes if index not in members]
     if unknown or not scenes:
         raise ValueError(
-            f"scenes={list(scenes)}: the split {split!r} has the scenes {sorted(members)} (see --list_scenes=true)"
+            f"scenes={list(scenes)}: the split {split!r} has {sorted(members)} (see --list_scenes=true)"
         )
     return tuple(members[index] for index in scenes)
 

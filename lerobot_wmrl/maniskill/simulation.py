@@ -56,7 +56,9 @@ class Simulation:
         robot_mesh_detail: float = ROBOT_MESH_DETAIL,
     ) -> None:
         self.task, self.cameras = task, tuple(cameras)
-        self.env = TabletopEnv(scenes, cameras, image_size, robot_mesh_detail, render_backend=render_backend())
+        self.env = TabletopEnv(
+            scenes, cameras, image_size, robot_mesh_detail, render_backend=render_backend()
+        )
         self.env.reset(seed=0)
         self._low, self._high = np.array(ACTION_LOW, np.float32), np.array(ACTION_HIGH, np.float32)
 

@@ -36,7 +36,12 @@ class TabletopEnv(BaseEnv):
     agent: BaseAxesPanda
 
     def __init__(
-        self, scenes: Sequence[Scene], cameras: Sequence[str], image_size: int, robot_mesh_detail: float, **kwargs: Any
+        self,
+        scenes: Sequence[Scene],
+        cameras: Sequence[str],
+        image_size: int,
+        robot_mesh_detail: float,
+        **kwargs: Any,
     ) -> None:
         self.scenes, self.cameras, self.image_size = tuple(scenes), tuple(cameras), image_size
         self.robot_mesh_detail = robot_mesh_detail
@@ -60,7 +65,9 @@ class TabletopEnv(BaseEnv):
 
     def _load_scene(self, options: dict) -> None:
         self.objects = {n: build_object(self.scene, OBJECTS[n]) for n in _names(self.scenes, "object")}
-        self.containers = {n: build_container(self.scene, CONTAINERS[n]) for n in _names(self.scenes, "container")}
+        self.containers = {
+            n: build_container(self.scene, CONTAINERS[n]) for n in _names(self.scenes, "container")
+        }
         self.tables = {n: build_table(self.scene, n) for n in _names(self.scenes, "table")}
         for actor in self.objects.values():
             actor._bodies[0].set_angular_damping(ANGULAR_DAMPING)
@@ -70,9 +77,14 @@ class TabletopEnv(BaseEnv):
     def _load_lighting(self, options: dict) -> None:
         self.scene.set_ambient_light([0.45, 0.45, 0.45])
         self.scene.add_directional_light(
-            [-0.15, 0.1, -1.0], [1.5, 1.5, 1.5], shadow=True, shadow_scale=0.4, shadow_near=-1.5, shadow_far=1.5,
+            direction=[-0.15, 0.1, -1.0],
+            color=[1.5, 1.5, 1.5],
+            shadow=True,  # the gripper's shadow shows its height
+            shadow_scale=0.4,
+            shadow_near=-1.5,
+            shadow_far=1.5,
             shadow_map_size=256,
-        )  # fmt: skip
+        )
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         """Nothing to draw here: `place` puts everything where the task's start says."""
@@ -88,7 +100,7 @@ class TabletopEnv(BaseEnv):
         self._place_robot(start.tcp)
 
     def _place_robot(self, tcp: np.ndarray) -> None:
-        """Solve inverse kinematics from the rest pose so that the closed gripper points down at `tcp` (3,)."""
+        """Solve inverse kinematics from rest, so that the closed gripper points down at `tcp` (3,)."""
         arm = self.agent.controller.controllers["arm"]
         model = arm.kinematics.pmodel
         target = sapien.Pose(p=np.asarray(tcp) - np.array(BASE_POSITION), q=[0.0, 1.0, 0.0, 0.0])
@@ -114,7 +126,9 @@ def _show_only(actors: dict[str, Any], shown: str, pose: sapien.Pose) -> None:
         body = entity.find_component_by_type(sapien.physx.PhysxRigidDynamicComponent)
         visual = entity.find_component_by_type(sapien.render.RenderBodyComponent)
         visual.visibility = float(name == shown)
-        entity.set_pose(pose if name == shown else sapien.Pose(p=[PARKING[0], PARKING[1] + 3.0 * place, PARKING[2]]))
+        entity.set_pose(
+            pose if name == shown else sapien.Pose(p=[PARKING[0], PARKING[1] + 3.0 * place, PARKING[2]])
+        )
         if actor.px_body_type == "dynamic":
             body.set_kinematic(name != shown)
             if name == shown:

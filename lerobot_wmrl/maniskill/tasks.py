@@ -37,7 +37,7 @@ class Start:
 
 @dataclass(frozen=True)
 class Situation:
-    """What a task judges: object at the start and now, its resting height (its centre), and the TCP; all (3,)."""
+    """What a task judges: the object at the start and now, the TCP, each (3,); the height of its centre."""
 
     object_start: np.ndarray
     object_now: np.ndarray
