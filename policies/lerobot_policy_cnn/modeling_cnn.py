@@ -1,5 +1,6 @@
 """The small image policy: what lerobot-train clones, lerobot-eval runs and PPO improves."""
 
+import math
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -18,6 +19,9 @@ STATE_LIMIT = 10.0
 
 CONSTANT_RANGE = 1e-3
 """A component of the normalised action that varies less than this in the demonstrations is constant."""
+
+STD_MARGIN = 0.01
+"""A standard deviation starts at least this share of the way from its bounds: at them it cannot learn."""
 
 Observation = dict[str, Any]
 
@@ -53,7 +57,8 @@ class CnnPolicy(PreTrainedPolicy):
         actions = config.action_feature.shape[0]
         self.actor = Trunk(*inputs, config.width, *sizes, outputs=actions)
         self.critic = Trunk(*inputs, config.value_width, *sizes, outputs=1)
-        self.log_std = nn.Parameter(torch.full((actions,), config.initial_std).log())
+        self.std_logit = nn.Parameter(torch.zeros(actions))
+        self.set_std(config.initial_std)
         self.register_buffer("target_low", torch.full((actions,), torch.inf))
         self.register_buffer("target_high", torch.full((actions,), -torch.inf))
 
@@ -62,7 +67,7 @@ class CnnPolicy(PreTrainedPolicy):
         rate = self.config.optimizer_lr * self.config.std_lr_factor
         return [
             {"params": list(self.actor.parameters())},
-            {"params": [self.log_std], "lr": rate, "weight_decay": 0.0},
+            {"params": [self.std_logit], "lr": rate, "weight_decay": 0.0},
         ]
 
     def value_parameters(self) -> Iterator[nn.Parameter]:
@@ -115,8 +120,9 @@ class CnnPolicy(PreTrainedPolicy):
         return self.critic(*self._inputs(observation)).squeeze(1)
 
     def std(self) -> Tensor:
-        """Standard deviation within its bounds, in normalised actions. → (K,)"""
-        return self.log_std.exp().clamp(self.config.min_std, self.config.max_std)
+        """Standard deviation in normalised actions, smoothly within its bounds. → (K,)"""
+        low, high = math.log(self.config.min_std), math.log(self.config.max_std)
+        return (low + (high - low) * self.std_logit.sigmoid()).exp()
 
     @torch.no_grad()
     def set_std(self, std: float) -> None:
@@ -124,12 +130,8 @@ class CnnPolicy(PreTrainedPolicy):
         low, high = self.config.min_std, self.config.max_std
         if not low <= std <= high:
             raise ValueError(f"initial_std={std}: must be between {low} and {high}, the policy's bounds")
-        self.log_std.fill_(std).log_()
-
-    @torch.no_grad()
-    def clamp_std(self) -> None:
-        """Bring the parameter back within the bounds, beyond which it would get no gradient."""
-        self.log_std.copy_(self.std().log())
+        share = math.log(std / low) / max(math.log(high / low), 1e-8)
+        self.std_logit.copy_(torch.full_like(self.std_logit, share).logit(STD_MARGIN))
 
     def varies(self) -> Tensor:
         """Components that the demonstrations vary; all of them before there were any. → (K,) bool"""

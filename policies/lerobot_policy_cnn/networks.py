@@ -40,17 +40,23 @@ class ImageEncoder(nn.Module):
         self.fine = nn.Conv2d(wide, wide, 3, padding=1)
         self.coarse = nn.Conv2d(wide, wide, 3, stride=2, padding=1)
         self.grid = nn.Conv2d(wide, GRID_CHANNELS, 1)
+        self.normalise = nn.GroupNorm(wide, wide, affine=False)
+        self.sharpness = nn.Parameter(torch.full((wide, 1, 1), 2.0))
         self.size = 2 * wide + GRID_CHANNELS * GRID * GRID
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
 
     def forward(self, images: Tensor) -> Tensor:
         """Images in [0, 1]. (B, 3, H, W) → (B, self.size)"""
         position = torch.stack(coordinates(images.shape[2], images.shape[3], images))[None]
-        centred = (images - 0.5).contiguous(memory_format=torch.channels_last)
-        x = F.relu(self.stem(centred) + self.stem_position(position))
-        x = F.relu(self.down(x))
+        centred = (4 * (images - 0.5)).contiguous(memory_format=torch.channels_last)
+        x = F.relu_(self.stem(centred) + self.stem_position(position))
+        x = F.relu_(self.down(x))
         fine = self.fine(x)
-        coarse = self.grid(F.relu(self.coarse(F.relu(fine))))
-        return torch.cat([soft_positions(fine), F.adaptive_avg_pool2d(coarse, GRID).flatten(1)], dim=1)
+        coarse = self.grid(F.relu_(self.coarse(F.relu(fine))))
+        positions = soft_positions(self.sharpness * self.normalise(fine))
+        return torch.cat([positions, F.adaptive_avg_pool2d(coarse, GRID).flatten(1)], dim=1)
 
 
 @lru_cache(maxsize=4096)

@@ -1,0 +1,51 @@
+"""What reinforcement learning needs of a policy. B environments, K action components."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+from torch import Tensor, nn
+
+Observation = dict[str, Any]
+"""Tensors by LeRobot's names, batch first, and `task`: a list of instructions."""
+
+
+class Sample(Protocol):
+    """Actions as they were sampled, before any clipping or unnormalisation."""
+
+    @property
+    def raw_action(self) -> Tensor:
+        """(B, K)"""
+
+    @property
+    def log_prob(self) -> Tensor:
+        """One a component, float32. (B, K)"""
+
+    @property
+    def value(self) -> Tensor:
+        """(B,)"""
+
+
+@runtime_checkable
+class StochasticPolicy(Protocol):
+    """A policy that can sample, and say how likely a sample is. Observations come from its preprocessor."""
+
+    def sample(self, observation: Observation) -> Sample:
+        """Draw actions from the very distribution that `evaluate` measures."""
+
+    def evaluate(self, observation: Observation, raw_action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """→ log-probs (B, K), entropies (B,), values (B,)"""
+
+    def value(self, observation: Observation) -> Tensor:
+        """→ (B,)"""
+
+    def value_parameters(self) -> Iterable[nn.Parameter]:
+        """Parameters that only the value depends on."""
+
+
+@dataclass(frozen=True)
+class Pipeline:
+    """A policy's processors: `prepare` an environment's observation, turn raw actions into metres."""
+
+    prepare: Callable[[Observation], Observation]
+    to_action: Callable[[Tensor], Tensor]
