@@ -25,6 +25,9 @@ GAIN: Final = 2.0
 TOP_SPEED: Final = ACTION_HIGH[0]
 OPTIMAL_SPEED: Final = 0.8 * TOP_SPEED
 CLOSED: Final = -1.0
+TURNED: Final = ("waypoint", "disturbed")
+"""Kinds whose rotations and gripper commands are disturbed too."""
+
 LOWEST: Final = 0.012
 """The fingertips stay this far above the table (m)."""
 
@@ -114,7 +117,9 @@ def plan_push(kind: str, spec: ObjectSpec, start: Start, rng: np.random.Generato
     geometry = PushGeometry(spec, start)
     if kind == "optimal":
         return Plan(essential_push(geometry), speed=OPTIMAL_SPEED)
-    noise = Noise(rng.uniform(0.0, 0.015), rng.uniform(0.0, 0.06), rng.uniform(0.0, 0.4))
+    noise = Noise(rng.uniform(0.0, 0.015))
+    if kind in TURNED:
+        noise = Noise(noise.position, rng.uniform(0.0, 0.05), rng.uniform(0.0, 0.3))
     plan = Plan((), rng.uniform(0.55, 1.0) * TOP_SPEED, noise)
     return replace(plan, waypoints=SUBOPTIMAL[kind](geometry, rng))
 

@@ -1,0 +1,113 @@
+"""ManiSkill through LeRobot's and through the trainer's eyes."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+from lerobot.envs.utils import NEW_ROLLOUT_OPTION, preprocess_observation
+
+from lerobot_wmrl.constants import EVALUATION_SEED
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.envs.maniskill_env import ManiSkillEnv
+from lerobot_wmrl.envs.maniskill_tensor_env import ManiSkillTensorEnv
+
+HORIZON = 3
+STAY = np.array([0, 0, 0, 0, 0, 0, -1], np.float32)
+
+
+@pytest.fixture(scope="module")
+def env() -> Iterator[ManiSkillEnv]:
+    env = ManiSkillEnv(WmrlManiSkillEnv(episode_length=HORIZON, cameras=["third_view", "wrist"]))
+    yield env
+    env.close()
+
+
+def test_observations_lie_in_their_space_and_the_seed_decides_them(env: ManiSkillEnv) -> None:
+    first, info = env.reset(seed=EVALUATION_SEED)
+    assert env.observation_space.contains(first)
+    again, _ = env.reset(seed=EVALUATION_SEED)
+    assert np.array_equal(first["pixels"]["wrist"], again["pixels"]["wrist"])
+    assert info["seed"] == EVALUATION_SEED
+    _, following = env.reset(seed=EVALUATION_SEED + 1)
+    assert following["scene"] != info["scene"]
+
+
+def test_the_wrist_camera_sees_something_else_than_the_third_view(env: ManiSkillEnv) -> None:
+    pixels = env.reset(seed=0)[0]["pixels"]
+    assert np.abs(pixels["wrist"].astype(int) - pixels["third_view"]).mean() > 5
+    assert pixels["wrist"].std() > 5
+
+
+def test_an_episode_is_truncated_at_the_horizon_not_terminated(env: ManiSkillEnv) -> None:
+    env.reset(seed=1)
+    ends = [env.step(STAY)[2:4] for _ in range(HORIZON)]
+    assert ends == [(False, False)] * (HORIZON - 1) + [(False, True)]
+
+
+def test_a_reset_without_a_seed_draws_a_training_seed(env: ManiSkillEnv) -> None:
+    env.reset(seed=EVALUATION_SEED)
+    assert all(env.reset()[1]["seed"] < EVALUATION_SEED for _ in range(3))
+
+
+def test_lerobot_gets_what_a_policy_is_trained_on() -> None:
+    config = WmrlManiSkillEnv(episode_length=HORIZON)
+    envs = config.create_envs(1)["wmrl_maniskill"][0]
+    try:
+        observation, _ = envs.reset(seed=[7], options={NEW_ROLLOUT_OPTION: True})
+        batch = preprocess_observation(observation)
+        assert batch["observation.images.third_view"].shape == (1, 3, 64, 64)
+        assert batch["observation.state"].shape == (1, 8)
+        assert set(batch) <= set(config.features_map.values()) | {"task"}
+        assert envs.call("_max_episode_steps") == (HORIZON,)
+        assert "push" in envs.call("task_description")[0] or "pushing" in envs.call("task_description")[0]
+        for _ in range(HORIZON):
+            *_, truncated, info = envs.step(STAY[None])
+        assert truncated.all()
+        assert not info["final_info"]["is_success"].any()
+    finally:
+        envs.close()
+
+
+def test_the_tensor_environment_keeps_the_last_observation_of_an_episode() -> None:
+    env = ManiSkillTensorEnv(WmrlManiSkillEnv(episode_length=HORIZON), 1, "cpu")
+    try:
+        observation, _ = env.reset(seed=[0])
+        assert observation["observation.images.third_view"].shape == (1, 3, 64, 64)
+        assert observation["observation.images.third_view"].min() >= 0.0
+        assert observation["observation.images.third_view"].max() <= 1.0
+        raise_gripper = torch.tensor([[0.0, 0.0, 0.05, 0.0, 0.0, 0.0, -1.0]])
+        for step in range(HORIZON):
+            observation, reward, terminated, truncated, info = env.step(raise_gripper)
+            assert ("final_obs" in info) == (step == HORIZON - 1)
+        assert reward.dtype == torch.float32
+        assert truncated.all()
+        assert not terminated.any()
+        assert info["final_info"]["episode_length"].tolist() == [HORIZON]
+        assert not info["final_info"]["is_success"].any()
+        final = info["final_obs"]["observation.state"]
+        assert not torch.allclose(final, observation["observation.state"], atol=1e-3)
+        assert len(info["final_obs"]["task"]) == 1
+    finally:
+        env.close()
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"cameras": ["ceiling"]}, "env.cameras"),
+        ({"image_size": 4}, "env.image_size=4"),
+        ({"episode_length": 0}, "env.episode_length=0"),
+        ({"robot_mesh_detail": 0.0}, "env.robot_mesh_detail"),
+    ],
+)
+def test_bad_settings_are_named(fields: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        WmrlManiSkillEnv(**fields)
+
+
+def test_unknown_tasks_and_foreign_scenes_are_named_before_anything_is_built() -> None:
+    with pytest.raises(ValueError, match="task='juggle'"):
+        WmrlManiSkillEnv(task="juggle").selected_scenes()
+    with pytest.raises(ValueError, match="split 'ood' has"):
+        WmrlManiSkillEnv(split="ood", scenes=[0]).selected_scenes()

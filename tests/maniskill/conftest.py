@@ -1,0 +1,16 @@
+"""One simulator for the tests of this package: building it costs seconds."""
+
+from collections.abc import Iterator
+
+import pytest
+
+from lerobot_wmrl.maniskill.scenes import SCENES
+from lerobot_wmrl.maniskill.simulation import Simulation
+from lerobot_wmrl.maniskill.tasks import Push
+
+
+@pytest.fixture(scope="session")
+def simulation() -> Iterator[Simulation]:
+    simulation = Simulation(Push(), SCENES, image_size=64)
+    yield simulation
+    simulation.close()
