@@ -1,0 +1,57 @@
+"""The list of episodes is a function of the configuration alone."""
+
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from lerobot_dataset_maniskill.configuration import RecordConfig
+from lerobot_dataset_maniskill.manifest import planned_kinds, planned_parts
+from lerobot_wmrl.constants import EVALUATION_SEED
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+
+
+def config(**fields: object) -> RecordConfig:
+    return RecordConfig(output_dir=Path("nowhere"), **fields)  # type: ignore[arg-type]
+
+
+def test_the_same_configuration_plans_the_same_parts() -> None:
+    first, again = (planned_parts(config(num_episodes=55, part_episodes=20)) for _ in range(2))
+    assert first == again
+    assert [len(part.episodes) for part in first] == [20, 20, 15]
+
+
+def test_seeds_are_consecutive_never_twice_and_never_for_evaluation() -> None:
+    seeds = [plan.seed for part in planned_parts(config(num_episodes=90, seed=100)) for plan in part.episodes]
+    assert seeds == list(range(100, 190))
+    with pytest.raises(ValueError, match="--seed="):
+        config(seed=EVALUATION_SEED - 10, num_episodes=11).validate()
+
+
+def test_kinds_have_exactly_their_shares_in_mixed_order() -> None:
+    kinds = planned_kinds(config(num_episodes=100, kinds={"optimal": 1.0, "near_miss": 3.0}))
+    assert Counter(kinds) == {"optimal": 25, "near_miss": 75}
+    assert "optimal" in kinds[:30]
+    assert "near_miss" in kinds[:30]
+
+
+def test_no_held_out_scene_is_recorded_by_default() -> None:
+    parts = planned_parts(config(num_episodes=12))
+    assert {plan.scene.split for part in parts for plan in part.episodes} == {"ind"}
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"num_episodes": 0}, "--num_episodes=0"),
+        ({"num_workers": 0}, "--num_workers=0"),
+        ({"kinds": {"perfect": 1.0}}, "--kinds="),
+        ({"kinds": {"optimal": 0.0}}, "--kinds="),
+        ({"env": WmrlManiSkillEnv(task="juggle")}, "task='juggle'"),
+        ({"env": WmrlManiSkillEnv(scenes=[99])}, r"scenes=\[99\]"),
+        ({"output_dir": None}, "--output_dir"),
+    ],
+)
+def test_bad_settings_are_named(fields: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        RecordConfig(**{"output_dir": Path("nowhere"), **fields}).validate()

@@ -1,0 +1,146 @@
+"""A recording that is killed, continued, finished and refused: one small dataset, real simulator."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from lerobot_dataset_maniskill.configuration import RecordConfig
+from lerobot_dataset_maniskill.integrity import episode_outcomes, whole_dataset
+from lerobot_dataset_maniskill.manifest import planned_parts
+from lerobot_dataset_maniskill.recorder import missing_parts, record
+from lerobot_dataset_maniskill.writer import HOLD_FRAMES
+from lerobot_wmrl.constants import KINDS, STATE_NAMES
+
+EPISODES, PART = 6, 2
+KIND_SHARES = {"optimal": 0.5, "near_miss": 0.5}
+PATIENCE_S = 240.0
+
+
+def config(root: Path, **fields: object) -> RecordConfig:
+    settings = {"num_episodes": EPISODES, "part_episodes": PART, "num_workers": 1, "kinds": KIND_SHARES}
+    return RecordConfig(output_dir=root / "dataset", **{**settings, **fields})  # type: ignore[arg-type]
+
+
+def start_and_kill(root: Path) -> Path:
+    """Start the command, `kill -9` it once its first part is whole; returns the folder of unfinished work."""
+    flags = [f"--num_episodes={EPISODES}", f"--part_episodes={PART}", "--num_workers=1",
+             f"--kinds={json.dumps(KIND_SHARES)}", f"--output_dir={root / 'dataset'}"]  # fmt: skip
+    command = subprocess.Popen([sys.executable, "-m", "lerobot_dataset_maniskill.record", *flags])
+    work = root / ".dataset.recording"
+    deadline = time.monotonic() + PATIENCE_S
+    while not (work / "part-00000").exists() and time.monotonic() < deadline and command.poll() is None:
+        time.sleep(0.02)
+    workers = psutil.Process(command.pid).children()
+    os.kill(command.pid, signal.SIGKILL)
+    command.wait()
+    _, alive = psutil.wait_procs(workers, timeout=60)
+    assert not alive, "the workers outlived the command"
+    return work
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished dataset whose recording was killed after its first part, and whose second part was torn."""
+    root = tmp_path_factory.mktemp("recorded")
+    work = start_and_kill(root)
+    first = (work / "part-00000" / "meta" / "info.json").stat().st_mtime_ns
+    torn = work / ".part-00001.1.partial"
+    (torn / "meta").mkdir(parents=True, exist_ok=True)
+    shutil.copytree(work / "part-00000", work / "part-00002", dirs_exist_ok=True)
+    for video in (work / "part-00002").rglob("*.mp4"):
+        os.truncate(video, video.stat().st_size // 2)
+    parts = planned_parts(config(root))
+    assert "part-00000" not in {part.name for part in missing_parts(work, parts)}
+    assert not torn.exists()
+    assert not (work / "part-00002").exists()
+    assert (work / "part-00000" / "meta" / "info.json").stat().st_mtime_ns == first
+    record(config(root))
+    assert not work.exists()
+    return root
+
+
+@pytest.fixture(scope="module")
+def dataset(recorded: Path) -> LeRobotDataset:
+    return LeRobotDataset("local/dataset", root=recorded / "dataset")
+
+
+def column(dataset: LeRobotDataset, name: str) -> np.ndarray:
+    return np.array([np.asarray(value) for value in dataset.hf_dataset[name]])
+
+
+def test_every_planned_episode_is_there_once_in_order(recorded: Path, dataset: LeRobotDataset) -> None:
+    plans = [plan for part in planned_parts(config(recorded)) for plan in part.episodes]
+    first = np.flatnonzero(column(dataset, "frame_index") == 0)
+    assert column(dataset, "start.seed")[first].ravel().tolist() == [plan.seed for plan in plans]
+    assert column(dataset, "start.scene")[first].ravel().tolist() == [plan.scene.index for plan in plans]
+    kinds = [KINDS[kind] for kind in column(dataset, "start.kind")[first].ravel()]
+    assert kinds == [plan.kind for plan in plans]
+    assert whole_dataset(recorded / "dataset", EPISODES) is None
+
+
+def test_columns_and_types_are_those_of_the_contract(dataset: LeRobotDataset) -> None:
+    row = dataset[0]
+    assert row["observation.images.third_view"].shape == (3, 64, 64)
+    assert dataset.features["observation.state"]["names"] == list(STATE_NAMES)
+    dtypes = {name: feature["dtype"] for name, feature in dataset.features.items()}
+    assert dtypes["action"] == dtypes["observation.state"] == dtypes["next.reward"] == "float32"
+    assert {dtypes[f"next.{name}"] for name in ("done", "success", "truncated")} == {"bool"}
+    assert {dtypes[f"start.{name}"] for name in ("task", "scene", "seed", "kind")} == {"int64"}
+    assert "push" in row["task"]
+
+
+def test_an_optimal_episode_holds_success_a_failure_is_truncated(dataset: LeRobotDataset) -> None:
+    episode, done = column(dataset, "episode_index"), column(dataset, "next.done").ravel()
+    truncated, success = column(dataset, "next.truncated").ravel(), column(dataset, "next.success").ravel()
+    assert np.array_equal(done, success)
+    kinds, wins = episode_outcomes(Path(dataset.root))
+    assert wins[kinds == KINDS.index("optimal")].all()
+    for index, won in enumerate(wins):
+        rows = np.flatnonzero(episode == index)
+        assert truncated[rows[-1]] == (not won)
+        assert not truncated[rows[:-1]].any()
+        if won:
+            assert len(rows) - np.flatnonzero(done[rows])[0] == HOLD_FRAMES + 1
+
+
+def test_the_same_command_again_says_that_it_is_done(
+    recorded: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record(config(recorded))
+    assert "already recorded" in capsys.readouterr().out
+
+
+def test_other_settings_and_foreign_folders_are_refused(recorded: Path, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"other settings.*seed 0 → 5"):
+        record(config(recorded, seed=5))
+    (tmp_path / "dataset").mkdir()
+    (tmp_path / "dataset" / "thesis.txt").write_text("do not lose")
+    with pytest.raises(ValueError, match="holds something else"):
+        record(config(tmp_path))
+    assert (tmp_path / "dataset" / "thesis.txt").read_text() == "do not lose"
+
+
+def test_unfinished_work_of_other_settings_is_refused(tmp_path: Path) -> None:
+    work = tmp_path / ".dataset.recording"
+    work.mkdir()
+    (work / "recording.json").write_text(json.dumps(config(tmp_path, seed=5).recorded_content()))
+    with pytest.raises(ValueError, match="other settings"):
+        record(config(tmp_path))
+
+
+def test_a_corrupted_finished_dataset_is_reported(recorded: Path, tmp_path: Path) -> None:
+    shutil.copytree(recorded / "dataset", tmp_path / "dataset")
+    data = next((tmp_path / "dataset" / "data").rglob("*.parquet"))
+    os.truncate(data, data.stat().st_size // 2)
+    with pytest.raises(ValueError, match=r"corrupted.*record again"):
+        record(config(tmp_path))
