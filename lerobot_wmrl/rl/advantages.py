@@ -14,8 +14,8 @@ def generalised_advantages(
     Termination makes it 0; truncation keeps it: the episode was cut, its future was not. Neither lets the
     next episode's advantages through.
     """
-    delta = reward + gamma * next_value * ~terminated - value
-    carry = gamma * gae_lambda * ~(terminated | truncated)
+    delta = reward + gamma * next_value * (~terminated).to(value.dtype) - value
+    carry = gamma * gae_lambda * (~(terminated | truncated)).to(delta.dtype)
     advantages = torch.empty_like(delta)
     running = torch.zeros_like(delta[0])
     for step in reversed(range(len(delta))):

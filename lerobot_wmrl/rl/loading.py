@@ -76,14 +76,14 @@ def check_fit(config: PreTrainedConfig, observation: Observation, action_size: i
     for name, feature in (config.input_features or {}).items():
         if name not in shown:
             raise ValueError(
-                f"policy.path={config.pretrained_path}: the policy needs {name}, which the environment does not "
-                f"have (its cameras: {cameras}); use an environment made from the policy's cameras and state, "
-                "or train the policy on what this one shows"
+                f"policy.path={config.pretrained_path}: the policy needs {name}, which the environment does "
+                f"not have (its cameras: {cameras}); use an environment made from the policy's cameras and "
+                "state, or train the policy on what this one shows"
             )
         if shown[name] != tuple(feature.shape):
             raise ValueError(
-                f"policy.path={config.pretrained_path}: the policy needs {name} of shape {tuple(feature.shape)}, "
-                f"the environment has {shown[name]}"
+                f"policy.path={config.pretrained_path}: the policy needs {name} of shape "
+                f"{tuple(feature.shape)}, the environment has {shown[name]}"
             )
     wanted = (config.output_features or {})[ACTION].shape[0]
     if wanted != action_size:

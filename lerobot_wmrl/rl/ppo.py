@@ -50,12 +50,13 @@ class PPO(RLAlgorithm):
     name = "ppo"
 
     def __init__(self, policy: Any, config: PPOConfig) -> None:
-        if not isinstance(policy, StochasticPolicy):
+        self.policy: Any = policy
+        suitable: bool = isinstance(policy, StochasticPolicy)
+        if not suitable:
             raise ValueError(
                 f"policy.type={policy.config.type}: PPO needs a policy with `sample`, `evaluate`, `value` "
                 "and `value_parameters`, for example cnn"
             )
-        self.policy: Any = policy
         self.config = config
         self.iteration = 0
         if config.initial_std is not None:
@@ -166,8 +167,8 @@ class PPO(RLAlgorithm):
             raise TrainingStopped(f"iteration {self.iteration + 1}: {', '.join(broken)} is not finite")
         if record["reference_kl"] > self.config.max_reference_kl:
             raise TrainingStopped(
-                f"iteration {self.iteration + 1}: the policy is {record['reference_kl'].item():.1f} nats from "
-                f"the cloned one, more than algorithm.max_reference_kl={self.config.max_reference_kl}; "
+                f"iteration {self.iteration + 1}: the policy is {record['reference_kl'].item():.1f} nats "
+                f"from the cloned one, above algorithm.max_reference_kl={self.config.max_reference_kl}; "
                 "raise algorithm.reference_coefficient or lower algorithm.policy_lr"
             )
 

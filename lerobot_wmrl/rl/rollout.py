@@ -97,12 +97,12 @@ class RolloutBuffer:
         self.terminated[step], self.truncated[step] = terminated, truncated
 
     def write_end(self, step: int, success: Tensor, final_value: Tensor) -> None:
-        """Keep what is known of episodes that ended at `step`: outcome, value of the final observation. (B,)"""
+        """Keep an ended episode's outcome and the value of its final observation. (B,), (B,)"""
         self.success[step] = success & self.finished[step]
         self.final_value[step] = final_value
 
     def fill_next_value(self, last_value: Tensor) -> None:
-        """V(o_{t+1}): the next row's value, or the final observation's where the next row is another episode."""
+        """V(o_{t+1}): the next row's, or the final observation's where the next row is another episode."""
         following = torch.cat([self.value[1:], last_value[None]])
         self.next_value = torch.where(self.finished, self.final_value, following)
         if not bool(self.next_value.isfinite().all()):
@@ -115,7 +115,7 @@ class RolloutBuffer:
         return self.terminated | self.truncated
 
     def statistics(self) -> dict[str, float]:
-        """Success and length of each environment's first episode: later ones are more often the short ones."""
+        """Success and length of each environment's first episode; of later ones only short ones would end."""
         first = self.finished.cumsum(0).cumsum(0) == 1
         steps = torch.arange(1, self.steps + 1, device=self.device)[:, None]
         episodes = first.sum().clamp_min(1)

@@ -2,7 +2,7 @@
 
     lerobot-wmrl-train --policy.path=outputs/sft --env.type=world_model --env.world_model_path=W \\
         --env.text_world_model_path=X --env.dataset.root=D --algorithm.type=ppo --output_dir=outputs/rl
-    lerobot-wmrl-train --policy.path=outputs/sft --env.type=wmrl_maniskill --num_envs=2 --output_dir=outputs/rl
+    lerobot-wmrl-train --policy.path=outputs/sft --env.type=wmrl_maniskill --num_envs=2 --output_dir=rl
 
 Running the same command again continues from the last checkpoint. `--preset=demo` sets the sizes.
 `lerobot-eval --policy.path=outputs/rl/checkpoints/last/pretrained_model …` evaluates the result.

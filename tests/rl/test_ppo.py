@@ -1,0 +1,149 @@
+"""PPO's arithmetic, and that it learns."""
+
+import copy
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from lerobot_policy_cnn.modeling_cnn import CnnPolicy
+from lerobot_wmrl.rl.configuration_ppo import PPOConfig
+from lerobot_wmrl.rl.ppo import PPO, TrainingStopped, clipped_objective, kl_estimate, reference_penalty
+from lerobot_wmrl.rl.protocol import Pipeline
+from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
+from tests.rl.point_env import PointEnv
+
+FAST = {"policy_lr": 3e-3, "value_lr": 3e-3, "target_kl": 0.05, "minibatch_size": 240, "value_iterations": 1}
+MakePolicy = Callable[..., CnnPolicy]
+
+
+def one_rollout(
+    policy: CnnPolicy, pipeline: Pipeline, image_size: int = 0, **config: Any
+) -> tuple[PPO, RolloutBuffer]:
+    """An algorithm and a buffer whose advantages are computed, before any update."""
+    algorithm = PPO(policy, PPOConfig(**{"value_iterations": 0, **config}))
+    env = PointEnv(16, horizon=6, image_size=image_size)
+    buffer = RolloutBuffer(12, 16, "cpu")
+    collect(env, policy, pipeline, buffer, seed=0)
+    algorithm._add_targets(buffer, pipeline)
+    return algorithm, buffer
+
+
+@pytest.mark.parametrize("image_size", [0, 32])
+def test_before_the_first_update_the_ratio_is_one_and_kl_is_zero(
+    make_policy: MakePolicy, pipeline: Pipeline, image_size: int
+) -> None:
+    algorithm, buffer = one_rollout(make_policy(image_size), pipeline, image_size, initial_std=0.3)
+    _, record = algorithm.losses(buffer.minibatch(torch.randperm(192)[:100], pipeline))
+    assert record["ratio_error"] < 1e-3
+    assert record["kl"].abs() < 1e-5
+    assert record["reference_kl"].abs() < 1e-5
+
+
+def test_positive_advantage_raises_the_log_prob_of_what_was_done(
+    make_policy: MakePolicy, pipeline: Pipeline
+) -> None:
+    for sign in (1.0, -1.0):
+        policy = make_policy()
+        algorithm, buffer = one_rollout(policy, pipeline, policy_lr=1e-3)
+        buffer.columns["advantage"] = torch.full((12, 16), sign)
+        batch = buffer.minibatch(torch.arange(192), pipeline)
+        algorithm._descend(algorithm.losses(batch)[0])
+        moved = policy.evaluate(batch["observation"], batch["raw_action"])[0] - batch["log_prob"]
+        assert sign * moved.sum(dim=1).mean() > 1e-3
+
+
+def test_the_objective_stops_paying_outside_the_clip() -> None:
+    log_ratio = torch.tensor([0.5, -0.5, 0.5, -0.5], requires_grad=True)
+    clipped_objective(log_ratio, torch.tensor([1.0, -1.0, -1.0, 1.0]), 0.2).backward()
+    assert log_ratio.grad is not None
+    assert (log_ratio.grad[:2] == 0).all()
+    assert (log_ratio.grad[2:] != 0).all()
+
+
+def test_kl_estimate_and_penalty_gradient_agree_with_the_gaussian() -> None:
+    """KL(N(μ, σ²) ‖ N(0, 1)) and its derivative by μ, which is μ."""
+    torch.manual_seed(0)
+    mean, std = torch.tensor(0.3, requires_grad=True), torch.tensor(0.8)
+    policy, reference = torch.distributions.Normal(mean, std), torch.distributions.Normal(0.0, 1.0)
+    samples = policy.sample((400_000, 1))
+    log_prob = policy.log_prob(samples)
+    exact = torch.distributions.kl_divergence(policy, reference)
+    assert kl_estimate(log_prob, reference.log_prob(samples)).item() == pytest.approx(exact.item(), abs=2e-3)
+    reference_penalty(log_prob, reference.log_prob(samples)).backward()
+    assert mean.grad is not None
+    assert mean.grad.item() == pytest.approx(0.3, abs=0.01)
+
+
+def test_value_iterations_leave_the_policy_alone(make_policy: MakePolicy, pipeline: Pipeline) -> None:
+    policy = make_policy()
+    algorithm, buffer = one_rollout(policy, pipeline, value_iterations=1)
+    before = copy.deepcopy(policy.state_dict())
+    algorithm.improve(buffer, pipeline)
+    changed = {
+        name.split(".")[0]
+        for name, value in policy.state_dict().items()
+        if not torch.equal(value, before[name])
+    }
+    assert changed == {"critic"}
+    algorithm.improve(buffer, pipeline)
+    assert not torch.equal(policy.actor.head.weight, before["actor.head.weight"])
+    reference = algorithm.reference.state_dict()
+    assert all(torch.equal(reference[name], value) for name, value in before.items())
+
+
+def test_updates_stop_at_the_target_kl(make_policy: MakePolicy, pipeline: Pipeline) -> None:
+    algorithm, buffer = one_rollout(make_policy(), pipeline, policy_lr=1e-2, minibatch_size=32, epochs=9)
+    stats = algorithm.improve(buffer, pipeline)
+    assert 1 < stats.extra["updates"] < 9 * 6
+
+
+@pytest.mark.parametrize(("column", "value", "reason"), [
+    ("advantage", torch.nan, "not finite"), ("reference_log_prob", 50.0, "max_reference_kl"),
+])  # fmt: skip
+def test_training_stops_before_a_bad_step(
+    make_policy: MakePolicy, pipeline: Pipeline, column: str, value: float, reason: str
+) -> None:
+    policy = make_policy()
+    algorithm, buffer = one_rollout(policy, pipeline)
+    before = copy.deepcopy(policy.state_dict())
+    shift = torch.full_like(buffer.columns[column], value)
+    buffer.columns[column] = buffer.columns[column] - shift
+    with pytest.raises(TrainingStopped, match=reason):
+        algorithm.update(buffer.minibatches(64, 1, pipeline))
+    assert all(torch.equal(value, before[name]) for name, value in policy.state_dict().items())
+
+
+def test_a_policy_without_log_probs_is_refused() -> None:
+    policy = SimpleNamespace(config=SimpleNamespace(type="act"))
+    with pytest.raises(ValueError, match=r"policy\.type=act"):
+        PPO(policy, PPOConfig())
+
+
+def test_ppo_learns_to_reach(make_policy: MakePolicy, pipeline: Pipeline) -> None:
+    policy = make_policy()
+    env, buffer = PointEnv(64), RolloutBuffer(15, 64, "cpu")
+    algorithm = PPO(policy, PPOConfig(**FAST, reference_coefficient=0.0))
+    rates = []
+    for iteration in range(26):
+        rates.append(collect(env, policy, pipeline, buffer, 64 * iteration)["success_rate"])
+        algorithm.improve(buffer, pipeline)
+    assert max(rates[:2]) < 0.3
+    assert sum(rates[-3:]) / 3 > 0.85, rates
+
+
+def test_the_reference_holds_the_policy(make_policy: MakePolicy, pipeline: Pipeline) -> None:
+    """The same training with a heavy penalty stays nearer to where it began."""
+    distance = {}
+    for coefficient in (0.0, 3.0):
+        torch.manual_seed(0)
+        policy = make_policy()
+        env, buffer = PointEnv(64), RolloutBuffer(15, 64, "cpu")
+        algorithm = PPO(policy, PPOConfig(**FAST, reference_coefficient=coefficient))
+        for iteration in range(6):
+            collect(env, policy, pipeline, buffer, 64 * iteration)
+            stats = algorithm.improve(buffer, pipeline)
+        distance[coefficient] = stats.extra["reference_kl"]
+    assert distance[3.0] < 0.5 * distance[0.0]

@@ -1,0 +1,106 @@
+"""Rollouts keep what happened: rewards at their steps, values of final observations, bytes of images."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lerobot_policy_cnn.modeling_cnn import CnnPolicy
+from lerobot_wmrl.rl.protocol import Pipeline
+from lerobot_wmrl.rl.rollout import ObservationBuffer, RolloutBuffer, collect
+from tests.rl.point_env import PointEnv
+
+HORIZON = 6
+
+
+class Recorder(PointEnv):
+    """Remembers what it was asked and what it answered."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.log: list[dict[str, Any]] = []
+
+    def step(self, action: Tensor) -> Any:
+        shown = self._observe()
+        result = super().step(action)
+        self.log.append({
+            "shown": shown, "action": action, "reward": result[1], "terminated": result[2],
+            "truncated": result[3], "next": result[4].get("final_obs", result[0]),
+        })  # fmt: skip
+        return result
+
+
+def filled(
+    policy: CnnPolicy, pipeline: Pipeline, steps: int = 20, **env: Any
+) -> tuple[Recorder, RolloutBuffer, Any]:
+    world, buffer = Recorder(16, horizon=HORIZON, **env), RolloutBuffer(steps, 16, "cpu")
+    return world, buffer, collect(world, policy, pipeline, buffer, seed=3)
+
+
+def test_every_step_keeps_its_own_outcome(make_policy: Callable[..., CnnPolicy], pipeline: Pipeline) -> None:
+    world, buffer, _ = filled(make_policy(), pipeline)
+    stored = buffer.observations.tensors["observation.state"]
+    for step, seen in enumerate(world.log):
+        assert torch.equal(stored[step], seen["shown"]["observation.state"])
+        assert torch.equal(pipeline.to_action(buffer.raw_action[step]), seen["action"])
+        assert torch.equal(buffer.reward[step], seen["reward"])
+        assert torch.equal(buffer.terminated[step], seen["terminated"])
+        assert torch.equal(buffer.truncated[step], seen["truncated"])
+        assert torch.equal(buffer.success[step], seen["terminated"])
+
+
+def test_the_next_value_is_that_of_the_observation_before_the_reset(
+    make_policy: Callable[..., CnnPolicy], pipeline: Pipeline
+) -> None:
+    policy = make_policy()
+    torch.nn.init.normal_(policy.critic.head.weight)
+    world, buffer, _ = filled(policy, pipeline)
+    with torch.no_grad():
+        expected = torch.stack([policy.value(seen["next"]) for seen in world.log])
+    assert buffer.truncated.any()
+    assert torch.allclose(buffer.next_value, expected, atol=1e-6)
+    following = torch.cat([buffer.value[1:], buffer.value[-1:]])
+    assert not torch.allclose(buffer.next_value[buffer.truncated], following[buffer.truncated], atol=1e-3)
+
+
+def test_success_counts_the_first_episode_of_each_environment() -> None:
+    buffer = RolloutBuffer(6, 2, "cpu")
+    buffer.terminated[1, 0] = buffer.terminated[3, 0] = buffer.truncated[5, 1] = True
+    buffer.success[1, 0] = buffer.success[3, 0] = True
+    statistics = buffer.statistics()
+    assert statistics["success_rate"] == 0.5
+    assert statistics["episode_length"] == 4.0
+
+
+def test_images_and_instructions_survive_as_bytes_and_indices() -> None:
+    buffer, images = ObservationBuffer(2, 3), torch.randint(0, 256, (2, 3, 3, 8, 8)) / 255.0
+    texts = [["push", "pull", "push"], ["lift", "push", "push"]]
+    for step in range(2):
+        buffer.write(step, {"observation.images.wrist": images[step], "task": texts[step]})
+    assert buffer.tensors["observation.images.wrist"].dtype == torch.uint8
+    read = buffer.read(torch.tensor([0, 3, 4]))
+    assert torch.equal(
+        read["observation.images.wrist"], torch.stack([images[0, 0], images[1, 0], images[1, 1]])
+    )
+    assert read["task"] == ["push", "lift", "push"]
+
+
+def test_minibatches_visit_every_step_once_an_epoch(
+    make_policy: Callable[..., CnnPolicy], pipeline: Pipeline
+) -> None:
+    _, buffer, _ = filled(make_policy(), pipeline)
+    buffer.columns = {"row": torch.arange(20 * 16).view(20, 16)}
+    rows = torch.cat([batch["row"] for batch in buffer.minibatches(50, 2, pipeline)])
+    assert torch.equal(rows.sort().values, torch.arange(320).repeat_interleave(2))
+
+
+def test_actions_keep_their_values(make_policy: Callable[..., CnnPolicy], pipeline: Pipeline) -> None:
+    """Continuous actions are stored as sampled: unclipped float32, with the log-probs they had."""
+    policy = make_policy()
+    _, buffer, _ = filled(policy, pipeline, image_size=0)
+    assert buffer.raw_action.dtype == buffer.log_prob.dtype == torch.float32
+    assert (buffer.raw_action.abs() > 1).any()
+    batch = buffer.minibatch(torch.arange(320), pipeline)
+    log_prob = policy.evaluate(batch["observation"], batch["raw_action"])[0]
+    assert torch.allclose(log_prob, batch["log_prob"], atol=1e-5)
