@@ -105,6 +105,8 @@ class RolloutBuffer:
         """V(o_{t+1}): the next row's, or the final observation's where the next row is another episode."""
         following = torch.cat([self.value[1:], last_value[None]])
         self.next_value = torch.where(self.finished, self.final_value, following)
+        if not bool(self.value.isfinite().all()):
+            raise ValueError("rollout: the value is not finite, so neither is what the policy saw or became")
         if not bool(self.next_value.isfinite().all()):
             raise ValueError(
                 "environment: an episode ended without `final_obs` in info, or the value is not finite"

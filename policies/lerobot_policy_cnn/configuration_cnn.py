@@ -38,7 +38,7 @@ class CnnConfig(PreTrainedConfig):
     initial_std: float = 0.5
     min_std: float = 0.05
     max_std: float = 1.0
-    std_lr_factor: float = 10.0
+    std_lr_factor: float = 20.0
     min_state_std: float = 1e-2
     min_action_std: float = 1e-4
     optimizer_lr: float = 1e-3

@@ -87,7 +87,7 @@ class CnnPolicy(PreTrainedPolicy):
             self._widen_range(target)
         mean = self._mean(batch, augment=self.training)
         fit = F.huber_loss(mean, target, reduction="none").mean(dim=1)
-        likelihood = Normal(mean.detach(), self.std()).log_prob(target)
+        likelihood = Normal(mean.detach(), self.std(), validate_args=False).log_prob(target)
         loss = fit - (likelihood * self.varies()).mean(dim=1)
         metrics = {"fit_loss": fit.mean().item(), "std": self.std().mean().item()}
         return (loss.mean() if reduction == "mean" else loss), metrics
@@ -106,13 +106,15 @@ class CnnPolicy(PreTrainedPolicy):
     def sample(self, observation: Observation) -> Sample:
         """Draw actions; `evaluate` gives these log-probs again."""
         mean = self._mean(observation)
-        raw_action = torch.where(self.varies(), Normal(mean, self.std()).sample(), mean).detach()
+        raw_action = torch.where(
+            self.varies(), Normal(mean, self.std(), validate_args=False).sample(), mean
+        ).detach()
         return Sample(raw_action, self._log_prob(mean, raw_action), self.value(observation))
 
     def evaluate(self, observation: Observation, raw_action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """→ log-probs (B, K), entropies (B,), values (B,)"""
         mean = self._mean(observation)
-        entropy = (Normal(mean, self.std()).entropy() * self.varies()).sum(dim=1)
+        entropy = (Normal(mean, self.std(), validate_args=False).entropy() * self.varies()).sum(dim=1)
         return self._log_prob(mean, raw_action), entropy, self.value(observation)
 
     def value(self, observation: Observation) -> Tensor:
@@ -150,7 +152,7 @@ class CnnPolicy(PreTrainedPolicy):
         return torch.where(self.varies(), self.actor(images, state, instructions), self.target_low)
 
     def _log_prob(self, mean: Tensor, raw_action: Tensor) -> Tensor:
-        return Normal(mean, self.std()).log_prob(raw_action) * self.varies()
+        return Normal(mean, self.std(), validate_args=False).log_prob(raw_action) * self.varies()
 
     def _inputs(self, observation: Observation) -> tuple[list[Tensor], Tensor | None, Sequence[str]]:
         """The observation after the preprocessor → images in [0, 1], clamped state, instructions."""

@@ -1,0 +1,100 @@
+"""The training loop resumes bit by bit, and trains on seeds that no evaluation uses."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from lerobot_policy_cnn.modeling_cnn import CnnPolicy
+
+from lerobot_wmrl.constants import EVALUATION_SEED
+from lerobot_wmrl.rl.configuration_ppo import PPOConfig
+from lerobot_wmrl.rl.ppo import PPO, TrainingStopped
+from lerobot_wmrl.rl.protocol import Pipeline
+from lerobot_wmrl.rl.rollout import RolloutBuffer
+from lerobot_wmrl.rl.trainer import Schedule, rollout_seed, train
+from lerobot_wmrl.tracking import read_metrics
+from tests.rl.point_env import PointEnv
+
+MakePolicy = Callable[..., CnnPolicy]
+
+
+class Killed(Exception):
+    """Stands for kill -9: nothing after it runs."""
+
+
+class FailingEnv(PointEnv):
+    """Dies, or answers nonsense, from its `resets`-th reset on."""
+
+    def __init__(self, num_envs: int, horizon: int, resets: int, nonsense: bool = False) -> None:
+        super().__init__(num_envs, horizon)
+        self.left, self.nonsense = resets, nonsense
+
+    def reset(self, **kwargs: object) -> tuple[dict, dict]:
+        self.left -= 1
+        if self.left < 0 and not self.nonsense:
+            raise Killed
+        observation, info = super().reset(**kwargs)
+        if self.left < 0:
+            observation["observation.state"] += torch.nan
+        return observation, info
+
+
+def run(policy: CnnPolicy, pipeline: Pipeline, output_dir: Path, env: PointEnv, iterations: int = 4) -> PPO:
+    """The trainer as the command calls it, from a fixed seed and the same initial policy."""
+    output_dir.mkdir(exist_ok=True)
+    torch.manual_seed(7)
+    algorithm = PPO(policy, PPOConfig(value_iterations=1, minibatch_size=32, policy_lr=1e-3))
+    buffer = RolloutBuffer(6, env.num_envs, "cpu")
+    train(env, algorithm, pipeline, buffer, Schedule(iterations, 1, 0), output_dir, policy.save_pretrained)
+    return algorithm
+
+
+def test_an_interrupted_training_ends_bit_by_bit_where_the_other_does(
+    make_policy: MakePolicy, pipeline: Pipeline, tmp_path: Path
+) -> None:
+    initial = make_policy().state_dict()
+
+    def fresh() -> CnnPolicy:
+        policy = make_policy()
+        policy.load_state_dict(initial)
+        return policy
+
+    whole = run(fresh(), pipeline, tmp_path / "whole", PointEnv(8, 6))
+    with pytest.raises(Killed):
+        run(fresh(), pipeline, tmp_path / "cut", FailingEnv(8, 6, resets=2))
+    torch.rand(5)
+    resumed = run(fresh(), pipeline, tmp_path / "cut", PointEnv(8, 6))
+    for name, value in whole.policy.state_dict().items():
+        assert torch.equal(resumed.policy.state_dict()[name], value), name
+    for name, value in whole.reference.state_dict().items():
+        assert torch.equal(resumed.reference.state_dict()[name], value), name
+    timeless = [
+        [
+            {name: value for name, value in line.items() if not name.endswith("_s")}
+            for line in read_metrics(folder)
+        ]
+        for folder in (tmp_path / "whole", tmp_path / "cut")
+    ]
+    assert timeless[0] == timeless[1]
+    assert [line["step"] for line in timeless[0]] == [1, 2, 3, 4]
+
+
+def test_not_a_number_stops_training_and_the_last_checkpoint_stays(
+    make_policy: MakePolicy, pipeline: Pipeline, tmp_path: Path
+) -> None:
+    with pytest.raises((TrainingStopped, ValueError), match="finite|nan"):
+        run(make_policy(), pipeline, tmp_path, FailingEnv(8, 6, resets=2, nonsense=True))
+    last = tmp_path / "checkpoints" / "last"
+    assert last.resolve().name == "000002"
+    weights = CnnPolicy.from_pretrained(last / "pretrained_model")
+    assert all(value.isfinite().all() for name, value in weights.state_dict().items() if "target" not in name)
+
+
+def test_training_seeds_are_apart_from_evaluation_seeds() -> None:
+    for seed, num_envs in ((0, 64), (900_000, 64), (EVALUATION_SEED - 3, 128)):
+        for iteration in (0, 1, 77, 10_000):
+            first = rollout_seed(seed, iteration, num_envs)
+            assert 0 <= first
+            assert first + num_envs <= EVALUATION_SEED
+    assert rollout_seed(5, 2, 64) != rollout_seed(5, 3, 64)
