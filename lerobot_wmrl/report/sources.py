@@ -44,9 +44,9 @@ def stage_records(output_dir: Path, names: list[str]) -> list[dict[str, Any]]:
 
 
 PPO_PANELS = (
-    (["success_rate", "rollout/success_rate"], "PPO: imagined success"),
-    (["reward", "rollout/reward"], "PPO: reward"),
-    (["kl_to_reference", "approx_kl"], "PPO: distance from the cloned policy"),
+    (["success_rate"], "PPO: imagined success"),
+    (["reward"], "PPO: reward a step"),
+    (["reference_kl"], "PPO: distance from the cloned policy"),
 )
 """Columns of the PPO run's metrics file that the report plots, and their titles."""
 
