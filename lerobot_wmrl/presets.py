@@ -61,6 +61,7 @@ PRESETS: Final[dict[str, dict[str, Flags]]] = {
             "num_envs": 4,
             "iterations": 2,
             "save_freq": 1,
+            "algorithm.type": "ppo",
             "algorithm.value_iterations": 1,
             "algorithm.minibatch_size": 64,
         },
@@ -68,7 +69,7 @@ PRESETS: Final[dict[str, dict[str, Flags]]] = {
         "eval-imagined": {"eval.batch_size": 4},
     },
     "demo": {
-        "record": {"num_episodes": 900, "part_episodes": 25, "num_workers": 2},
+        "record": {"num_episodes": 900, "part_episodes": 30, "num_workers": 2},
         "demo": {
             "stage_preset": "demo",
             "sft_episodes": 12,
@@ -89,6 +90,7 @@ PRESETS: Final[dict[str, dict[str, Flags]]] = {
             "num_envs": 64,
             "iterations": 40,
             "save_freq": 5,
+            "algorithm.type": "ppo",
             "algorithm.initial_std": 0.3,
         },
         "eval": {"eval.batch_size": 2, "eval.use_async_envs": True},

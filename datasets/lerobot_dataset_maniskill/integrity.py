@@ -38,9 +38,11 @@ def parquet_files(root: Path) -> list[Path]:
 
 def video_frames(path: Path) -> int:
     """Frames in a video file, counted by its packets, so that a truncated file shows."""
-    with av.open(str(path)) as container:
-        frames = sum(packet.size > 0 for packet in container.demux(video=0))
-    return frames
+    container = av.open(str(path))
+    try:
+        return sum(packet.size > 0 for packet in container.demux(video=0))
+    finally:
+        container.close()
 
 
 def episode_outcomes(root: Path) -> tuple[np.ndarray, np.ndarray]:

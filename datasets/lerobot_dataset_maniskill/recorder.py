@@ -30,6 +30,8 @@ from lerobot_wmrl.maniskill.renderer import render_backend
 
 CONTENT_FILE = "recording.json"
 POLL_SECONDS = 1.0
+GRACE_SECONDS = 10.0
+"""How long a worker may take to leave when its work is done."""
 
 
 def record(config: RecordConfig) -> None:
@@ -127,6 +129,8 @@ def record_parts(config: RecordConfig, work: Path, parts: list[Part]) -> None:
         worker.start()
     try:
         follow_progress(config, missing, results, workers)
+        for worker in workers:
+            worker.join(GRACE_SECONDS)
     finally:
         for worker in workers:
             worker.terminate()
@@ -168,6 +172,7 @@ def merge(config: RecordConfig, work: Path, parts: list[Part]) -> None:
     aggregate_datasets(
         repo_ids=[config.dataset_id] * len(parts), aggr_repo_id=config.dataset_id,
         roots=[work / part.name for part in parts], aggr_root=merged,
+        concatenate_videos=False, concatenate_data=False,  # appending rewrites the whole file for every part
     )  # fmt: skip
     problem = whole_dataset(merged, config.num_episodes)
     if problem:
