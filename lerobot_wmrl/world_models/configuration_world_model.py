@@ -19,7 +19,7 @@ class WorldModelConfig(RewardModelConfig):
         window: frames the model remembers. clip_length: frames of a training clip.
         patch: side of the square of tokens that forms one transformer token.
         code_width: channels of the convolutions on the token grid.
-        motion_weight: how much more a token counts in the loss when it changes.
+        motion_weight: how much more a token counts in the loss when it moves.
         done_weight, done_positive_weight, state_weight: of the other losses, beside the tokens' one.
         self_forcing: share of input frames replaced by the model's own predictions in training.
         token_noise: share of input code factors moved by one level in training.
@@ -34,7 +34,7 @@ class WorldModelConfig(RewardModelConfig):
     state_size: int = 8
 
     layers: int = 4
-    width: int = 160
+    width: int = 128
     heads: int = 4
     window: int = 48
     clip_length: int = 28

@@ -41,7 +41,7 @@ def test_perfect_predictions_cost_nothing_and_are_for_the_next_frame():
     loss, metrics = next_frame_loss(perfect, CODEBOOK, digits, clip.state, clip, CONFIG)
     assert loss.item() < 1e-6
     assert metrics["token_accuracy"] == 1
-    assert metrics["changed_token_accuracy"] == 1
+    assert metrics["moving_token_accuracy"] == 1
 
 
 def test_unknown_outcomes_do_not_train_done():
