@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 import draccus
+from draccus.utils import ParsingError
 from lerobot.configs import parser
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
@@ -74,6 +75,7 @@ def run_command[Config: "RunConfig"](
             function(cfg)
 
         parsed()
-    except (ValueError, FileNotFoundError) as error:
-        print(f"error: {error}", file=sys.stderr)
+    except (ValueError, FileNotFoundError, ParsingError) as error:
+        reason = error.__cause__ if isinstance(error, ParsingError) and error.__cause__ else error
+        print(f"error: {reason}", file=sys.stderr)
         sys.exit(1)
