@@ -109,7 +109,7 @@ class Simulation:
     def _state(self) -> np.ndarray:
         pose = self.env.agent.tcp._objs[0].entity.pose
         opening = self.env.agent.robot._objs[0].qpos[-1] / GRIPPER_OPEN
-        return np.array([*pose.p, *pose.q, np.clip(opening, 0.0, 1.0)], np.float32)
+        return np.array([*pose.p, *continuous(pose.q), np.clip(opening, 0.0, 1.0)], np.float32)
 
     def _images(self) -> dict[str, np.ndarray]:
         self.env.scene.sub_scenes[0].update_render()
@@ -119,3 +119,11 @@ class Simulation:
             camera.take_picture()
             images[name] = np.ascontiguousarray(camera.get_picture("Color")[..., :3])
         return images
+
+
+def continuous(quaternion: np.ndarray) -> np.ndarray:
+    """q or −q, which are the same rotation: the one nearer to a hand that points down, (0, 1, 0, 0) wxyz.
+
+    Otherwise the sign jumps while nothing moves, and drowns the statistics and whoever learns from them.
+    """
+    return -quaternion if quaternion[1] < 0 else quaternion

@@ -34,6 +34,10 @@ MIN_SPREAD = 1e-3
 """Components that vary less than this are constants, and left alone by normalisation."""
 
 
+STATE_LIMIT = 5.0
+"""In standard deviations."""
+
+
 class Imagined(NamedTuple):
     """One imagined frame of every environment.
 
@@ -115,8 +119,8 @@ class WorldModelRewardModel(PreTrainedRewardModel):
         self.register_buffer(f"{name}_std", std)
 
     def normalize_state(self, state: Tensor) -> Tensor:
-        """Dataset units to zero mean and unit spread."""
-        return (state - self.state_mean) / self.state_std
+        """Dataset units to zero mean and unit spread, clipped: a rare collision must not outweigh the rest."""
+        return ((state - self.state_mean) / self.state_std).clamp(-STATE_LIMIT, STATE_LIMIT)
 
     def condition(self, clip: Clip) -> Condition:
         """Eq. 1's c as tokens for cross-attention."""
