@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 
+from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_wmrl.constants import EVALUATION_SEED
 from lerobot_wmrl.rl.configuration_ppo import PPOConfig
 from lerobot_wmrl.rl.ppo import PPO, TrainingStopped
@@ -83,7 +83,7 @@ def test_an_interrupted_training_ends_bit_by_bit_where_the_other_does(
 def test_not_a_number_stops_training_and_the_last_checkpoint_stays(
     make_policy: MakePolicy, pipeline: Pipeline, tmp_path: Path
 ) -> None:
-    with pytest.raises((TrainingStopped, ValueError), match="finite|nan"):
+    with pytest.raises((TrainingStopped, ValueError), match="not finite"):
         run(make_policy(), pipeline, tmp_path, FailingEnv(8, 6, resets=2, nonsense=True))
     last = tmp_path / "checkpoints" / "last"
     assert last.resolve().name == "000002"
@@ -95,6 +95,6 @@ def test_training_seeds_are_apart_from_evaluation_seeds() -> None:
     for seed, num_envs in ((0, 64), (900_000, 64), (EVALUATION_SEED - 3, 128)):
         for iteration in (0, 1, 77, 10_000):
             first = rollout_seed(seed, iteration, num_envs)
-            assert 0 <= first
+            assert first >= 0
             assert first + num_envs <= EVALUATION_SEED
     assert rollout_seed(5, 2, 64) != rollout_seed(5, 3, 64)

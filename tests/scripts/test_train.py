@@ -8,16 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
-from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import EnvConfig
-from lerobot.policies.factory import make_pre_post_processors
 
-from lerobot_policy_cnn.configuration_cnn import CnnConfig
-from lerobot_policy_cnn.modeling_cnn import CnnPolicy
-from lerobot_wmrl.scripts.train import main
+from lerobot_wmrl.scripts.train import TrainConfig, check_config, main, rollout_length
 from lerobot_wmrl.tracking import read_metrics
+from tests.rl.checkpoints import save_untrained_policy
 from tests.rl.point_env import PointEnv
 
 BIN = Path(sys.executable).parent
@@ -92,64 +88,35 @@ def test_a_finished_training_is_left_alone(
     assert not (tmp_path / "metrics.jsonl").exists()
 
 
-def other_policy(folder: Path, camera: str = "third_view", size: int = 32, actions: int = 3) -> Path:
-    """An untrained policy's checkpoint that wants something else of its environment."""
-    image = PolicyFeature(type=FeatureType.VISUAL, shape=(3, size, size))
-    action = PolicyFeature(type=FeatureType.ACTION, shape=(actions,))
-    config = CnnConfig(
-        device="cpu",
-        input_features={f"observation.images.{camera}": image},
-        output_features={"action": action},
-    )
-    CnnPolicy(config).save_pretrained(folder)
-    stats = {"action": {"mean": torch.zeros(actions), "std": torch.ones(actions)}}
-    for processor in make_pre_post_processors(config, dataset_stats=stats):
-        processor.save_pretrained(folder)
-    return folder
-
-
-@pytest.mark.parametrize(("wants", "message"), [
-    ({"camera": "wrist"}, "needs observation.images.wrist"),
-    ({"size": 64}, r"(3, 64, 64), the environment has (3, 32, 32)"),
-    ({"actions": 5}, "5 action components, the environment 3"),
-])  # fmt: skip
-def test_a_policy_that_does_not_fit_the_environment_is_refused_before_training(
-    wants: dict[str, int], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
-    policy = other_policy(tmp_path / "policy", **wants)
-    output_dir = tmp_path / "rl"
-    with pytest.raises(SystemExit) as stopped:
-        improve(monkeypatch, f"--policy.path={policy}", *POINT, *SHORT, f"--output_dir={output_dir}")
-    assert stopped.value.code == 1
-    assert message in capsys.readouterr().err
-    assert not output_dir.exists()
-
-
 @pytest.mark.parametrize(("flags", "message"), [
-    ([], "--policy.path: give the checkpoint"),
-    (["--policy.path={tmp}/nothing_here"], "nothing_here"),
-    (["--policy.path={tmp}/world_model"], "world_model: no policy can be loaded"),
-    (["--policy.path={tmp}/truncated"], "truncated or of another version"),
-    (["--policy.path={tmp}/whole", "--rollout_steps=2"], "--rollout_steps=2: episodes last up to 4"),
-    (["--policy.path={tmp}/whole", "--output_dir={tmp}/whole"], "holds something else"),
-    (["--policy.path={tmp}/whole", "--num_envs=0"], "--num_envs=0: must be at least 1"),
-    (["--policy.path={tmp}/whole", "--algorithm.clip=0"], "algorithm.clip=0"),
-    (["--policy.path={tmp}/whole", "--algorithm.initial_std=7"], "initial_std=7"),
+    (["--policy.path={tmp}/policy", *POINT], "needs observation.images.wrist, which"),
+    (["--policy.path={tmp}/policy", *POINT, "--output_dir={tmp}/policy"], "holds something else"),
+    (["--policy.path={tmp}/policy", *POINT, "--algorithm.clip=0"], "algorithm.clip=0"),
+    (POINT, "--policy.path: give the checkpoint"),
 ])  # fmt: skip
-def test_bad_input_is_named(
+def test_bad_input_is_named_and_nothing_is_written(
     flags: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
-    weights = other_policy(tmp_path / "whole") / "model.safetensors"
-    truncated = other_policy(tmp_path / "truncated") / "model.safetensors"
-    truncated.write_bytes(weights.read_bytes()[:20_000])
-    (tmp_path / "world_model").mkdir()
-    (tmp_path / "world_model" / "config.json").write_text('{"type": "action_world_model"}')
+    save_untrained_policy(tmp_path / "policy", camera="third_view" if "holds" in message else "wrist")
     before = sorted(tmp_path.rglob("*"))
     given = [flag.format(tmp=tmp_path) for flag in flags]
     with pytest.raises(SystemExit) as stopped:
-        improve(monkeypatch, *POINT, *SHORT, f"--output_dir={tmp_path}/new", *given)
-    assert stopped.value.code != 0
+        improve(monkeypatch, *SHORT, f"--output_dir={tmp_path}/new", *given)
+    assert stopped.value.code == 1
     assert message in capsys.readouterr().err
     assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(("settings", "message"), [
+    ({"env": None}, r"--env\.type"), ({"num_envs": 0}, "--num_envs=0"), ({"seed": -1}, "--seed=-1"),
+])  # fmt: skip
+def test_impossible_settings_are_named(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        check_config(TrainConfig(**{"env": PointConfig(), **settings}))
+
+
+def test_a_rollout_reaches_the_end_of_an_episode() -> None:
+    assert rollout_length(TrainConfig(), longest=4) == 4
+    with pytest.raises(ValueError, match=r"--rollout_steps=2: episodes last up to 4"):
+        rollout_length(TrainConfig(rollout_steps=2), longest=4)

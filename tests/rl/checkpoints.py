@@ -1,0 +1,26 @@
+"""Checkpoints of untrained policies."""
+
+from pathlib import Path
+
+import torch
+from lerobot.configs.types import FeatureType, PolicyFeature
+from lerobot.policies.factory import make_pre_post_processors
+
+from lerobot_policy_cnn.configuration_cnn import CnnConfig
+from lerobot_policy_cnn.modeling_cnn import CnnPolicy
+
+
+def save_untrained_policy(folder: Path, camera: str = "third_view", size: int = 32, actions: int = 3) -> Path:
+    """A policy that sees one camera, with its processors."""
+    image = PolicyFeature(type=FeatureType.VISUAL, shape=(3, size, size))
+    action = PolicyFeature(type=FeatureType.ACTION, shape=(actions,))
+    config = CnnConfig(
+        device="cpu",
+        input_features={f"observation.images.{camera}": image},
+        output_features={"action": action},
+    )
+    CnnPolicy(config).save_pretrained(folder)
+    stats = {"action": {"mean": torch.zeros(actions), "std": torch.ones(actions)}}
+    for processor in make_pre_post_processors(config, dataset_stats=stats):
+        processor.save_pretrained(folder)
+    return folder
