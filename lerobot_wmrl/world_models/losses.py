@@ -38,6 +38,12 @@ def corrupt_digits(digits: Tensor, levels: Tensor, share: float) -> Tensor:
     return (digits + shift * hit).clamp_min(0).minimum(levels - 1)
 
 
+def forced_share(target: float, progress: float) -> float:
+    """Share of input frames to replace after `progress` (0 to 1) of the training: none in the first
+    quarter, when predictions are noise, then rising to `target` at half time."""
+    return target * min(1.0, max(0.0, 4 * progress - 1))
+
+
 def force_predictions(
     guess: Prediction, codebook: CodeBook, digits: Tensor, state: Tensor, share: float
 ) -> tuple[Tensor, Tensor]:

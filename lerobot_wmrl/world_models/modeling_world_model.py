@@ -21,7 +21,7 @@ from lerobot_wmrl.world_models.configuration_world_model import (
 )
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
 from lerobot_wmrl.world_models.goal import imagine_goal, similarity_to_goal
-from lerobot_wmrl.world_models.losses import Clip, corrupt_digits, force_predictions, next_frame_loss
+from lerobot_wmrl.world_models.losses import Clip, corrupt_digits, force_predictions, forced_share, next_frame_loss
 from lerobot_wmrl.world_models.modeling_frame_tokenizer import check_cameras, stack_cameras
 from lerobot_wmrl.world_models.next_frame import NextFrameNetwork, Prediction
 from lerobot_wmrl.world_models.st_transformer import TemporalCache
@@ -75,6 +75,7 @@ class WorldModelRewardModel(PreTrainedRewardModel):
     ) -> None:
         super().__init__(config)
         self.config: Any = config
+        self.training_progress = 1.0
         source = self._adopt_tokenizer() if config.tokenizer_path else None
         if dataset_meta is not None:
             self._adopt_features(dataset_meta.features)
@@ -134,12 +135,11 @@ class WorldModelRewardModel(PreTrainedRewardModel):
             corrupt_digits(digits, self.network.codebook.levels, self.config.token_noise),
             state,
         )
-        if self.config.self_forcing > 0:
+        share = forced_share(self.config.self_forcing, self.training_progress)
+        if share > 0:
             with torch.no_grad():
                 guess = self.network(seen, seen_state, *condition)
-            seen, seen_state = force_predictions(
-                guess, self.network.codebook, seen, seen_state, self.config.self_forcing
-            )
+            seen, seen_state = force_predictions(guess, self.network.codebook, seen, seen_state, share)
         prediction = self.network(seen, seen_state, *condition)
         return next_frame_loss(prediction, self.network.codebook, digits, state, clip, self.config)
 

@@ -90,6 +90,7 @@ def train(
         range(step, cfg.steps), initial=step, total=cfg.steps, desc=f"Training {model.name}", unit="step"
     )
     for _ in progress:
+        model.training_progress = step / cfg.steps
         loss, metrics = loss_function(sampler(step))
         if not torch.isfinite(loss):
             raise ValueError(
