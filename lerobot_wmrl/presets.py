@@ -70,6 +70,10 @@ PRESETS: Final[dict[str, dict[str, Flags]]] = {
     },
     "demo": {
         "record": {"num_episodes": 900, "part_episodes": 30, "num_workers": 2},
+        "train-world-model:frame_tokenizer": {"model.image_size": 64, "steps": 800, "batch_size": 48},
+        "train-world-model:action_world_model": {"steps": 800, "batch_size": 6},
+        "train-world-model:text_world_model": {"model.layers": 3, "steps": 300, "batch_size": 6},
+        "eval-world-model": {},
         "demo": {
             "stage_preset": "demo",
             "sft_episodes": 12,
