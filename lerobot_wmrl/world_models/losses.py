@@ -8,7 +8,6 @@ from torch.nn import functional as F
 
 from lerobot_wmrl.world_models.next_frame import STATE_STEP, CodeBook, Prediction
 
-
 MOTION_LEVELS = 3
 """A token moves when its factors change by so many levels in all; less is mostly the codes' own flicker."""
 

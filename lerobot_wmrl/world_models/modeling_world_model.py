@@ -21,7 +21,13 @@ from lerobot_wmrl.world_models.configuration_world_model import (
 )
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
 from lerobot_wmrl.world_models.goal import imagine_goal, similarity_to_goal
-from lerobot_wmrl.world_models.losses import Clip, corrupt_digits, force_predictions, forced_share, next_frame_loss
+from lerobot_wmrl.world_models.losses import (
+    Clip,
+    corrupt_digits,
+    force_predictions,
+    forced_share,
+    next_frame_loss,
+)
 from lerobot_wmrl.world_models.modeling_frame_tokenizer import check_cameras, stack_cameras
 from lerobot_wmrl.world_models.next_frame import NextFrameNetwork, Prediction
 from lerobot_wmrl.world_models.st_transformer import TemporalCache
@@ -120,7 +126,7 @@ class WorldModelRewardModel(PreTrainedRewardModel):
         self.register_buffer(f"{name}_std", std)
 
     def normalize_state(self, state: Tensor) -> Tensor:
-        """Dataset units to zero mean and unit spread, clipped: a rare collision must not outweigh the rest."""
+        """Dataset units to zero mean and unit spread, clipped: rare collisions must not outweigh the rest."""
         return ((state - self.state_mean) / self.state_std).clamp(-STATE_LIMIT, STATE_LIMIT)
 
     def condition(self, clip: Clip) -> Condition:
