@@ -4,9 +4,9 @@
         --output=docs/results/imagination_speed.json
 
 Both sides do what a policy sees: the world model imagines and decodes the picture, ManiSkill steps the
-physics and renders the same picture. ManiSkill is measured twice: with this package's light robot meshes
-and with the stock ones, which is what a user would render without it. The floor is the network's arithmetic at the
-machine's measured matrix-multiplication rate.
+physics and renders the same picture. ManiSkill is measured twice: with this package's light robot meshes,
+and with the stock ones, which is what a user would render without it. The floor is the network's
+arithmetic at the machine's measured matrix-multiplication rate.
 """
 
 import argparse
