@@ -92,10 +92,11 @@ PRESETS: Final[dict[str, dict[str, Flags]]] = {
         },
         "train": {
             "num_envs": 64,
-            "iterations": 40,
+            "iterations": 25,
             "save_freq": 5,
             "algorithm.type": "ppo",
             "algorithm.initial_std": 0.3,
+            "algorithm.value_iterations": 2,
         },
         "eval": {"eval.batch_size": 2, "eval.use_async_envs": True},
         "eval-imagined": {"eval.batch_size": 50},

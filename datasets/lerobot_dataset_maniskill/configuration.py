@@ -16,7 +16,7 @@ POLICY_KIND = "policy"
 
 def default_kinds() -> dict[str, float]:
     """Shares of the trajectory kinds; they need not sum to 1."""
-    return {"optimal": 0.35, "waypoint": 0.10, "interpolated": 0.07, "disturbed": 0.13, "near_miss": 0.35}
+    return {"optimal": 0.30, "waypoint": 0.08, "interpolated": 0.07, "disturbed": 0.15, "near_miss": 0.40}
 
 
 @dataclass

@@ -174,6 +174,16 @@ def pass_beside(geometry: PushGeometry, rng: np.random.Generator) -> tuple[Waypo
     return (Waypoint(geometry.at(-0.025, sideways), 0.014), Waypoint(geometry.at(far, sideways)))
 
 
+def push_off_centre(geometry: PushGeometry, rng: np.random.Generator) -> tuple[Waypoint, ...]:
+    """A straight push anywhere along the object's back, then a rest: near the edge it turns and slips off.
+
+    This is how a policy fails that has nearly learnt the task, and the world model must not believe it.
+    """
+    sideways = rng.uniform(-1.0, 1.0) * (geometry.spec.half_size[1] + FINGER_HALF_THICKNESS)
+    behind = Waypoint(geometry.at(-0.025, sideways), 0.016)
+    return (behind, Waypoint(geometry.at(Push.distance + rng.uniform(-0.03, 0.03), sideways), 0.001))
+
+
 def stop_short(geometry: PushGeometry, rng: np.random.Generator) -> tuple[Waypoint, ...]:
     """Stops just before contact and stays a while (a tolerance that is never met)."""
     stop = geometry.at(-rng.uniform(0.002, 0.04), rng.normal(0.0, 0.01))
@@ -214,7 +224,9 @@ SUBOPTIMAL: Final[dict[str, Shaper]] = {
     "disturbed": disturbed_push,
     "near_miss": near_miss_push,
 }
-NEAR_MISSES: Final[tuple[Shaper, ...]] = (pass_over, pass_beside, stop_short, push_partly, push_diagonally)
+NEAR_MISSES: Final[tuple[Shaper, ...]] = (
+    pass_over, pass_beside, stop_short, push_partly, push_diagonally, *3 * (push_off_centre,),
+)  # fmt: skip
 
 PLANNERS: Final = {Push.name: plan_push}
 """Task → planner."""

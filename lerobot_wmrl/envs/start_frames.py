@@ -8,7 +8,7 @@ from torch import Tensor
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.world_models.episode_table import choose_episodes, open_dataset, read_episodes
 from lerobot_wmrl.world_models.frame_cache import cached_frames, frames_to_tensor
-from lerobot_wmrl.world_models.goal import imagine_goal
+from lerobot_wmrl.world_models.goal import imagine_goal, similarity
 from lerobot_wmrl.world_models.modeling_world_model import (
     ActionWorldModelRewardModel,
     TextWorldModelRewardModel,
@@ -18,13 +18,16 @@ GOAL_BATCH = 64
 
 
 class Starts(NamedTuple):
-    """K starts: tokens (K, S), proprioception (K, P), instructions, goal features [(K·N, C, h, w)], and
+    """K starts: tokens (K, S), the images they decode to (K, N, 3, H, W), proprioception (K, P),
+    instructions, goal features [(K·N, C, h, w)], the start's similarity to its goal (K,), and
     goal_reached (K,), False where the text model never reached θ."""
 
     tokens: Tensor
+    images: Tensor
     proprioception: Tensor
     instructions: list[str]
     goal_features: list[Tensor]
+    similarity: Tensor
     goal_reached: Tensor
 
 
@@ -54,5 +57,8 @@ def load_starts(
         )
         for i in range(0, len(rows), GOAL_BATCH)
     ]
-    features = model.tokenizer.decode_with_features(torch.cat([goal.tokens for goal in goals])).features
-    return Starts(tokens, state, instructions, features, torch.cat([goal.reached for goal in goals]))
+    goal_features = model.tokenizer.decode_with_features(torch.cat([goal.tokens for goal in goals])).features
+    decoded = model.tokenizer.decode_with_features(tokens)
+    closeness = similarity(decoded.features, goal_features, len(tokens))
+    reached = torch.cat([goal.reached for goal in goals])
+    return Starts(tokens, decoded.images, state, instructions, goal_features, closeness, reached)

@@ -76,10 +76,8 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         self._imagination = self.model.start(tokens, state)
         self._elapsed = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
         self._done_streak = torch.zeros_like(self._elapsed)
-        decoded = self.model.tokenizer.decode_with_features(tokens)
-        self._similarity = self._similarity_to_goal(decoded.features)
-        self._observation = self._observe(decoded.images, state)
-        return self._observation, {}
+        self._similarity = self.starts.similarity[drawn]
+        return self._observe(self.starts.images[drawn], state), {}
 
     @torch.no_grad()
     def step(self, actions: Tensor) -> tuple[Observation, Tensor, Tensor, Tensor, dict[str, Any]]:
@@ -109,7 +107,6 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
             info["final_obs"] = observation
             info["final_info"] = {"is_success": terminated, "episode_length": self._elapsed.clone()}
             observation = self._restart(finished, observation)
-        self._observation = observation
         return observation, reward, terminated, truncated, info
 
     def _advance(self, imagined: Imagined) -> tuple[Tensor, Tensor]:
@@ -127,9 +124,8 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         self.model.restart(self._imagination, mask, tokens, state)
         self._elapsed = self._elapsed.masked_fill(mask, 0)
         self._done_streak = self._done_streak.masked_fill(mask, 0)
-        decoded = self.model.tokenizer.decode_with_features(tokens)
-        self._similarity = torch.where(mask, self._similarity_to_goal(decoded.features), self._similarity)
-        fresh = self._observe(decoded.images, state)
+        self._similarity = torch.where(mask, self.starts.similarity[self._start_index], self._similarity)
+        fresh = self._observe(self.starts.images[self._start_index], state)
         for key, value in observation.items():
             if isinstance(value, Tensor):
                 fresh[key] = torch.where(mask.reshape(-1, *[1] * (value.ndim - 1)), fresh[key], value)
