@@ -23,7 +23,7 @@ from lerobot_wmrl.constants import KINDS, STATE_NAMES
 
 EPISODES, PART = 6, 2
 KIND_SHARES = {"optimal": 0.5, "near_miss": 0.5}
-PATIENCE_S = 240.0
+PATIENCE_S = 480.0
 
 
 def config(root: Path, **fields: object) -> RecordConfig:
