@@ -4,12 +4,14 @@ import numpy as np
 import pytest
 
 from lerobot_dataset_maniskill.planner import (
+    FINGER_HALF_THICKNESS,
     NEAR_MISSES,
     SUBOPTIMAL,
     Follower,
     PushGeometry,
     pass_over,
     plan_push,
+    push_off_centre,
     push_partly,
     stop_short,
 )
@@ -62,10 +64,15 @@ def test_an_optimal_plan_goes_behind_the_object_and_then_straight_through_its_pl
         assert not actions[:, 3:6].any()
 
 
-def test_near_misses_come_in_all_five_forms_around_the_push() -> None:
+def test_near_misses_come_in_all_forms_around_the_push() -> None:
     geometry = PushGeometry(SPEC, start(0))
     rng = np.random.default_rng(0)
-    assert len(NEAR_MISSES) == 5
+    assert len(set(NEAR_MISSES)) == 6
+    edge = SPEC.half_size[1] + FINGER_HALF_THICKNESS
+    offsets = [push_off_centre(geometry, rng)[-1].position[1] - geometry.at(0.0)[1] for _ in range(100)]
+    assert np.abs(offsets).max() <= edge
+    assert min(offsets) < -0.7 * edge
+    assert max(offsets) > 0.7 * edge
     for _ in range(50):
         over = pass_over(geometry, rng)
         assert min(w.position[2] for w in over) > 2 * SPEC.half_size[2] - 0.01
