@@ -9,6 +9,18 @@ from typing import Final
 
 Flags = Mapping[str, str | int | float | bool]
 
+TINY_WORLD_MODEL: Final[Flags] = {
+    "model.layers": 1,
+    "model.width": 32,
+    "model.heads": 2,
+    "model.clip_length": 12,
+    "model.code_width": 16,
+    "steps": 16,
+    "batch_size": 4,
+    "save_freq": 8,
+    "log_freq": 5,
+}
+
 PRESETS: Final[dict[str, dict[str, Flags]]] = {
     "tiny": {
         "record": {"num_episodes": 24, "part_episodes": 8, "num_workers": 2},
@@ -20,28 +32,8 @@ PRESETS: Final[dict[str, dict[str, Flags]]] = {
             "save_freq": 10,
             "log_freq": 5,
         },
-        "train-world-model:action_world_model": {
-            "model.layers": 1,
-            "model.width": 32,
-            "model.heads": 2,
-            "model.clip_length": 12,
-            "model.code_width": 16,
-            "steps": 16,
-            "batch_size": 4,
-            "save_freq": 8,
-            "log_freq": 5,
-        },
-        "train-world-model:text_world_model": {
-            "model.layers": 1,
-            "model.width": 32,
-            "model.heads": 2,
-            "model.clip_length": 12,
-            "model.code_width": 16,
-            "steps": 16,
-            "batch_size": 4,
-            "save_freq": 8,
-            "log_freq": 5,
-        },
+        "train-world-model:action_world_model": TINY_WORLD_MODEL,
+        "train-world-model:text_world_model": TINY_WORLD_MODEL,
         "eval-world-model": {"max_episodes": 8},
         "demo": {
             "stage_preset": "tiny",

@@ -2,12 +2,13 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from lerobot.configs import parser
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 
+from lerobot_wmrl.command import RunConfig
 from lerobot_wmrl.constants import EVALUATION_SEED, KINDS
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 
@@ -20,7 +21,7 @@ def default_kinds() -> dict[str, float]:
 
 
 @dataclass
-class RecordConfig:
+class RecordConfig(RunConfig):
     """Record trajectories in ManiSkill as a LeRobotDataset.
 
     Planned trajectories by default; with --policy.path=… the real rollouts of that policy. The same command
@@ -41,6 +42,8 @@ class RecordConfig:
         private: publish it privately.
         list_scenes: print the table of scenes and stop.
     """
+
+    path_fields: ClassVar[list[str]] = ["policy"]
 
     output_dir: Path | None = None
     repo_id: str | None = None
@@ -68,11 +71,6 @@ class RecordConfig:
             overrides = parser.get_cli_overrides("policy") or []
             self.policy = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
             self.policy.pretrained_path = Path(path)
-
-    @classmethod
-    def __get_path_fields__(cls) -> list[str]:
-        """Lets LeRobot's parser accept --policy.path=…."""
-        return ["policy"]
 
     def validate(self) -> None:
         """ValueError that names the field, its value and the remedy."""

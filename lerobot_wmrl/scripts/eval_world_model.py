@@ -12,8 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lerobot_wmrl.scripts.command import RunConfig, run_command
-from lerobot_wmrl.scripts.train_world_model import DatasetSource
+from lerobot_wmrl.command import DatasetSource, RunConfig, run_command
 
 if TYPE_CHECKING:
     from lerobot_wmrl.world_models.evaluation import Replay

@@ -17,8 +17,8 @@ from lerobot.configs import PreTrainedConfig, parser
 from lerobot.envs.configs import EnvConfig
 from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 
+from lerobot_wmrl.command import RunConfig, claim_output_dir, run_command
 from lerobot_wmrl.rl.configuration_ppo import PPOConfig
-from lerobot_wmrl.scripts.command import RunConfig, claim_output_dir, run_command
 
 
 @dataclass

@@ -14,16 +14,8 @@ from pathlib import Path
 import draccus
 from lerobot.configs.rewards import RewardModelConfig
 
-from lerobot_wmrl.scripts.command import RunConfig, claim_output_dir, run_command
+from lerobot_wmrl.command import DatasetSource, RunConfig, claim_output_dir, run_command
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
-
-
-@dataclass
-class DatasetSource:
-    """Where the data is: `root`, the dataset's folder, and optionally its `repo_id` on the hub."""
-
-    root: str = ""
-    repo_id: str | None = None
 
 
 @dataclass

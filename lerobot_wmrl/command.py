@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import draccus
 from draccus.utils import ParsingError
@@ -17,7 +17,6 @@ from lerobot.utils.utils import init_logging
 from lerobot_wmrl.presets import expand_preset
 
 CONFIG_FILE = "train_config.json"
-Config = TypeVar("Config", bound="RunConfig")
 
 
 @dataclass
@@ -35,6 +34,14 @@ class RunConfig:
         """Write the configuration as LeRobot does, `train_config.json`."""
         folder.mkdir(parents=True, exist_ok=True)
         (folder / CONFIG_FILE).write_text(json.dumps(draccus.encode(self), indent=4))
+
+
+@dataclass
+class DatasetSource:
+    """Where the data is: `root`, the dataset's folder, and optionally its `repo_id` on the hub."""
+
+    root: str = ""
+    repo_id: str | None = None
 
 
 def claim_output_dir(output_dir: Path, config: dict[str, Any]) -> None:
@@ -60,7 +67,7 @@ def claim_output_dir(output_dir: Path, config: dict[str, Any]) -> None:
     partial.replace(marker)
 
 
-def run_command[Config: "RunConfig"](
+def run_command[Config: RunConfig](
     function: Callable[[Config], None], config_class: type[Config], command: str
 ) -> None:
     """Parse the command line for `function`, run it, and turn bad input into one clear line, exit code 1."""
