@@ -17,6 +17,8 @@ from lerobot.configs.rewards import RewardModelConfig
 from lerobot_wmrl.command import DatasetSource, RunConfig, claim_output_dir, run_command
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
 
+TRAINED = ("frame_tokenizer", "action_world_model", "text_world_model")
+
 
 @dataclass
 class TrainWorldModelConfig(RunConfig):
@@ -49,6 +51,8 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
     from lerobot_wmrl.world_models.episode_table import open_dataset, read_episodes
     from lerobot_wmrl.world_models.training import build_model, make_sampler, train
 
+    if cfg.model.type not in TRAINED:
+        raise ValueError(f"--model.type={cfg.model.type}: this command trains {', '.join(TRAINED)}")
     table = read_episodes(open_dataset(cfg.dataset.root, cfg.dataset.repo_id))
     set_seed(cfg.seed)
     given = draccus.encode(cfg)

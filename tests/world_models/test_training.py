@@ -7,6 +7,7 @@ import torch
 from lerobot.configs.rewards import RewardModelConfig
 from safetensors.torch import load_file
 
+from lerobot_wmrl.rewards.configuration_general import GeneralConfig
 from lerobot_wmrl.tracking import read_metrics
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.clips import ClipSampler
@@ -125,6 +126,8 @@ def test_wrong_input_is_named(small_dataset, trained_models, tmp_path):
     config.tokenizer_path = None
     with pytest.raises(ValueError, match="image_size=128"):
         run_training(config, root, tmp_path / "c")
+    with pytest.raises(ValueError, match="type=general: this command trains frame_tokenizer"):
+        run_training(GeneralConfig(device="cpu"), root, tmp_path / "d")
     assert not (tmp_path / "a").exists()
     (tmp_path / "foreign").mkdir()
     (tmp_path / "foreign" / "thesis.txt").write_text("precious")
