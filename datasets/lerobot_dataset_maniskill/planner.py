@@ -28,6 +28,10 @@ CLOSED: Final = -1.0
 TURNED: Final = ("waypoint", "disturbed")
 """Kinds whose rotations and gripper commands are disturbed too."""
 
+CALM_SHARE: Final = {"waypoint": 0.3, "interpolated": 0.3, "disturbed": 0.5, "near_miss": 0.6}
+"""Share of each suboptimal kind that moves as evenly as the optimal trajectories do. If only good episodes
+were calm, a world model would take calm actions for success: a cloned policy is calm when it fails, too."""
+
 LOWEST: Final = 0.012
 """The fingertips stay this far above the table (m)."""
 
@@ -117,10 +121,12 @@ def plan_push(kind: str, spec: ObjectSpec, start: Start, rng: np.random.Generato
     geometry = PushGeometry(spec, start)
     if kind == "optimal":
         return Plan(essential_push(geometry), speed=OPTIMAL_SPEED)
-    noise = Noise(rng.uniform(0.0, 0.015))
-    if kind in TURNED:
-        noise = Noise(noise.position, rng.uniform(0.0, 0.05), rng.uniform(0.0, 0.3))
-    plan = Plan((), rng.uniform(0.55, 1.0) * TOP_SPEED, noise)
+    plan = Plan((), OPTIMAL_SPEED)
+    if rng.random() >= CALM_SHARE[kind]:
+        noise = Noise(rng.uniform(0.0, 0.015))
+        if kind in TURNED:
+            noise = Noise(noise.position, rng.uniform(0.0, 0.05), rng.uniform(0.0, 0.3))
+        plan = Plan((), rng.uniform(0.55, 1.0) * TOP_SPEED, noise)
     return replace(plan, waypoints=SUBOPTIMAL[kind](geometry, rng))
 
 
@@ -147,10 +153,12 @@ def disturbed_push(geometry: PushGeometry, rng: np.random.Generator) -> tuple[Wa
 
 
 def near_miss_push(geometry: PushGeometry, rng: np.random.Generator) -> tuple[Waypoint, ...]:
-    """Nearly a push: over, beside, short of, not far enough, or too much to one side."""
-    miss = NEAR_MISSES[int(rng.integers(len(NEAR_MISSES)))]
+    """Nearly a push: over, beside, short of, not far enough, or too much to one side; then rest or leave."""
+    miss = NEAR_MISSES[int(rng.integers(len(NEAR_MISSES)))](geometry, rng)
+    if rng.random() < 0.5:
+        return miss
     afterwards = geometry.at(rng.uniform(-0.08, 0.1), rng.uniform(-0.1, 0.1), rng.uniform(0.03, 0.16))
-    return (*miss(geometry, rng), Waypoint(afterwards, 0.02))
+    return (*miss, Waypoint(afterwards, 0.02))
 
 
 def pass_over(geometry: PushGeometry, rng: np.random.Generator) -> tuple[Waypoint, ...]:

@@ -6,8 +6,10 @@ import pytest
 from lerobot_dataset_maniskill.planner import (
     FINGER_HALF_THICKNESS,
     NEAR_MISSES,
+    OPTIMAL_SPEED,
     SUBOPTIMAL,
     Follower,
+    Noise,
     PushGeometry,
     pass_over,
     plan_push,
@@ -87,3 +89,11 @@ def test_suboptimal_actions_differ_in_how_noisy_they_are() -> None:
     ]
     assert min(sigmas) < 0.003
     assert max(sigmas) > 0.012
+
+
+def test_calm_motion_does_not_give_success_away() -> None:
+    """Episodes that fail are as often as even as those that succeed, or a world model learns the evenness."""
+    plans = [plan_push("near_miss", SPEC, start(seed), np.random.default_rng(seed)) for seed in range(200)]
+    calm = [plan for plan in plans if plan.noise == Noise() and plan.speed == OPTIMAL_SPEED]
+    assert 0.5 < len(calm) / len(plans) < 0.7
+    assert plan_push("optimal", SPEC, start(0), np.random.default_rng(0)).speed == OPTIMAL_SPEED
