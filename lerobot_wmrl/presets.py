@@ -84,9 +84,10 @@ PRESETS: Final[dict[str, dict[str, Flags]]] = {
         },
         "train": {
             "num_envs": 64,
-            "iterations": 25,
+            "iterations": 20,
             "save_freq": 5,
             "algorithm.type": "ppo",
+            "algorithm.epochs": 2,
             "algorithm.initial_std": 0.3,
             "algorithm.value_iterations": 2,
         },
