@@ -108,6 +108,7 @@ def main() -> None:
     figures = {
         "machine": platform.processor() or platform.machine(),
         "threads": torch.get_num_threads(),
+        "maniskill_processes": 1,
         "image_size": model.config.image_size,
         "imagined_frames_per_s": round(imagined, 1),
         "maniskill_frames_per_s": round(light, 1),
