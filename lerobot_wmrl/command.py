@@ -14,6 +14,7 @@ from lerobot.configs import parser
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
 
+from lerobot_wmrl.files import write_json
 from lerobot_wmrl.presets import expand_preset
 
 CONFIG_FILE = "train_config.json"
@@ -32,8 +33,7 @@ class RunConfig:
 
     def save_pretrained(self, folder: Path) -> None:
         """Write the configuration as LeRobot does, `train_config.json`."""
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / CONFIG_FILE).write_text(json.dumps(draccus.encode(self), indent=4))
+        write_json(folder / CONFIG_FILE, draccus.encode(self))
 
 
 @dataclass
@@ -47,7 +47,7 @@ class DatasetSource:
 def claim_output_dir(output_dir: Path, config: dict[str, Any]) -> None:
     """Mark a new folder as this run's, or recognise it. ValueError if it holds something else.
 
-    `output_dir` and device may differ between the first call and its continuation; nothing else may.
+    Only `output_dir` may differ between the first call and its continuation: a run may be moved.
     """
     marker = output_dir / CONFIG_FILE
     if marker.is_file():
@@ -61,10 +61,7 @@ def claim_output_dir(output_dir: Path, config: dict[str, Any]) -> None:
         return
     if output_dir.is_dir() and any(output_dir.iterdir()):
         raise ValueError(f"output_dir={output_dir} holds something else; choose a new folder")
-    output_dir.mkdir(parents=True, exist_ok=True)
-    partial = marker.with_suffix(".partial")
-    partial.write_text(json.dumps(config, indent=4))
-    partial.replace(marker)
+    write_json(marker, config)
 
 
 def run_command[Config: RunConfig](

@@ -155,11 +155,8 @@ def make_world_model_env(config: WorldModelEnv, n_envs: int, device: str) -> Wor
     """Load both world models and the start frames. ValueError says which of them does not fit."""
     model = load_model(config.world_model_path, "action_world_model", device)
     text_model = load_model(config.text_world_model_path, "text_world_model", device)
-    same = all(
-        torch.equal(a, b)
-        for a, b in zip(model.tokenizer.parameters(), text_model.tokenizer.parameters(), strict=True)
-        if a.shape == b.shape
-    )
+    own, other = model.tokenizer.state_dict(), text_model.tokenizer.state_dict()
+    same = own.keys() == other.keys() and all(torch.equal(own[name], other[name]) for name in own)
     if not same:
         raise ValueError(
             f"text_world_model_path={config.text_world_model_path}: trained on another tokenizer than "

@@ -54,11 +54,10 @@ def open_dataset(root: str | Path, repo_id: str | None = None) -> LeRobotDataset
 
 def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
     """Read the columns that models train on. ValueError names a missing column."""
+    if ACTION not in dataset.features:
+        raise ValueError(f"dataset {dataset.repo_id}: the feature {ACTION!r} is missing")
     columns = [ACTION, "episode_index"]
     columns += [name for name in (OBS_STATE, "next.done", "start.kind") if name in dataset.features]
-    for needed in (ACTION,):
-        if needed not in dataset.features:
-            raise ValueError(f"dataset {dataset.repo_id}: the feature {needed!r} is missing")
     rows = dataset.hf_dataset.with_format("numpy", columns=columns)[:]
     frames = len(rows["episode_index"])
     _, start, length = np.unique(rows["episode_index"], return_index=True, return_counts=True)

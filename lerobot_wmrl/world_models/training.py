@@ -45,7 +45,7 @@ def make_sampler(
 ) -> ClipSampler | FrameSampler:
     """Batches for this kind of model from the episodes that are not held out."""
     config: Any = model.config
-    episodes = ~table.validation if len(table.start) > 1 else ~table.validation | True
+    episodes = ~table.validation
     if model.name == "frame_tokenizer":
         frames = cached_frames(table.dataset, config.camera_keys)
         return FrameSampler(
