@@ -17,6 +17,10 @@ ACTION_LOW: Final = (-0.05, -0.05, -0.05, -0.25, -0.25, -0.25, -1.0)
 ACTION_HIGH: Final = (0.05, 0.05, 0.05, 0.25, 0.25, 0.25, 1.0)
 """The one action box: both environments clip to it, the recorder never exceeds it."""
 
+WORKSPACE_FLOOR: Final = 0.015
+"""The simulator moves the TCP no lower (m), as a real robot's controller would. At 0.009 the fingertips
+scrape over the table, and how they stick and slip there can be neither learnt nor repeated."""
+
 TASKS: Final = ("push", "pull", "pick_place", "move_to_aim")
 """Vocabulary of the column `start.task`."""
 

@@ -38,6 +38,7 @@ PRESETS: Final[dict[str, dict[str, Flags]]] = {
         "demo": {
             "stage_preset": "tiny",
             "sft_episodes": 3,
+            "explore_episodes": 4,
             "eval_episodes": 4,
             "rollout_episodes": 4,
         },
@@ -61,14 +62,31 @@ PRESETS: Final[dict[str, dict[str, Flags]]] = {
         "eval-imagined": {"eval.batch_size": 4},
     },
     "demo": {
-        "record": {"num_episodes": 900, "part_episodes": 30, "num_workers": 2},
-        "train-world-model:frame_tokenizer": {"model.image_size": 64, "steps": 800, "batch_size": 48},
-        "train-world-model:action_world_model": {"steps": 800, "batch_size": 6},
-        "train-world-model:text_world_model": {"model.layers": 3, "steps": 300, "batch_size": 6},
+        "record": {"num_episodes": 600, "part_episodes": 30, "num_workers": 2},
+        "train-world-model:frame_tokenizer": {
+            "model.image_size": 64,
+            "steps": 800,
+            "batch_size": 48,
+            "save_freq": 100,
+        },
+        "train-world-model:action_world_model": {
+            "model.patch": 4,
+            "steps": 1600,
+            "batch_size": 6,
+            "save_freq": 100,
+        },
+        "train-world-model:text_world_model": {
+            "model.patch": 4,
+            "model.layers": 3,
+            "steps": 400,
+            "batch_size": 6,
+            "save_freq": 100,
+        },
         "eval-world-model": {},
         "demo": {
             "stage_preset": "demo",
             "sft_episodes": 12,
+            "explore_episodes": 240,
             "eval_episodes": 100,
             "rollout_episodes": 60,
         },

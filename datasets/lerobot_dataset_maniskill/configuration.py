@@ -37,7 +37,8 @@ class RecordConfig(RunConfig):
         num_workers: simulating processes.
         part_episodes: episodes a sub-dataset, the piece of work an interruption can cost each worker.
         policy: a LeRobot policy to roll out, given as --policy.path=….
-        stochastic: sample from the policy where it can be sampled, instead of its best action.
+        exploration: largest standard deviation of the noise added to a policy's translations, as a share of
+            the action box; each episode draws its own level up to it, and the noise lasts a while.
         push_to_hub: publish the dataset as repo_id when it is complete.
         private: publish it privately.
         list_scenes: print the table of scenes and stop.
@@ -54,7 +55,7 @@ class RecordConfig(RunConfig):
     num_workers: int = 2
     part_episodes: int = 20
     policy: PreTrainedConfig | None = None
-    stochastic: bool = False
+    exploration: float = 0.0
     push_to_hub: bool = False
     private: bool = False
     list_scenes: bool = False
@@ -85,6 +86,10 @@ class RecordConfig(RunConfig):
             raise ValueError(
                 f"--seed={self.seed}: the seeds of planned trajectories are from 0 to {EVALUATION_SEED - 1}; "
                 "those above are for evaluation"
+            )
+        if not 0 <= self.exploration <= 1 or (self.exploration and self.policy is None):
+            raise ValueError(
+                f"--exploration={self.exploration}: a share of the action box, 0 to 1, for --policy.path only"
             )
         self._validate_kinds()
         self.env.selected_scenes()
@@ -123,5 +128,5 @@ class RecordConfig(RunConfig):
             "seed": self.seed,
             "kinds": self.kinds if self.policy is None else {POLICY_KIND: 1.0},
             "policy": None if self.policy is None else str(self.policy.pretrained_path),
-            "stochastic": self.stochastic,
+            "exploration": self.exploration,
         }

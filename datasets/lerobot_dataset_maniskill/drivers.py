@@ -14,6 +14,9 @@ from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.maniskill.objects import OBJECTS
 from lerobot_wmrl.maniskill.simulation import Frame, Simulation
 
+NOISE_MEMORY = 0.9
+"""Autocorrelation of exploration noise from one step to the next: it lasts about ten steps."""
+
 
 class Driver(Protocol):
     """Chooses actions (7,) float32 inside the action box."""
@@ -38,10 +41,30 @@ class PlannerDriver:
         return self.follower.act(simulation.tcp_position)
 
 
-class PolicyDriver:
-    """A LeRobot policy with its own pre- and postprocessors; samples where the policy offers `sample`."""
+class ExplorationNoise:
+    """A first-order autoregressive walk on the translations, its level drawn once an episode.
 
-    def __init__(self, config: PreTrainedConfig, env: WmrlManiSkillEnv, stochastic: bool) -> None:
+    Independent noise averages out within a few steps; this leads an episode away from the policy's path,
+    to where the policy will be once it has changed.
+    """
+
+    def __init__(self, largest: float, seed: int) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.level = self.rng.uniform(0.0, largest) * np.array(ACTION_HIGH[:3])
+        self.state = self.rng.normal(size=3)
+
+    def __call__(self) -> np.ndarray:
+        """What to add to the next action: (3,) metres."""
+        offset = self.level * self.state
+        fresh = np.sqrt(1.0 - NOISE_MEMORY**2) * self.rng.normal(size=3)
+        self.state = NOISE_MEMORY * self.state + fresh
+        return offset
+
+
+class PolicyDriver:
+    """A LeRobot policy with its own pre- and postprocessors, and noise on its actions if asked for."""
+
+    def __init__(self, config: PreTrainedConfig, env: WmrlManiSkillEnv, exploration: float) -> None:
         from lerobot.policies.factory import make_policy, make_pre_post_processors
 
         self.policy: Any = make_policy(cfg=config, env_cfg=env).eval()
@@ -49,14 +72,11 @@ class PolicyDriver:
             config, pretrained_path=str(config.pretrained_path),
             preprocessor_overrides={"device_processor": {"device": str(config.device)}},
         )  # fmt: skip
-        self.stochastic = stochastic
-        if stochastic and not hasattr(self.policy, "sample"):
-            raise ValueError(
-                f"--stochastic=true: the policy {config.type} cannot be sampled; leave the flag out"
-            )
+        self.exploration = exploration
 
     def begin(self, simulation: Simulation, plan: EpisodePlan) -> None:
         torch.manual_seed(plan.seed)
+        self.noise = ExplorationNoise(self.exploration, plan.seed)
         self.policy.reset()
         self.preprocess.reset()
         self.postprocess.reset()
@@ -64,8 +84,8 @@ class PolicyDriver:
     @torch.no_grad()
     def act(self, simulation: Simulation, frame: Frame) -> np.ndarray:
         batch = self.preprocess(policy_observation(frame, simulation.instruction))
-        raw = self.policy.sample(batch).raw_action if self.stochastic else self.policy.select_action(batch)
-        action = self.postprocess(raw).squeeze(0).cpu().numpy()
+        action = self.postprocess(self.policy.select_action(batch)).squeeze(0).cpu().numpy()
+        action[:3] += self.noise()
         return np.clip(action, ACTION_LOW, ACTION_HIGH).astype(np.float32)
 
 

@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW
+from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, WORKSPACE_FLOOR
 from lerobot_wmrl.maniskill.objects import ObjectSpec
 from lerobot_wmrl.maniskill.tasks import Push, Start
 
@@ -32,8 +32,8 @@ CALM_SHARE: Final = {"waypoint": 0.3, "interpolated": 0.3, "disturbed": 0.5, "ne
 """Share of each suboptimal kind that moves as evenly as the optimal trajectories do. If only good episodes
 were calm, a world model would take calm actions for success: a cloned policy is calm when it fails, too."""
 
-LOWEST: Final = 0.012
-"""The fingertips stay this far above the table (m)."""
+MARGIN: Final = 0.04
+"""How much further than success demands a good push aims (m), so that a cloned policy stops no hair early."""
 
 
 @dataclass(frozen=True)
@@ -108,12 +108,12 @@ class PushGeometry:
         """TCP position such that, touching, the object has moved by `forward` from its start."""
         x, y = self.start.object_xy
         z = self.height if height is None else height
-        return np.array([x + forward - self.reach, y + sideways, max(z, LOWEST)])
+        return np.array([x + forward - self.reach, y + sideways, max(z, WORKSPACE_FLOOR)])
 
 
-def essential_push(geometry: PushGeometry, distance: float = Push.distance + 0.015) -> tuple[Waypoint, ...]:
-    """Behind the object, then forward by `distance`."""
-    return (Waypoint(geometry.at(-0.025), 0.016), Waypoint(geometry.at(distance), 0.006))
+def essential_push(geometry: PushGeometry) -> tuple[Waypoint, ...]:
+    """Behind the object, then forward, further than need be."""
+    return (Waypoint(geometry.at(-0.025), 0.016), Waypoint(geometry.at(Push.distance + MARGIN), 0.006))
 
 
 def plan_push(kind: str, spec: ObjectSpec, start: Start, rng: np.random.Generator) -> Plan:
@@ -222,7 +222,7 @@ def _jittered(
 
 
 def _above_table(position: np.ndarray) -> np.ndarray:
-    return np.array([position[0], position[1], max(position[2], LOWEST)])
+    return np.array([position[0], position[1], max(position[2], WORKSPACE_FLOOR)])
 
 
 Shaper = Callable[[PushGeometry, np.random.Generator], tuple[Waypoint, ...]]

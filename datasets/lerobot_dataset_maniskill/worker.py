@@ -37,7 +37,7 @@ class PartRecorder:
         self.config, self.folder, self.horizon = config, folder, env.horizon
         self.simulation = env.create_simulation()
         self.driver: Driver = (
-            PlannerDriver() if config.policy is None else PolicyDriver(config.policy, env, config.stochastic)
+            PlannerDriver() if config.policy is None else PolicyDriver(config.policy, env, config.exploration)
         )
 
     def record(self, part: Part, report: Report) -> None:

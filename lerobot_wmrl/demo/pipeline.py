@@ -9,8 +9,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from lerobot_wmrl.demo.process import run_measured
-from lerobot_wmrl.demo.stages import DemoConfig, Stage, executable
+from lerobot_wmrl.demo.process import preload, run_measured
+from lerobot_wmrl.demo.stages import DemoConfig, Stage
 from lerobot_wmrl.files import write_json
 
 MARKER = "demo.json"
@@ -80,7 +80,8 @@ def run_stage(stage: Stage, heading: str, output_dir: Path, record: dict[str, An
     print(f"\n{heading}\n$ {shlex.join(command)}", flush=True)
     log = output_dir / "logs" / f"{stage.name}.log"
     log.parent.mkdir(parents=True, exist_ok=True)
-    status = run_measured(executable(command), log, save)
+    preload()
+    status = run_measured(command, log, save)
     if status != 0:
         raise StageError(
             f"{stage.title}: exit status {status}. Its output is in {log}; run the demo again to continue."

@@ -1,7 +1,6 @@
 """The stages of the demo: which command each one runs, as a user would type it."""
 
 import shutil
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -14,8 +13,14 @@ from lerobot_wmrl.presets import Flags, format_flags, preset_flags
 SEED_STRIDE = 100_000
 """Demo seed s records and trains with seeds from s·SEED_STRIDE on, below EVALUATION_SEED."""
 
+EXPLORATION_SEED = SEED_STRIDE // 2
+"""Offset of the seeds with which the cloned policy gathers experience for the world models."""
+
 ROLLOUT_SEED = EVALUATION_SEED + SEED_STRIDE
 """First seed of the rollouts replayed in the world model: neither trained on nor used for a success rate."""
+
+EXPLORATION = 0.4
+"""Largest noise on the cloned policy's actions while it gathers experience, as a share of the action box."""
 
 
 @dataclass
@@ -29,6 +34,7 @@ class DemoConfig:
         seed: of recording, training and PPO; the evaluation seeds stay the same.
         stage_preset: the --preset that each stage's command gets.
         sft_episodes: optimal episodes the first policy is cloned from.
+        explore_episodes: episodes of that policy, disturbed, that the world models learn from as well.
         eval_episodes: held-out episodes of each success rate.
         rollout_episodes: real episodes of each policy that are replayed in the world model.
     """
@@ -37,6 +43,7 @@ class DemoConfig:
     seed: int = 0
     stage_preset: str = "demo"
     sft_episodes: int = 12
+    explore_episodes: int = 240
     eval_episodes: int = 100
     rollout_episodes: int = 60
 
@@ -47,7 +54,7 @@ class DemoConfig:
             raise ValueError(
                 f"--seed={self.seed}: must be from 0 to {last}, so that no evaluation seed is trained on"
             )
-        for name in ("sft_episodes", "eval_episodes", "rollout_episodes"):
+        for name in ("sft_episodes", "explore_episodes", "eval_episodes", "rollout_episodes"):
             if getattr(self, name) < 1:
                 raise ValueError(f"--{name}={getattr(self, name)}: must be at least 1")
 
@@ -64,7 +71,10 @@ class Stage:
 def demo_stages(config: DemoConfig) -> list[Stage]:
     """Every stage in order. Paths are relative to where the demo runs, so that each line can be copied."""
     return [
-        Stage("record", "Record trajectories in ManiSkill", partial(record, config)),
+        Stage("record", "Record planned trajectories in ManiSkill", partial(record, config)),
+        Stage("sft", "Clone a policy from a few optimal episodes", partial(clone, config)),
+        Stage("explore", "Record that policy's disturbed attempts", partial(explore, config)),
+        Stage("merge", "Merge both recordings", partial(merge, config)),
         *(
             Stage(model, f"Train the {model.replace('_', ' ')}", partial(train_model, config, model))
             for model in ("frame_tokenizer", "action_world_model", "text_world_model")
@@ -74,7 +84,6 @@ def demo_stages(config: DemoConfig) -> list[Stage]:
             "Replay held-out recordings in it",
             partial(replay, config, "dataset", "held_out"),
         ),
-        Stage("sft", "Clone a policy from a few optimal episodes", partial(clone, config)),
         *measurements(config, "sft", "cloned policy"),
         Stage("rl", "Improve it by PPO inside the world model", partial(reinforce, config)),
         *measurements(config, "rl", "PPO policy"),
@@ -111,7 +120,7 @@ def ours(config: DemoConfig, program: str, flags: Flags) -> list[str]:
 
 
 def record(config: DemoConfig) -> list[str]:
-    flags: Flags = {"output_dir": str(config.output_dir / "dataset"), "seed": first_seed(config)}
+    flags: Flags = {"output_dir": str(config.output_dir / "planned"), "seed": first_seed(config)}
     return ours(config, "lerobot-wmrl-record", flags)
 
 
@@ -129,7 +138,7 @@ def train_model(config: DemoConfig, model: str) -> list[str]:
 
 def clone(config: DemoConfig) -> list[str]:
     """LeRobot's own training. It continues by other flags, and refuses a folder without checkpoints."""
-    folder, dataset = config.output_dir / "sft", config.output_dir / "dataset"
+    folder, dataset = config.output_dir / "sft", config.output_dir / "planned"
     if (folder / "checkpoints" / "last").exists():
         resume: Flags = {"config_path": str(checkpoint(folder) / "train_config.json"), "resume": True}
         return ["lerobot-train", *format_flags(resume)]
@@ -191,14 +200,41 @@ def success_rate(config: DemoConfig, policy: str, env: Flags, preset: str, folde
 
 
 def record_policy(config: DemoConfig, policy: str) -> list[str]:
+    """Held-out episodes of a policy, as it acts."""
+    folder = config.output_dir / f"rollouts_{policy}"
+    return roll_out(config, policy, folder, config.rollout_episodes, ROLLOUT_SEED)
+
+
+def explore(config: DemoConfig) -> list[str]:
+    """The world models must know how a cloned policy fails, not only how planners do."""
+    seed = first_seed(config) + EXPLORATION_SEED
+    command = roll_out(config, "sft", config.output_dir / "explored", config.explore_episodes, seed)
+    return [*command, f"--exploration={EXPLORATION}"]
+
+
+def roll_out(config: DemoConfig, policy: str, folder: Path, episodes: int, seed: int) -> list[str]:
     flags: Flags = {
         "policy.path": str(checkpoint(config.output_dir / policy)),
         "env.type": "wmrl_maniskill",
-        "num_episodes": config.rollout_episodes,
-        "output_dir": str(config.output_dir / f"rollouts_{policy}"),
-        "seed": ROLLOUT_SEED,
+        "num_episodes": episodes,
+        "output_dir": str(folder),
+        "seed": seed,
     }
     return ours(config, "lerobot-wmrl-record", flags)
+
+
+def merge(config: DemoConfig) -> list[str]:
+    """LeRobot's own tool. It refuses a folder that an interrupted call left."""
+    target, names = config.output_dir / "dataset", ("planned", "explored")
+    shutil.rmtree(target, ignore_errors=True)
+    flags: Flags = {
+        "new_repo_id": "local/dataset",
+        "new_root": str(target),
+        "operation.type": "merge",
+        "operation.repo_ids": str([f"local/{name}" for name in names]),
+        "operation.roots": str([str(config.output_dir / name) for name in names]),
+    }
+    return ["lerobot-edit-dataset", *format_flags(flags)]
 
 
 def replay(config: DemoConfig, dataset: str, name: str) -> list[str]:
@@ -212,8 +248,3 @@ def replay(config: DemoConfig, dataset: str, name: str) -> list[str]:
         "output_dir": str(out / f"replay_{name}"),
     }
     return ours(config, "lerobot-wmrl-eval-world-model", flags)
-
-
-def executable(command: list[str]) -> list[str]:
-    """The command by its path beside this interpreter: the shell may not have activated the environment."""
-    return [str(Path(sys.executable).parent / command[0]), *command[1:]]

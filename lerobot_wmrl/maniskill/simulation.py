@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW
+from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, WORKSPACE_FLOOR
 from lerobot_wmrl.maniskill.objects import OBJECTS
 from lerobot_wmrl.maniskill.renderer import render_backend
 from lerobot_wmrl.maniskill.scenes import Scene
@@ -75,8 +75,9 @@ class Simulation:
         return self._frame()
 
     def step(self, action: np.ndarray) -> Frame:
-        """Apply one action (7,), clipped to the action box, for one control step."""
+        """Apply one action (7,), clipped to the action box and to the workspace, for one control step."""
         clipped = np.clip(np.asarray(action, np.float32), self._low, self._high)
+        clipped[2] = max(clipped[2], WORKSPACE_FLOOR - self.tcp_position[2])
         self.env.step(torch.from_numpy(clipped)[None])
         return self._frame()
 

@@ -11,6 +11,9 @@ from lerobot_wmrl.world_models.next_frame import STATE_STEP, CodeBook, Predictio
 MOTION_LEVELS = 3
 """A token moves when its factors change by so many levels in all; less is mostly the codes' own flicker."""
 
+STATE_PRECISION = 0.1
+"""Where the state loss turns from squared to absolute, in `STATE_STEP`s: about a millimetre of the TCP."""
+
 
 class Clip(NamedTuple):
     """Rows t = 0 … T − 1 of an episode: what is seen, what is done, and what that leads to.
@@ -68,7 +71,8 @@ def next_frame_loss(
     token_loss = (codebook.cross_entropy(logits, target) * weight).sum() / weight.sum().clamp_min(1)
     state_error = (prediction.proprioception[:, :-1] - state[:, 1:]) / STATE_STEP
     state_loss = (
-        F.smooth_l1_loss(state_error, torch.zeros_like(state_error), reduction="none") * valid
+        F.smooth_l1_loss(state_error, torch.zeros_like(state_error), reduction="none", beta=STATE_PRECISION)
+        * valid
     ).sum()
     state_loss = state_loss / (valid.sum() * max(1, state.shape[-1])).clamp_min(1)
     done_loss = masked_done_loss(prediction.done_logit, clip, config.done_positive_weight)

@@ -124,11 +124,19 @@ class FrameHead(nn.Module):
         return logits, F.softplus(gate)
 
 
+def pooled(condition: Tensor, mask: Tensor | None) -> Tensor:
+    """Mean of the condition tokens (B, T or 1, M, D) that mask (B, 1, 1, 1, M) keeps. → (B, T or 1, D)"""
+    if mask is None:
+        return condition.mean(2)
+    kept = mask[:, :, 0, 0, :, None].to(condition.dtype)
+    return (condition * kept).sum(2) / kept.sum(2).clamp_min(1)
+
+
 class NextFrameNetwork(nn.Module):
     """Embeds frames, runs the transformer, reads the three predictions.
 
-    A register token a frame carries the proprioceptive state, looks at all visual tokens, and is where
-    done and the next state are read from.
+    A register token a frame carries the proprioceptive state and the mean of the condition, looks at all
+    visual tokens, and is where done and the next state are read from.
 
     Args:
         levels: FSQ levels. grid: side of a camera's token grid. num_cameras: grids a frame.
@@ -161,14 +169,14 @@ class NextFrameNetwork(nn.Module):
         self, digits: Tensor, state: Tensor, condition: Tensor, mask: Tensor | None = None
     ) -> Prediction:
         """Teacher-forced pass. digits (B, T, S, C), state (B, T, P), condition (B, T or 1, M, D)."""
-        x, local = self._embed(digits, state)
+        x, local = self._embed(digits, state, pooled(condition, mask))
         return self._read(self.transformer(x, condition, mask), local, digits, state)
 
     def step(
         self, digits: Tensor, state: Tensor, condition: Tensor, mask: Tensor | None, cache: TemporalCache
     ) -> Prediction:
         """The same for one new frame (T = 1) against the cache."""
-        x, local = self._embed(digits, state)
+        x, local = self._embed(digits, state, pooled(condition, mask))
         return self._read(self.transformer.step(x, condition, mask, cache), local, digits, state)
 
     def _grids(self, per_token: Tensor) -> Tensor:
@@ -176,11 +184,11 @@ class NextFrameNetwork(nn.Module):
         grids = per_token.unflatten(2, (self.num_cameras, self.grid, self.grid))
         return grids.flatten(0, 2).permute(0, 3, 1, 2)
 
-    def _embed(self, digits: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+    def _embed(self, digits: Tensor, state: Tensor, condition: Tensor) -> tuple[Tensor, Tensor]:
         batch, time = digits.shape[:2]
         tokens, local = self.embedding(self._grids(self.codebook.values(digits)))
         tokens = tokens.unflatten(0, (batch, time, self.num_cameras)) + self.camera
-        register = (self.register + self.state_in(state))[:, :, None]
+        register = (self.register + self.state_in(state) + condition)[:, :, None]
         return torch.cat([register, tokens.flatten(2, 3)], 2), local
 
     def _read(self, x: Tensor, local: Tensor, digits: Tensor, state: Tensor) -> Prediction:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from transforms3d.quaternions import qconjugate, qmult, quat2axangle
 
-from lerobot_wmrl.constants import ACTION_HIGH
+from lerobot_wmrl.constants import ACTION_HIGH, WORKSPACE_FLOOR
 from lerobot_wmrl.maniskill import renderer
 from lerobot_wmrl.maniskill.scenes import SCENES
 from lerobot_wmrl.maniskill.simulation import Simulation
@@ -49,6 +49,14 @@ def test_a_translation_moves_the_gripper_along_that_base_axis(
     moved = after[:3] - before[:3]
     assert sign * moved[axis] > 0.008
     assert np.abs(np.delete(moved, axis)).max() < 0.3 * abs(moved[axis])
+
+
+def test_the_gripper_stops_above_the_table(simulation: Simulation) -> None:
+    """However hard it is pushed down, so that the fingertips never scrape."""
+    simulation.reset(SCENES[0], 0)
+    heights = [simulation.step(command(2, -0.05)).state[2] for _ in range(20)]
+    assert min(heights) > WORKSPACE_FLOOR - 0.002
+    assert heights[-1] < WORKSPACE_FLOOR + 0.004
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])

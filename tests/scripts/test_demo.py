@@ -95,7 +95,8 @@ def test_the_dataset_reopens_and_holds_successes_and_failures(outputs: tuple[Pat
 
 def test_no_held_out_seed_is_trained_on(outputs: tuple[Path, str]) -> None:
     demo, _ = outputs
-    assert episode_table(demo / "dataset")["seed"].max() < EVALUATION_SEED
+    for dataset in ("planned", "explored", "dataset"):
+        assert episode_table(demo / dataset)["seed"].max() < EVALUATION_SEED
     for policy in ("sft", "rl"):
         rollouts = episode_table(demo / f"rollouts_{policy}")["seed"]
         evaluated = range(EVALUATION_SEED, EVALUATION_SEED + int(PRESETS["tiny"]["demo"]["eval_episodes"]))
