@@ -41,7 +41,7 @@ def preload() -> None:
         importlib.import_module(module)
 
 
-def entry_point(program: str) -> Callable[[], object]:
+def entry_point(program: str) -> Callable[[], int | None]:
     """The function that the console command `program` calls. ValueError if no package installs it."""
     found = importlib.metadata.entry_points(group="console_scripts", name=program)
     if not found:
