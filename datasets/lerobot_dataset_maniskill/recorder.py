@@ -20,11 +20,12 @@ from tqdm import tqdm
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.drivers import check_policy
-from lerobot_dataset_maniskill.integrity import episode_outcomes, whole_dataset
+from lerobot_dataset_maniskill.integrity import whole_dataset
 from lerobot_dataset_maniskill.manifest import Part, planned_parts
 from lerobot_dataset_maniskill.worker import EpisodeResult, serve_parts
 from lerobot_dataset_maniskill.writer import VOCABULARY_FILE, write_card, write_vocabulary
 from lerobot_wmrl.constants import KINDS
+from lerobot_wmrl.episodes import episode_table
 from lerobot_wmrl.files import write_json
 from lerobot_wmrl.maniskill.renderer import render_backend
 
@@ -187,7 +188,8 @@ def merge(config: RecordConfig, work: Path, parts: list[Part]) -> None:
 
 def success_by_kind(root: Path) -> dict[str, tuple[int, int]]:
     """Kind → (successful episodes, episodes)."""
-    kinds, success = episode_outcomes(root)
+    table = episode_table(root)
+    kinds, success = table["kind"], table["success"]
     return {
         name: (int(success[kinds == index].sum()), int(np.sum(kinds == index)))
         for index, name in enumerate(KINDS)

@@ -6,6 +6,7 @@ Forking from a process that has imported the libraries saves every stage the 8 s
 import ctypes
 import importlib
 import importlib.metadata
+import logging
 import multiprocessing
 import os
 import select
@@ -36,7 +37,8 @@ Report = Callable[[float, int], None]
 
 
 def preload() -> None:
-    """Import what every stage needs, once."""
+    """Import what every stage needs, once, and spare the reader a page about FFmpeg from each of them."""
+    logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
     for module in PRELOADED:
         importlib.import_module(module)
 

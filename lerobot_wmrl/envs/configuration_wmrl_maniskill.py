@@ -10,7 +10,7 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
-from lerobot_wmrl.constants import ACTION_NAMES, CAMERAS, FPS, STATE_NAMES
+from lerobot_wmrl.constants import ACTION_NAMES, CAMERAS, FPS, ROBOT_MESH_DETAIL, STATE_NAMES
 from lerobot_wmrl.maniskill.scenes import Scene, scenes_of
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ class WmrlManiSkillEnv(EnvConfig):
     cameras: list[str] = field(default_factory=lambda: ["third_view"])
     image_size: int = 64
     episode_length: int | None = None
-    robot_mesh_detail: float = 0.04
+    robot_mesh_detail: float = ROBOT_MESH_DETAIL
     fps: int = FPS
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(default_factory=dict)

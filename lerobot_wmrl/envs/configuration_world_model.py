@@ -9,22 +9,20 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
+from lerobot_wmrl.command import DatasetSource
 from lerobot_wmrl.constants import FPS
 from lerobot_wmrl.rewards.configuration_general import GeneralConfig
 
 
 @dataclass
-class StartFrames:
+class StartFrames(DatasetSource):
     """Where imagined episodes begin: the first frames of a LeRobotDataset's episodes.
 
     Args:
-        root, repo_id: the dataset.
         split: `train` (what the world model was trained on), `validation` (held out) or `all`.
         max_starts: at most so many episodes, drawn evenly; each needs a goal frame.
     """
 
-    root: str = ""
-    repo_id: str | None = None
     split: str = "all"
     max_starts: int = 256
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, WORKSPACE_FLOOR
+from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, ROBOT_MESH_DETAIL, WORKSPACE_FLOOR
 from lerobot_wmrl.maniskill.objects import OBJECTS
 from lerobot_wmrl.maniskill.renderer import render_backend
 from lerobot_wmrl.maniskill.scenes import Scene
@@ -15,8 +15,6 @@ from lerobot_wmrl.maniskill.tasks import Situation, Start, Task
 
 GRIPPER_OPEN = 0.04
 """Finger joint position (m) of the open gripper."""
-
-ROBOT_MESH_DETAIL = 0.04
 
 
 @dataclass(frozen=True)

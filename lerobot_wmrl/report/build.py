@@ -8,8 +8,8 @@ import jinja2
 import numpy as np
 
 from lerobot_wmrl.constants import KINDS
-from lerobot_wmrl.demo.episodes import episode_table
 from lerobot_wmrl.demo.stages import DemoConfig
+from lerobot_wmrl.episodes import episode_table
 from lerobot_wmrl.files import write_json, write_text
 from lerobot_wmrl.report import figures, sources
 from lerobot_wmrl.report.pictures import EPISODES, picture_sections

@@ -54,14 +54,15 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
     if cfg.model.type not in TRAINED:
         raise ValueError(f"--model.type={cfg.model.type}: this command trains {', '.join(TRAINED)}")
     table = read_episodes(open_dataset(cfg.dataset.root, cfg.dataset.repo_id))
-    set_seed(cfg.seed)
     given = draccus.encode(cfg)
-    model = build_model(cfg.model, table, cfg.output_dir)
-    claim_output_dir(cfg.output_dir, given)
     checkpoint = latest_checkpoint(cfg.output_dir)
     if checkpoint is not None and int(checkpoint.name) >= cfg.steps:
+        claim_output_dir(cfg.output_dir, given)
         print(f"{cfg.output_dir}: already trained for {cfg.steps} steps")
         return
+    set_seed(cfg.seed)
+    model = build_model(cfg.model, table, cfg.output_dir)
+    claim_output_dir(cfg.output_dir, given)
     sampler = make_sampler(model, table, cfg.batch_size, cfg.seed)
     train(model, sampler, cfg, cfg.save_pretrained)
 

@@ -15,11 +15,12 @@ import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
-from lerobot_dataset_maniskill.integrity import episode_outcomes, whole_dataset
+from lerobot_dataset_maniskill.integrity import whole_dataset
 from lerobot_dataset_maniskill.manifest import planned_parts
 from lerobot_dataset_maniskill.recorder import missing_parts, record
 from lerobot_dataset_maniskill.writer import HOLD_FRAMES
 from lerobot_wmrl.constants import KINDS, STATE_NAMES
+from lerobot_wmrl.episodes import episode_table
 
 EPISODES, PART = 6, 2
 KIND_SHARES = {"optimal": 0.5, "near_miss": 0.5}
@@ -103,7 +104,8 @@ def test_an_optimal_episode_holds_success_a_failure_is_truncated(dataset: LeRobo
     episode, done = column(dataset, "episode_index"), column(dataset, "next.done").ravel()
     truncated, success = column(dataset, "next.truncated").ravel(), column(dataset, "next.success").ravel()
     assert np.array_equal(done, success)
-    kinds, wins = episode_outcomes(Path(dataset.root))
+    table = episode_table(Path(dataset.root))
+    kinds, wins = table["kind"], table["success"]
     assert wins[kinds == KINDS.index("optimal")].all()
     for index, won in enumerate(wins):
         rows = np.flatnonzero(episode == index)

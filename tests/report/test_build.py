@@ -11,8 +11,9 @@ import pytest
 from PIL import Image
 
 from lerobot_wmrl.constants import KINDS
-from lerobot_wmrl.demo.episodes import episode_table, optimal_episodes
+from lerobot_wmrl.demo.episodes import optimal_episodes
 from lerobot_wmrl.demo.stages import DemoConfig, demo_stages
+from lerobot_wmrl.episodes import episode_table
 from lerobot_wmrl.files import write_json
 from lerobot_wmrl.report.build import verdict, write_report
 from lerobot_wmrl.statistics import Proportion

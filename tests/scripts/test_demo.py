@@ -12,8 +12,8 @@ import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wmrl.constants import EVALUATION_SEED
-from lerobot_wmrl.demo.episodes import episode_table
 from lerobot_wmrl.demo.stages import DemoConfig, demo_stages
+from lerobot_wmrl.episodes import episode_table
 from lerobot_wmrl.presets import PRESETS
 from lerobot_wmrl.tracking import read_metrics
 

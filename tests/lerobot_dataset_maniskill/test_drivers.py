@@ -1,0 +1,45 @@
+"""The noise that leads a policy's episodes off their path."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lerobot_dataset_maniskill.configuration import RecordConfig
+from lerobot_dataset_maniskill.drivers import ExplorationNoise
+from lerobot_wmrl.constants import ACTION_HIGH
+
+STEPS = 400
+
+
+def walk(largest: float, seed: int) -> np.ndarray:
+    noise = ExplorationNoise(largest, seed)
+    return np.array([noise() for _ in range(STEPS)]) / ACTION_HIGH[:3]
+
+
+def test_a_seed_gives_its_noise_again() -> None:
+    assert np.array_equal(walk(0.4, 7), walk(0.4, 7))
+    assert not np.array_equal(walk(0.4, 7), walk(0.4, 8))
+
+
+def test_without_exploration_nothing_is_added() -> None:
+    assert not walk(0.0, 3).any()
+
+
+def test_episodes_have_their_own_level_below_the_largest() -> None:
+    levels = np.array([walk(0.4, seed).std() for seed in range(60)])
+    assert levels.max() < 0.4 * 1.4
+    assert levels.min() < 0.08
+    assert levels.max() > 0.25
+
+
+def test_noise_lasts_about_ten_steps() -> None:
+    path = np.concatenate([walk(0.4, seed) for seed in range(20)])
+    along, later = path[:-1].ravel(), path[1:].ravel()
+    assert 0.8 < np.corrcoef(along, later)[0, 1] < 0.97
+
+
+@pytest.mark.parametrize("exploration", [-0.1, 1.5, 0.3])
+def test_a_share_outside_the_box_or_without_a_policy_is_refused(exploration: float, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=rf"--exploration={exploration}: .*--policy\.path only"):
+        RecordConfig(output_dir=tmp_path, exploration=exploration).validate()
