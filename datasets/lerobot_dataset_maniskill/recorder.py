@@ -3,8 +3,6 @@
 import fcntl
 import json
 import logging
-import multiprocessing
-import os
 import queue
 import shutil
 from collections import Counter
@@ -27,6 +25,7 @@ from lerobot_dataset_maniskill.writer import VOCABULARY_FILE, write_card, write_
 from lerobot_wmrl.constants import KINDS
 from lerobot_wmrl.episodes import episode_table
 from lerobot_wmrl.files import write_json
+from lerobot_wmrl.maniskill.processes import simulating_context
 from lerobot_wmrl.maniskill.renderer import render_backend
 
 CONTENT_FILE = "recording.json"
@@ -119,12 +118,12 @@ def record_parts(config: RecordConfig, work: Path, parts: list[Part]) -> None:
     missing = missing_parts(work, parts)
     if not missing:
         return
-    context = multiprocessing.get_context("spawn")  # fork hangs once a renderer exists
+    context = simulating_context()
     jobs, results = context.Queue(), context.Queue()
     count = min(config.num_workers, len(missing))
     for item in [*missing, *[None] * count]:
         jobs.put(item)
-    arguments = (config, work, jobs, results, os.getpid())
+    arguments = (config, work, jobs, results)
     workers = [context.Process(target=serve_parts, args=arguments, daemon=True) for _ in range(count)]
     for worker in workers:
         worker.start()

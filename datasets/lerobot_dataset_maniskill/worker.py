@@ -72,15 +72,19 @@ class PartRecorder:
         return succeeded, frames
 
 
-def serve_parts(config: RecordConfig, folder: Path, parts: Any, results: Any, parent: int) -> None:
-    """A worker process: take parts from the queue until None comes, or until the parent is gone."""
+def serve_parts(config: RecordConfig, folder: Path, parts: Any, results: Any) -> None:
+    """A worker process: take parts from the queue until None comes, or until the command is gone.
+
+    The command's end ends the server that this process was forked from, and so changes its parent.
+    """
     import torch
 
     torch.set_num_threads(1)
+    server = os.getppid()
     silence_libraries()
 
     def report(result: EpisodeResult) -> None:
-        if os.getppid() != parent:
+        if os.getppid() != server:
             os._exit(1)
         results.put(result)
 

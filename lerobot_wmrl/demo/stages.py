@@ -233,6 +233,8 @@ def merge(config: DemoConfig) -> list[str]:
         "operation.type": "merge",
         "operation.repo_ids": str([f"local/{name}" for name in names]),
         "operation.roots": str([str(config.output_dir / name) for name in names]),
+        "operation.concatenate_videos": False,
+        "operation.concatenate_data": False,
     }
     return ["lerobot-edit-dataset", *format_flags(flags)]
 

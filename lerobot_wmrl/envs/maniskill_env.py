@@ -10,6 +10,7 @@ from lerobot.envs.utils import FreezeAfterEpisodeEnd
 
 from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, EVALUATION_SEED, FPS, STATE_NAMES
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.maniskill.processes import simulating_context
 from lerobot_wmrl.maniskill.scenes import scene_for_seed
 from lerobot_wmrl.maniskill.simulation import Frame
 
@@ -103,6 +104,7 @@ def make_vector_env(
 ) -> gym.vector.VectorEnv:
     """`n_envs` environments with SAME_STEP autoreset, in processes of their own if `use_async_envs`."""
     factories = [partial(make_env, config, freeze)] * n_envs
-    if use_async_envs and n_envs > 1:  # spawn: fork hangs once a renderer exists
-        return AsyncVectorEnv(factories, context="spawn", autoreset_mode=AutoresetMode.SAME_STEP)
+    if use_async_envs and n_envs > 1:
+        context = simulating_context().get_start_method()
+        return AsyncVectorEnv(factories, context=context, autoreset_mode=AutoresetMode.SAME_STEP)
     return SyncVectorEnv(factories, autoreset_mode=AutoresetMode.SAME_STEP)

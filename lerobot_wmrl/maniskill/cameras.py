@@ -1,4 +1,9 @@
-"""Cameras, chosen so that the gripper's height, lateral offset and contact show in one small picture."""
+"""Cameras, chosen so that what decides an episode shows in one small picture.
+
+The third view looks back at the robot from the front, steeply: how far the gripper is to the object's side is a
+distance in the picture, and a pushed object comes towards the camera, in front of the hand. From an oblique
+view a gripper that passes before the object looks like one that pushes it, and world models believed it.
+"""
 
 from typing import Any
 
@@ -8,8 +13,8 @@ from mani_skill.utils import sapien_utils
 
 from lerobot_wmrl.constants import CAMERAS
 
-THIRD_VIEW_EYE = (0.55, 0.42, 0.50)
-THIRD_VIEW_TARGET = (-0.02, -0.005, 0.05)
+THIRD_VIEW_EYE = (0.52, 0.0, 0.60)
+THIRD_VIEW_TARGET = (0.0, -0.035, 0.035)
 THIRD_VIEW_FOV = 0.53
 WRIST_POSITION = (0.08, 0.0, 0.0)
 WRIST_QUATERNION = (0.5736, 0.0, -0.8192, 0.0)

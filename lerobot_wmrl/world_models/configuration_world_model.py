@@ -21,7 +21,7 @@ class WorldModelConfig(RewardModelConfig):
         code_width: channels of the convolutions on the token grid.
         motion_weight: how much more a token counts in the loss when it moves.
         done_weight, done_positive_weight, state_weight: of the other losses, beside the tokens' one.
-        self_forcing: share of training clips seen as the model imagines them from their first frame.
+        self_forcing: share of input frames replaced by the model's own predictions in training.
         token_noise: share of input code factors moved by one level in training.
         temperature: of sampling in imagination; 0 takes the most likely code.
     """

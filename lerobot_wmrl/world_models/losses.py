@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from lerobot_wmrl.world_models.next_frame import STATE_STEP, CodeBook, NextFrameNetwork, Prediction
+from lerobot_wmrl.world_models.next_frame import STATE_STEP, CodeBook, Prediction
 
 MOTION_LEVELS = 3
 """A token moves when its factors change by so many levels in all; less is mostly the codes' own flicker."""
@@ -41,29 +41,20 @@ def corrupt_digits(digits: Tensor, levels: Tensor, share: float) -> Tensor:
 
 
 def forced_share(target: float, progress: float) -> float:
-    """Share of clips to imagine after `progress` (0 to 1) of the training: none in the first quarter, when
-    predictions are noise, then rising to `target` at half time."""
+    """Share of input frames to replace after `progress` (0 to 1) of the training: none in the first
+    quarter, when predictions are noise, then rising to `target` at half time."""
     return target * min(1.0, max(0.0, 4 * progress - 1))
 
 
-@torch.no_grad()
-def imagine_clips(
-    network: NextFrameNetwork, digits: Tensor, state: Tensor, condition: Tensor, mask: Tensor | None
+def force_predictions(
+    guess: Prediction, codebook: CodeBook, digits: Tensor, state: Tensor, share: float
 ) -> tuple[Tensor, Tensor]:
-    """Clips as the network imagines them from their first frame: digits (B, T, S, C), state (B, T, P).
-
-    Trained on its own imagination with the real frames as targets, a model learns not to drift (Venkatraman
-    et al. 2015, "data as demonstrator").
-    """
-    batch, time = digits.shape[:2]
-    cache = network.transformer.make_cache(batch, network.transformer_tokens, digits.device, state.dtype)
-    frames, states = [digits[:, :1]], [state[:, :1]]
-    for step in range(time - 1):
-        given = condition[:, step : step + 1] if condition.shape[1] > 1 else condition
-        prediction = network.step(frames[-1], states[-1], given, mask, cache)
-        frames.append(network.codebook.sample(prediction.logits, 0.0, None))
-        states.append(prediction.proprioception)
-    return torch.cat(frames, 1), torch.cat(states, 1)
+    """Scheduled sampling in parallel: replace a share of the input frames by one-pass predictions of them."""
+    predicted = codebook.sample(guess.logits[:, :-1], 0.0, None)
+    swap = torch.rand(digits.shape[:2], device=digits.device)[:, 1:] < share
+    frames = torch.where(swap[..., None, None], predicted, digits[:, 1:])
+    states = torch.where(swap[..., None], guess.proprioception[:, :-1], state[:, 1:])
+    return torch.cat([digits[:, :1], frames], 1), torch.cat([state[:, :1], states], 1)
 
 
 def next_frame_loss(

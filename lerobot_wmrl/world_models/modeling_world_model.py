@@ -24,8 +24,8 @@ from lerobot_wmrl.world_models.goal import imagine_goal, similarity_to_goal
 from lerobot_wmrl.world_models.losses import (
     Clip,
     corrupt_digits,
+    force_predictions,
     forced_share,
-    imagine_clips,
     next_frame_loss,
 )
 from lerobot_wmrl.world_models.modeling_frame_tokenizer import check_cameras, stack_cameras
@@ -134,18 +134,19 @@ class WorldModelRewardModel(PreTrainedRewardModel):
         raise NotImplementedError
 
     def loss(self, clip: Clip) -> tuple[Tensor, dict[str, float]]:
-        """Eqs. 2-4 on clips of tokens; a part of them is seen as the model itself imagines them."""
-        condition, mask = self.condition(clip)
+        """Eqs. 2-4 on a clip of tokens, with part of the inputs replaced by the model's own predictions."""
+        condition = self.condition(clip)
         digits, state = self.network.codebook.digits(clip.tokens), self.normalize_state(clip.state)
-        seen = corrupt_digits(digits, self.network.codebook.levels, self.config.token_noise)
-        seen_state = state
+        seen, seen_state = (
+            corrupt_digits(digits, self.network.codebook.levels, self.config.token_noise),
+            state,
+        )
         share = forced_share(self.config.self_forcing, self.training_progress)
-        rows = (torch.rand(len(digits)) < share).nonzero()[:, 0].to(digits.device)
-        if len(rows):
-            kept = None if mask is None else mask[rows]
-            imagined = imagine_clips(self.network, digits[rows], state[rows], condition[rows], kept)
-            seen, seen_state = seen.index_copy(0, rows, imagined[0]), state.index_copy(0, rows, imagined[1])
-        prediction = self.network(seen, seen_state, condition, mask)
+        if share > 0:
+            with torch.no_grad():
+                guess = self.network(seen, seen_state, *condition)
+            seen, seen_state = force_predictions(guess, self.network.codebook, seen, seen_state, share)
+        prediction = self.network(seen, seen_state, *condition)
         return next_frame_loss(prediction, self.network.codebook, digits, state, clip, self.config)
 
     def forward(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, float]]:

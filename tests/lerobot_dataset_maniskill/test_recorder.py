@@ -41,7 +41,7 @@ def start_and_kill(root: Path) -> Path:
     deadline = time.monotonic() + PATIENCE_S
     while not (work / "part-00000").exists() and time.monotonic() < deadline and command.poll() is None:
         time.sleep(0.02)
-    workers = psutil.Process(command.pid).children()
+    workers = psutil.Process(command.pid).children(recursive=True)
     os.kill(command.pid, signal.SIGKILL)
     command.wait()
     _, alive = psutil.wait_procs(workers, timeout=60)

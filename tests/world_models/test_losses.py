@@ -2,7 +2,7 @@ from types import SimpleNamespace
 
 import torch
 
-from lerobot_wmrl.world_models.losses import Clip, corrupt_digits, forced_share, next_frame_loss
+from lerobot_wmrl.world_models.losses import Clip, corrupt_digits, force_predictions, next_frame_loss
 from lerobot_wmrl.world_models.next_frame import CodeBook, Prediction
 
 CONFIG = SimpleNamespace(motion_weight=3.0, done_weight=1.0, done_positive_weight=2.0, state_weight=1.0)
@@ -51,9 +51,13 @@ def test_unknown_outcomes_do_not_train_done():
     assert metrics["done_loss"] == 0
 
 
-def test_clips_are_imagined_late_and_then_up_to_the_share():
-    shares = [forced_share(0.5, progress) for progress in (0.0, 0.25, 0.375, 0.5, 1.0)]
-    assert shares == [0.0, 0.0, 0.25, 0.5, 0.5]
+def test_forcing_replaces_later_frames_only_and_only_by_predictions():
+    clip, prediction, digits = clip_and_prediction(torch.ones(2, 5, dtype=torch.bool))
+    seen, state = force_predictions(prediction, CODEBOOK, digits, clip.state, share=1.0)
+    assert torch.equal(seen[:, 0], digits[:, 0])
+    assert torch.equal(state[:, 0], clip.state[:, 0])
+    assert torch.equal(seen[:, 1:], CODEBOOK.sample(prediction.logits[:, :-1], 0.0, None))
+    assert torch.equal(state[:, 1:], prediction.proprioception[:, :-1])
 
 
 def test_corruption_moves_a_share_of_the_factors_by_one_level():

@@ -13,7 +13,6 @@ from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.clips import ClipSampler
 from lerobot_wmrl.world_models.episode_table import golden_episodes, read_episodes
 from lerobot_wmrl.world_models.frame_cache import cached_frames, cached_tokens
-from lerobot_wmrl.world_models.losses import imagine_clips
 from tests.trained import action_config, run_training, text_config, train_tokenizer
 
 WEIGHTS = "checkpoints/last/pretrained_model/model.safetensors"
@@ -101,21 +100,6 @@ def test_imagination_equals_the_teacher_forced_pass_on_its_own_frames(sampler, t
     assert torch.equal(again[:, :11], frames[:, 1:])
     done = torch.stack([step.done_logit for step in steps], 1)
     torch.testing.assert_close(prediction.done_logit[:, :11], done, atol=1e-4, rtol=1e-4)
-
-
-def test_training_sees_the_clips_that_imagination_would_give(sampler, trained_models):
-    model = load_model(trained_models["action_world_model"], "action_world_model")
-    clip = sampler.clips(np.arange(4), np.zeros(4, int))
-    condition = model.condition(clip)
-    digits, state = model.network.codebook.digits(clip.tokens), model.normalize_state(clip.state)
-    imagined, states = imagine_clips(model.network, digits, state, *condition)
-    imagination = model.start(clip.tokens[:, 0], clip.state[:, 0])
-    steps = [model.step(imagination, clip.action[:, t]) for t in range(11)]
-    assert torch.equal(imagined[:, 0], digits[:, 0])
-    assert torch.equal(
-        model.network.codebook.tokens(imagined[:, 1:12]), torch.stack([step.tokens for step in steps], 1)
-    )
-    torch.testing.assert_close(states[:, 0], state[:, 0])
 
 
 def test_checkpoints_are_self_contained_and_in_lerobots_layout(trained_models):
