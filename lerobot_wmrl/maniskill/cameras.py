@@ -1,8 +1,8 @@
 """Cameras, chosen so that what decides an episode shows in one small picture.
 
-The third view looks back at the robot from the front, steeply: how far the gripper is to the object's side is a
-distance in the picture, and a pushed object comes towards the camera, in front of the hand. From an oblique
-view a gripper that passes before the object looks like one that pushes it, and world models believed it.
+The third view looks back at the robot from the front, steeply: how far the gripper is to the object's side
+is a distance in the picture, and a pushed object comes towards the camera, in front of the hand. From an
+oblique view a gripper that passes before the object looks like one that pushes it: world models believed it.
 """
 
 from typing import Any
