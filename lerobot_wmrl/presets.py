@@ -23,7 +23,7 @@ TINY_WORLD_MODEL: Final[Flags] = {
 
 PRESETS: Final[dict[str, dict[str, Flags]]] = {
     "tiny": {
-        "record": {"num_episodes": 24, "part_episodes": 8, "num_workers": 2},
+        "record": {"num_episodes": 24, "part_episodes": 8, "num_workers": 1},
         "train-world-model:frame_tokenizer": {
             "model.image_size": 64,
             "model.widths": "[8,16]",

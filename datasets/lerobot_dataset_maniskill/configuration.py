@@ -17,7 +17,7 @@ POLICY_KIND = "policy"
 
 def default_kinds() -> dict[str, float]:
     """Shares of the trajectory kinds; they need not sum to 1."""
-    return {"optimal": 0.30, "waypoint": 0.08, "interpolated": 0.07, "disturbed": 0.15, "near_miss": 0.40}
+    return {"optimal": 0.20, "waypoint": 0.06, "interpolated": 0.06, "disturbed": 0.13, "near_miss": 0.55}
 
 
 @dataclass

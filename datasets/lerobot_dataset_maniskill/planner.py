@@ -175,11 +175,15 @@ def pass_over(geometry: PushGeometry, rng: np.random.Generator) -> tuple[Waypoin
 
 
 def pass_beside(geometry: PushGeometry, rng: np.random.Generator) -> tuple[Waypoint, ...]:
-    """Past the object's side: from a grazing contact that turns it to a clear miss."""
+    """Past the object's side: from a grazing contact that turns it to a clear miss, at any height."""
     edge = geometry.spec.half_size[1] + FINGER_HALF_THICKNESS
-    sideways = rng.choice((-1.0, 1.0)) * (edge + rng.uniform(-0.022, 0.025))
-    far = Push.distance + rng.uniform(-0.02, 0.03)
-    return (Waypoint(geometry.at(-0.025, sideways), 0.014), Waypoint(geometry.at(far, sideways)))
+    sideways = rng.choice((-1.0, 1.0)) * (edge + rng.uniform(-0.015, 0.045))
+    height = geometry.height + rng.choice([rng.uniform(-0.01, 0.015), rng.uniform(0.0, 0.08)])
+    far = Push.distance + rng.uniform(-0.02, MARGIN)
+    return (
+        Waypoint(geometry.at(-0.025, sideways, height), 0.014),
+        Waypoint(geometry.at(far, sideways, height)),
+    )
 
 
 def push_off_centre(geometry: PushGeometry, rng: np.random.Generator) -> tuple[Waypoint, ...]:
@@ -189,7 +193,7 @@ def push_off_centre(geometry: PushGeometry, rng: np.random.Generator) -> tuple[W
     """
     sideways = rng.uniform(-1.0, 1.0) * (geometry.spec.half_size[1] + FINGER_HALF_THICKNESS)
     behind = Waypoint(geometry.at(-0.025, sideways), 0.016)
-    return (behind, Waypoint(geometry.at(Push.distance + rng.uniform(-0.03, 0.03), sideways), 0.001))
+    return (behind, Waypoint(geometry.at(Push.distance + rng.uniform(-0.03, MARGIN), sideways), 0.001))
 
 
 def stop_short(geometry: PushGeometry, rng: np.random.Generator) -> tuple[Waypoint, ...]:
@@ -233,7 +237,7 @@ SUBOPTIMAL: Final[dict[str, Shaper]] = {
     "near_miss": near_miss_push,
 }
 NEAR_MISSES: Final[tuple[Shaper, ...]] = (
-    pass_over, pass_beside, stop_short, push_partly, push_diagonally, *3 * (push_off_centre,),
+    pass_over, stop_short, push_partly, push_diagonally, *3 * (pass_beside,), *3 * (push_off_centre,),
 )  # fmt: skip
 
 PLANNERS: Final = {Push.name: plan_push}

@@ -19,7 +19,8 @@ class WorldModelConfig(RewardModelConfig):
         window: frames the model remembers. clip_length: frames of a training clip.
         patch: side of the square of tokens that forms one transformer token.
         code_width: channels of the convolutions on the token grid.
-        motion_weight: how much more a token counts in the loss when it moves.
+        motion_weight: how much more a token counts in the loss when it moves. A high weight makes the model
+            believe in motion: it then pushes objects that the hand misses.
         done_weight, done_positive_weight, state_weight: of the other losses, beside the tokens' one.
         self_forcing: share of input frames replaced by the model's own predictions in training.
         token_noise: share of input code factors moved by one level in training.
@@ -41,9 +42,9 @@ class WorldModelConfig(RewardModelConfig):
     patch: int = 2
     code_width: int = 48
 
-    motion_weight: float = 4.0
+    motion_weight: float = 1.0
     done_weight: float = 1.0
-    done_positive_weight: float = 2.0
+    done_positive_weight: float = 1.0
     state_weight: float = 4.0
     self_forcing: float = 0.5
     token_noise: float = 0.02

@@ -1,4 +1,6 @@
 import json
+import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -145,6 +147,16 @@ def test_a_truncated_checkpoint_is_named(trained_models, tmp_path):
         )
     with pytest.raises(ValueError, match="truncated"):
         load_model(tmp_path, "frame_tokenizer")
+
+
+def test_a_corrupted_episode_file_is_named_and_leaves_nothing(small_dataset, tmp_path):
+    root = tmp_path / "dataset"
+    shutil.copytree(small_dataset.root, root)
+    video = next(root.rglob("*.mp4"))
+    os.truncate(video, video.stat().st_size // 3)
+    with pytest.raises(ValueError, match=rf"episode \d+: .*{video.name} cannot be decoded .*record it again"):
+        train_tokenizer(root, tmp_path / "run", steps=1)
+    assert not list(tmp_path.rglob("frames-*"))
 
 
 def test_other_settings_do_not_continue_a_run(small_dataset, trained_models, tmp_path):
