@@ -20,7 +20,7 @@ from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.drivers import check_policy
 from lerobot_dataset_maniskill.integrity import whole_dataset
 from lerobot_dataset_maniskill.manifest import Part, planned_parts
-from lerobot_dataset_maniskill.worker import EpisodeResult, serve_parts
+from lerobot_dataset_maniskill.worker import EpisodeResult, PartRecorder, Report, serve_parts
 from lerobot_dataset_maniskill.writer import VOCABULARY_FILE, write_card, write_vocabulary
 from lerobot_wmrl.constants import KINDS
 from lerobot_wmrl.episodes import episode_table
@@ -114,13 +114,41 @@ def missing_parts(work: Path, parts: list[Part]) -> list[Part]:
 
 
 def record_parts(config: RecordConfig, work: Path, parts: list[Part]) -> None:
-    """Let the workers record the missing parts, with a progress bar."""
+    """Record the missing parts, in this process or in several, with a progress bar."""
     missing = missing_parts(work, parts)
     if not missing:
         return
+    count = min(config.num_workers, len(missing))
+    with progress_bar(config, missing) as report:
+        if count == 1:
+            recorder = PartRecorder(config, work)
+            for part in missing:
+                recorder.record(part, report)
+        else:
+            record_in_parallel(config, work, missing, count, report)
+
+
+@contextmanager
+def progress_bar(config: RecordConfig, missing: list[Part]) -> Iterator[Report]:
+    """Shows what it is told of: episodes, the share that succeeded, frames."""
+    done = config.num_episodes - sum(len(part.episodes) for part in missing)
+    seen: Counter[str] = Counter()
+    with tqdm(total=config.num_episodes, initial=done, unit="episode", desc="record") as bar:
+
+        def report(result: EpisodeResult) -> None:
+            seen.update(episodes=1, success=int(result.success), frames=result.frames)
+            bar.update()
+            bar.set_postfix(success=f"{seen['success'] / seen['episodes']:.0%}", frames=seen["frames"])
+
+        yield report
+
+
+def record_in_parallel(
+    config: RecordConfig, work: Path, missing: list[Part], count: int, report: Report
+) -> None:
+    """Let `count` processes share the parts."""
     context = simulating_context()
     jobs, results = context.Queue(), context.Queue()
-    count = min(config.num_workers, len(missing))
     for item in [*missing, *[None] * count]:
         jobs.put(item)
     arguments = (config, work, jobs, results)
@@ -128,7 +156,7 @@ def record_parts(config: RecordConfig, work: Path, parts: list[Part]) -> None:
     for worker in workers:
         worker.start()
     try:
-        follow_progress(config, missing, results, workers)
+        follow_workers({part.index for part in missing}, results, workers, report)
         for worker in workers:
             worker.join(GRACE_SECONDS)
     finally:
@@ -137,31 +165,21 @@ def record_parts(config: RecordConfig, work: Path, parts: list[Part]) -> None:
             worker.join()
 
 
-def follow_progress(config: RecordConfig, missing: list[Part], results: Any, workers: list[Any]) -> None:
-    """Until every missing part is whole. A worker's error is raised here."""
-    open_parts = {part.index for part in missing}
-    todo = sum(len(part.episodes) for part in missing)
-    seen: Counter[str] = Counter()
-    with tqdm(
-        total=config.num_episodes, initial=config.num_episodes - todo, unit="episode", desc="record"
-    ) as bar:
-        while open_parts:
-            try:
-                result = results.get(timeout=POLL_SECONDS)
-            except queue.Empty:
-                if not any(worker.is_alive() for worker in workers):
-                    raise RuntimeError(
-                        "the recording processes died; run the same command to continue"
-                    ) from None
-                continue
-            if isinstance(result, Exception):
-                raise result
-            if isinstance(result, EpisodeResult):
-                seen.update(episodes=1, success=int(result.success), frames=result.frames)
-                bar.update()
-                bar.set_postfix(success=f"{seen['success'] / seen['episodes']:.0%}", frames=seen["frames"])
-            else:
-                open_parts.discard(result)
+def follow_workers(open_parts: set[int], results: Any, workers: list[Any], report: Report) -> None:
+    """Until every open part is whole. A worker's error is raised here."""
+    while open_parts:
+        try:
+            result = results.get(timeout=POLL_SECONDS)
+        except queue.Empty:
+            if not any(worker.is_alive() for worker in workers):
+                raise RuntimeError("the recording processes died; run the same command to continue") from None
+            continue
+        if isinstance(result, Exception):
+            raise result
+        if isinstance(result, EpisodeResult):
+            report(result)
+        else:
+            open_parts.discard(result)
 
 
 def merge(config: RecordConfig, work: Path, parts: list[Part]) -> None:

@@ -34,7 +34,7 @@ def config(root: Path, **fields: object) -> RecordConfig:
 
 def start_and_kill(root: Path) -> Path:
     """Start the command, `kill -9` it once its first part is whole; returns the folder of unfinished work."""
-    flags = [f"--num_episodes={EPISODES}", f"--part_episodes={PART}", "--num_workers=1",
+    flags = [f"--num_episodes={EPISODES}", f"--part_episodes={PART}", "--num_workers=2",
              f"--kinds={json.dumps(KIND_SHARES)}", f"--output_dir={root / 'dataset'}"]  # fmt: skip
     command = subprocess.Popen([sys.executable, "-m", "lerobot_dataset_maniskill.record", *flags])
     work = root / ".dataset.recording"
