@@ -73,7 +73,7 @@ def demo_stages(config: DemoConfig) -> list[Stage]:
     return [
         Stage("record", "Record planned trajectories in ManiSkill", partial(record, config)),
         Stage("sft", "Clone a policy from a few optimal episodes", partial(clone, config)),
-        Stage("explore", "Record that policy's disturbed attempts", partial(explore, config)),
+        Stage("explore", "Record disturbed attempts of that policy", partial(explore, config)),
         Stage("merge", "Merge both recordings", partial(merge, config)),
         *(
             Stage(model, f"Train the {model.replace('_', ' ')}", partial(train_model, config, model))
