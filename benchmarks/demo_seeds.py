@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from lerobot_wmrl.files import write_json
 from lerobot_wmrl.report.figures import IMAGINED, REAL, tidy
-from lerobot_wmrl.statistics import Proportion
+from lerobot_wmrl.statistics import PairedChange, Proportion
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
 
@@ -31,7 +31,9 @@ def results(summaries: list[dict[str, Any]]) -> dict[str, Any]:
     together = {
         policy: {key: pooled(summaries, policy, key).as_json() for key in first[policy]} for policy in first
     }
-    return {"pooled": together, "runs": summaries}
+    changes = [summary["real_change"] for summary in summaries]
+    change = PairedChange(*(sum(each[key] for each in changes) for key in ("gained", "lost")))
+    return {"pooled": {**together, "real_change": change.as_json()}, "runs": summaries}
 
 
 def draw(summaries: list[dict[str, Any]], path: Path) -> None:
@@ -69,7 +71,9 @@ def main() -> None:
     summaries = [json.loads((run / "summary.json").read_text()) for run in runs]
     write_json(RESULTS / "demo.json", results(summaries))
     draw(summaries, RESULTS / "demo.png")
-    for policy, row in results(summaries)["pooled"].items():
+    together = results(summaries)["pooled"]
+    print("real change:", together.pop("real_change"))
+    for policy, row in together.items():
         print(policy, *(f"{key} {rate['k']}/{rate['n']}" for key, rate in row.items()))
 
 

@@ -1,7 +1,10 @@
 """Proportions with their uncertainty."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+
+from scipy.stats import binomtest
 
 Z_95 = 1.959963984540054
 
@@ -45,3 +48,26 @@ class Proportion:
             "share": self.share if self.n else None,
             "wilson_95": list(self.interval),
         }
+
+
+@dataclass(frozen=True)
+class PairedChange:
+    """Two policies on the same starts: failures that became successes, and the reverse."""
+
+    gained: int
+    lost: int
+
+    @classmethod
+    def between(cls, before: Sequence[bool], after: Sequence[bool]) -> "PairedChange":
+        """From the outcomes of the same episodes in the same order. ValueError if their number differs."""
+        pairs = list(zip(before, after, strict=True))
+        return cls(sum(b and not a for a, b in pairs), sum(a and not b for a, b in pairs))
+
+    @property
+    def p_value(self) -> float:
+        """Of no change at all, two-sided: McNemar's test in its exact form."""
+        changed = self.gained + self.lost
+        return float(binomtest(self.gained, changed).pvalue) if changed else 1.0
+
+    def as_json(self) -> dict[str, float | int]:
+        return {"gained": self.gained, "lost": self.lost, "p_value": self.p_value}

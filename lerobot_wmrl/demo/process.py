@@ -1,6 +1,6 @@
 """Runs one command in a forked process: shows and logs its output, measures it, ends its whole group.
 
-Forking from a process that has imported the libraries saves every stage the 8 to 12 seconds they take to import.
+Forking from a process that has imported the libraries saves every stage the ten seconds they take to import.
 """
 
 import ctypes

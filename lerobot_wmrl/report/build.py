@@ -13,8 +13,10 @@ from lerobot_wmrl.episodes import episode_table
 from lerobot_wmrl.files import write_json, write_text
 from lerobot_wmrl.report import figures, sources
 from lerobot_wmrl.report.pictures import EPISODES, picture_sections
-from lerobot_wmrl.statistics import Proportion
+from lerobot_wmrl.statistics import PairedChange, Proportion
 from lerobot_wmrl.tracking import read_metrics
+
+SIGNIFICANCE = 0.05
 
 POLICIES = {"sft": "cloned policy", "rl": "PPO policy"}
 
@@ -62,6 +64,7 @@ def summary(
         "preset": config.stage_preset,
         "seed": config.seed,
         "policies": {policy: {k: v.as_json() for k, v in row.items()} for policy, row in measured.items()},
+        "real_change": sources.real_change(config.output_dir).as_json(),
         "dataset": {"episodes": len(table["episode"]), "frames": int(table["length"].sum())},
         "seconds": sum(record["seconds"] for record in records),
         "peak_memory_bytes": max(record["peak_memory_bytes"] for record in records),
@@ -72,16 +75,19 @@ def summary(
     }
 
 
-def verdict(before: Proportion, after: Proportion) -> str:
-    """In plain words whether real success changed: two intervals are compared, no more is claimed."""
-    change = 100 * (after.share - before.share)
+def verdict(before: Proportion, after: Proportion, change: PairedChange) -> str:
+    """In plain words whether real success changed, judged on the same starts; no more is claimed."""
     shares = f"from {100 * before.share:.0f} % to {100 * after.share:.0f} %"
-    numbers = f"Real success went {shares} ({change:+.0f} points)."
-    if after.interval[0] > before.interval[1]:
-        return f"{numbers} The two 95 % intervals do not overlap: it helped in reality."
-    if after.interval[1] < before.interval[0]:
-        return f"{numbers} The two 95 % intervals do not overlap: it made the policy worse in reality."
-    return f"{numbers} The two 95 % intervals overlap: this run alone does not show a difference."
+    told = (
+        f"Real success went {shares} ({100 * (after.share - before.share):+.0f} points): "
+        f"of the same {before.n} starts, {change.gained} were gained and {change.lost} lost "
+        f"(exact McNemar test: p = {change.p_value:.2g})."
+    )
+    if change.p_value >= SIGNIFICANCE:
+        return f"{told} This run alone does not show a difference."
+    if change.gained > change.lost:
+        return f"{told} It helped in reality."
+    return f"{told} It made the policy worse in reality."
 
 
 def headline_cards(measured: dict[str, dict[str, Proportion]]) -> list[dict[str, Any]]:
@@ -144,7 +150,9 @@ def render(
         minutes=round(sum(record["seconds"] for record in records) / 60, 1),
         peak_memory=f"{max(record['peak_memory_bytes'] for record in records) / 1e9:.1f}",
         cards=headline_cards(measured),
-        verdict=verdict(measured["sft"]["real"], measured["rl"]["real"]),
+        verdict=verdict(
+            measured["sft"]["real"], measured["rl"]["real"], sources.real_change(config.output_dir)
+        ),
         bars=figures.success_bars({POLICIES[p]: (r["real"], r["imagined"]) for p, r in measured.items()}),
         trust=trust_rows(config.output_dir),
         pictures=picture_sections(config.output_dir),

@@ -5,17 +5,27 @@ import re
 from pathlib import Path
 from typing import Any
 
-from lerobot_wmrl.statistics import Proportion
+from lerobot_wmrl.statistics import PairedChange, Proportion
 
 Curve = tuple[list[float], list[float]]
 """Steps and values."""
 
 
-def success_rate(eval_dir: Path) -> Proportion:
-    """From lerobot-eval's `eval_info.json`: one success a held-out episode."""
+def outcomes(eval_dir: Path) -> list[bool]:
+    """From lerobot-eval's `eval_info.json`: one success a held-out episode, in the order of their seeds."""
     info = json.loads((eval_dir / "eval_info.json").read_text())
-    successes = [bool(success) for task in info["per_task"] for success in task["metrics"]["successes"]]
+    return [bool(success) for task in info["per_task"] for success in task["metrics"]["successes"]]
+
+
+def success_rate(eval_dir: Path) -> Proportion:
+    """Share of successful episodes."""
+    successes = outcomes(eval_dir)
     return Proportion(sum(successes), len(successes))
+
+
+def real_change(output_dir: Path) -> PairedChange:
+    """From the cloned to the PPO policy, on the same held-out starts in the simulator."""
+    return PairedChange.between(outcomes(output_dir / "eval_sft"), outcomes(output_dir / "eval_rl"))
 
 
 def lerobot_train_curve(log: Path, name: str = "loss") -> Curve:

@@ -16,7 +16,7 @@ from lerobot_wmrl.demo.stages import DemoConfig, demo_stages
 from lerobot_wmrl.episodes import episode_table
 from lerobot_wmrl.files import write_json
 from lerobot_wmrl.report.build import verdict, write_report
-from lerobot_wmrl.statistics import Proportion
+from lerobot_wmrl.statistics import PairedChange, Proportion
 from lerobot_wmrl.tracking import append_metrics
 
 SUCCESSES = {"eval_sft": 4, "imagine_sft": 5, "eval_rl": 6, "imagine_rl": 9}
@@ -70,7 +70,7 @@ def test_page_is_self_contained_and_says_the_numbers(finished: DemoConfig) -> No
     page = write_report(finished, stages).read_text()
     assert not re.findall(r"""(?:src|href)=["'](?!data:)""", page), "the page needs other files"
     assert "4 of 10; 95 %: 17–69 %" in page
-    assert "Real success went from 40 % to 60 % (+20 points)" in page
+    assert "Real success went from 40 % to 60 % (+20 points): of the same 10 starts, 2 were gained" in page
     assert "40 % (2 of 5; 12–77 %)" in page
     for name in stages:
         assert f"<pre>run-{name}</pre>" in page
@@ -82,20 +82,18 @@ def test_summary_holds_every_headline_number(finished: DemoConfig) -> None:
     summary = json.loads((finished.output_dir / "summary.json").read_text())
     assert summary["policies"]["rl"]["real"]["k"] == SUCCESSES["eval_rl"]
     assert summary["policies"]["sft"]["false_success"]["share"] == 0.4
+    assert summary["real_change"] == {"gained": 2, "lost": 0, "p_value": 0.5}
     assert summary["dataset"] == {"episodes": 4, "frames": 12}
     assert summary["seconds"] == 3.0 * len(demo_stages(finished))
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "words"),
-    [
-        (10, 90, "it helped in reality"),
-        (90, 10, "made the policy worse"),
-        (50, 55, "does not show"),
-    ],
+    ("gained", "lost", "words"),
+    [(20, 5, "It helped in reality"), (5, 20, "made the policy worse"), (14, 9, "does not show")],
 )
-def test_verdict_claims_no_more_than_the_intervals(before: int, after: int, words: str) -> None:
-    assert words in verdict(Proportion(before, 100), Proportion(after, 100))
+def test_verdict_claims_no_more_than_the_same_starts_show(gained: int, lost: int, words: str) -> None:
+    before, after = Proportion(50, 100), Proportion(50 + gained - lost, 100)
+    assert words in verdict(before, after, PairedChange(gained, lost))
 
 
 def test_episode_table_reads_outcomes_by_episode(tmp_path: Path) -> None:
