@@ -3,11 +3,24 @@
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
 from lerobot.common.train_utils import get_step_checkpoint_dir
-from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK
+from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
+from safetensors import SafetensorError
+from safetensors.torch import load_file
 
 LAST_CHECKPOINT = f"{CHECKPOINTS_DIR}/{LAST_CHECKPOINT_LINK}"
+
+
+def resolve_checkpoint(path: str | Path) -> Path:
+    """A training's output folder, or one of its checkpoints → the `pretrained_model` folder inside."""
+    root = Path(path)
+    for candidate in (root, root / PRETRAINED_MODEL_DIR, root / LAST_CHECKPOINT / PRETRAINED_MODEL_DIR):
+        if (candidate / "config.json").is_file():
+            return candidate
+    return root
 
 
 def write_checkpoint(output_dir: Path, total_steps: int, step: int, write: Callable[[Path], None]) -> Path:
@@ -23,6 +36,17 @@ def write_checkpoint(output_dir: Path, total_steps: int, step: int, write: Calla
     link.symlink_to(target.name)
     link.replace(target.with_name(LAST_CHECKPOINT_LINK))
     return target
+
+
+def read_weights(checkpoint: Path) -> dict[str, Any]:
+    """The tensors of a checkpoint's model. ValueError if the file is truncated."""
+    path = checkpoint / PRETRAINED_MODEL_DIR / SAFETENSORS_SINGLE_FILE
+    try:
+        return load_file(path)
+    except (SafetensorError, OSError) as error:
+        raise ValueError(
+            f"{path}: cannot be read ({error}); remove {checkpoint} to continue from the one before"
+        ) from error
 
 
 def latest_checkpoint(output_dir: Path) -> Path | None:

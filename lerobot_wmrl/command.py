@@ -36,32 +36,31 @@ class RunConfig:
         write_json(folder / CONFIG_FILE, draccus.encode(self))
 
 
-@dataclass
-class DatasetSource:
-    """Where the data is: `root`, the dataset's folder, and optionally its `repo_id` on the hub."""
-
-    root: str = ""
-    repo_id: str | None = None
-
-
 def claim_output_dir(output_dir: Path, config: dict[str, Any]) -> None:
-    """Mark a new folder as this run's, or recognise it. ValueError if it holds something else.
+    """Mark a new folder as this run's, or recognise it. ValueError if it holds something else."""
+    require_free(output_dir, config)
+    if not (output_dir / CONFIG_FILE).is_file():
+        write_json(output_dir / CONFIG_FILE, config)
+
+
+def require_free(output_dir: Path, config: dict[str, Any]) -> None:
+    """ValueError unless the folder is new, empty or this run's; it is left as it is.
 
     Only `output_dir` may differ between the first call and its continuation: a run may be moved.
     """
     marker = output_dir / CONFIG_FILE
+    if output_dir.exists() and not output_dir.is_dir():
+        raise ValueError(f"--output_dir={output_dir} is a file; choose a new folder")
     if marker.is_file():
         stored = json.loads(marker.read_text())
         differing = [key for key in config if key != "output_dir" and stored.get(key) != config[key]]
         if differing:
             raise ValueError(
-                f"output_dir={output_dir} holds a run with other settings ({', '.join(differing)}); "
+                f"--output_dir={output_dir} holds a run with other settings ({', '.join(differing)}); "
                 "choose another folder, or repeat the settings of the first run to continue it"
             )
-        return
-    if output_dir.is_dir() and any(output_dir.iterdir()):
-        raise ValueError(f"output_dir={output_dir} holds something else; choose a new folder")
-    write_json(marker, config)
+    elif output_dir.is_dir() and any(path.name != f".{CONFIG_FILE}.partial" for path in output_dir.iterdir()):
+        raise ValueError(f"--output_dir={output_dir} holds something else; choose a new folder")
 
 
 def run_command[Config: RunConfig](
@@ -79,7 +78,7 @@ def run_command[Config: RunConfig](
             function(cfg)
 
         parsed()
-    except (ValueError, FileNotFoundError, ParsingError) as error:
+    except (ValueError, OSError, ParsingError) as error:
         reason = error.__cause__ if isinstance(error, ParsingError) and error.__cause__ else error
         print(f"error: {reason}", file=sys.stderr)
         sys.exit(1)

@@ -71,8 +71,9 @@ PRESETS: Final[dict[str, dict[str, Flags]]] = {
         },
         "train-world-model:action_world_model": {
             "model.patch": 4,
-            "steps": 1600,
-            "batch_size": 6,
+            "model.clip_length": 40,
+            "steps": 1500,
+            "batch_size": 5,
             "save_freq": 100,
         },
         "train-world-model:text_world_model": {
@@ -130,6 +131,9 @@ def preset_flags(preset: str, command: str, types: Sequence[str] = ()) -> list[s
         raise ValueError(f"--preset={preset}: unknown preset; choose one of {', '.join(PRESETS)}")
     keys = [command, *(f"{command}:{name}" for name in types)]
     if not PRESETS[preset].keys() & set(keys):
+        known = [key.partition(":")[2] for key in PRESETS[preset] if key.startswith(f"{command}:")]
+        if known and not types:
+            raise ValueError(f"--preset={preset}: {command} has one a type; give a type: {', '.join(known)}")
         sizes = ", ".join(name for name, commands in PRESETS.items() if commands.keys() & set(keys)) or "none"
         raise ValueError(f"--preset={preset}: {command} has no such preset; it has: {sizes}")
     return [flag for key in keys for flag in format_flags(PRESETS[preset].get(key, {}))]

@@ -29,7 +29,8 @@ def test_the_chosen_type_adds_its_own_flags() -> None:
     ("argv", "message"),
     [
         (["--preset=huge"], "--preset=huge: unknown preset; choose one of tiny, demo"),
-        (["--preset=demo"], "--preset=demo: train has no such preset; it has: tiny"),
+        (["--preset=demo", "--x.type=c"], "--preset=demo: train has no such preset; it has: tiny"),
+        (["--preset=demo"], "--preset=demo: train has one a type; give a type: b"),
     ],
 )
 def test_unknown_presets_are_named(argv: list[str], message: str) -> None:

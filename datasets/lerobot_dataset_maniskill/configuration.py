@@ -11,6 +11,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot_wmrl.command import RunConfig
 from lerobot_wmrl.constants import EVALUATION_SEED, KINDS
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.policy_checkpoints import read_policy_config
 
 POLICY_KIND = "policy"
 
@@ -63,15 +64,7 @@ class RecordConfig(RunConfig):
     def __post_init__(self) -> None:
         path = parser.get_path_arg("policy")
         if path:
-            if not (Path(path) / "config.json").is_file() and (
-                path.startswith((".", "/")) or Path(path).exists()
-            ):
-                raise ValueError(
-                    f"--policy.path={path}: there is no config.json; give a folder `pretrained_model`"
-                )
-            overrides = parser.get_cli_overrides("policy") or []
-            self.policy = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
-            self.policy.pretrained_path = Path(path)
+            self.policy = read_policy_config(path, parser.get_cli_overrides("policy") or [])
 
     def validate(self) -> None:
         """ValueError that names the field, its value and the remedy."""

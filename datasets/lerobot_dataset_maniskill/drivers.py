@@ -1,6 +1,5 @@
 """What chooses the actions of an episode: a planner or a policy."""
 
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -10,9 +9,12 @@ from lerobot.configs.policies import PreTrainedConfig
 from lerobot_dataset_maniskill.manifest import EpisodePlan
 from lerobot_dataset_maniskill.planner import PLANNERS, Follower
 from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, KINDS
-from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.maniskill.objects import OBJECTS
 from lerobot_wmrl.maniskill.simulation import Frame, Simulation
+from lerobot_wmrl.policy_checkpoints import load_policy, load_processors
+
+EXPLORATION_STREAM = 1 << 20
+"""Tells this noise from the draws of starts, which are seeded by (seed, task, scene)."""
 
 NOISE_MEMORY = 0.9
 """Autocorrelation of exploration noise from one step to the next: it lasts about ten steps."""
@@ -49,7 +51,7 @@ class ExplorationNoise:
     """
 
     def __init__(self, largest: float, seed: int) -> None:
-        self.rng = np.random.default_rng(seed)
+        self.rng = np.random.default_rng((seed, EXPLORATION_STREAM))
         self.level = self.rng.uniform(0.0, largest) * np.array(ACTION_HIGH[:3])
         self.state = self.rng.normal(size=3)
 
@@ -64,14 +66,9 @@ class ExplorationNoise:
 class PolicyDriver:
     """A LeRobot policy with its own pre- and postprocessors, and noise on its actions if asked for."""
 
-    def __init__(self, config: PreTrainedConfig, env: WmrlManiSkillEnv, exploration: float) -> None:
-        from lerobot.policies.factory import make_policy, make_pre_post_processors
-
-        self.policy: Any = make_policy(cfg=config, env_cfg=env).eval()
-        self.preprocess, self.postprocess = make_pre_post_processors(
-            config, pretrained_path=str(config.pretrained_path),
-            preprocessor_overrides={"device_processor": {"device": str(config.device)}},
-        )  # fmt: skip
+    def __init__(self, config: PreTrainedConfig, exploration: float) -> None:
+        self.policy: Any = load_policy(config).eval()
+        self.preprocess, self.postprocess = load_processors(config)
         self.exploration = exploration
 
     def begin(self, simulation: Simulation, plan: EpisodePlan) -> None:
@@ -96,21 +93,3 @@ def policy_observation(frame: Frame, instruction: str) -> dict[str, Any]:
         for camera, image in frame.images.items()
     }
     return {**images, "observation.state": torch.from_numpy(frame.state)[None], "task": [instruction]}
-
-
-def check_policy(config: PreTrainedConfig, env: WmrlManiSkillEnv) -> None:
-    """ValueError if the policy wants cameras, or a frame size, that the environment does not have."""
-    offered = {f"observation.images.{camera}" for camera in env.cameras}
-    missing = [name for name in config.image_features if name not in offered]
-    if missing:
-        raise ValueError(
-            f"--policy.path={config.pretrained_path} wants {', '.join(missing)}, the environment has "
-            f"{', '.join(sorted(offered))}: set --env.cameras"
-        )
-    if (
-        not (Path(str(config.pretrained_path)) / "model.safetensors").exists()
-        and Path(str(config.pretrained_path)).exists()
-    ):
-        raise ValueError(
-            f"--policy.path={config.pretrained_path}: there is no model.safetensors in this folder"
-        )

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_dataset_maniskill.configuration import POLICY_KIND, RecordConfig
+from lerobot_wmrl.constants import KINDS
 from lerobot_wmrl.maniskill.scenes import Scene, scene_for_seed
 
 
@@ -48,7 +49,7 @@ def planned_kinds(config: RecordConfig) -> list[str]:
     """The kind of each episode: the configured shares, exactly (largest remainders), in random order."""
     if config.policy is not None:
         return [POLICY_KIND] * config.num_episodes
-    names = list(config.kinds)
+    names = sorted(config.kinds, key=KINDS.index)
     shares = np.array([config.kinds[name] for name in names], dtype=np.float64)
     ideal = shares / shares.sum() * config.num_episodes
     counts = np.floor(ideal).astype(int)

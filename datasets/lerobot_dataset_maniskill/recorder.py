@@ -17,16 +17,16 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from tqdm import tqdm
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
-from lerobot_dataset_maniskill.drivers import check_policy
 from lerobot_dataset_maniskill.integrity import whole_dataset
 from lerobot_dataset_maniskill.manifest import Part, planned_parts
 from lerobot_dataset_maniskill.worker import EpisodeResult, PartRecorder, Report, serve_parts
 from lerobot_dataset_maniskill.writer import VOCABULARY_FILE, write_card, write_vocabulary
-from lerobot_wmrl.constants import KINDS
+from lerobot_wmrl.constants import ACTION_NAMES, KINDS
 from lerobot_wmrl.episodes import episode_table
 from lerobot_wmrl.files import write_json
 from lerobot_wmrl.maniskill.processes import simulating_context
 from lerobot_wmrl.maniskill.renderer import render_backend
+from lerobot_wmrl.policy_checkpoints import check_fit, check_weights
 
 CONTENT_FILE = "recording.json"
 POLL_SECONDS = 1.0
@@ -39,11 +39,14 @@ def record(config: RecordConfig) -> None:
     config.validate()
     assert config.output_dir is not None
     output_dir = config.output_dir
-    if not already_recorded(output_dir, config.recorded_content()):
+    work = output_dir.parent / f".{output_dir.name}.recording"
+    if already_recorded(output_dir, config.recorded_content()):
+        discard(work, config.recorded_content())
+    else:
         render_backend()
         if config.policy is not None:
-            check_policy(config.policy, config.maniskill)
-        work = output_dir.parent / f".{output_dir.name}.recording"
+            check_weights(config.policy)
+            check_fit(config.policy, config.maniskill.shown(), len(ACTION_NAMES))
         with claimed(work, config.recorded_content()):
             parts = planned_parts(config)
             record_parts(config, work, parts)
@@ -66,6 +69,13 @@ def already_recorded(output_dir: Path, content: Mapping[str, Any]) -> bool:
         raise ValueError(f"--output_dir={output_dir}: {problem}; remove the folder and record again")
     print(f"{output_dir} is already recorded: {content['num_episodes']} episodes")
     return True
+
+
+def discard(work: Path, content: Mapping[str, Any]) -> None:
+    """Remove what a command that was killed between finishing and tidying up has left."""
+    stored = work / CONTENT_FILE
+    if stored.is_file() and json.loads(stored.read_text()) == content:
+        shutil.rmtree(work, ignore_errors=True)
 
 
 def require_same(stored: Mapping[str, Any], content: Mapping[str, Any], folder: Path) -> None:
@@ -92,6 +102,8 @@ def claimed(work: Path, content: Mapping[str, Any]) -> Iterator[None]:
         stored = work / CONTENT_FILE
         if stored.is_file():
             require_same(json.loads(stored.read_text()), content, work)
+        elif {path.name for path in work.iterdir()} - {"lock", f".{CONTENT_FILE}.partial"}:
+            raise ValueError(f"{work} holds something else; move it away to record here")
         else:
             write_json(stored, dict(content))
         yield
@@ -160,6 +172,7 @@ def record_in_parallel(
         for worker in workers:
             worker.join(GRACE_SECONDS)
     finally:
+        jobs.cancel_join_thread()  # else a full pipe that nobody reads any more holds the command up
         for worker in workers:
             worker.terminate()
             worker.join()
@@ -172,7 +185,7 @@ def follow_workers(open_parts: set[int], results: Any, workers: list[Any], repor
             result = results.get(timeout=POLL_SECONDS)
         except queue.Empty:
             if not any(worker.is_alive() for worker in workers):
-                raise RuntimeError("the recording processes died; run the same command to continue") from None
+                raise ValueError("the recording processes died; run the same command to continue") from None
             continue
         if isinstance(result, Exception):
             raise result

@@ -37,7 +37,7 @@ class PartRecorder:
         self.config, self.folder, self.horizon = config, folder, env.horizon
         self.simulation = env.create_simulation()
         self.driver: Driver = (
-            PlannerDriver() if config.policy is None else PolicyDriver(config.policy, env, config.exploration)
+            PlannerDriver() if config.policy is None else PolicyDriver(config.policy, config.exploration)
         )
 
     def record(self, part: Part, report: Report) -> None:
@@ -93,6 +93,8 @@ def serve_parts(config: RecordConfig, folder: Path, parts: Any, results: Any) ->
         while (part := parts.get()) is not None:
             recorder.record(part, report)
             results.put(part.index)
+    except ValueError as error:
+        results.put(error)
     except Exception as error:
         results.put(error)
         raise

@@ -27,7 +27,9 @@ def claimed(config: DemoConfig) -> Iterator[None]:
     settings = {**asdict(config), "output_dir": str(config.output_dir)}
     if marker.exists():
         check_settings(json.loads(marker.read_text()), settings)
-    elif config.output_dir.exists() and any(config.output_dir.iterdir()):
+    elif config.output_dir.exists() and any(
+        path.name != f".{MARKER}.partial" for path in config.output_dir.iterdir()
+    ):
         raise ValueError(
             f"--output_dir={config.output_dir}: holds something that is not a demo; choose another folder"
         )
@@ -42,8 +44,9 @@ def claimed(config: DemoConfig) -> Iterator[None]:
 
 
 def check_settings(found: dict[str, Any], wanted: dict[str, Any]) -> None:
+    """ValueError unless the demo goes on as it began, also under the same path: its commands contain it."""
     for name, value in wanted.items():
-        if name != "output_dir" and found.get(name) != value:
+        if found.get(name) != value:
             raise ValueError(
                 f"--{name}={value}: {wanted['output_dir']} was started with {found.get(name)}; "
                 "give that value to continue, or another --output_dir"

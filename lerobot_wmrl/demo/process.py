@@ -42,7 +42,11 @@ Report = Callable[[float, int], None]
 
 
 def preload() -> None:
-    """Import what every stage needs, once, and spare the reader a page about FFmpeg from each of them."""
+    """Import what every stage needs, once, and spare the reader a page about FFmpeg from each of them.
+
+    No stage needs the network; the libraries ask whether they may use it when they are imported.
+    """
+    os.environ.setdefault("HF_HUB_OFFLINE", "1")
     logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
     for module in PRELOADED:
         importlib.import_module(module)
@@ -57,10 +61,10 @@ def entry_point(program: str) -> Callable[[], int | None]:
 
 
 def environment() -> dict[str, str]:
-    """What a command of the demo gets: no network (everything is local), fast malloc for its children."""
+    """What a command of the demo gets: the width of the screen, fast malloc for its children."""
     columns = str(shutil.get_terminal_size().columns)
     malloc = {name: str(value) for name, value in MALLOC.items()}
-    return {"HF_HUB_OFFLINE": "1", "PYTHONUNBUFFERED": "1", "COLUMNS": columns, **malloc, **os.environ}
+    return {"COLUMNS": columns, **malloc, **os.environ}
 
 
 def run_measured(command: Sequence[str], log: Path, report: Report) -> int:

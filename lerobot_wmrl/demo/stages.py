@@ -6,6 +6,9 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from lerobot.utils.constants import PRETRAINED_MODEL_DIR
+
+from lerobot_wmrl.checkpoints import LAST_CHECKPOINT, latest_checkpoint
 from lerobot_wmrl.constants import EVALUATION_SEED
 from lerobot_wmrl.demo.episodes import optimal_episodes
 from lerobot_wmrl.presets import Flags, format_flags, preset_flags
@@ -49,6 +52,7 @@ class DemoConfig:
 
     def check(self) -> None:
         """ValueError names a setting that cannot be."""
+        preset_flags(self.stage_preset, "demo")
         last = EVALUATION_SEED // SEED_STRIDE - 1
         if not 0 <= self.seed <= last:
             raise ValueError(
@@ -61,7 +65,8 @@ class DemoConfig:
 
 @dataclass(frozen=True)
 class Stage:
-    """One command, made when the stage starts, because some flags depend on what earlier stages left."""
+    """One command, made when the stage starts: some flags depend on what earlier stages left, and what an
+    interrupted call left may have to be cleared away first."""
 
     name: str
     title: str
@@ -107,7 +112,7 @@ def measurements(config: DemoConfig, policy: str, title: str) -> list[Stage]:
 
 def checkpoint(folder: Path) -> Path:
     """The latest checkpoint of a training command that wrote to `folder`."""
-    return folder / "checkpoints" / "last" / "pretrained_model"
+    return folder / LAST_CHECKPOINT / PRETRAINED_MODEL_DIR
 
 
 def first_seed(config: DemoConfig) -> int:
@@ -137,11 +142,14 @@ def train_model(config: DemoConfig, model: str) -> list[str]:
 
 
 def clone(config: DemoConfig) -> list[str]:
-    """LeRobot's own training. It continues by other flags, and refuses a folder without checkpoints."""
+    """LeRobot's own training. It continues by other flags, and refuses a folder without checkpoints, which
+    is therefore removed. It points `last` at a checkpoint that is whole, but a kill can come in between."""
     folder, dataset = config.output_dir / "sft", config.output_dir / "planned"
-    if (folder / "checkpoints" / "last").exists():
-        resume: Flags = {"config_path": str(checkpoint(folder) / "train_config.json"), "resume": True}
-        return ["lerobot-train", *format_flags(resume)]
+    last = folder / LAST_CHECKPOINT
+    newest = last if last.exists() else latest_checkpoint(folder)
+    if newest is not None:
+        trained = newest / PRETRAINED_MODEL_DIR / "train_config.json"
+        return ["lerobot-train", *format_flags({"config_path": str(trained), "resume": True})]
     shutil.rmtree(folder, ignore_errors=True)
     episodes = ",".join(str(episode) for episode in optimal_episodes(dataset, config.sft_episodes))
     flags: Flags = {
@@ -224,7 +232,7 @@ def roll_out(config: DemoConfig, policy: str, folder: Path, episodes: int, seed:
 
 
 def merge(config: DemoConfig) -> list[str]:
-    """LeRobot's own tool. It refuses a folder that an interrupted call left."""
+    """LeRobot's own tool. It refuses a folder that an interrupted call left, which is therefore removed."""
     target, names = config.output_dir / "dataset", ("planned", "explored")
     shutil.rmtree(target, ignore_errors=True)
     flags: Flags = {

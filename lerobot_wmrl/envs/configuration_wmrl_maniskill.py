@@ -91,6 +91,12 @@ class WmrlManiSkillEnv(EnvConfig):
     def gym_kwargs(self) -> dict[str, Any]:
         return {"config": self}
 
+    def shown(self) -> dict[str, tuple[int, ...]]:
+        """The observations a policy gets, by LeRobot's names, with their shapes (images channels first)."""
+        picture = (3, self.image_size, self.image_size)
+        images = {f"{OBS_IMAGES}.{camera}": picture for camera in self.cameras}
+        return {**images, OBS_STATE: (len(STATE_NAMES),)}
+
     def create_simulation(self) -> "Simulation":
         """A simulator for these scenes and cameras, in this process."""
         from lerobot_wmrl.maniskill.simulation import Simulation

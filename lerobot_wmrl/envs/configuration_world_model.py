@@ -9,8 +9,8 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
-from lerobot_wmrl.command import DatasetSource
 from lerobot_wmrl.constants import FPS
+from lerobot_wmrl.dataset_source import DatasetSource
 from lerobot_wmrl.rewards.configuration_general import GeneralConfig
 
 
@@ -38,7 +38,7 @@ class WorldModelEnv(EnvConfig):
         reward: `--env.reward.type=general` and its settings.
         episode_length: frames after which an episode is truncated.
         done_threshold: θ_sps of eq. 7. done_frames: k, consecutive frames that must reach it.
-        device: where the models live.
+        device: where the models live; the best there is by default.
     """
 
     task: str | None = "imagination"
@@ -50,19 +50,27 @@ class WorldModelEnv(EnvConfig):
     episode_length: int = 40
     done_threshold: float = 0.5
     done_frames: int = 3
-    device: str = "cpu"
+    device: str | None = None
     features: dict[str, PolicyFeature] = field(
         default_factory=lambda: {ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(7,))}
     )
     features_map: dict[str, str] = field(default_factory=lambda: {ACTION: ACTION, "agent_pos": OBS_STATE})
 
     def __post_init__(self) -> None:
-        """Describe the observation as the world model's checkpoint has it."""
+        """Describe observation and action as the world model's checkpoint has them."""
+        for name in ("episode_length", "done_frames"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"--env.{name}={getattr(self, name)}: must be at least 1")
+        if not 0 < self.done_threshold < 1:
+            raise ValueError(f"--env.done_threshold={self.done_threshold}: must be a probability")
+        if self.dataset.max_starts < 1:
+            raise ValueError(f"--env.dataset.max_starts={self.dataset.max_starts}: must be at least 1")
         if not self.world_model_path:
             return
         from lerobot_wmrl.world_models.checkpoint import read_config
 
         model: Any = read_config(self.world_model_path, "action_world_model")
+        self.features[ACTION] = PolicyFeature(type=FeatureType.ACTION, shape=(model.action_size,))
         if model.state_size:
             self.features["agent_pos"] = PolicyFeature(type=FeatureType.STATE, shape=(model.state_size,))
         for camera in model.cameras:

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
+from lerobot_wmrl.world_models.compatibility import check_dataset
 from lerobot_wmrl.world_models.episode_table import choose_episodes, open_dataset, read_episodes
 from lerobot_wmrl.world_models.frame_cache import cached_frames, frames_to_tensor
 from lerobot_wmrl.world_models.goal import imagine_goal, similarity
@@ -37,10 +38,8 @@ def load_starts(
 ) -> Starts:
     """Read the starts and imagine each one's goal frame once (eq. 6)."""
     table = read_episodes(open_dataset(source.root, source.repo_id))
-    if table.state.shape[1] < model.config.state_size:
-        raise ValueError(
-            f"dataset.root={source.root}: the world model needs observation.state, the dataset has none"
-        )
+    for config in (model.config, text_model.config):
+        check_dataset(config, table.dataset.features)
     episodes = choose_episodes(table, source.split, source.max_starts)
     rows = table.start[episodes]
     instructions = [table.instructions[episode] for episode in episodes]
@@ -57,7 +56,7 @@ def load_starts(
         )
         for i in range(0, len(rows), GOAL_BATCH)
     ]
-    goal_features = model.tokenizer.decode_with_features(torch.cat([goal.tokens for goal in goals])).features
+    goal_features = [torch.cat(layers) for layers in zip(*(goal.features for goal in goals), strict=True)]
     decoded = model.tokenizer.decode_with_features(tokens)
     closeness = similarity(decoded.features, goal_features, len(tokens))
     reached = torch.cat([goal.reached for goal in goals])

@@ -39,8 +39,7 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         self.num_envs, self.max_episode_steps = n_envs, config.episode_length
         self.device = starts.tokens.device
         self.action_low, self.action_high = (
-            torch.tensor(bound[: model.config.action_size], device=self.device)
-            for bound in (ACTION_LOW, ACTION_HIGH)
+            torch.tensor(bound, device=self.device) for bound in (ACTION_LOW, ACTION_HIGH)
         )
         self.single_action_space = gym.spaces.Box(
             self.action_low.cpu().numpy(), self.action_high.cpu().numpy()
@@ -99,6 +98,7 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
             "reward_parts": {
                 **parts,
                 "entropy": imagined.entropy,
+                "goal_reached": self.starts.goal_reached[self._start_index],
                 "done_probability": imagined.done_logit.sigmoid(),
             }
         }
@@ -151,15 +151,20 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         return observation
 
 
-def make_world_model_env(config: WorldModelEnv, n_envs: int, device: str) -> WorldModelVectorEnv:
+def make_world_model_env(config: WorldModelEnv, n_envs: int, device: str | None) -> WorldModelVectorEnv:
     """Load both world models and the start frames. ValueError says which of them does not fit."""
     model = load_model(config.world_model_path, "action_world_model", device)
+    if model.config.action_size != len(ACTION_LOW):
+        raise ValueError(
+            f"--env.world_model_path={config.world_model_path}: was trained on {model.config.action_size} "
+            f"action components; the action box has {len(ACTION_LOW)}, so record with lerobot-wmrl-record"
+        )
     text_model = load_model(config.text_world_model_path, "text_world_model", device)
     own, other = model.tokenizer.state_dict(), text_model.tokenizer.state_dict()
     same = own.keys() == other.keys() and all(torch.equal(own[name], other[name]) for name in own)
     if not same:
         raise ValueError(
-            f"text_world_model_path={config.text_world_model_path}: trained on another tokenizer than "
+            f"--env.text_world_model_path={config.text_world_model_path}: trained on another tokenizer than "
             f"{config.world_model_path}; train both with the same --model.tokenizer_path"
         )
     starts = load_starts(config.dataset, model, text_model)

@@ -28,9 +28,10 @@ def reward_along_episode(
     goal_frame and the real final_frame (N, H, W, 3) uint8, and goal_reached.
     """
     rows = slice(table.start[episode], table.start[episode] + table.length[episode])
-    tokens = model.tokenizer.encode(frames_to_tensor(frame_store[rows]))
-    state, action = torch.from_numpy(table.state[rows]), torch.from_numpy(table.action[rows])
-    known = torch.ones(1, len(tokens), dtype=torch.bool)
+    device = model.state_mean.device
+    tokens = model.tokenizer.encode(frames_to_tensor(frame_store[rows]).to(device))
+    state, action = (torch.from_numpy(column[rows]).to(device) for column in (table.state, table.action))
+    known = torch.ones(1, len(tokens), dtype=torch.bool, device=device)
     instruction = [table.instructions[episode]]
     clip = Clip(tokens[None], state[None], action[None], known.float(), known, known, instruction)
     done_logit = model.predict(clip).done_logit[0, :-1]
@@ -47,14 +48,14 @@ def reward_along_episode(
         "similarity": closeness[1:].tolist(),
         "return": earned.cumsum(0).tolist(),
         "goal_reached": bool(goal.reached[0]),
-        "goal_frame": (picture * 255).round().byte().numpy(),
+        "goal_frame": (picture * 255).round().byte().cpu().numpy(),
         "final_frame": np.asarray(frame_store[rows][-1]),
     }
 
 
 def success_once(done_logit: torch.Tensor, threshold: float, frames: int) -> torch.Tensor:
     """1 on the frame that completes the first run of `frames` done frames, else 0. (T,) → (T,)"""
-    count, paid = torch.zeros((), dtype=torch.long), torch.zeros_like(done_logit)
+    count, paid = done_logit.new_zeros((), dtype=torch.long), torch.zeros_like(done_logit)
     for step, logit in enumerate(done_logit):
         count = consecutive_count(count, sparse_reward(logit, threshold) > 0)
         if count >= frames:

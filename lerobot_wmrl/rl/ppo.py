@@ -117,6 +117,7 @@ class PPO(RLAlgorithm):
     def update(self, batch_iterator: Iterator[Minibatch]) -> TrainingStats:
         """Descend on each minibatch until they end or the policy has moved by `target_kl`."""
         records: list[dict[str, Tensor]] = []
+        first = self.optimization_step
         for batch in batch_iterator:
             loss, record = self.losses(batch)
             records.append({name: value.detach() for name, value in record.items()})
@@ -129,7 +130,7 @@ class PPO(RLAlgorithm):
         extra = {
             **mean,
             "first_ratio_error": records[0]["ratio_error"].item(),
-            "updates": float(len(records)),
+            "updates": float(self.optimization_step - first),
         }
         return TrainingStats(losses=losses, extra=extra)
 
@@ -164,7 +165,10 @@ class PPO(RLAlgorithm):
         """TrainingStopped before a step that would spoil the policy."""
         broken = [name for name, value in record.items() if not bool(value.isfinite())]
         if broken:
-            raise TrainingStopped(f"iteration {self.iteration + 1}: {', '.join(broken)} is not finite")
+            raise TrainingStopped(
+                f"iteration {self.iteration + 1}: {', '.join(broken)} is not finite; the last checkpoint is "
+                "kept: lower algorithm.policy_lr or algorithm.value_lr"
+            )
         if record["reference_kl"] > self.config.max_reference_kl:
             raise TrainingStopped(
                 f"iteration {self.iteration + 1}: the policy is {record['reference_kl'].item():.1f} nats "

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
+from lerobot.configs import PreTrainedConfig
 from torch import Tensor, nn
 
 Observation = dict[str, Any]
@@ -49,3 +50,16 @@ class Pipeline:
 
     prepare: Callable[[Observation], Observation]
     to_action: Callable[[Tensor], Tensor]
+
+
+def make_pipeline(config: PreTrainedConfig, preprocessor: Any, postprocessor: Any) -> Pipeline:
+    """The processors as functions; observations the policy does not know are left out."""
+    known = {*(config.input_features or {}), "task"}
+
+    def prepare(observation: Observation) -> Observation:
+        return preprocessor({name: value for name, value in observation.items() if name in known})
+
+    def to_action(raw_action: Tensor) -> Tensor:
+        return postprocessor(raw_action)
+
+    return Pipeline(prepare, to_action)

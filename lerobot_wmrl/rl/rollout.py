@@ -45,7 +45,10 @@ def encode(observation: Observation, instructions: dict[str, int]) -> dict[str, 
         if isinstance(value, Tensor)
     }
     indices = [instructions.setdefault(text, len(instructions)) for text in observation.get(TASK, [])]
-    return {**encoded, **({TASK: torch.tensor(indices)} if indices else {})}
+    if indices:
+        device = next(iter(encoded.values())).device
+        encoded[TASK] = torch.tensor(indices, device=device)
+    return encoded
 
 
 def decode(encoded: dict[str, Tensor], instructions: dict[str, int]) -> Observation:
@@ -106,7 +109,10 @@ class RolloutBuffer:
         following = torch.cat([self.value[1:], last_value[None]])
         self.next_value = torch.where(self.finished, self.final_value, following)
         if not bool(self.value.isfinite().all()):
-            raise ValueError("rollout: the value is not finite, so neither is what the policy saw or became")
+            raise ValueError(
+                "rollout: the policy's value is not finite, so neither is what it saw or became; the last "
+                "checkpoint is kept: lower --algorithm.value_lr or --algorithm.policy_lr"
+            )
         if not bool(self.next_value.isfinite().all()):
             raise ValueError(
                 "environment: an episode ended without `final_obs` in info, or the value is not finite"

@@ -4,15 +4,13 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
 from lerobot.common.train_utils import load_training_state, save_training_state, should_save_checkpoint
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
-from safetensors.torch import load_file
 from tqdm import tqdm
 
-from lerobot_wmrl.checkpoints import latest_checkpoint, write_checkpoint
+from lerobot_wmrl.checkpoints import latest_checkpoint, read_weights, write_checkpoint
 from lerobot_wmrl.constants import EVALUATION_SEED
 from lerobot_wmrl.rl.ppo import PPO
 from lerobot_wmrl.rl.protocol import Pipeline
@@ -76,6 +74,5 @@ def resume(algorithm: PPO, output_dir: Path) -> None:
     checkpoint = latest_checkpoint(output_dir)
     if checkpoint is None:
         return
-    weights: dict[str, Any] = load_file(checkpoint / PRETRAINED_MODEL_DIR / "model.safetensors")
-    algorithm.load_weights(weights)
+    algorithm.load_weights(read_weights(checkpoint))
     algorithm.iteration, _, _ = load_training_state(checkpoint, algorithm.optimizer, None)

@@ -12,7 +12,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lerobot_wmrl.command import DatasetSource, RunConfig, run_command
+import draccus
+
+from lerobot_wmrl.command import RunConfig, claim_output_dir, run_command
+from lerobot_wmrl.dataset_source import DatasetSource
+from lerobot_wmrl.rewards.configuration_general import GeneralConfig
 
 if TYPE_CHECKING:
     from lerobot_wmrl.world_models.evaluation import Replay
@@ -37,7 +41,8 @@ class EvalWorldModelConfig(RunConfig):
         split: `all`, or `train` / `validation` of the dataset the model was trained on.
         max_episodes: at most so many, evenly spread.
         done_threshold, done_frames: when an imagined episode counts as a success; as in the environment.
-        alpha, form, gamma: of the general reward in the curves; as in the environment.
+        reward: the general reward of the curves (--reward.alpha …); as in the environment.
+        device: where the models run; the best there is by default.
         output_dir: where metrics.json and the pictures go.
     """
 
@@ -48,28 +53,39 @@ class EvalWorldModelConfig(RunConfig):
     max_episodes: int = 200
     done_threshold: float = 0.5
     done_frames: int = 3
-    alpha: float = 0.9
-    form: str = "potential"
-    gamma: float = 0.97
+    reward: GeneralConfig = field(default_factory=GeneralConfig)
+    device: str | None = None
     output_dir: Path = Path("outputs/eval_world_model")
+
+
+def check_config(cfg: EvalWorldModelConfig) -> None:
+    """ValueError names the setting that cannot be."""
+    for name in ("max_episodes", "done_frames"):
+        if getattr(cfg, name) < 1:
+            raise ValueError(f"--{name}={getattr(cfg, name)}: must be at least 1")
+    if not 0 < cfg.done_threshold < 1:
+        raise ValueError(f"--done_threshold={cfg.done_threshold}: must be a probability between 0 and 1")
 
 
 def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     """Replay, measure, draw."""
     from lerobot_wmrl.files import write_json
     from lerobot_wmrl.world_models.checkpoint import load_model
+    from lerobot_wmrl.world_models.compatibility import check_dataset
     from lerobot_wmrl.world_models.episode_table import choose_episodes, open_dataset, read_episodes
     from lerobot_wmrl.world_models.evaluation import accuracy_by_step, replay, success_agreement
     from lerobot_wmrl.world_models.frame_cache import cached_frames
 
-    model = load_model(cfg.model.path, "action_world_model")
+    check_config(cfg)
+    model = load_model(cfg.model.path, "action_world_model", cfg.device)
     table = read_episodes(open_dataset(cfg.dataset.root, cfg.dataset.repo_id))
+    check_dataset(model.config, table.dataset.features)
     episodes = choose_episodes(table, cfg.split, cfg.max_episodes)
+    claim_output_dir(cfg.output_dir, draccus.encode(cfg))
     frames = cached_frames(table.dataset, model.config.camera_keys)
     run = replay(model, table, frames, episodes)
     agreement = success_agreement(run, cfg.done_threshold, cfg.done_frames)
     accuracy = accuracy_by_step(model, run)
-    cfg.output_dir.mkdir(parents=True, exist_ok=True)
     draw(cfg, model, run, accuracy)
     write_json(cfg.output_dir / "metrics.json", {**agreement, **accuracy, "dataset": cfg.dataset.root})
     print(
@@ -102,15 +118,13 @@ def reward_curves(
     cfg: EvalWorldModelConfig, model: "ActionWorldModelRewardModel", run: "Replay", shown: dict[str, int]
 ) -> dict[str, dict[str, Any]]:
     """Per shown episode: done probability, similarity and the return so far."""
-    from lerobot_wmrl.rewards.configuration_general import GeneralConfig
     from lerobot_wmrl.rewards.curves import reward_along_episode
     from lerobot_wmrl.world_models.checkpoint import load_model
 
-    text_model = load_model(cfg.text_model.path, "text_world_model")
-    reward = GeneralConfig(alpha=cfg.alpha, form=cfg.form, gamma=cfg.gamma, device="cpu")
+    text_model = load_model(cfg.text_model.path, "text_world_model", cfg.device)
     return {
         name: reward_along_episode(
-            model, text_model, reward, run.table, run.frames, int(run.episodes[index]),
+            model, text_model, cfg.reward, run.table, run.frames, int(run.episodes[index]),
             threshold=cfg.done_threshold, frames=cfg.done_frames,
         )
         for name, index in shown.items()

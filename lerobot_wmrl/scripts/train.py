@@ -18,6 +18,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 
 from lerobot_wmrl.command import RunConfig, claim_output_dir, run_command
+from lerobot_wmrl.constants import EVALUATION_SEED
 from lerobot_wmrl.rl.configuration_ppo import PPOConfig
 
 
@@ -59,8 +60,10 @@ def check_config(cfg: TrainConfig) -> PPOConfig:
     for name in ("num_envs", "iterations", "save_freq"):
         if getattr(cfg, name) < 1:
             raise ValueError(f"--{name}={getattr(cfg, name)}: must be at least 1")
-    if cfg.seed < 0:
-        raise ValueError(f"--seed={cfg.seed}: must not be negative")
+    if not 0 <= cfg.seed < EVALUATION_SEED:
+        raise ValueError(
+            f"--seed={cfg.seed}: must be from 0 to {EVALUATION_SEED - 1}; those above are for evaluation"
+        )
     return cfg.algorithm
 
 
@@ -75,59 +78,66 @@ def rollout_length(cfg: TrainConfig, longest: int) -> int:
     return steps
 
 
+def load_config(cfg: TrainConfig) -> PreTrainedConfig:
+    """The policy's configuration, also kept in `cfg`. ValueError if no policy is given."""
+    from lerobot_wmrl.policy_checkpoints import read_policy_config
+
+    path = parser.get_path_arg("policy")
+    if not path:
+        raise ValueError("--policy.path: give the checkpoint of the policy to improve")
+    cfg.policy = read_policy_config(path, parser.get_cli_overrides("policy") or [])
+    cfg.policy.push_to_hub = False
+    return cfg.policy
+
+
 def train_policy(cfg: TrainConfig) -> None:
     """Load the policy, build the environment, see that they fit, train."""
     from lerobot.utils.random_utils import set_seed
 
     from lerobot_wmrl.checkpoints import latest_checkpoint
-    from lerobot_wmrl.rl.loading import (
-        check_fit,
-        load_policy,
-        load_processors,
-        make_pipeline,
-        read_policy_config,
-    )
-    from lerobot_wmrl.rl.ppo import PPO
-    from lerobot_wmrl.rl.rollout import RolloutBuffer
-    from lerobot_wmrl.rl.trainer import Schedule, train
+    from lerobot_wmrl.policy_checkpoints import load_policy, load_processors
 
-    algorithm_config = check_config(cfg)
-    path = parser.get_path_arg("policy")
-    if not path:
-        raise ValueError("--policy.path: give the checkpoint of the policy to improve")
-    config = cfg.policy = read_policy_config(path, parser.get_cli_overrides("policy") or [])
-    config.push_to_hub = False
+    algorithm = check_config(cfg)
+    config = load_config(cfg)
     done = latest_checkpoint(cfg.output_dir)
     if done is not None and int(done.name) >= cfg.iterations:
+        claim_output_dir(cfg.output_dir, draccus.encode(cfg))
         print(f"{cfg.output_dir}: already trained for {cfg.iterations} iterations")
         return
     set_seed(cfg.seed)
     policy, processors = load_policy(config), load_processors(config)
     env: Any = cfg.env.create_tensor_env(cfg.num_envs, config.device)  # type: ignore[union-attr]
     try:
-        check_fit(config, env.reset(seed=cfg.seed)[0], env.single_action_space.shape[-1])
-        algorithm = PPO(policy, algorithm_config)
-        buffer = RolloutBuffer(rollout_length(cfg, env.max_episode_steps), cfg.num_envs, config.device)
-        claim_output_dir(cfg.output_dir, draccus.encode(cfg))
-
-        def save_pretrained(folder: Path) -> None:
-            policy.save_pretrained(folder)
-            for processor in processors:
-                processor.save_pretrained(folder)
-            cfg.save_pretrained(folder)
-
-        schedule = Schedule(cfg.iterations, cfg.save_freq, cfg.seed)
-        train(
-            env,
-            algorithm,
-            make_pipeline(config, *processors),
-            buffer,
-            schedule,
-            cfg.output_dir,
-            save_pretrained,
-        )
+        train_in(env, cfg, algorithm, policy, processors)
     finally:
         env.close()
+
+
+def train_in(
+    env: Any, cfg: TrainConfig, algorithm_config: PPOConfig, policy: Any, processors: tuple[Any, Any]
+) -> None:
+    """See that policy and environment fit, then train."""
+    from lerobot_wmrl.policy_checkpoints import check_fit
+    from lerobot_wmrl.rl.ppo import PPO
+    from lerobot_wmrl.rl.protocol import make_pipeline
+    from lerobot_wmrl.rl.rollout import RolloutBuffer
+    from lerobot_wmrl.rl.trainer import Schedule, train
+
+    config = policy.config
+    observation = env.reset(seed=cfg.seed)[0]
+    shown = {name: tuple(value.shape[1:]) for name, value in observation.items() if hasattr(value, "shape")}
+    check_fit(config, shown, env.single_action_space.shape[-1])
+    algorithm = PPO(policy, algorithm_config)
+    buffer = RolloutBuffer(rollout_length(cfg, env.max_episode_steps), cfg.num_envs, config.device)
+    claim_output_dir(cfg.output_dir, draccus.encode(cfg))
+
+    def save_pretrained(folder: Path) -> None:
+        for part in (policy, *processors, cfg):
+            part.save_pretrained(folder)
+
+    schedule = Schedule(cfg.iterations, cfg.save_freq, cfg.seed)
+    pipeline = make_pipeline(config, *processors)
+    train(env, algorithm, pipeline, buffer, schedule, cfg.output_dir, save_pretrained)
 
 
 def main() -> None:

@@ -14,8 +14,10 @@ from pathlib import Path
 import draccus
 from lerobot.configs.rewards import RewardModelConfig
 
-from lerobot_wmrl.command import DatasetSource, RunConfig, claim_output_dir, run_command
+from lerobot_wmrl.command import RunConfig, claim_output_dir, require_free, run_command
+from lerobot_wmrl.dataset_source import DatasetSource
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
+from lerobot_wmrl.world_models.configuration_world_model import WorldModelConfig
 
 TRAINED = ("frame_tokenizer", "action_world_model", "text_world_model")
 
@@ -43,6 +45,24 @@ class TrainWorldModelConfig(RunConfig):
     seed: int = 0
 
 
+def check_config(cfg: TrainWorldModelConfig) -> None:
+    """ValueError names the setting that cannot be."""
+    if cfg.model.type not in TRAINED:
+        raise ValueError(f"--model.type={cfg.model.type}: this command trains {', '.join(TRAINED)}")
+    for name in ("steps", "batch_size", "save_freq", "log_freq"):
+        if getattr(cfg, name) < 1:
+            raise ValueError(f"--{name}={getattr(cfg, name)}: must be at least 1")
+
+
+def check_tokenizer_path(model: RewardModelConfig) -> None:
+    """ValueError if a world model would learn the codes of an untrained tokenizer."""
+    if isinstance(model, WorldModelConfig) and not model.tokenizer_path:
+        raise ValueError(
+            "--model.tokenizer_path is missing: give the output folder of a training with "
+            "--model.type=frame_tokenizer"
+        )
+
+
 def train_world_model(cfg: TrainWorldModelConfig) -> None:
     """Build or reload the model, cache the data, train."""
     from lerobot.utils.random_utils import set_seed
@@ -51,8 +71,7 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
     from lerobot_wmrl.world_models.episode_table import open_dataset, read_episodes
     from lerobot_wmrl.world_models.training import build_model, make_sampler, train
 
-    if cfg.model.type not in TRAINED:
-        raise ValueError(f"--model.type={cfg.model.type}: this command trains {', '.join(TRAINED)}")
+    check_config(cfg)
     table = read_episodes(open_dataset(cfg.dataset.root, cfg.dataset.repo_id))
     given = draccus.encode(cfg)
     checkpoint = latest_checkpoint(cfg.output_dir)
@@ -60,10 +79,13 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
         claim_output_dir(cfg.output_dir, given)
         print(f"{cfg.output_dir}: already trained for {cfg.steps} steps")
         return
+    if checkpoint is None:
+        check_tokenizer_path(cfg.model)
     set_seed(cfg.seed)
     model = build_model(cfg.model, table, cfg.output_dir)
-    claim_output_dir(cfg.output_dir, given)
+    require_free(cfg.output_dir, given)
     sampler = make_sampler(model, table, cfg.batch_size, cfg.seed)
+    claim_output_dir(cfg.output_dir, given)
     train(model, sampler, cfg, cfg.save_pretrained)
 
 

@@ -2,44 +2,56 @@
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
+import torch
 from lerobot.configs.rewards import RewardModelConfig
 from lerobot.rewards.factory import get_reward_model_class
-from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from safetensors import SafetensorError
 
-from lerobot_wmrl.checkpoints import LAST_CHECKPOINT
+from lerobot_wmrl.checkpoints import resolve_checkpoint
+
+FLAGS: Final = {
+    "frame_tokenizer": "--model.tokenizer_path",
+    "action_world_model": "--env.world_model_path / --model.path",
+    "text_world_model": "--env.text_world_model_path / --text_model.path",
+}
+"""How the commands call the path of a model of each type."""
 
 
-def resolve_checkpoint(path: str | Path) -> Path:
-    """A training's output folder, or one of its checkpoints → the `pretrained_model` folder inside."""
-    root = Path(path)
-    for candidate in (root, root / PRETRAINED_MODEL_DIR, root / LAST_CHECKPOINT / PRETRAINED_MODEL_DIR):
-        if (candidate / "config.json").is_file():
-            return candidate
-    return root
-
-
-def read_config(path: str | Path, expected_type: str, device: str = "cpu") -> RewardModelConfig:
-    """The configuration of a checkpoint of exactly `expected_type`, else ValueError."""
+def read_config(path: str | Path, expected_type: str, device: str | None = "cpu") -> RewardModelConfig:
+    """The configuration of a checkpoint of exactly `expected_type`, else ValueError. No device: the best."""
+    flag = FLAGS[expected_type]
     folder = resolve_checkpoint(path)
     if not (folder / "config.json").is_file():
         if folder.is_dir() or str(path).startswith((".", "/", "outputs")) or str(path).count("/") != 1:
             raise ValueError(
-                f"{path!r}: no {expected_type} there; give the output folder of its training, or a hub id"
+                f"{flag}={path}: no {expected_type} there; give its training's output folder, or a hub id"
             )
     else:
-        found = json.loads((folder / "config.json").read_text()).get("type")
+        found = _stored_type(folder / "config.json")
         if found != expected_type:
             raise ValueError(
-                f"{path}: is a checkpoint of type {found!r}, but {expected_type!r} is needed here"
+                f"{flag}={path}: is a checkpoint of type {found!r}, but {expected_type!r} is needed here: "
+                f"give the output folder of a training with --model.type={expected_type}"
             )
+    if device is None:
+        accelerator = torch.accelerator.current_accelerator(check_available=True)
+        device = accelerator.type if accelerator else "cpu"
     return RewardModelConfig.from_pretrained(str(folder), cli_overrides=[f"--device={device}"])
 
 
-def load_model(path: str | Path, expected_type: str, device: str = "cpu") -> Any:
-    """Load a checkpoint of exactly `expected_type` in evaluation mode.
+def _stored_type(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text()).get("type")
+    except (json.JSONDecodeError, AttributeError) as error:
+        raise ValueError(
+            f"{path}: is truncated or no configuration ({error}); use an earlier checkpoint"
+        ) from error
+
+
+def load_model(path: str | Path, expected_type: str, device: str | None = "cpu") -> Any:
+    """Load a checkpoint of exactly `expected_type` in evaluation mode. None: on the best device there is.
 
     Raises:
         ValueError: not found, of another type, truncated, or with other tensors than its config.

@@ -16,7 +16,9 @@ class WorldModelConfig(RewardModelConfig):
         cameras, image_size, tokenizer_widths, levels: of that tokenizer, filled in from its checkpoint.
         state_size: width of `observation.state`, 0 to do without proprioception; filled in from the dataset.
         layers, width, heads: of the spatial-temporal transformer.
-        window: frames the model remembers. clip_length: frames of a training clip.
+        window: frames the model remembers.
+        clip_length: frames of a training clip. Success is learnt only that far from an episode's start, so
+            give it the number of frames that episodes are imagined for.
         patch: side of the square of tokens that forms one transformer token.
         code_width: channels of the convolutions on the token grid.
         motion_weight: how much more a token counts in the loss when it moves. A high weight makes the model
@@ -50,6 +52,24 @@ class WorldModelConfig(RewardModelConfig):
     token_noise: float = 0.02
     temperature: float = 0.0
     learning_rate: float = 1e-3
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("layers", "width", "heads", "window", "patch", "code_width"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"--model.{name}={getattr(self, name)}: must be at least 1")
+        if self.clip_length < 2:
+            raise ValueError(
+                f"--model.clip_length={self.clip_length}: must be at least 2, a frame and its next"
+            )
+        if self.width % (2 * self.heads):
+            raise ValueError(
+                f"--model.width={self.width}: must be a multiple of 2 x --model.heads={self.heads}"
+            )
+        if self.state_size < 0:
+            raise ValueError(
+                f"--model.state_size={self.state_size}: must be 0 (none) or the width of the state"
+            )
 
     def get_optimizer_preset(self) -> AdamWConfig:
         return AdamWConfig(lr=self.learning_rate, weight_decay=1e-2, grad_clip_norm=1.0)

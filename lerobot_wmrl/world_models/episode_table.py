@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import ACTION, OBS_STATE
 
@@ -44,18 +45,43 @@ class EpisodeTable:
 
 
 def open_dataset(root: str | Path, repo_id: str | None = None) -> LeRobotDataset:
-    """Open a local LeRobotDataset. ValueError if there is none at `root`."""
+    """Open a local LeRobotDataset. ValueError if there is none at `root`, or it is not whole."""
     if not (Path(root) / "meta" / "info.json").is_file():
         raise ValueError(
             f"dataset.root={root}: no LeRobotDataset there (meta/info.json is missing); record one first"
         )
-    return LeRobotDataset(repo_id or Path(root).name, root=root, video_backend=VIDEO_BACKEND)
+    name = repo_id or Path(root).name
+    try:
+        missing = missing_files(LeRobotDatasetMetadata(name, root=root))
+        if not missing:
+            return LeRobotDataset(name, root=root, video_backend=VIDEO_BACKEND)
+    except Exception as error:  # parquet, JSON, datasets and the hub each raise their own
+        raise ValueError(
+            f"dataset.root={root}: cannot be opened ({str(error).strip().splitlines()[0]}); it is corrupted: "
+            "remove it and record it again"
+        ) from error
+    raise ValueError(
+        f"dataset.root={root}: {len(missing)} files are missing, the first is {missing[0]}; copy the dataset "
+        "again, or remove it and record it again"
+    )
+
+
+def missing_files(meta: LeRobotDatasetMetadata) -> list[Path]:
+    """Files that the metadata names and that are not there; LeRobot would ask the hub for them."""
+    named = set()
+    for episode in range(meta.total_episodes):
+        named.add(meta.get_data_file_path(episode))
+        named.update(meta.get_video_file_path(episode, key) for key in meta.video_keys)
+    return sorted(path for path in named if not (Path(meta.root) / path).is_file())
 
 
 def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
     """Read the columns that models train on. ValueError names a missing column."""
     if ACTION not in dataset.features:
-        raise ValueError(f"dataset {dataset.repo_id}: the feature {ACTION!r} is missing")
+        raise ValueError(
+            f"dataset.root={dataset.root}: the feature {ACTION!r} is missing (it has "
+            f"{', '.join(dataset.features)}); world models need what was done beside what was seen"
+        )
     columns = [ACTION, "episode_index"]
     columns += [name for name in (OBS_STATE, "next.done", "start.kind") if name in dataset.features]
     rows = dataset.hf_dataset.with_format("numpy", columns=columns)[:]

@@ -5,9 +5,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 from tqdm import trange
 
+from lerobot_wmrl.constants import STATE_NAMES
 from lerobot_wmrl.statistics import Proportion
 from lerobot_wmrl.world_models.episode_table import EpisodeTable
 from lerobot_wmrl.world_models.frame_cache import frames_to_tensor
@@ -110,12 +112,10 @@ def accuracy_by_step(model: ActionWorldModelRewardModel, run: Replay) -> dict[st
         if step + 1 == DELTA_PSNR_STEP:
             other = (decode(model, run.shuffled.tokens[keep, step]) - real) ** 2
             delta.append((_db(error.mean((1, 2, 3, 4))) - _db(other.mean((1, 2, 3, 4)))).mean())
-        if run.table.state.shape[1]:
+        if knows_tcp(run):
             imagined = run.imagined.proprioception[keep, step, :3].cpu().numpy()
-            tcp.append(
-                1000
-                * np.linalg.norm(imagined - run.table.state[run.rows(step + 1)[keep], :3], axis=-1).mean()
-            )
+            error_m = np.linalg.norm(imagined - run.table.state[run.rows(step + 1)[keep], :3], axis=-1)
+            tcp.append(1000 * error_m.mean())
     return {
         "psnr_by_step": [round(float(value), 3) for value in psnr],
         "moving_psnr_by_step": [round(value, 3) for value in moving],
@@ -124,13 +124,19 @@ def accuracy_by_step(model: ActionWorldModelRewardModel, run: Replay) -> dict[st
     }
 
 
-def longest_run(fired: np.ndarray) -> np.ndarray:
-    """Longest run of consecutive True along the last axis. (E, T) → (E,)"""
-    longest = current = np.zeros(fired.shape[0], int)
-    for column in fired.T:
-        current = np.where(column, current + 1, 0)
-        longest = np.maximum(longest, current)
-    return longest
+def knows_tcp(run: Replay) -> bool:
+    """Whether the model predicts a state that begins with the TCP's position in metres."""
+    names = run.table.dataset.features.get(OBS_STATE, {}).get("names") or []
+    return bool(run.imagined.proprioception.shape[-1]) and list(names[:3]) == list(STATE_NAMES[:3])
+
+
+def first_run(fired: np.ndarray, frames: int) -> np.ndarray:
+    """Where the first run of `frames` consecutive True begins, −1 if there is none. (E, T) → (E,)"""
+    count, begin = np.zeros(fired.shape[0], int), np.full(fired.shape[0], -1)
+    for step, column in enumerate(fired.T):
+        count = np.where(column, count + 1, 0)
+        begin = np.where((begin < 0) & (count >= frames), step - frames + 1, begin)
+    return begin
 
 
 def success_agreement(run: Replay, threshold: float, frames: int) -> dict[str, Any]:
@@ -139,9 +145,10 @@ def success_agreement(run: Replay, threshold: float, frames: int) -> dict[str, A
     An episode is called a success as the environment would: `frames` consecutive frames at `threshold`.
     """
     fired = (run.imagined.done_probability.cpu().numpy() >= threshold) & run.acted
-    called, real = longest_run(fired) >= frames, run.done.any(1)
+    begin = first_run(fired, frames)
+    called, real = begin >= 0, run.done.any(1)
     both = called & real
-    delay = fired.argmax(1)[both] - run.done.argmax(1)[both]
+    delay = (begin - run.done.argmax(1))[both]
     counts = {
         "real_failures": ~real, "false_successes": called & ~real,
         "real_successes": real, "recognised_successes": both,

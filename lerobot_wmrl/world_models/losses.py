@@ -64,7 +64,8 @@ def next_frame_loss(
 
     Tokens that move count `motion_weight` times more: most of a frame is still, and what moves decides.
     """
-    target, valid = digits[:, 1:], clip.valid[:, 1:, None].float()
+    target, known = digits[:, 1:], (clip.valid[:, 1:] & clip.valid[:, :-1])[..., None]
+    valid = known.float()
     moved = (target - digits[:, :-1]).abs().sum(-1) >= MOTION_LEVELS
     weight = (1 + config.motion_weight * moved) * valid
     logits = prediction.logits[:, :-1]
@@ -77,7 +78,7 @@ def next_frame_loss(
     state_loss = state_loss / (valid.sum() * max(1, state.shape[-1])).clamp_min(1)
     done_loss = masked_done_loss(prediction.done_logit, clip, config.done_positive_weight)
     loss = token_loss + config.done_weight * done_loss + config.state_weight * state_loss
-    right = (codebook.sample(logits.detach(), 0.0, None) == target).all(-1) & clip.valid[:, 1:, None]
+    right = (codebook.sample(logits.detach(), 0.0, None) == target).all(-1) & known
     return loss, {
         "token_loss": token_loss.item(),
         "done_loss": done_loss.item(),

@@ -7,17 +7,18 @@ import torch
 from lerobot.rewards.pretrained import PreTrainedRewardModel
 from torch import Tensor
 
+from lerobot_wmrl.world_models.compatibility import check_cameras
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer, motion_weight
 from lerobot_wmrl.world_models.goal import similarity_to_goal
 
 
 def stack_cameras(batch: dict[str, Tensor], keys: Sequence[str]) -> Tensor:
-    """Camera images (…, 3, H, W) of a batch → (…, N, 3, H, W). KeyError names a missing camera."""
+    """Camera images (…, 3, H, W) of a batch → (…, N, 3, H, W). ValueError names a missing camera."""
     missing = [key for key in keys if key not in batch]
     if missing:
         present = [key for key in batch if "images" in key]
-        raise KeyError(
+        raise ValueError(
             f"the batch lacks the cameras {missing}; it has {present}. Train on a dataset with them."
         )
     return torch.stack([batch[key] for key in keys], dim=-4)
@@ -52,19 +53,3 @@ class FrameTokenizerRewardModel(PreTrainedRewardModel):
         goal = stack_cameras(batch, [f"goal.{camera}" for camera in self.config.cameras])
         goal_features = self.tokenizer.decode_with_features(self.tokenizer.encode(goal)).features
         return similarity_to_goal(self.tokenizer, self.tokenizer.encode(images), goal_features)
-
-
-def check_cameras(config: Any, features: dict[str, Any]) -> None:
-    """ValueError unless the dataset has the config's cameras at its image size."""
-    for key in config.camera_keys:
-        if key not in features:
-            cameras = [name for name in features if name.startswith("observation.images.")]
-            raise ValueError(
-                f"cameras: the dataset has no {key}, it has {cameras}; set --model.cameras to match"
-            )
-        height, width = features[key]["shape"][:2]
-        if (height, width) != (config.image_size, config.image_size):
-            raise ValueError(
-                f"image_size={config.image_size}: the dataset's {key} is {height}x{width}; "
-                f"train a tokenizer with --model.image_size={height} or record at {config.image_size}"
-            )

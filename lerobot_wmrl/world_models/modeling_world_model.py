@@ -14,6 +14,7 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 
 from lerobot_wmrl.world_models.checkpoint import load_model
+from lerobot_wmrl.world_models.compatibility import check_cameras
 from lerobot_wmrl.world_models.configuration_world_model import (
     ActionWorldModelConfig,
     TextWorldModelConfig,
@@ -28,7 +29,7 @@ from lerobot_wmrl.world_models.losses import (
     forced_share,
     next_frame_loss,
 )
-from lerobot_wmrl.world_models.modeling_frame_tokenizer import check_cameras, stack_cameras
+from lerobot_wmrl.world_models.modeling_frame_tokenizer import stack_cameras
 from lerobot_wmrl.world_models.next_frame import NextFrameNetwork, Prediction
 from lerobot_wmrl.world_models.st_transformer import TemporalCache
 from lerobot_wmrl.world_models.text_encoder import ByteTextEncoder
@@ -90,6 +91,10 @@ class WorldModelRewardModel(PreTrainedRewardModel):
         ).requires_grad_(False)
         if source is not None:
             self.tokenizer.load_state_dict(source.tokenizer.state_dict())
+        if self.tokenizer.grid % config.patch:
+            raise ValueError(
+                f"--model.patch={config.patch}: must divide the tokenizer's grid, {self.tokenizer.grid}"
+            )
         self.network = NextFrameNetwork(
             levels=config.levels, grid=self.tokenizer.grid, num_cameras=len(config.cameras),
             state_size=config.state_size, patch=config.patch, layers=config.layers, width=config.width,
@@ -113,8 +118,10 @@ class WorldModelRewardModel(PreTrainedRewardModel):
 
     def _adopt_features(self, features: dict[str, Any]) -> None:
         check_cameras(self.config, features)
+        if self.config.state_size and OBS_STATE not in features:
+            raise ValueError("the dataset has no observation.state; set --model.state_size=0 to do without")
         if self.config.state_size:
-            self.config.state_size = features[OBS_STATE]["shape"][0] if OBS_STATE in features else 0
+            self.config.state_size = features[OBS_STATE]["shape"][0]
 
     def _register_statistics(self, name: str, key: str, size: int, stats: Any) -> None:
         mean, std = torch.zeros(size), torch.ones(size)
@@ -126,7 +133,11 @@ class WorldModelRewardModel(PreTrainedRewardModel):
         self.register_buffer(f"{name}_std", std)
 
     def normalize_state(self, state: Tensor) -> Tensor:
-        """Dataset units to zero mean and unit spread, clipped: rare collisions must not outweigh the rest."""
+        """Dataset units to zero mean and unit spread, clipped: rare collisions must not outweigh the rest.
+
+        Components beyond the model's `state_size` are dropped.
+        """
+        state = state[..., : self.config.state_size]
         return ((state - self.state_mean) / self.state_std).clamp(-STATE_LIMIT, STATE_LIMIT)
 
     def condition(self, clip: Clip) -> Condition:

@@ -24,7 +24,8 @@ def side_by_side(model: ActionWorldModelRewardModel, run: Replay, index: int) ->
     length = int(run.table.length[run.episodes[index]])
     real = np.stack([run.real_frames(step)[index] for step in range(length)])
     imagined = (decode(model, run.imagined.tokens[index, : length - 1]) * 255).round().astype(np.uint8)
-    start = (decode(model, model.tokenizer.encode(frames_to_tensor(real[:1]))) * 255).round().astype(np.uint8)
+    first = frames_to_tensor(real[:1]).to(model.state_mean.device)
+    start = (decode(model, model.tokenizer.encode(first)) * 255).round().astype(np.uint8)
     rows = [
         np.concatenate(list(cameras.swapaxes(0, 1)), 2)
         for cameras in (real, np.concatenate([start, imagined]))

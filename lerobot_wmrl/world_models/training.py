@@ -1,5 +1,6 @@
 """The one training loop of tokenizer and world models: seeded, resumable, logged."""
 
+import logging
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -57,6 +58,11 @@ def make_sampler(
             raise ValueError(
                 "the text world model learns from successful optimal episodes; the dataset has none"
             )
+    elif "next.done" not in table.dataset.features:
+        logging.warning(
+            "the dataset has no next.done: the model cannot learn what success is, and nothing that is "
+            "imagined in it will succeed"
+        )
     tokenizer: Any = model.tokenizer
     tokens = cached_tokens(table.dataset, config.camera_keys, tokenizer)
     return ClipSampler(
@@ -92,20 +98,27 @@ def train(
     for _ in progress:
         model.training_progress = step / cfg.steps
         loss, metrics = loss_function(sampler(step))
-        if not torch.isfinite(loss):
-            raise ValueError(
-                f"step {step}: the loss is {loss.item()}; the last checkpoint is kept. Lower learning_rate"
-            )
-        optimizer.zero_grad()
-        loss.backward()
-        grad_norm = torch.nn.utils.clip_grad_norm_(model.parameters(), preset.grad_clip_norm)
-        optimizer.step()
+        metrics |= descend(model, loss, optimizer, preset.grad_clip_norm)
         scheduler.step()
         step += 1
         if step % cfg.log_freq == 0 or step == cfg.steps:
-            speed = (step - first) / (time.monotonic() - began)
-            logged = {"loss": loss.item(), **metrics, "grad_norm": grad_norm.item(), "steps_per_s": speed}
-            append_metrics(cfg.output_dir, step, logged)
-            progress.set_postfix(loss=f"{loss.item():.3f}")
+            metrics["steps_per_s"] = (step - first) / (time.monotonic() - began)
+            append_metrics(cfg.output_dir, step, metrics)
+            progress.set_postfix(loss=f"{metrics['loss']:.3f}")
         if should_save_checkpoint(step, cfg.save_freq, cfg.steps):
             write_checkpoint(cfg.output_dir, cfg.steps, step, save)
+
+
+def descend(
+    model: torch.nn.Module, loss: Tensor, optimizer: torch.optim.Optimizer, grad_clip_norm: float
+) -> dict[str, float]:
+    """One optimiser step. → the loss and the norm of its gradient. ValueError, and no step, on a NaN."""
+    if not torch.isfinite(loss):
+        raise ValueError(
+            f"the loss is {loss.item()}; the last checkpoint is kept: lower --model.learning_rate"
+        )
+    optimizer.zero_grad()
+    loss.backward()
+    grad_norm = torch.nn.utils.clip_grad_norm_(model.parameters(), grad_clip_norm)
+    optimizer.step()
+    return {"loss": loss.item(), "grad_norm": grad_norm.item()}

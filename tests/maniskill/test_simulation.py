@@ -119,6 +119,10 @@ def test_a_lighter_robot_looks_like_the_full_one(simulation: Simulation) -> None
 def test_without_a_device_the_error_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
     import sapien
 
+    def no_device(name: str) -> None:
+        raise RuntimeError(f"{name}: none here")
+
+    monkeypatch.setattr(sapien, "Device", no_device)
     monkeypatch.setattr(sapien.render, "get_device_summary", lambda: "")
     with pytest.raises(renderer.NoRendererError, match="make setup"):
         renderer.render_backend()

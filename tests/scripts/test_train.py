@@ -80,12 +80,25 @@ def test_clone_improve_and_evaluate(cloned: Path, tmp_path: Path, monkeypatch: p
     assert "pc_success" in json.loads((tmp_path / "eval" / "eval_info.json").read_text())["overall"]
 
 
-def test_a_finished_training_is_left_alone(
-    cloned: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_finished_training_is_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    policy = save_untrained_policy(tmp_path / "policy")
+    flags = [f"--policy.path={policy}", *SHORT, f"--output_dir={tmp_path / 'rl'}"]
+    improve(monkeypatch, *flags, *POINT)
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+    improve(monkeypatch, *flags, *POINT)
+    with pytest.raises(SystemExit) as stopped:
+        improve(monkeypatch, *flags, *POINT, "--seed=5")
+    assert stopped.value.code == 1
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
+
+
+def test_a_finished_training_of_something_else_is_refused(
+    cloned: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "checkpoints" / "000002").mkdir(parents=True)
-    improve(monkeypatch, f"--policy.path={cloned}", *POINT, *SHORT, f"--output_dir={tmp_path}")
-    assert not (tmp_path / "metrics.jsonl").exists()
+    with pytest.raises(SystemExit) as stopped:
+        improve(monkeypatch, f"--policy.path={cloned}", *POINT, *SHORT, f"--output_dir={cloned}")
+    assert stopped.value.code == 1
+    assert "holds something else" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("flags", "message"), [
@@ -110,6 +123,7 @@ def test_bad_input_is_named_and_nothing_is_written(
 
 @pytest.mark.parametrize(("settings", "message"), [
     ({"env": None}, r"--env\.type"), ({"num_envs": 0}, "--num_envs=0"), ({"seed": -1}, "--seed=-1"),
+    ({"seed": 1_000_000}, "--seed=1000000"),
 ])  # fmt: skip
 def test_impossible_settings_are_named(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_wmrl.command import DatasetSource
+from lerobot_wmrl.dataset_source import DatasetSource
 from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.episode_table import choose_episodes, read_episodes
@@ -13,7 +13,7 @@ from lerobot_wmrl.world_models.evaluation import (
     OpenLoop,
     Replay,
     accuracy_by_step,
-    longest_run,
+    first_run,
     replay,
     success_agreement,
 )
@@ -42,9 +42,11 @@ def perfect(run: Replay, model) -> Replay:
     return run
 
 
-def test_longest_run_counts_consecutive_frames():
-    fired = np.array([[0, 1, 1, 0, 1], [1, 1, 1, 0, 0], [0, 0, 0, 0, 0]], bool)
-    assert longest_run(fired).tolist() == [2, 3, 0]
+def test_the_first_run_is_of_consecutive_frames():
+    fired = np.array([[0, 1, 1, 0, 1], [1, 0, 1, 1, 1], [0, 0, 0, 0, 0]], bool)
+    assert first_run(fired, 2).tolist() == [1, 2, -1]
+    assert first_run(fired, 1).tolist() == [1, 0, -1]
+    assert first_run(fired, 6).tolist() == [-1, -1, -1]
 
 
 def test_a_perfect_model_agrees_about_every_episode(run, model):

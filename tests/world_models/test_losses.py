@@ -33,6 +33,17 @@ def test_padding_does_not_count():
     torch.testing.assert_close(loss, again)
 
 
+def test_no_transition_is_learnt_out_of_padding_before_an_episode():
+    """LeRobot pads a window that begins before its episode by repeating the first frame."""
+    valid = torch.tensor([[False, False, True, True, True], [True] * 5])
+    clip, prediction, digits = clip_and_prediction(valid)
+    loss, _ = next_frame_loss(prediction, CODEBOOK, digits, clip.state, clip, CONFIG)
+    for tensor in (prediction.logits, prediction.proprioception):
+        tensor[0, 1] += torch.randn_like(tensor[0, 1])
+    again, _ = next_frame_loss(prediction, CODEBOOK, digits, clip.state, clip, CONFIG)
+    torch.testing.assert_close(loss, again)
+
+
 def test_perfect_predictions_cost_nothing_and_are_for_the_next_frame():
     clip, prediction, digits = clip_and_prediction(torch.ones(2, 5, dtype=torch.bool))
     logits = torch.roll(CODEBOOK.one_hot(digits), -1, 1) * 100

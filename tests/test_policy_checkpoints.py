@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
-from lerobot_wmrl.rl.loading import check_fit, load_policy, load_processors, make_pipeline, read_policy_config
+from lerobot_wmrl.policy_checkpoints import check_fit, check_weights, load_policy, read_policy_config
 from tests.rl.checkpoints import save_untrained_policy
 
 IMAGE = "observation.images.third_view"
@@ -17,22 +17,6 @@ def test_the_output_folder_of_a_training_is_enough(tmp_path: Path) -> None:
     policy = load_policy(read_policy_config(str(tmp_path), []))
     saved = CnnPolicy.from_pretrained(folder).state_dict()
     assert all(torch.equal(value, saved[name]) for name, value in policy.state_dict().items())
-
-
-def test_the_pipeline_gives_the_policy_what_it_knows(tmp_path: Path) -> None:
-    config = read_policy_config(str(save_untrained_policy(tmp_path)), [])
-    pipeline = make_pipeline(config, *load_processors(config))
-    observation = {
-        IMAGE: torch.rand(2, 3, 32, 32),
-        "observation.images.wrist": torch.rand(2, 3, 8, 8),
-        "task": ["a", "b"],
-    }
-    prepared = pipeline.prepare(observation)
-    assert "observation.images.wrist" not in prepared
-    assert torch.equal(prepared[IMAGE], observation[IMAGE])
-    assert prepared["task"] == ["a", "b"]
-    raw = torch.randn(2, 3)
-    assert torch.equal(pipeline.to_action(raw), raw)
 
 
 @pytest.mark.parametrize(("content", "message"), [
@@ -52,8 +36,10 @@ def test_what_is_no_policy_is_refused(content: str | None, message: str, tmp_pat
 def test_truncated_weights_are_refused(tmp_path: Path) -> None:
     weights = save_untrained_policy(tmp_path) / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:20_000])
-    with pytest.raises(ValueError, match="truncated or of another version"):
-        load_policy(read_policy_config(str(tmp_path), []))
+    config = read_policy_config(str(tmp_path), [])
+    for read in (load_policy, check_weights):
+        with pytest.raises(ValueError, match="truncated or of another version"):
+            read(config)
 
 
 @pytest.mark.parametrize(("camera", "size", "actions", "message"), [
@@ -66,4 +52,4 @@ def test_an_environment_that_does_not_fit_is_refused(
 ) -> None:
     config = read_policy_config(str(save_untrained_policy(tmp_path, camera, size, actions)), [])
     with pytest.raises(ValueError, match=message):
-        check_fit(config, {IMAGE: torch.zeros(1, 3, 32, 32), "task": ["push"]}, action_size=3)
+        check_fit(config, {IMAGE: (3, 32, 32)}, action_size=3)

@@ -1,0 +1,27 @@
+"""What the trainer needs of a policy's processors."""
+
+from pathlib import Path
+
+import torch
+
+from lerobot_wmrl.policy_checkpoints import load_processors, read_policy_config
+from lerobot_wmrl.rl.protocol import make_pipeline
+from tests.rl.checkpoints import save_untrained_policy
+
+IMAGE = "observation.images.third_view"
+
+
+def test_the_pipeline_gives_the_policy_what_it_knows(tmp_path: Path) -> None:
+    config = read_policy_config(str(save_untrained_policy(tmp_path)), [])
+    pipeline = make_pipeline(config, *load_processors(config))
+    observation = {
+        IMAGE: torch.rand(2, 3, 32, 32),
+        "observation.images.wrist": torch.rand(2, 3, 8, 8),
+        "task": ["a", "b"],
+    }
+    prepared = pipeline.prepare(observation)
+    assert "observation.images.wrist" not in prepared
+    assert torch.equal(prepared[IMAGE], observation[IMAGE])
+    assert prepared["task"] == ["a", "b"]
+    raw = torch.randn(2, 3)
+    assert torch.equal(pipeline.to_action(raw), raw)

@@ -1,0 +1,131 @@
+"""What is wrong with a dataset, a checkpoint or a setting is named, and nothing is written."""
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from lerobot_wmrl.dataset_source import DatasetSource
+from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
+from lerobot_wmrl.rewards.configuration_general import GeneralConfig
+from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
+from lerobot_wmrl.world_models.checkpoint import load_model
+from tests.trained import action_config, run_training, train_tokenizer
+
+
+def test_wrong_input_is_named(small_dataset, trained_models, tmp_path):
+    tokenizer, root = trained_models["frame_tokenizer"], Path(small_dataset.root)
+    with pytest.raises(ValueError, match="type 'frame_tokenizer', but 'action_world_model' is needed"):
+        load_model(tokenizer, "action_world_model")
+    with pytest.raises(ValueError, match="no LeRobotDataset there"):
+        run_training(action_config(tokenizer), tmp_path / "nothing", tmp_path / "a")
+    config = action_config(tokenizer)
+    config.tokenizer_path = None
+    with pytest.raises(ValueError, match=r"--model\.tokenizer_path is missing"):
+        run_training(config, root, tmp_path / "b")
+    with pytest.raises(ValueError, match="type=general: this command trains frame_tokenizer"):
+        run_training(GeneralConfig(device="cpu"), root, tmp_path / "d")
+    assert not (tmp_path / "a").exists()
+    (tmp_path / "foreign").mkdir()
+    (tmp_path / "foreign" / "thesis.txt").write_text("precious")
+    with pytest.raises(ValueError, match="holds something else"):
+        train_tokenizer(root, tmp_path / "foreign")
+    assert (tmp_path / "foreign" / "thesis.txt").read_text() == "precious"
+
+
+@pytest.mark.parametrize(("shape", "message"), [
+    ({"size": 48}, r"image_size=32: .* is 48x48; .* or record at 32"),
+    ({"cameras": ("top",)}, r"no observation\.images\.third_view \(its cameras: observation\.images\.top\)"),
+])  # fmt: skip
+def test_another_dataset_than_the_tokenizers_is_named(
+    shape, message, make_synthetic_dataset, trained_models, tmp_path
+):
+    """In training, in replays and where imagined episodes begin, and nothing is written."""
+    root = Path(make_synthetic_dataset(tmp_path / "other", episodes=2, **shape).root)
+    with pytest.raises(ValueError, match=message):
+        run_training(action_config(trained_models["frame_tokenizer"]), root, tmp_path / "out")
+    source, model = DatasetSource(str(root)), Checkpoint(str(trained_models["action_world_model"]))
+    with pytest.raises(ValueError, match=message):
+        eval_world_model(EvalWorldModelConfig(model=model, dataset=source, output_dir=tmp_path / "out"))
+    env = WorldModelEnv(
+        world_model_path=model.path,
+        text_world_model_path=str(trained_models["text_world_model"]),
+        dataset=StartFrames(str(root)),
+    )
+    with pytest.raises(ValueError, match=message):
+        env.create_tensor_env(2)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("setting", "message"), [
+    ({"patch": 3}, r"--model\.patch=3: must divide"), ({"heads": 3}, r"--model\.width=32: must be"),
+    ({"clip_length": 1}, r"--model\.clip_length=1"), ({"state_size": -1}, r"--model\.state_size=-1"),
+])  # fmt: skip
+def test_impossible_sizes_are_named(setting, message, small_dataset, trained_models, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        run_training(
+            action_config(trained_models["frame_tokenizer"], **setting),
+            Path(small_dataset.root),
+            tmp_path / "out",
+        )
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["steps", "batch_size", "save_freq", "log_freq"])
+def test_impossible_schedules_are_named(name, small_dataset, tmp_path):
+    with pytest.raises(ValueError, match=f"--{name}=0: must be at least 1"):
+        train_tokenizer(Path(small_dataset.root), tmp_path / "out", **{name: 0})
+
+
+def test_a_truncated_configuration_is_named(trained_models, tmp_path):
+    source = trained_models["frame_tokenizer"] / "checkpoints" / "last" / "pretrained_model"
+    shutil.copytree(source, tmp_path / "copy")
+    os.truncate(tmp_path / "copy" / "config.json", 40)
+    with pytest.raises(ValueError, match=r"config\.json: is truncated"):
+        load_model(tmp_path / "copy", "frame_tokenizer")
+
+
+def test_a_truncated_checkpoint_is_named(trained_models, tmp_path):
+    source = trained_models["frame_tokenizer"] / "checkpoints" / "last" / "pretrained_model"
+    for path in source.iterdir():
+        content = path.read_bytes()
+        (tmp_path / path.name).write_bytes(
+            content[: len(content) // 2 if path.suffix == ".safetensors" else None]
+        )
+    with pytest.raises(ValueError, match="truncated"):
+        load_model(tmp_path, "frame_tokenizer")
+
+
+def test_a_corrupted_episode_file_is_named_and_leaves_nothing(small_dataset, tmp_path):
+    root = tmp_path / "dataset"
+    shutil.copytree(small_dataset.root, root)
+    video = next(root.rglob("*.mp4"))
+    os.truncate(video, video.stat().st_size // 3)
+    with pytest.raises(ValueError, match=rf"episode \d+: .*{video.name} cannot be decoded .*record it again"):
+        train_tokenizer(root, tmp_path / "run", steps=1)
+    assert not (tmp_path / "run").exists()
+    assert not list(tmp_path.rglob("frames-*"))
+
+
+@pytest.mark.parametrize(("pattern", "message"), [
+    ("*.mp4", r"1 files are missing, the first is videos/.*mp4"),
+    ("data/**/*.parquet", r"1 files are missing, the first is data/.*parquet"),
+])  # fmt: skip
+def test_a_missing_file_is_named_and_not_downloaded(pattern, message, small_dataset, tmp_path):
+    root = tmp_path / "dataset"
+    shutil.copytree(small_dataset.root, root)
+    next(root.rglob(pattern)).unlink()
+    with pytest.raises(ValueError, match=message):
+        train_tokenizer(root, tmp_path / "run", steps=1)
+    assert not (tmp_path / "run").exists()
+
+
+def test_truncated_numbers_are_named(small_dataset, tmp_path):
+    root = tmp_path / "dataset"
+    shutil.copytree(small_dataset.root, root)
+    table = next((root / "data").rglob("*.parquet"))
+    os.truncate(table, table.stat().st_size // 2)
+    with pytest.raises(ValueError, match=r"dataset\.root=.*cannot be opened .*record it again"):
+        train_tokenizer(root, tmp_path / "run", steps=1)
+    assert not (tmp_path / "run").exists()
