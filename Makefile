@@ -1,6 +1,6 @@
 .PHONY: setup demo test lint lock
 
-# What `lerobot-wmrl-demo` gets besides its preset, for example: make demo DEMO_FLAGS=--seed=1
+# What `lerobot-wmrl-demo` gets besides its preset: make demo DEMO_FLAGS="--seed=1 --output_dir=outputs/demo-1"
 DEMO_FLAGS ?=
 PYTEST_FLAGS ?=
 

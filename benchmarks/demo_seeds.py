@@ -7,6 +7,7 @@ Reads each run's summary.json; writes docs/results/demo.json and docs/results/de
 
 import argparse
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,29 +15,17 @@ from matplotlib.figure import Figure
 
 from lerobot_wmrl.files import write_json
 from lerobot_wmrl.report.figures import IMAGINED, REAL, tidy
-from lerobot_wmrl.statistics import PairedChange, Proportion
+from lerobot_wmrl.report.runs import Summary, mean_change, rate, run_rows
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
 
 
-def pooled(summaries: list[dict[str, Any]], policy: str, key: str) -> Proportion:
-    """Episodes of all runs counted together."""
-    rates = [summary["policies"][policy][key] for summary in summaries]
-    return Proportion(sum(rate["k"] for rate in rates), sum(rate["n"] for rate in rates))
+def results(runs: list[Summary]) -> dict[str, Any]:
+    """Every run, and what they agree on."""
+    return {"real_change": asdict(mean_change(runs)), "runs": runs}
 
 
-def results(summaries: list[dict[str, Any]]) -> dict[str, Any]:
-    """Every run, and all of them pooled."""
-    first = summaries[0]["policies"]
-    together = {
-        policy: {key: pooled(summaries, policy, key).as_json() for key in first[policy]} for policy in first
-    }
-    changes = [summary["real_change"] for summary in summaries]
-    change = PairedChange(*(sum(each[key] for each in changes) for key in ("gained", "lost")))
-    return {"pooled": {**together, "real_change": change.as_json()}, "runs": summaries}
-
-
-def draw(summaries: list[dict[str, Any]], path: Path) -> None:
+def draw(summaries: list[Summary], path: Path) -> None:
     """One panel a place: a line from the cloned to the PPO policy for each run, with Wilson intervals."""
     figure = Figure(figsize=(8, 3.4))
     panels = figure.subplots(1, 2, sharey=True)
@@ -44,12 +33,13 @@ def draw(summaries: list[dict[str, Any]], path: Path) -> None:
         panels, ("real", "imagined"), ("in ManiSkill", "in the world model"), (REAL, IMAGINED), strict=True
     ):
         for offset, summary in enumerate(summaries):
-            rates = [Proportion(**{k: summary["policies"][p][key][k] for k in "kn"}) for p in ("sft", "rl")]
+            rates = [rate(summary, policy, key) for policy in ("sft", "rl")]
             places = [place + 0.04 * offset for place in (0, 1)]
-            shares = [rate.share for rate in rates]
-            below = [rate.share - rate.interval[0] for rate in rates]
-            above = [rate.interval[1] - rate.share for rate in rates]
-            axes.errorbar(places, shares, [below, above], color=colour, alpha=1 - 0.25 * offset, marker="o",
+            shares = [each.share for each in rates]
+            below = [each.share - each.interval[0] for each in rates]
+            above = [each.interval[1] - each.share for each in rates]
+            alpha = 1 - 0.6 * offset / len(summaries)
+            axes.errorbar(places, shares, [below, above], color=colour, alpha=alpha, marker="o",
                           capsize=3, label=f"seed {summary['seed']}")  # fmt: skip
         axes.set_title(title)
         axes.set_xticks((0, 1), ("cloned", "PPO"))
@@ -71,10 +61,9 @@ def main() -> None:
     summaries = [json.loads((run / "summary.json").read_text()) for run in runs]
     write_json(RESULTS / "demo.json", results(summaries))
     draw(summaries, RESULTS / "demo.png")
-    together = results(summaries)["pooled"]
-    print("real change:", together.pop("real_change"))
-    for policy, row in together.items():
-        print(policy, *(f"{key} {rate['k']}/{rate['n']}" for key, rate in row.items()))
+    for row in run_rows(summaries):
+        print(", ".join(f"{name} {value}" for name, value in row.items()))
+    print(f"real success changed by {mean_change(summaries)}")
 
 
 if __name__ == "__main__":

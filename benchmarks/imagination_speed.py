@@ -21,6 +21,7 @@ import torch
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.files import write_json
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 
@@ -110,6 +111,8 @@ def main() -> None:
         "threads": torch.get_num_threads(),
         "maniskill_processes": 1,
         "image_size": model.config.image_size,
+        "batch": arguments.batch,
+        "network": {name: getattr(model.config, name) for name in ("layers", "width", "heads", "patch")},
         "imagined_frames_per_s": round(imagined, 1),
         "maniskill_frames_per_s": round(light, 1),
         "maniskill_stock_meshes_frames_per_s": round(stock, 1),
@@ -121,8 +124,7 @@ def main() -> None:
     }
     print(json.dumps(figures, indent=2))
     if arguments.output:
-        arguments.output.parent.mkdir(parents=True, exist_ok=True)
-        arguments.output.write_text(json.dumps(figures, indent=2) + "\n")
+        write_json(arguments.output, figures)
 
 
 if __name__ == "__main__":

@@ -6,13 +6,15 @@ import numpy as np
 import pyarrow.parquet as pq
 
 
-def episode_table(root: Path) -> dict[str, np.ndarray]:
+def parquet_files(root: Path) -> list[Path]:
+    """The files that hold a dataset's rows, in order."""
+    return sorted((root / "data").rglob("*.parquet"))
+
+
+def recorded_episodes(root: Path) -> dict[str, np.ndarray]:
     """Columns (E,) one row an episode: episode, kind, seed, scene, length in rows, success at any row."""
     columns = ["episode_index", "start.kind", "start.seed", "start.scene", "next.success"]
-    rows = [
-        pq.read_table(path, columns=columns).to_pydict()
-        for path in sorted((root / "data").rglob("*.parquet"))
-    ]
+    rows = [pq.read_table(path, columns=columns).to_pydict() for path in parquet_files(root)]
     stacked = {
         name: np.concatenate([np.asarray(part[name]).reshape(-1) for part in rows]) for name in columns
     }

@@ -4,7 +4,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from scipy.stats import binomtest
+import numpy as np
+from scipy.stats import binomtest, bootstrap
 
 Z_95 = 1.959963984540054
 
@@ -69,5 +70,39 @@ class PairedChange:
         changed = self.gained + self.lost
         return float(binomtest(self.gained, changed).pvalue) if changed else 1.0
 
+    def __str__(self) -> str:
+        return f"{self.gained} gained, {self.lost} lost (p = {self.p_value:.2g})"
+
     def as_json(self) -> dict[str, float | int]:
         return {"gained": self.gained, "lost": self.lost, "p_value": self.p_value}
+
+
+@dataclass(frozen=True)
+class MeanChange:
+    """The mean change of a success rate over several runs on the same starts, with a 95 % interval."""
+
+    mean: float
+    low: float
+    high: float
+    runs: int
+    starts: int
+
+    @classmethod
+    def over_runs(cls, before: Sequence[Sequence[bool]], after: Sequence[Sequence[bool]]) -> "MeanChange":
+        """From the outcomes of R runs on the same E starts, in the same order.
+
+        The runs share their starts, so that R·E outcomes are not independent: the bootstrap draws starts
+        (Efron 1979). How much another seed of the training would differ, the interval does not say.
+        """
+        if len({len(run) for run in (*before, *after)}) != 1:
+            raise ValueError("the runs were evaluated on different numbers of starts: they cannot be pooled")
+        change = (np.asarray(after, float) - np.asarray(before, float)).mean(0)
+        low, high = (float(change.mean()),) * 2
+        if change.std() > 0:
+            interval = bootstrap((change,), np.mean, method="percentile", rng=0).confidence_interval
+            low, high = float(interval.low), float(interval.high)
+        return cls(float(change.mean()), low, high, len(before), len(change))
+
+    def __str__(self) -> str:
+        points = f"{100 * self.mean:+.1f} points (95 %: {100 * self.low:+.1f} to {100 * self.high:+.1f}"
+        return f"{points}; {self.runs} runs on the same {self.starts} starts)"

@@ -9,7 +9,7 @@ can_render() {
     .venv/bin/python -c '
 import sapien
 summary = sapien.render.get_device_summary()
-raise SystemExit("Supported: 1" not in summary)' 2>/dev/null
+raise SystemExit(None if "Supported: 1" in summary else summary or "SAPIEN sees no device")'
 }
 
 # mirror_of RELEASE: the address from which apt takes RELEASE, or nothing.
@@ -36,7 +36,7 @@ install_driver() {
 
 if [ "${1:-}" = --install ]; then
     install_driver
-elif ! can_render; then
+elif ! can_render 2>/dev/null; then
     as_root "a Vulkan driver that SAPIEN can render with" "$PWD/tools/ensure_renderer.sh" --install
     can_render || { echo "setup: SAPIEN still finds no rendering device: see the README, Renderer" >&2; exit 1; }
 fi

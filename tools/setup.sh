@@ -33,7 +33,7 @@ find_uv() {
             return
         fi
     done
-    install_uv >&2
+    install_uv >&2 || return 1
     echo .uv/bin/uv
 }
 
@@ -48,8 +48,8 @@ install_uv() {
     if [ -n "$python" ] && { install_uv_in_venv "$python" || install_uv_with_pip "$python"; }; then
         return
     fi
-    as_root "Python's venv module, which installs uv" sh -c "apt-get update && apt-get install -y python3-venv"
-    install_uv_in_venv /usr/bin/python3
+    as_root "Python's venv module, which installs uv" sh -c "apt-get update && apt-get install -y python3-venv" &&
+        install_uv_in_venv /usr/bin/python3
 }
 
 install_uv_in_venv() {
@@ -64,9 +64,10 @@ install_uv_with_pip() {
 
 make_venv() {
     runs_312 "$venv_python" && return
-    local python
+    local python uv
     python=$(find_python)
-    "$(find_uv)" venv --clear --python "${python:-3.12}" .venv
+    uv=$(find_uv)
+    "$uv" venv --clear --python "${python:-3.12}" .venv
 }
 
 # install_once NAME FILES COMMAND...: run COMMAND unless it succeeded before for the same content of FILES.
@@ -81,13 +82,17 @@ install_once() {
 }
 
 install_locked_packages() {
+    local uv
+    uv=$(find_uv)
     # Compiled once here: a command imports thousands of modules, and some machines keep Python from caching them.
-    "$(find_uv)" pip sync --python "$venv_python" --compile-bytecode --require-hashes requirements.lock
+    "$uv" pip sync --python "$venv_python" --compile-bytecode --require-hashes requirements.lock
     rm -f .venv/.installed-project # uv removed it: it is not in the lock
 }
 
 install_project() {
-    "$(find_uv)" pip install --python "$venv_python" --no-deps --no-build-isolation --editable .
+    local uv
+    uv=$(find_uv)
+    "$uv" pip install --python "$venv_python" --no-deps --no-build-isolation --editable .
 }
 
 make_venv

@@ -27,6 +27,7 @@ class RecordConfig(RunConfig):
 
     Planned trajectories by default; with --policy.path=… the real rollouts of that policy. The same command
     again continues an interrupted recording, or reports that it is complete.
+    `--preset=tiny` or `--preset=demo` stands for the flags of that size; flags further right override it.
 
     Args:
         output_dir: root of the dataset; it appears when everything is recorded.

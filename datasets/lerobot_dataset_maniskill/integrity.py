@@ -7,6 +7,8 @@ import av
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from lerobot_wmrl.episodes import parquet_files
+
 
 def whole_dataset(root: Path, episodes: int) -> str | None:
     """What is wrong with the dataset at `root`, or None if it has `episodes` whole episodes."""
@@ -29,10 +31,6 @@ def _first_problem(root: Path, episodes: int) -> str | None:
         if frames != rows:
             return f"{camera} has {frames} of {rows} frames"
     return None
-
-
-def parquet_files(root: Path) -> list[Path]:
-    return sorted((root / "data").rglob("*.parquet"))
 
 
 def video_frames(path: Path) -> int:

@@ -22,7 +22,7 @@ from lerobot_dataset_maniskill.manifest import Part, planned_parts
 from lerobot_dataset_maniskill.worker import EpisodeResult, PartRecorder, Report, serve_parts
 from lerobot_dataset_maniskill.writer import VOCABULARY_FILE, write_card, write_vocabulary
 from lerobot_wmrl.constants import ACTION_NAMES, KINDS
-from lerobot_wmrl.episodes import episode_table
+from lerobot_wmrl.episodes import recorded_episodes
 from lerobot_wmrl.files import write_json
 from lerobot_wmrl.maniskill.processes import simulating_context
 from lerobot_wmrl.maniskill.renderer import render_backend
@@ -218,7 +218,7 @@ def merge(config: RecordConfig, work: Path, parts: list[Part]) -> None:
 
 def success_by_kind(root: Path) -> dict[str, tuple[int, int]]:
     """Kind → (successful episodes, episodes)."""
-    table = episode_table(root)
+    table = recorded_episodes(root)
     kinds, success = table["kind"], table["success"]
     return {
         name: (int(success[kinds == index].sum()), int(np.sum(kinds == index)))

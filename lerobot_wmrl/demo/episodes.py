@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 
 from lerobot_wmrl.constants import KINDS
-from lerobot_wmrl.episodes import episode_table
+from lerobot_wmrl.episodes import recorded_episodes
 
 
 def optimal_episodes(root: Path, count: int) -> list[int]:
     """The first `count` successful episodes of the kind `optimal`, taken from the scenes in turn."""
-    table = episode_table(root)
+    table = recorded_episodes(root)
     chosen = (table["kind"] == KINDS.index("optimal")) & table["success"]
     rank = np.zeros(len(chosen), dtype=np.int64)
     for scene in np.unique(table["scene"]):

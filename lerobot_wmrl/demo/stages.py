@@ -30,7 +30,8 @@ EXPLORATION = 0.4
 class DemoConfig:
     """The whole loop on one task: record, train, clone, improve, measure, report.
 
-    Running the same command again continues after the last finished piece of work.
+    Running the same command again continues after the last finished piece of work. `--preset=demo` (the
+    default) or `--preset=tiny` sets the sizes; flags further right override it.
 
     Args:
         output_dir: folder of everything the demo makes.

@@ -9,9 +9,9 @@ import numpy as np
 
 from lerobot_wmrl.constants import KINDS
 from lerobot_wmrl.demo.stages import DemoConfig
-from lerobot_wmrl.episodes import episode_table
+from lerobot_wmrl.episodes import recorded_episodes
 from lerobot_wmrl.files import write_json, write_text
-from lerobot_wmrl.report import figures, sources
+from lerobot_wmrl.report import figures, runs, sources
 from lerobot_wmrl.report.pictures import EPISODES, picture_sections
 from lerobot_wmrl.statistics import PairedChange, Proportion
 from lerobot_wmrl.tracking import read_metrics
@@ -25,7 +25,7 @@ def write_report(config: DemoConfig, stages: list[str]) -> Path:
     """Write both files; returns the page."""
     records = sources.stage_records(config.output_dir, stages)
     measured = measure(config.output_dir)
-    table = episode_table(config.output_dir / "dataset")
+    table = recorded_episodes(config.output_dir / "dataset")
     write_json(config.output_dir / "summary.json", summary(config, measured, table, records))
     page = config.output_dir / "report.html"
     write_text(page, render(config, measured, table, records))
@@ -65,6 +65,9 @@ def summary(
         "seed": config.seed,
         "policies": {policy: {k: v.as_json() for k, v in row.items()} for policy, row in measured.items()},
         "real_change": sources.real_change(config.output_dir).as_json(),
+        "real_outcomes": {
+            policy: sources.outcomes(config.output_dir / f"eval_{policy}") for policy in POLICIES
+        },
         "dataset": {"episodes": len(table["episode"]), "frames": int(table["length"].sum())},
         "seconds": sum(record["seconds"] for record in records),
         "peak_memory_bytes": max(record["peak_memory_bytes"] for record in records),
@@ -110,7 +113,7 @@ def training_curves(output_dir: Path) -> list[str]:
         ("action_world_model", "Action world model"),
         ("text_world_model", "Text world model"),
     ):
-        lines = sources.metric_curves(read_metrics(output_dir / folder), ["loss", "validation_loss"])
+        lines = sources.metric_curves(read_metrics(output_dir / folder), ["loss"])
         panels.append(figures.curves(lines, title))
     loss = sources.lerobot_train_curve(output_dir / "logs" / "sft.log")
     panels.append(figures.curves({"loss": loss}, "Cloned policy"))
@@ -120,6 +123,18 @@ def training_curves(output_dir: Path) -> list[str]:
         if lines:
             panels.append(figures.curves(lines, title, xlabel="iteration"))
     return panels
+
+
+def other_seeds(config: DemoConfig) -> dict[str, Any] | None:
+    """This run and those with other seeds beside it, if there are any that met the same starts."""
+    found = [
+        run
+        for run in runs.finished_runs(config.output_dir, config.stage_preset)
+        if len(run["real_outcomes"]["sft"]) == config.eval_episodes
+    ]
+    if len(found) < 2:
+        return None
+    return {"rows": runs.run_rows(found), "change": str(runs.mean_change(found))}
 
 
 def kind_rows(table: dict[str, np.ndarray]) -> list[dict[str, Any]]:
@@ -157,6 +172,7 @@ def render(
         trust=trust_rows(config.output_dir),
         pictures=picture_sections(config.output_dir),
         curves=training_curves(config.output_dir),
+        runs=other_seeds(config),
         kinds=kind_rows(table),
         stages=records,
     )

@@ -48,7 +48,7 @@ def success_bars(rates: Mapping[str, tuple[Proportion, Proportion]]) -> str:
     return drawn(tidy(figure))
 
 
-def curves(named: Mapping[str, Curve], title: str, ylabel: str = "", xlabel: str = "step") -> str:
+def curves(named: Mapping[str, Curve], title: str, xlabel: str = "step") -> str:
     """One panel with a line a name."""
     figure = Figure(figsize=(4.6, 2.9))
     axes = figure.subplots()
@@ -56,7 +56,6 @@ def curves(named: Mapping[str, Curve], title: str, ylabel: str = "", xlabel: str
         axes.plot(steps, values, color=colour, label=name, linewidth=1.4)
     axes.set_title(title, fontsize=11)
     axes.set_xlabel(xlabel)
-    axes.set_ylabel(ylabel)
     return drawn(tidy(figure))
 
 

@@ -29,13 +29,14 @@ def real_change(output_dir: Path) -> PairedChange:
 
 
 def lerobot_train_curve(log: Path, name: str = "loss") -> Curve:
-    """lerobot-train's own log lines, `… step:200 … loss:0.123 …`; it keeps its numbers nowhere else."""
-    steps: list[float] = []
-    values: list[float] = []
+    """lerobot-train's own log lines, `… step:200 … loss:0.123 …`; it keeps its numbers nowhere else.
+
+    After a resume the later line of a step wins.
+    """
+    found: dict[float, float] = {}
     for step, value in re.findall(rf"step:(\d+K?)\b.*?\b{name}:([-\d.e]+)", log.read_text(errors="replace")):
-        steps.append(float(step.rstrip("K")) * (1000 if step.endswith("K") else 1))
-        values.append(float(value))
-    return steps, values
+        found[float(step.rstrip("K")) * (1000 if step.endswith("K") else 1)] = float(value)
+    return sorted(found), [found[step] for step in sorted(found)]
 
 
 def metric_curves(metrics: list[dict[str, Any]], names: list[str]) -> dict[str, Curve]:

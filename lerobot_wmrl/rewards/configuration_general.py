@@ -13,7 +13,7 @@ class GeneralConfig(RewardModelConfig):
     Args:
         alpha: weight α of the sparse part; the dense part has 1 − α.
         form: `potential` pays for getting closer to the goal frame, `absolute` (the paper's) for being close.
-        gamma: discount of the potential form; the algorithm's discount keeps the optimum unchanged.
+        gamma: discount of the potential form; give it the algorithm's discount.
     """
 
     alpha: float = 0.9
@@ -23,6 +23,6 @@ class GeneralConfig(RewardModelConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.form not in ("absolute", "potential"):
-            raise ValueError(f"form={self.form!r}: choose absolute or potential")
+            raise ValueError(f"--reward.form={self.form}: choose absolute or potential")
         if not 0 <= self.alpha <= 1:
-            raise ValueError(f"alpha={self.alpha}: choose a weight in [0, 1]")
+            raise ValueError(f"--reward.alpha={self.alpha}: choose a weight in [0, 1]")

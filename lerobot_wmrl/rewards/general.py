@@ -3,8 +3,6 @@
 import torch
 from torch import Tensor
 
-FORMS = ("absolute", "potential")
-
 
 def sparse_reward(done_logit: Tensor, threshold: float) -> Tensor:
     """Eq. 7: 1 where the done probability reaches θ. (B,) → (B,)"""
@@ -14,7 +12,9 @@ def sparse_reward(done_logit: Tensor, threshold: float) -> Tensor:
 def dense_reward(similarity: Tensor, previous: Tensor, form: str, gamma: float) -> Tensor:
     """Eq. 5, as it stands (`absolute`) or as the potential difference γ·s_t − s_{t−1}. (B,), (B,) → (B,)
 
-    The potential form telescopes over an episode, so lingering near the goal earns nothing.
+    The potential form telescopes: an episode earns γ^T·s_T − s_0 in all, so lingering near the goal costs a
+    little. A success keeps its last γ·s_T, as a bonus for ending like the goal (Ng et al. 1999 would take it
+    back); with α near 1 it is small beside the sparse reward.
     """
     return similarity if form == "absolute" else gamma * similarity - previous
 

@@ -34,6 +34,8 @@ class Checkpoint:
 class EvalWorldModelConfig(RunConfig):
     """Replay real episodes in a world model.
 
+    `--preset=tiny` or `--preset=demo` stands for the flags of that size; flags further right override it.
+
     Args:
         model: `--model.path=…`, an action world model.
         text_model: `--text_model.path=…`, for goal frames and reward curves.

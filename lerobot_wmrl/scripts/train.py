@@ -26,6 +26,8 @@ from lerobot_wmrl.rl.configuration_ppo import PPOConfig
 class TrainConfig(RunConfig):
     """Improve a policy by reinforcement learning.
 
+    `--preset=tiny` or `--preset=demo` stands for the flags of that size; flags further right override it.
+
     Args:
         policy: `--policy.path=`, a checkpoint of lerobot-train or the folder it was written to.
         env: `--env.type=world_model|wmrl_maniskill` and its settings.

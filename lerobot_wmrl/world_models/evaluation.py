@@ -13,11 +13,11 @@ from lerobot_wmrl.constants import STATE_NAMES
 from lerobot_wmrl.statistics import Proportion
 from lerobot_wmrl.world_models.episode_table import EpisodeTable
 from lerobot_wmrl.world_models.frame_cache import frames_to_tensor
+from lerobot_wmrl.world_models.frame_tokenizer import MOTION_THRESHOLD
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 
 DELTA_PSNR_STEP = 15
 BATCH = 64
-MOTION_THRESHOLD = 0.08
 
 
 class OpenLoop(NamedTuple):

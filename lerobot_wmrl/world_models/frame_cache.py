@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+import psutil
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.video_utils import decode_video_frames
@@ -95,6 +96,9 @@ def _memory_map(
     """The array at `path`, or a new one that `fill` writes; it appears only once it is whole."""
     if not path.is_file():
         path.parent.mkdir(parents=True, exist_ok=True)
+        for torn in path.parent.glob("*.partial"):
+            if not psutil.pid_exists(int(torn.suffixes[-2][1:])):
+                torn.unlink(missing_ok=True)
         partial = path.with_suffix(f".{os.getpid()}.partial")
         target = np.lib.format.open_memmap(partial, mode="w+", dtype=dtype, shape=shape)
         try:

@@ -15,6 +15,9 @@ from vector_quantize_pytorch import FSQ
 
 PATCH = 4
 
+MOTION_THRESHOLD = 0.08
+"""A pixel has moved when a colour, in [0, 1], differs by more from the episode's first frame."""
+
 
 class Decoded(NamedTuple):
     """Images (B, N, 3, H, W) in [0, 1] and the decoder's feature maps [(B·N, C, h, w), …]."""
@@ -153,7 +156,7 @@ def motion_weight(images: Tensor, reference: Tensor, strength: float) -> Tensor:
     (B, N, 3, H, W) in [0, 1] → (B, N, 1, H, W).
     """
     change = (images - reference).abs().amax(dim=2, keepdim=True)
-    moved = F.max_pool2d((change.flatten(0, 1) > 0.08).float(), 5, stride=1, padding=2)
+    moved = F.max_pool2d((change.flatten(0, 1) > MOTION_THRESHOLD).float(), 5, stride=1, padding=2)
     return 1 + strength * moved.reshape(change.shape)
 
 

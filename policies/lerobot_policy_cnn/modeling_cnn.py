@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import torch
 import torch.nn.functional as F
 from lerobot.policies.pretrained import PreTrainedPolicy
-from lerobot.utils.constants import ACTION, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 from torch import Tensor, nn
 from torch.distributions import Normal
 
@@ -156,6 +156,13 @@ class CnnPolicy(PreTrainedPolicy):
 
     def _inputs(self, observation: Observation) -> tuple[list[Tensor], Tensor | None, Sequence[str]]:
         """The observation after the preprocessor → images in [0, 1], clamped state, instructions."""
+        missing = [camera for camera in self.cameras if camera not in observation]
+        if missing:
+            shown = ", ".join(name for name in observation if name.startswith(OBS_IMAGES)) or "none"
+            raise ValueError(
+                f"the policy needs {', '.join(missing)}, the environment or dataset shows {shown}: use "
+                "one with the cameras that the policy was trained on"
+            )
         images = [observation[camera].float() for camera in self.cameras]
         state = observation[OBS_STATE] if self.config.state_feature else None
         batch = len(images[0]) if images else len(observation[OBS_STATE])

@@ -20,7 +20,7 @@ from lerobot_dataset_maniskill.manifest import planned_parts
 from lerobot_dataset_maniskill.recorder import missing_parts, record
 from lerobot_dataset_maniskill.writer import HOLD_FRAMES
 from lerobot_wmrl.constants import KINDS, STATE_NAMES
-from lerobot_wmrl.episodes import episode_table
+from lerobot_wmrl.episodes import recorded_episodes
 
 EPISODES, PART = 6, 2
 KIND_SHARES = {"optimal": 0.5, "near_miss": 0.5}
@@ -104,7 +104,7 @@ def test_an_optimal_episode_holds_success_a_failure_is_truncated(dataset: LeRobo
     episode, done = column(dataset, "episode_index"), column(dataset, "next.done").ravel()
     truncated, success = column(dataset, "next.truncated").ravel(), column(dataset, "next.success").ravel()
     assert np.array_equal(done, success)
-    table = episode_table(Path(dataset.root))
+    table = recorded_episodes(Path(dataset.root))
     kinds, wins = table["kind"], table["success"]
     assert wins[kinds == KINDS.index("optimal")].all()
     for index, won in enumerate(wins):

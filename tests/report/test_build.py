@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from PIL import Image
 from lerobot_wmrl.constants import KINDS
 from lerobot_wmrl.demo.episodes import optimal_episodes
 from lerobot_wmrl.demo.stages import DemoConfig, demo_stages
-from lerobot_wmrl.episodes import episode_table
+from lerobot_wmrl.episodes import recorded_episodes
 from lerobot_wmrl.files import write_json
 from lerobot_wmrl.report.build import verdict, write_report
 from lerobot_wmrl.statistics import PairedChange, Proportion
@@ -25,6 +26,7 @@ SUCCESSES = {"eval_sft": 4, "imagine_sft": 5, "eval_rl": 6, "imagine_rl": 9}
 @pytest.fixture
 def finished(tmp_path: Path) -> DemoConfig:
     """An output folder as ten episodes of evaluation and four recorded episodes would leave it."""
+    tmp_path = tmp_path / "demo"
     config = DemoConfig(tmp_path)
     write_dataset(tmp_path / "dataset")
     for stage in demo_stages(config):
@@ -83,8 +85,25 @@ def test_summary_holds_every_headline_number(finished: DemoConfig) -> None:
     assert summary["policies"]["rl"]["real"]["k"] == SUCCESSES["eval_rl"]
     assert summary["policies"]["sft"]["false_success"]["share"] == 0.4
     assert summary["real_change"] == {"gained": 2, "lost": 0, "p_value": 0.5}
+    assert sum(summary["real_outcomes"]["rl"]) == SUCCESSES["eval_rl"]
     assert summary["dataset"] == {"episodes": 4, "frames": 12}
     assert summary["seconds"] == 3.0 * len(demo_stages(finished))
+
+
+def test_runs_with_other_seeds_stand_side_by_side(finished: DemoConfig) -> None:
+    """Those beside this one, of the same size and on as many starts; each seed once."""
+    config = replace(finished, eval_episodes=10)
+    stages = [stage.name for stage in demo_stages(config)]
+    assert "Other seeds" not in write_report(config, stages).read_text()
+    own = json.loads((config.output_dir / "summary.json").read_text())
+    beside = config.output_dir.parent
+    other = {**own, "seed": 1, "real_outcomes": {"sft": [False] * 10, "rl": [True] * 4 + [False] * 6}}
+    write_json(beside / "another" / "summary.json", other)
+    write_json(beside / "copy" / "summary.json", own)
+    write_json(beside / "tiny" / "summary.json", {**own, "preset": "tiny", "seed": 2})
+    page = write_report(config, stages).read_text()
+    assert "+30.0 points" in page
+    assert "2 runs on the same 10 starts" in page
 
 
 @pytest.mark.parametrize(
@@ -98,7 +117,7 @@ def test_verdict_claims_no_more_than_the_same_starts_show(gained: int, lost: int
 
 def test_episode_table_reads_outcomes_by_episode(tmp_path: Path) -> None:
     write_dataset(tmp_path)
-    table = episode_table(tmp_path)
+    table = recorded_episodes(tmp_path)
     assert table["length"].tolist() == [3, 3, 3, 3]
     assert table["success"].tolist() == [True, False, False, True]
 

@@ -13,7 +13,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wmrl.constants import EVALUATION_SEED
 from lerobot_wmrl.demo.stages import DemoConfig, demo_stages
-from lerobot_wmrl.episodes import episode_table
+from lerobot_wmrl.episodes import recorded_episodes
 from lerobot_wmrl.presets import PRESETS
 from lerobot_wmrl.tracking import read_metrics
 
@@ -88,7 +88,7 @@ def test_the_dataset_reopens_and_holds_successes_and_failures(outputs: tuple[Pat
     assert frame["observation.images.third_view"].shape[0] == 3
     assert frame["observation.state"].shape == (8,)
     assert frame["action"].shape == (7,)
-    success = episode_table(demo / "dataset")["success"]
+    success = recorded_episodes(demo / "dataset")["success"]
     assert len(success) == dataset.num_episodes
     assert 0 < success.sum() < len(success)
 
@@ -96,9 +96,9 @@ def test_the_dataset_reopens_and_holds_successes_and_failures(outputs: tuple[Pat
 def test_no_held_out_seed_is_trained_on(outputs: tuple[Path, str]) -> None:
     demo, _ = outputs
     for dataset in ("planned", "explored", "dataset"):
-        assert episode_table(demo / dataset)["seed"].max() < EVALUATION_SEED
+        assert recorded_episodes(demo / dataset)["seed"].max() < EVALUATION_SEED
     for policy in ("sft", "rl"):
-        rollouts = episode_table(demo / f"rollouts_{policy}")["seed"]
+        rollouts = recorded_episodes(demo / f"rollouts_{policy}")["seed"]
         evaluated = range(EVALUATION_SEED, EVALUATION_SEED + int(PRESETS["tiny"]["demo"]["eval_episodes"]))
         assert rollouts.min() >= EVALUATION_SEED
         assert not set(rollouts.tolist()) & set(evaluated)
@@ -119,7 +119,7 @@ def test_the_summary_counts_what_was_evaluated(outputs: tuple[Path, str]) -> Non
         assert [summary["policies"][policy][key]["n"] for key in ("real", "imagined")] == [n, n]
         replayed = summary["policies"][policy]
         assert replayed["false_success"]["n"] + replayed["recognised"]["n"] == len(
-            episode_table(demo / f"rollouts_{policy}")["episode"]
+            recorded_episodes(demo / f"rollouts_{policy}")["episode"]
         )
     assert summary["peak_memory_bytes"] < 8e9
 

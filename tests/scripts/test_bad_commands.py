@@ -1,0 +1,90 @@
+"""Every command answers bad input with one line, an exit code that is not 0, and untouched folders."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from lerobot_dataset_maniskill.record import main as record
+from lerobot_wmrl.maniskill import renderer
+from lerobot_wmrl.scripts.demo import main as demo
+from lerobot_wmrl.scripts.eval_world_model import main as eval_world_model
+from lerobot_wmrl.scripts.train import main as train
+from lerobot_wmrl.scripts.train_world_model import main as train_world_model
+from tests.rl.checkpoints import save_untrained_policy
+
+Command = Callable[[], None]
+REPLAY = ["--model.path={action_world_model}", "--dataset.root={data}"]
+ROLL_OUT = ["--policy.path={policy}", "--env.type=wmrl_maniskill", "--num_episodes=1"]
+
+
+@pytest.mark.parametrize(("command", "flags", "message"), [
+    (record, ["--env.task=juggle"], "task='juggle' is unknown; choose one of push"),
+    (record, ["--preset=huge"], "--preset=huge: unknown preset; choose one of tiny, demo"),
+    (record, ["--output_dir={foreign}"], "foreign holds something else"),
+    (record, ROLL_OUT, "the policy needs observation.images.third_view of shape (3, 32, 32), the environment has"),
+    (record, ["--policy.path={action_world_model}"], "no policy can be loaded from it"),
+    (record, ["--policy.path={foreign}"], "config.json is missing"),
+    (train, ["--policy.path={foreign}", "--env.type=wmrl_maniskill"], "config.json is missing"),
+    (train, ["--env.type=wmrl_maniskill", "--preset=huge"], "--preset=huge: unknown preset"),
+    (train_world_model, ["--dataset.root={foreign}"], "no LeRobotDataset there"),
+    (train_world_model, ["--dataset.root={data}", "--preset=demo"], "one a type; give a type: frame_tokenizer"),
+    (train_world_model, ["--dataset.root={data}", "--output_dir={foreign}"], "foreign holds something else"),
+    (train_world_model, ["--dataset.root={data}", "--output_dir={foreign}/thesis.txt"], "thesis.txt is a file"),
+    (eval_world_model, [*REPLAY, "--output_dir={foreign}"], "foreign holds something else"),
+    (eval_world_model, ["--model.path={frame_tokenizer}", "--dataset.root={data}"], "'action_world_model' is needed"),
+    (eval_world_model, [*REPLAY, "--max_episodes=0"], "--max_episodes=0: must be at least 1"),
+    (demo, ["--preset=huge"], "--preset=huge: unknown preset"),
+    (demo, ["--stage_preset=huge"], "--preset=huge: unknown preset"),
+    (demo, ["--output_dir={foreign}"], "holds something that is not a demo"),
+    (demo, ["--sead=1"], "--sead"),
+])  # fmt: skip
+def test_bad_input_is_one_line_and_changes_nothing(
+    command: Command, flags: list[str], message: str, trained_models: dict[str, Path], small_dataset,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    foreign = tmp_path / "foreign"
+    foreign.mkdir()
+    (foreign / "thesis.txt").write_text("precious")
+    paths = {
+        "policy": save_untrained_policy(tmp_path / "policy"),
+        "foreign": foreign,
+        "data": small_dataset.root,
+    }
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+    given = [flag.format(**paths, **trained_models) for flag in flags]
+    if not any(flag.startswith("--output_dir") for flag in given):
+        given.append(f"--output_dir={tmp_path / 'new'}")
+    assert message in error_of(command, given, monkeypatch, capfd)
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
+
+
+def test_without_a_renderer_nothing_is_recorded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    import sapien
+
+    def no_device(name: str) -> None:
+        raise RuntimeError(f"{name}: none here")
+
+    monkeypatch.setattr(sapien, "Device", no_device)
+    monkeypatch.setattr(sapien.render, "get_device_summary", lambda: "")
+    assert renderer.REMEDY in error_of(record, [f"--output_dir={tmp_path / 'new'}"], monkeypatch, capfd)
+    assert not list(tmp_path.iterdir())
+
+
+def error_of(
+    command: Command, flags: list[str], monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> str:
+    """What the command says as it stops."""
+    monkeypatch.setattr(sys, "argv", ["command", *flags])
+    with pytest.raises(SystemExit) as stopped:
+        command()
+    said = capfd.readouterr().err
+    if isinstance(stopped.value.code, str):  # Python prints it, and exits with 1
+        said += stopped.value.code
+    else:
+        assert stopped.value.code == 1, said
+    assert "Traceback" not in said
+    return said
