@@ -9,6 +9,9 @@ from typing import Final
 
 Flags = Mapping[str, str | int | float | bool]
 
+DEMO_SCENES: Final = "[0,1,2]"
+"""A sponge, a can and a box: what 600 episodes suffice for."""
+
 TINY_WORLD_MODEL: Final[Flags] = {
     "model.layers": 1,
     "model.width": 32,
@@ -23,7 +26,13 @@ TINY_WORLD_MODEL: Final[Flags] = {
 
 PRESETS: Final[dict[str, dict[str, Flags]]] = {
     "tiny": {
-        "record": {"num_episodes": 24, "part_episodes": 8, "num_workers": 1},
+        "record": {
+            "env.type": "wmrl_maniskill",
+            "env.scenes": DEMO_SCENES,
+            "num_episodes": 24,
+            "part_episodes": 8,
+            "num_workers": 1,
+        },
         "train-world-model:frame_tokenizer": {
             "model.image_size": 64,
             "model.widths": "[8,16]",
@@ -62,7 +71,13 @@ PRESETS: Final[dict[str, dict[str, Flags]]] = {
         "eval-imagined": {"eval.batch_size": 4},
     },
     "demo": {
-        "record": {"num_episodes": 600, "part_episodes": 30, "num_workers": 2},
+        "record": {
+            "env.type": "wmrl_maniskill",
+            "env.scenes": DEMO_SCENES,
+            "num_episodes": 600,
+            "part_episodes": 30,
+            "num_workers": 2,
+        },
         "train-world-model:frame_tokenizer": {
             "model.image_size": 64,
             "steps": 800,

@@ -7,9 +7,9 @@ import torch
 from lerobot.configs.policies import PreTrainedConfig
 
 from lerobot_dataset_maniskill.manifest import EpisodePlan
-from lerobot_dataset_maniskill.planner import PLANNERS, Follower
+from lerobot_dataset_maniskill.planners import PLANNERS, Follower
 from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, KINDS
-from lerobot_wmrl.maniskill.objects import OBJECTS
+from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS
 from lerobot_wmrl.maniskill.simulation import Frame, Simulation
 from lerobot_wmrl.policy_checkpoints import load_policy, load_processors
 
@@ -35,12 +35,12 @@ class PlannerDriver:
 
     def begin(self, simulation: Simulation, plan: EpisodePlan) -> None:
         rng = np.random.default_rng((plan.seed, KINDS.index(plan.kind), simulation.task.index))
-        planner = PLANNERS[simulation.task.name]
-        waypoints = planner(plan.kind, OBJECTS[plan.scene.object], simulation.current_start, rng)
-        self.follower = Follower(waypoints, rng)
+        things = OBJECTS[plan.scene.object], CONTAINERS[plan.scene.container]
+        planner = PLANNERS[simulation.task.name](*things, simulation.current_start)
+        self.follower = Follower(planner.plan(plan.kind, rng), rng)
 
     def act(self, simulation: Simulation, frame: Frame) -> np.ndarray:
-        return self.follower.act(simulation.tcp_position)
+        return self.follower.act(simulation.tcp_position, simulation.object_position)
 
 
 class ExplorationNoise:

@@ -1,16 +1,12 @@
-"""Objects, containers and tables made by code: nothing is downloaded. Metres, z up, table top at z = 0."""
+"""The things of the scenes, as numbers: nothing is downloaded. Metres, z up, table top at z = 0."""
 
-import tempfile
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
-import numpy as np
-import sapien
-import trimesh
-
-Shape = Literal["box", "cylinder", "ellipsoid"]
+Shape = Literal["box", "cylinder", "ellipsoid", "revolved"]
 Colour = tuple[float, float, float]
+Profile = tuple[tuple[float, float], ...]
+"""Radius (as a share of the largest) by height (from −1 at one end to 1 at the other)."""
 
 
 @dataclass(frozen=True)
@@ -18,8 +14,12 @@ class ObjectSpec:
     """Something to manipulate, standing on the table.
 
     Args:
-        half_size: half extents in x, y, z (a cylinder stands upright; its radius is x).
+        half_size: half extents in x, y, z. A cylinder stands upright.
         label: how an instruction calls it.
+        profile: outline of a revolved shape.
+        lies: whether it is revolved around x, not z.
+        lobes: bulges around the axis, as a bell pepper has them.
+        stalk: colour of a stalk at the upper (or far) end, which is only seen.
     """
 
     name: str
@@ -27,18 +27,41 @@ class ObjectSpec:
     half_size: tuple[float, float, float]
     colour: Colour
     label: str
+    profile: Profile = ()
+    lies: bool = False
+    lobes: int = 0
+    stalk: Colour | None = None
     density: float = 500.0
 
 
 @dataclass(frozen=True)
 class ContainerSpec:
-    """A plate (flat) or a bowl (with a rim): scenery in push, a target in other tasks."""
+    """A plate (flat) or a bowl (with a rim): the target of pick_place, scenery in the other tasks."""
 
     name: str
     radius: float
     height: float
     colour: Colour
+    label: str
 
+
+PEAR: Profile = ((0.35, -1.0), (0.8, -0.8), (1.0, -0.4), (0.92, 0.0), (0.6, 0.45), (0.42, 0.75), (0.2, 1.0))
+PEPPER: Profile = ((0.5, -1.0), (0.8, -0.85), (0.95, -0.2), (1.0, 0.45), (0.85, 0.85), (0.45, 1.0))
+GARLIC: Profile = ((0.4, -1.0), (0.9, -0.75), (1.0, -0.4), (0.8, 0.05), (0.35, 0.4), (0.2, 1.0))
+CARROT: Profile = ((0.6, -1.0), (1.0, -0.8), (0.85, -0.2), (0.6, 0.5), (0.3, 1.0))
+AUBERGINE: Profile = ((0.5, -1.0), (0.9, -0.8), (1.0, -0.35), (0.8, 0.3), (0.6, 0.75), (0.35, 1.0))
+APPLE: Profile = (
+    (0.4, -1.0),
+    (0.75, -0.85),
+    (0.95, -0.35),
+    (1.0, 0.15),
+    (0.85, 0.7),
+    (0.5, 0.95),
+    (0.2, 1.0),
+)
+CUP: Profile = ((0.75, -1.0), (1.0, 1.0))
+
+GREEN: Final[Colour] = (0.10, 0.38, 0.08)
 
 OBJECTS: Final = {
     spec.name: spec
@@ -47,96 +70,51 @@ OBJECTS: Final = {
         ObjectSpec("tomato_can", "cylinder", (0.031, 0.031, 0.030), (0.80, 0.07, 0.06), "tomato can"),
         ObjectSpec("blue_box", "box", (0.028, 0.028, 0.028), (0.06, 0.16, 0.62), "blue box"),
         ObjectSpec("lime", "ellipsoid", (0.030, 0.035, 0.028), (0.22, 0.62, 0.10), "lime"),
+        ObjectSpec("lemon", "ellipsoid", (0.034, 0.026, 0.026), (0.98, 0.88, 0.20), "lemon"),
+        ObjectSpec("peach", "ellipsoid", (0.032, 0.032, 0.030), (0.98, 0.58, 0.42), "peach"),
+        ObjectSpec(
+            "bell_pepper", "revolved", (0.031, 0.031, 0.034), (0.08, 0.42, 0.06), "green bell pepper",
+            profile=PEPPER, lobes=4, stalk=(0.35, 0.30, 0.08),
+        ),
+        ObjectSpec("garlic", "revolved", (0.028, 0.028, 0.030), (0.95, 0.92, 0.86), "garlic", profile=GARLIC),
+        ObjectSpec(
+            "carrot", "revolved", (0.042, 0.019, 0.019), (0.95, 0.38, 0.03), "carrot",
+            profile=CARROT, lies=True, stalk=GREEN,
+        ),
+        ObjectSpec("tomato", "ellipsoid", (0.033, 0.033, 0.028), (0.85, 0.05, 0.03), "tomato", stalk=GREEN),
+        ObjectSpec(
+            "pear", "revolved", (0.029, 0.029, 0.040), (0.72, 0.75, 0.18), "pear",
+            profile=PEAR, stalk=(0.30, 0.18, 0.08),
+        ),
+        ObjectSpec(
+            "aubergine", "revolved", (0.044, 0.025, 0.025), (0.22, 0.05, 0.28), "aubergine",
+            profile=AUBERGINE, lies=True, stalk=GREEN,
+        ),
+        ObjectSpec("potato", "ellipsoid", (0.037, 0.028, 0.025), (0.58, 0.42, 0.22), "potato"),
+        ObjectSpec(
+            "apple", "revolved", (0.033, 0.033, 0.031), (0.62, 0.04, 0.10), "red apple",
+            profile=APPLE, stalk=(0.25, 0.15, 0.06),
+        ),
+        ObjectSpec("orange", "ellipsoid", (0.033, 0.033, 0.033), (0.98, 0.48, 0.02), "orange"),
+        ObjectSpec("soap", "box", (0.032, 0.024, 0.016), (0.95, 0.62, 0.72), "pink soap"),
+        ObjectSpec("cup", "revolved", (0.032, 0.032, 0.032), (0.05, 0.52, 0.52), "teal cup", profile=CUP),
+        ObjectSpec("tea_tin", "box", (0.023, 0.023, 0.036), (0.05, 0.22, 0.14), "dark green tea tin"),
+        ObjectSpec("wooden_block", "box", (0.026, 0.020, 0.026), (0.76, 0.58, 0.36), "wooden block"),
+        ObjectSpec("glue_stick", "cylinder", (0.018, 0.018, 0.036), (0.45, 0.12, 0.62), "purple glue stick"),
     )
-}
+}  # fmt: skip
+"""Twenty things, told apart by shape, size and colour, each narrow enough for the gripper (8 cm)."""
 
 CONTAINERS: Final = {
     spec.name: spec
     for spec in (
-        ContainerSpec("plate", 0.060, 0.010, (0.92, 0.92, 0.90)),
-        ContainerSpec("bowl", 0.055, 0.045, (0.35, 0.20, 0.45)),
+        ContainerSpec("plate", 0.060, 0.010, (0.92, 0.92, 0.90), "white plate"),
+        ContainerSpec("bowl", 0.055, 0.045, (0.35, 0.20, 0.45), "purple bowl"),
     )
 }
 
 TABLES: Final[dict[str, Colour]] = {"wood": (0.50, 0.36, 0.22), "slate": (0.36, 0.40, 0.44)}
 
-OBJECT_FRICTION: Final = 0.6
-
-
-def render_material(colour: Colour) -> Any:
-    """A matt surface: highlights would only cost the frame tokenizer."""
-    return sapien.render.RenderMaterial(base_color=[*colour, 1.0], roughness=0.9, specular=0.1, metallic=0.0)
-
-
-def build_object(scene: Any, spec: ObjectSpec) -> Any:
-    """A dynamic actor of `spec` in a ManiSkill scene."""
-    builder = scene.create_actor_builder()
-    surface = sapien.physx.PhysxMaterial(OBJECT_FRICTION, OBJECT_FRICTION, 0.0)
-    material = render_material(spec.colour)
-    half_x, _, half_z = spec.half_size
-    if spec.shape == "box":
-        builder.add_box_collision(half_size=spec.half_size, material=surface, density=spec.density)
-        builder.add_box_visual(half_size=spec.half_size, material=material)
-    elif spec.shape == "cylinder":
-        upright = sapien.Pose(q=[np.sqrt(0.5), 0, np.sqrt(0.5), 0])
-        builder.add_cylinder_collision(upright, half_x, half_z, material=surface, density=spec.density)
-        builder.add_cylinder_visual(upright, half_x, half_z, material=material)
-    else:
-        mesh = trimesh.creation.icosphere(subdivisions=2)
-        mesh.apply_scale(spec.half_size)
-        return _build_mesh(builder, spec, mesh, material, surface)
-    builder.initial_pose = sapien.Pose(p=[0, 0, half_z])
-    return builder.build(name=spec.name)
-
-
-def build_container(scene: Any, spec: ContainerSpec) -> Any:
-    """A kinematic actor of `spec`; it collides as a solid disc of its height."""
-    builder = scene.create_actor_builder()
-    upright = sapien.Pose(p=[0, 0, spec.height / 2], q=[np.sqrt(0.5), 0, np.sqrt(0.5), 0])
-    builder.add_cylinder_collision(upright, spec.radius, spec.height / 2)
-    builder.initial_pose = sapien.Pose()
-    profile = _container_profile(spec)
-    mesh = trimesh.creation.revolve(profile, sections=24)
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / f"{spec.name}.obj"
-        mesh.export(file)
-        builder.add_visual_from_file(str(file), material=render_material(spec.colour))
-        return builder.build_kinematic(name=spec.name)
-
-
-def build_table(scene: Any, name: str) -> Any:
-    """The table: one box whose top is z = 0, in one plain colour."""
-    half_size = (0.9, 1.2, 0.05)
-    pose = sapien.Pose(p=[-0.1, 0, -half_size[2]])
-    builder = scene.create_actor_builder()
-    builder.add_box_collision(half_size=half_size)
-    builder.add_box_visual(half_size=half_size, material=render_material(TABLES[name]))
-    builder.initial_pose = pose
-    return builder.build_kinematic(name=f"table_{name}")
-
-
-def _build_mesh(builder: Any, spec: ObjectSpec, mesh: Any, material: Any, surface: Any) -> Any:
-    """SAPIEN loads meshes from files only, and reads them while it builds."""
-    with tempfile.TemporaryDirectory() as folder:
-        file = str(Path(folder) / f"{spec.name}.obj")
-        mesh.export(file)
-        builder.add_convex_collision_from_file(file, material=surface, density=spec.density)
-        builder.add_visual_from_file(file, material=material)
-        builder.initial_pose = sapien.Pose(p=[0, 0, spec.half_size[2]])
-        return builder.build(name=spec.name)
-
-
-def _container_profile(spec: ContainerSpec) -> np.ndarray:
-    """(N, 2) radius and height of the outline that is revolved around z."""
-    radius, height = spec.radius, spec.height
-    wall = 0.006
-    return np.array(
-        [
-            (0.0, 0.0),
-            (0.6 * radius, 0.0),
-            (radius, height),
-            (radius - wall, height),
-            (0.55 * radius, wall),
-            (0.0, wall),
-        ]
-    )
+CARPET_RADIUS: Final = 0.05
+CARPET_COLOUR: Final[Colour] = (0.10, 0.60, 0.85)
+"""The target of move_to_aim: a flat round mat."""

@@ -12,6 +12,9 @@ from mani_skill.agents.robots.panda.panda import Panda
 
 CONTROL_MODE = "base_delta_pose"
 BASE_POSITION = (-0.615, 0.0, 0.0)
+GRIPPER_OPEN = 0.04
+"""Finger joint position (m) of the open gripper."""
+
 FINE_LINKS = ("panda_hand", "panda_leftfinger", "panda_rightfinger")
 """Links whose outline decides whether there is contact keep more triangles."""
 

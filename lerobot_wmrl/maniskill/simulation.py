@@ -6,15 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, ROBOT_MESH_DETAIL, WORKSPACE_FLOOR
-from lerobot_wmrl.maniskill.objects import OBJECTS
+from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, FPS, ROBOT_MESH_DETAIL, WORKSPACE_FLOOR
+from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS
 from lerobot_wmrl.maniskill.renderer import render_backend
+from lerobot_wmrl.maniskill.robot import GRIPPER_OPEN
 from lerobot_wmrl.maniskill.scenes import Scene
 from lerobot_wmrl.maniskill.tabletop import TabletopEnv
 from lerobot_wmrl.maniskill.tasks import Situation, Start, Task
-
-GRIPPER_OPEN = 0.04
-"""Finger joint position (m) of the open gripper."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +38,7 @@ class Simulation:
     Args:
         task: what succeeds and what pays.
         scenes: the scenes that may be asked for.
-        cameras: names from `constants.CAMERAS`.
+        cameras: names from `constants.CAMERAS`; none of them is fastest.
         image_size: pixels of each side.
         robot_mesh_detail: share of the robot's triangles that are drawn; 1 draws ManiSkill's own meshes.
     """
@@ -62,20 +60,21 @@ class Simulation:
 
     def start(self, scene: Scene, seed: int) -> Start:
         """The start of this scene and seed, as a plan: nothing is moved."""
-        return self.task.start(scene, OBJECTS[scene.object].label, seed)
+        return self.task.start(scene, seed)
 
     def reset(self, scene: Scene, seed: int) -> Frame:
         """Rebuild the start of (task, scene, seed). The same arguments give the same frame."""
         self.scene = scene
         self.current_start = self.start(scene, seed)
         self.env.place(scene, self.current_start)
-        self.object_start = self.object_position
+        self.object_start = self._object_before = self.object_position
         return self._frame()
 
     def step(self, action: np.ndarray) -> Frame:
         """Apply one action (7,), clipped to the action box and to the workspace, for one control step."""
         clipped = np.clip(np.asarray(action, np.float32), self._low, self._high)
         clipped[2] = max(clipped[2], WORKSPACE_FLOOR - self.tcp_position[2])
+        self._object_before = self.object_position
         self.env.step(torch.from_numpy(clipped)[None])
         return self._frame()
 
@@ -89,14 +88,22 @@ class Simulation:
         return np.asarray(self.env.active._objs[0].pose.p, np.float64)
 
     @property
+    def gripper_opening(self) -> float:
+        """0 closed to 1 open."""
+        return float(np.clip(self.env.agent.robot._objs[0].qpos[-1] / GRIPPER_OPEN, 0.0, 1.0))
+
+    @property
     def tcp_position(self) -> np.ndarray:
         """(3,)"""
         return np.asarray(self.env.agent.tcp._objs[0].entity.pose.p, np.float64)
 
     def situation(self) -> Situation:
         """What the task judges now."""
-        height = OBJECTS[self.scene.object].half_size[2]
-        return Situation(self.object_start, self.object_position, self.tcp_position, height)
+        return Situation(
+            self.current_start, OBJECTS[self.scene.object], CONTAINERS[self.scene.container],
+            self.object_start, self.object_position, self.tcp_position, self.gripper_opening,
+            float(np.linalg.norm(self.object_position - self._object_before)) * FPS,
+        )  # fmt: skip
 
     def close(self) -> None:
         self.env.close()
@@ -107,12 +114,12 @@ class Simulation:
 
     def _state(self) -> np.ndarray:
         pose = self.env.agent.tcp._objs[0].entity.pose
-        opening = self.env.agent.robot._objs[0].qpos[-1] / GRIPPER_OPEN
-        return np.array([*pose.p, *continuous(pose.q), np.clip(opening, 0.0, 1.0)], np.float32)
+        return np.array([*pose.p, *continuous(pose.q), self.gripper_opening], np.float32)
 
     def _images(self) -> dict[str, np.ndarray]:
-        self.env.scene.sub_scenes[0].update_render()
-        images = {}
+        images: dict[str, np.ndarray] = {}
+        if self.cameras:
+            self.env.scene.sub_scenes[0].update_render()
         for name in self.cameras:
             camera = self.env._sensors[name].camera._render_cameras[0]
             camera.take_picture()

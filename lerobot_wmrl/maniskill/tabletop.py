@@ -15,9 +15,16 @@ from mani_skill.utils.structs.types import SimConfig
 from transforms3d.euler import euler2quat
 
 from lerobot_wmrl.constants import FPS
+from lerobot_wmrl.maniskill.actors import build_carpet, build_container, build_object, build_table
 from lerobot_wmrl.maniskill.cameras import camera_config
-from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS, build_container, build_object, build_table
-from lerobot_wmrl.maniskill.robot import BASE_POSITION, CONTROL_MODE, BaseAxesPanda, lighten_meshes
+from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS
+from lerobot_wmrl.maniskill.robot import (
+    BASE_POSITION,
+    CONTROL_MODE,
+    GRIPPER_OPEN,
+    BaseAxesPanda,
+    lighten_meshes,
+)
 from lerobot_wmrl.maniskill.scenes import Scene
 from lerobot_wmrl.maniskill.tasks import Start
 
@@ -68,6 +75,7 @@ class TabletopEnv(BaseEnv):
         self.containers = {
             n: build_container(self.scene, CONTAINERS[n]) for n in _names(self.scenes, "container")
         }
+        self.carpets = {"carpet": build_carpet(self.scene)}
         self.tables = {n: build_table(self.scene, n) for n in _names(self.scenes, "table")}
         for actor in self.objects.values():
             actor._bodies[0].set_angular_damping(ANGULAR_DAMPING)
@@ -93,14 +101,17 @@ class TabletopEnv(BaseEnv):
         """Put the scene's things and the robot where the episode starts, at rest."""
         _show_only(self.tables, scene.table, sapien.Pose(p=[-0.1, 0, -0.05]))
         _show_only(self.containers, scene.container, sapien.Pose(p=[*start.container_xy, 0.0]))
+        carpet_xy = PARKING[:2] if start.carpet_xy is None else start.carpet_xy
+        shown = None if start.carpet_xy is None else "carpet"
+        _show_only(self.carpets, shown, sapien.Pose(p=[*carpet_xy, 0.0]))
         height = OBJECTS[scene.object].half_size[2]
         pose = sapien.Pose(p=[*start.object_xy, height], q=euler2quat(0, 0, start.object_yaw))
         _show_only(self.objects, scene.object, pose)
         self.active = self.objects[scene.object]
-        self._place_robot(start.tcp)
+        self._place_robot(start.tcp, GRIPPER_OPEN if start.gripper_open else 0.0)
 
-    def _place_robot(self, tcp: np.ndarray) -> None:
-        """Solve inverse kinematics from rest, so that the closed gripper points down at `tcp` (3,)."""
+    def _place_robot(self, tcp: np.ndarray, finger: float) -> None:
+        """Solve inverse kinematics from rest, so that the gripper points down at `tcp` (3,)."""
         arm = self.agent.controller.controllers["arm"]
         model = arm.kinematics.pmodel
         target = sapien.Pose(p=np.asarray(tcp) - np.array(BASE_POSITION), q=[0.0, 1.0, 0.0, 0.0])
@@ -110,7 +121,7 @@ class TabletopEnv(BaseEnv):
         )
         if not solved:
             raise RuntimeError(f"inverse kinematics failed for the start position {np.round(tcp, 3)}")
-        qpos[-2:] = 0.0
+        qpos[-2:] = finger
         self.agent.reset(qpos)
         self.agent.controller.reset()
 
@@ -119,8 +130,8 @@ def _names(scenes: Sequence[Scene], field: str) -> list[str]:
     return sorted({getattr(scene, field) for scene in scenes})
 
 
-def _show_only(actors: dict[str, Any], shown: str, pose: sapien.Pose) -> None:
-    """Put `shown` at `pose` at rest, and park the others: hidden, immovable and far away."""
+def _show_only(actors: dict[str, Any], shown: str | None, pose: sapien.Pose) -> None:
+    """Put `shown`, if any, at `pose` at rest, and park the others: hidden, immovable and far away."""
     for place, (name, actor) in enumerate(actors.items()):
         entity = actor._objs[0]
         body = entity.find_component_by_type(sapien.physx.PhysxRigidDynamicComponent)

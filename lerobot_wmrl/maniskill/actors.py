@@ -1,0 +1,119 @@
+"""The things of the scenes in the simulator."""
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import sapien
+import trimesh
+
+from lerobot_wmrl.maniskill.meshes import BOWL_WALL, FLOOR_SHARE, container_mesh, object_mesh, stalk_mesh
+from lerobot_wmrl.maniskill.objects import (
+    CARPET_COLOUR,
+    CARPET_RADIUS,
+    TABLES,
+    Colour,
+    ContainerSpec,
+    ObjectSpec,
+)
+
+OBJECT_FRICTION: Final = 0.6
+WALL_BOXES: Final = 16
+"""Boxes around a container that keep what lies in it from rolling out."""
+
+CARPET_THICKNESS: Final = 0.001
+UPRIGHT: Final = (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)
+"""SAPIEN's cylinders lie along x."""
+
+
+def render_material(colour: Colour) -> Any:
+    """A matt surface: highlights would only cost the frame tokenizer."""
+    return sapien.render.RenderMaterial(base_color=[*colour, 1.0], roughness=0.9, specular=0.1, metallic=0.0)
+
+
+def build_object(scene: Any, spec: ObjectSpec) -> Any:
+    """A dynamic actor of `spec` in a ManiSkill scene. What is round collides as its convex hull."""
+    builder = scene.create_actor_builder()
+    surface = sapien.physx.PhysxMaterial(OBJECT_FRICTION, OBJECT_FRICTION, 0.0)
+    material = render_material(spec.colour)
+    radius, _, half_z = spec.half_size
+    builder.initial_pose = sapien.Pose(p=[0, 0, half_z])
+    if spec.shape == "box":
+        builder.add_box_collision(half_size=spec.half_size, material=surface, density=spec.density)
+        builder.add_box_visual(half_size=spec.half_size, material=material)
+        return builder.build(name=spec.name)
+    if spec.shape == "cylinder":
+        upright = sapien.Pose(q=UPRIGHT)
+        builder.add_cylinder_collision(upright, radius, half_z, material=surface, density=spec.density)
+        builder.add_cylinder_visual(upright, radius, half_z, material=material)
+        return builder.build(name=spec.name)
+    meshes = [(object_mesh(spec), material)]
+    if spec.stalk is not None:
+        meshes.append((stalk_mesh(spec), render_material(spec.stalk)))
+    with _files([mesh for mesh, _ in meshes]) as files:
+        builder.add_convex_collision_from_file(files[0], material=surface, density=spec.density)
+        for file, (_, colour) in zip(files, meshes, strict=True):
+            builder.add_visual_from_file(file, material=colour)
+        return builder.build(name=spec.name)
+
+
+def build_container(scene: Any, spec: ContainerSpec) -> Any:
+    """A kinematic actor of `spec`: a floor to lie on and a ring of tilted boxes as its wall."""
+    builder = scene.create_actor_builder()
+    floor = sapien.Pose(p=[0, 0, BOWL_WALL / 2], q=UPRIGHT)
+    builder.add_cylinder_collision(floor, FLOOR_SHARE * spec.radius, BOWL_WALL / 2)
+    for pose, half_size in wall_boxes(spec):
+        builder.add_box_collision(pose, half_size=half_size)
+    builder.initial_pose = sapien.Pose()
+    with _files([container_mesh(spec)]) as files:
+        builder.add_visual_from_file(files[0], material=render_material(spec.colour))
+        return builder.build_kinematic(name=spec.name)
+
+
+def wall_boxes(spec: ContainerSpec) -> Iterator[tuple[Any, list[float]]]:
+    """Poses and half sizes of the boxes between the floor's edge and the rim."""
+    inner, outer = FLOOR_SHARE * spec.radius, spec.radius
+    slope = np.hypot(outer - inner, spec.height)
+    tilt = np.arctan2(outer - inner, spec.height)
+    half_size = [BOWL_WALL / 2, outer * np.tan(np.pi / WALL_BOXES), slope / 2]
+    middle = (inner + outer) / 2
+    for angle in np.arange(WALL_BOXES) * 2 * np.pi / WALL_BOXES:
+        place = [middle * np.cos(angle), middle * np.sin(angle), spec.height / 2]
+        turn = trimesh.transformations.quaternion_multiply(
+            trimesh.transformations.quaternion_about_axis(angle, (0, 0, 1)),
+            trimesh.transformations.quaternion_about_axis(tilt, (0, 1, 0)),
+        )
+        yield sapien.Pose(p=place, q=turn), half_size
+
+
+def build_carpet(scene: Any) -> Any:
+    """The mat of move_to_aim: only seen, so that nothing catches on its edge."""
+    builder = scene.create_actor_builder()
+    pose = sapien.Pose(p=[0, 0, CARPET_THICKNESS / 2], q=UPRIGHT)
+    builder.add_cylinder_visual(pose, CARPET_RADIUS, CARPET_THICKNESS / 2, render_material(CARPET_COLOUR))
+    builder.initial_pose = sapien.Pose()
+    return builder.build_kinematic(name="carpet")
+
+
+def build_table(scene: Any, name: str) -> Any:
+    """The table: one box whose top is z = 0, in one plain colour."""
+    half_size = (0.9, 1.2, 0.05)
+    pose = sapien.Pose(p=[-0.1, 0, -half_size[2]])
+    builder = scene.create_actor_builder()
+    builder.add_box_collision(half_size=half_size)
+    builder.add_box_visual(half_size=half_size, material=render_material(TABLES[name]))
+    builder.initial_pose = pose
+    return builder.build_kinematic(name=f"table_{name}")
+
+
+@contextmanager
+def _files(meshes: list[trimesh.Trimesh]) -> Iterator[list[str]]:
+    """SAPIEN loads meshes from files only, and reads them while it builds."""
+    with tempfile.TemporaryDirectory() as folder:
+        files = [str(Path(folder) / f"{index}.obj") for index in range(len(meshes))]
+        for mesh, file in zip(meshes, files, strict=True):
+            mesh.export(file)
+        yield files
