@@ -71,9 +71,8 @@ def draw(visited: dict[str, dict[str, Way]], path: Path) -> None:
     for row, (task, kinds) in zip(panels, visited.items(), strict=True):
         for axes, (kind, places) in zip(row, kinds.items(), strict=True):
             for which, colour in ((0, "#2b6cb0"), (1, "#dd6b20")):
-                axes.plot(
-                    -places[:, which, 1], places[:, which, 0], ".", color=colour, markersize=0.6, alpha=0.3
-                )
+                x, y = places[:, which, :2].T
+                axes.plot(-y, x, ".", color=colour, markersize=0.6, alpha=0.3)
             axes.set_title(f"{task}: {kind.replace('_', ' ')}", fontsize=8)
             axes.set_aspect("equal")
             axes.set_xlim(-0.3, 0.35)

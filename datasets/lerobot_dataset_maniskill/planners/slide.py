@@ -12,7 +12,7 @@ from lerobot_wmrl.maniskill.tasks import Start
 from lerobot_wmrl.maniskill.tasks.push import Pull, Push, Slide
 
 MARGIN: Final = 0.04
-"""How much further than success demands a good slide aims (m), so that a cloned policy stops no hair early."""
+"""How much further than success demands a good slide aims (m), so that a clone stops no hair early."""
 
 BEHIND: Final = 0.025
 """Between the gripper and the object before they touch (m)."""
