@@ -16,10 +16,8 @@ FLOOR_SHARE = 0.6
 
 def object_mesh(spec: ObjectSpec) -> trimesh.Trimesh:
     """An ellipsoid or a revolved shape that fills `half_size`."""
-    if spec.shape == "ellipsoid":
-        mesh = trimesh.creation.icosphere(subdivisions=2)
-    else:
-        mesh = _revolved(spec)
+    round_one = spec.shape == "ellipsoid"
+    mesh = trimesh.creation.icosphere(subdivisions=2) if round_one else _revolved(spec)
     mesh.apply_scale(spec.half_size / np.abs(mesh.bounds).max(0))
     return mesh
 
