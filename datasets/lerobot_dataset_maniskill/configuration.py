@@ -11,6 +11,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot_wmrl.command import RunConfig
 from lerobot_wmrl.constants import EVALUATION_SEED, KINDS
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.maniskill.tasks import task_of
 from lerobot_wmrl.policy_checkpoints import read_policy_config
 
 POLICY_KIND = "policy"
@@ -34,6 +35,7 @@ class RecordConfig(RunConfig):
         repo_id: name of the dataset; local/<folder> by default.
         num_episodes: how many to record.
         seed: of the first episode; episode i has seed + i.
+        tasks: recorded in turn; the environment's own by default.
         env: task, scenes, cameras and image size (--env.type=wmrl_maniskill --env.task=push …).
         kinds: share of each trajectory kind (planned trajectories only).
         num_workers: simulating processes.
@@ -52,6 +54,7 @@ class RecordConfig(RunConfig):
     repo_id: str | None = None
     num_episodes: int = 100
     seed: int = 0
+    tasks: list[str] = field(default_factory=list)
     env: EnvConfig = field(default_factory=WmrlManiSkillEnv)
     kinds: dict[str, float] = field(default_factory=default_kinds)
     num_workers: int = 2
@@ -87,6 +90,8 @@ class RecordConfig(RunConfig):
             )
         self._validate_kinds()
         self.env.selected_scenes()
+        for task in self.tasks:
+            task_of(task)
 
     def _validate_kinds(self) -> None:
         planned = [kind for kind in KINDS if kind != POLICY_KIND]
@@ -103,6 +108,11 @@ class RecordConfig(RunConfig):
         return self.env
 
     @property
+    def recorded_tasks(self) -> list[str]:
+        """Names of the tasks, in turn."""
+        return self.tasks or [str(self.maniskill.task)]
+
+    @property
     def dataset_id(self) -> str:
         assert self.output_dir is not None
         return self.repo_id or f"local/{self.output_dir.name}"
@@ -111,11 +121,11 @@ class RecordConfig(RunConfig):
         """What decides the episodes, and so whether a folder continues this recording. JSON values only."""
         env = self.maniskill
         return {
-            "task": env.task,
+            "tasks": self.recorded_tasks,
             "scenes": [scene.index for scene in env.selected_scenes()],
             "cameras": list(env.cameras),
             "image_size": env.image_size,
-            "episode_length": env.horizon,
+            "episode_length": env.episode_length,
             "robot_mesh_detail": env.robot_mesh_detail,
             "num_episodes": self.num_episodes,
             "part_episodes": self.part_episodes,

@@ -11,8 +11,9 @@ from lerobot_wmrl.maniskill.scenes import Scene, scene_for_seed
 
 @dataclass(frozen=True)
 class EpisodePlan:
-    """One episode to record: with its task, this rebuilds its start."""
+    """One episode to record: task, scene and seed rebuild its start."""
 
+    task: str
     kind: str
     scene: Scene
     seed: int
@@ -31,12 +32,15 @@ class Part:
 
 
 def planned_parts(config: RecordConfig) -> list[Part]:
-    """All parts in order; episode i has the seed `config.seed + i`."""
-    scenes = config.maniskill.selected_scenes()
+    """All parts in order; episode i has the seed `config.seed + i`.
+
+    Consecutive seeds visit the scenes in turn, and every round of the scenes takes the next task.
+    """
+    scenes, tasks = config.maniskill.selected_scenes(), config.recorded_tasks
     seeds = range(config.seed, config.seed + config.num_episodes)
-    kinds = planned_kinds(config)
     episodes = [
-        EpisodePlan(kind, scene_for_seed(scenes, seed), seed) for kind, seed in zip(kinds, seeds, strict=True)
+        EpisodePlan(tasks[seed // len(scenes) % len(tasks)], kind, scene_for_seed(scenes, seed), seed)
+        for kind, seed in zip(planned_kinds(config), seeds, strict=True)
     ]
     size = config.part_episodes
     return [

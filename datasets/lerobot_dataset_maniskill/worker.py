@@ -14,6 +14,7 @@ from lerobot_dataset_maniskill.drivers import Driver, PlannerDriver, PolicyDrive
 from lerobot_dataset_maniskill.manifest import EpisodePlan, Part
 from lerobot_dataset_maniskill.quiet import silence_libraries
 from lerobot_dataset_maniskill.writer import HOLD_FRAMES, Outcome, StartColumns, add_step, create_dataset
+from lerobot_wmrl.maniskill.tasks import task_of
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class PartRecorder:
 
     def __init__(self, config: RecordConfig, folder: Path) -> None:
         env = config.maniskill
-        self.config, self.folder, self.horizon = config, folder, env.horizon
+        self.config, self.folder = config, folder
         self.simulation = env.create_simulation()
         self.driver: Driver = (
             PlannerDriver() if config.policy is None else PolicyDriver(config.policy, config.exploration)
@@ -55,10 +56,12 @@ class PartRecorder:
     def _record_episode(self, dataset: LeRobotDataset, plan: EpisodePlan) -> tuple[bool, int]:
         """Simulate and store one episode: to HOLD_FRAMES after success first holds, or to the horizon."""
         simulation = self.simulation
+        simulation.task = task_of(plan.task)
         frame = simulation.reset(plan.scene, plan.seed)
         self.driver.begin(simulation, plan)
         start = StartColumns(simulation.instruction, simulation.task.index, plan)
-        steps_left, succeeded, frames = self.horizon, False, 0
+        steps_left = self.config.maniskill.episode_length or simulation.task.horizon
+        succeeded, frames = False, 0
         while steps_left > 0:
             action = self.driver.act(simulation, frame)
             following = simulation.step(action)

@@ -133,7 +133,7 @@ def write_card(
     scenes = "\n".join(f"| {s.index} | {s.object} | {s.container} | {s.table} | {s.split} |" for s in SCENES)
     card = CARD.format(
         name=repo_id,
-        task=recording["task"],
+        recorded_tasks=", ".join(f"`{task}`" for task in recording["tasks"]),
         fps=FPS,
         rows=rows,
         scenes=scenes,
@@ -153,7 +153,7 @@ task_categories: [robotics]
 ---
 # {name}
 
-ManiSkill trajectories of the task `{task}`, {fps} Hz, recorded by `lerobot-wmrl-record`.
+ManiSkill trajectories ({recorded_tasks}), {fps} Hz, recorded by `lerobot-wmrl-record`.
 
 | kind | episodes | successful |
 |---|---|---|

@@ -36,7 +36,7 @@ class Simulation:
     """A ManiSkill table that plays episodes of one task in some scenes.
 
     Args:
-        task: what succeeds and what pays.
+        task: what succeeds and what pays; another may be set before a reset.
         scenes: the scenes that may be asked for.
         cameras: names from `constants.CAMERAS`; none of them is fastest.
         image_size: pixels of each side.

@@ -40,6 +40,13 @@ def test_no_held_out_scene_is_recorded_by_default() -> None:
     assert {plan.scene.split for part in parts for plan in part.episodes} == {"ind"}
 
 
+def test_every_task_meets_every_scene() -> None:
+    env, tasks = WmrlManiSkillEnv(scenes=[0, 1, 2]), ["push", "pull"]
+    parts = planned_parts(config(num_episodes=12, env=env, tasks=tasks))
+    met = Counter((plan.task, plan.scene.index) for part in parts for plan in part.episodes)
+    assert met == {(task, scene): 2 for task in tasks for scene in (0, 1, 2)}
+
+
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
@@ -48,6 +55,7 @@ def test_no_held_out_scene_is_recorded_by_default() -> None:
         ({"kinds": {"perfect": 1.0}}, "--kinds="),
         ({"kinds": {"optimal": 0.0}}, "--kinds="),
         ({"env": WmrlManiSkillEnv(task="juggle")}, "task='juggle'"),
+        ({"tasks": ["push", "juggle"]}, "task='juggle'"),
         ({"env": WmrlManiSkillEnv(scenes=[99])}, r"scenes=\[99\]"),
         ({"output_dir": None}, "--output_dir"),
     ],
