@@ -1,0 +1,177 @@
+"""What can be read from a single frame of a camera: a small network is asked where things are.
+
+    python benchmarks/camera_probe.py --episodes=120
+
+Frames of planned episodes of all tasks and kinds. A CNN is trained on some episodes and tested on others; the
+errors are means of absolute values in mm, and the accuracy of whether finger and object touch. Writes
+docs/results/cameras.json.
+"""
+
+import argparse
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+from tqdm import tqdm, trange
+
+from lerobot_dataset_maniskill.planners import PLANNERS, Follower
+from lerobot_wmrl.constants import KINDS
+from lerobot_wmrl.files import write_json
+from lerobot_wmrl.maniskill import cameras
+from lerobot_wmrl.maniskill.cameras import View
+from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS
+from lerobot_wmrl.maniskill.scenes import scenes_of
+from lerobot_wmrl.maniskill.simulation import Simulation
+from lerobot_wmrl.maniskill.tasks import TASKS
+
+RESULTS = Path(__file__).parents[1] / "docs" / "results"
+PLANNED_KINDS = [kind for kind in KINDS if kind != "policy"]
+CANDIDATES = {
+    "corner": View((0.45, 0.35, 0.45), (-0.1, 0.0, 0.05), 1.0),
+    "corner_near": View((0.34, 0.28, 0.34), (-0.02, -0.03, 0.04), 0.8),
+    "front_low": View((0.55, 0.0, 0.30), (-0.02, -0.03, 0.05), 0.6),
+    "side_low": View((-0.02, 0.50, 0.16), (-0.05, 0.0, 0.06), 0.8),
+}
+FIRST_SEED = 3_000_000
+NAMES = ("object_x", "object_y", "object_z", "tcp_x", "tcp_y", "tcp_z")
+EVERY = 2
+TEST_SHARE = 0.25
+LEAST_IMPULSE = 1e-6
+"""Of a contact that counts (N s)."""
+
+
+class Frames(NamedTuple):
+    """images {view: (N, H, W, 3) uint8}; places (N, 6) in mm; opening (N,); contact (N,); episode (N,)."""
+
+    images: dict[str, np.ndarray]
+    places: np.ndarray
+    opening: np.ndarray
+    contact: np.ndarray
+    episode: np.ndarray
+
+
+def touching(simulation: Simulation) -> bool:
+    """Whether a finger presses on the object."""
+    thing = simulation.env.active._objs[0]
+    contacts = simulation.env.scene.sub_scenes[0].physx_system.get_contacts()
+    return any(_presses(contact, thing) for contact in contacts)
+
+
+def _presses(contact: Any, thing: Any) -> bool:
+    entities = [body.entity for body in contact.bodies]
+    meets = thing in entities and any("finger" in entity.name for entity in entities)
+    return meets and any(np.linalg.norm(point.impulse) > LEAST_IMPULSE for point in contact.points)
+
+
+def record(views: list[str], episodes: int, image_size: int) -> Frames:
+    """Every other frame of `episodes` planned episodes."""
+    simulation = Simulation(TASKS["push"], scenes_of("ind"), views, image_size)
+    images: dict[str, list[np.ndarray]] = {view: [] for view in views}
+    rows: list[tuple[list[float], float, bool, int]] = []
+    tasks = list(TASKS.values())
+    for episode in trange(episodes, desc="Recording", unit="episode"):
+        rng = np.random.default_rng(FIRST_SEED + episode)
+        simulation.task = tasks[episode % len(tasks)]
+        scene = scenes_of("ind")[rng.integers(len(scenes_of("ind")))]
+        frame = simulation.reset(scene, FIRST_SEED + episode)
+        things = OBJECTS[scene.object], CONTAINERS[scene.container]
+        planner = PLANNERS[simulation.task.name](*things, simulation.current_start)
+        follower = Follower(planner.plan(PLANNED_KINDS[rng.integers(len(PLANNED_KINDS))], rng), rng)
+        for step in range(simulation.task.horizon):
+            places = simulation.tcp_position, simulation.object_position
+            if step % EVERY == 0:
+                for view in views:
+                    images[view].append(frame.images[view])
+                millimetres = [1000 * float(value) for value in (*places[1], *places[0])]
+                rows.append((millimetres, simulation.gripper_opening, touching(simulation), episode))
+            frame = simulation.step(follower.act(*places))
+            if frame.success:
+                break
+    simulation.close()
+    columns = [np.array(column) for column in zip(*rows, strict=True)]
+    return Frames({view: np.stack(kept) for view, kept in images.items()}, *columns)
+
+
+class Probe(nn.Module):
+    """A CNN that keeps where things are: strided convolutions, then a spatial soft-argmax and features."""
+
+    def __init__(self, outputs: int) -> None:
+        super().__init__()
+        widths = (3, 24, 48, 64, 64)
+        self.layers = nn.ModuleList(nn.Conv2d(a, b, 3, stride=2, padding=1) for a, b in pairwise(widths))
+        self.head = nn.Sequential(nn.LazyLinear(192), nn.ReLU(), nn.Linear(192, outputs))
+
+    def forward(self, images: Tensor) -> Tensor:
+        """(B, 3, H, W) in [0, 1] → (B, outputs)."""
+        x = images - 0.5
+        for layer in self.layers:
+            x = F.relu(layer(x))
+        return self.head(F.adaptive_avg_pool2d(x, 4 if images.shape[-1] <= 64 else 8).flatten(1))
+
+
+def probe(images: np.ndarray, frames: Frames, steps: int) -> dict[str, float]:
+    """Train on three quarters of the episodes, test on the others. → errors by name"""
+    torch.manual_seed(0)
+    pictures = torch.from_numpy(images).permute(0, 3, 1, 2)
+    targets = np.column_stack([frames.places, 100 * frames.opening])
+    train = frames.episode % round(1 / TEST_SHARE) != 0
+    mean, std = targets[train].mean(0), targets[train].std(0)
+    scaled = torch.from_numpy((targets - mean) / std).float()
+    contact = torch.from_numpy(frames.contact).float()
+    model = Probe(targets.shape[1] + 1)
+    model(pictures[:1].float() / 255)
+    optimizer = torch.optim.AdamW(model.parameters(), 2e-3, weight_decay=1e-3)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 2e-3, steps)
+    rows = torch.from_numpy(train.nonzero()[0])
+    for _ in trange(steps, desc="Probing", unit="step", leave=False):
+        batch = rows[torch.randint(len(rows), (64,))]
+        output = model(pictures[batch].float() / 255)
+        loss = F.smooth_l1_loss(output[:, :-1], scaled[batch], beta=0.1)
+        loss = loss + 0.3 * F.binary_cross_entropy_with_logits(output[:, -1], contact[batch])
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+    with torch.no_grad():
+        output = torch.cat([model(part.float() / 255) for part in pictures[~train].split(256)])
+    error = ((output[:, :-1] - scaled[~train]).abs().mean(0).numpy()) * std
+    right = ((output[:, -1] > 0) == frames.contact[~train]).float().mean()
+    result = {f"{name}_mm": round(float(value), 1) for name, value in zip(NAMES, error, strict=False)}
+    return {
+        **result,
+        "opening_percent": round(float(error[-1]), 1),
+        "contact_accuracy": round(float(right), 3),
+    }
+
+
+def main() -> None:
+    """Entry point."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--episodes", type=int, default=120, help="planned episodes to take frames from")
+    parser.add_argument("--steps", type=int, default=1200, help="optimiser steps of each probe")
+    parser.add_argument("--sizes", type=int, nargs="+", default=[64, 128], help="pixels a side")
+    parser.add_argument("--output", type=Path, default=RESULTS / "cameras.json", help="JSON file")
+    given = parser.parse_args()
+    views = ["third_view", "wrist", *CANDIDATES]
+    cameras.VIEWS.update(CANDIDATES)
+    table = {}
+    for size in given.sizes:
+        frames = record(views, given.episodes, size)
+        for view in tqdm(views, desc=f"{size} px"):
+            table[f"{view} {size}"] = probe(frames.images[view], frames, given.steps)
+        both = np.concatenate([frames.images[view] for view in ("third_view", "wrist")], axis=2)
+        table[f"third_view + wrist {size}"] = probe(both, frames, given.steps)
+    for name, errors in table.items():
+        print(name, errors)
+    test = int((frames.episode % round(1 / TEST_SHARE) == 0).sum())
+    write_json(given.output, {"frames": len(frames.episode), "test_frames": test, "probes": table})
+
+
+if __name__ == "__main__":
+    main()
