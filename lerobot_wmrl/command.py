@@ -3,7 +3,7 @@
 import json
 import logging
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -15,7 +15,6 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
 
 from lerobot_wmrl.files import write_json
-from lerobot_wmrl.presets import expand_preset
 
 CONFIG_FILE = "train_config.json"
 
@@ -64,14 +63,19 @@ def require_free(output_dir: Path, config: dict[str, Any]) -> None:
 
 
 def run_command[Config: RunConfig](
-    function: Callable[[Config], None], config_class: type[Config], command: str
+    function: Callable[[Config], None],
+    config_class: type[Config],
+    expand: Callable[[Sequence[str]], list[str]],
 ) -> None:
-    """Parse the command line for `function`, run it, and turn bad input into one clear line, exit code 1."""
+    """Parse the command line for `function`, run it, and turn bad input into one clear line, exit code 1.
+
+    `expand` replaces the flags that stand for others.
+    """
     register_third_party_plugins()
     init_logging()
     logging.getLogger("lerobot.configs").setLevel(logging.ERROR)
     try:
-        sys.argv[1:] = expand_preset(sys.argv[1:], command)
+        sys.argv[1:] = expand(sys.argv[1:])
 
         @parser.wrap()
         def parsed(cfg: config_class) -> None:  # type: ignore[valid-type]

@@ -1,4 +1,4 @@
-"""Presets: one place for the flags of every command at every size.
+"""Presets: one place for the flags of every command at every size; of recordings, their recipes are it.
 
 A preset is nothing but flags: `--preset=demo` is replaced, in place, by the flags listed here for that
 command, so whatever a preset sets can also be set (and overridden, further right) by hand.
@@ -10,7 +10,7 @@ from typing import Final
 Flags = Mapping[str, str | int | float | bool]
 
 DEMO_SCENES: Final = "[0,1,2]"
-"""A sponge, a can and a box: what 600 episodes suffice for."""
+"""A sponge, a can and a box: what the 600 episodes of the recipe `demo` suffice for."""
 
 TINY_WORLD_MODEL: Final[Flags] = {
     "model.layers": 1,
@@ -26,13 +26,6 @@ TINY_WORLD_MODEL: Final[Flags] = {
 
 PRESETS: Final[dict[str, dict[str, Flags]]] = {
     "tiny": {
-        "record": {
-            "env.type": "wmrl_maniskill",
-            "env.scenes": DEMO_SCENES,
-            "num_episodes": 24,
-            "part_episodes": 8,
-            "num_workers": 1,
-        },
         "train-world-model:frame_tokenizer": {
             "model.image_size": 64,
             "model.widths": "[8,16]",
@@ -71,13 +64,6 @@ PRESETS: Final[dict[str, dict[str, Flags]]] = {
         "eval-imagined": {"eval.batch_size": 4},
     },
     "demo": {
-        "record": {
-            "env.type": "wmrl_maniskill",
-            "env.scenes": DEMO_SCENES,
-            "num_episodes": 600,
-            "part_episodes": 30,
-            "num_workers": 2,
-        },
         "train-world-model:frame_tokenizer": {
             "model.image_size": 64,
             "steps": 800,

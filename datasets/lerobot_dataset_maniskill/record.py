@@ -1,6 +1,7 @@
 """`lerobot-wmrl-record`: trajectories in ManiSkill → a LeRobotDataset."""
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
+from lerobot_dataset_maniskill.recipe_files import expand_recipes
 from lerobot_wmrl.command import run_command
 from lerobot_wmrl.maniskill.scenes import describe_scenes
 
@@ -19,7 +20,7 @@ def run(config: RecordConfig) -> None:
 
 def main() -> None:
     """Entry point of the console command."""
-    run_command(run, RecordConfig, "record")
+    run_command(run, RecordConfig, expand_recipes)
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ Add `--text_model.path=…` for goal frames and the reward along a successful an
 """
 
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,7 @@ import draccus
 
 from lerobot_wmrl.command import RunConfig, claim_output_dir, run_command
 from lerobot_wmrl.dataset_source import DatasetSource
+from lerobot_wmrl.presets import expand_preset
 from lerobot_wmrl.rewards.configuration_general import GeneralConfig
 
 if TYPE_CHECKING:
@@ -135,7 +137,7 @@ def reward_curves(
 
 def main() -> None:
     """Entry point of the console command."""
-    run_command(eval_world_model, EvalWorldModelConfig, "eval-world-model")
+    run_command(eval_world_model, EvalWorldModelConfig, partial(expand_preset, command="eval-world-model"))
 
 
 if __name__ == "__main__":

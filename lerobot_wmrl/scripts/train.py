@@ -9,6 +9,7 @@ Running the same command again continues from the last checkpoint. `--preset=dem
 """
 
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -19,6 +20,7 @@ from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 
 from lerobot_wmrl.command import RunConfig, claim_output_dir, run_command
 from lerobot_wmrl.constants import EVALUATION_SEED
+from lerobot_wmrl.presets import expand_preset
 from lerobot_wmrl.rl.configuration_ppo import PPOConfig
 
 
@@ -144,7 +146,7 @@ def train_in(
 
 def main() -> None:
     """Entry point of the console command."""
-    run_command(train_policy, TrainConfig, "train")
+    run_command(train_policy, TrainConfig, partial(expand_preset, command="train"))
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ Running the same command again continues from the last checkpoint. `--preset=dem
 """
 
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import draccus
@@ -16,6 +17,7 @@ from lerobot.configs.rewards import RewardModelConfig
 
 from lerobot_wmrl.command import RunConfig, claim_output_dir, require_free, run_command
 from lerobot_wmrl.dataset_source import DatasetSource
+from lerobot_wmrl.presets import expand_preset
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
 from lerobot_wmrl.world_models.configuration_world_model import WorldModelConfig
 
@@ -93,7 +95,7 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
 
 def main() -> None:
     """Entry point of the console command."""
-    run_command(train_world_model, TrainWorldModelConfig, "train-world-model")
+    run_command(train_world_model, TrainWorldModelConfig, partial(expand_preset, command="train-world-model"))
 
 
 if __name__ == "__main__":
