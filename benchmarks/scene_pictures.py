@@ -1,0 +1,99 @@
+"""Pictures of every object, every task and every kind of trajectory, for docs/images.
+
+    python benchmarks/scene_pictures.py
+
+Writes objects.png, tasks.png and trajectories.png.
+"""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from lerobot_dataset_maniskill.planners import PLANNERS, Follower
+from lerobot_wmrl.constants import CAMERAS, KINDS
+from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS
+from lerobot_wmrl.maniskill.scenes import SCENES, Scene
+from lerobot_wmrl.maniskill.simulation import Simulation
+from lerobot_wmrl.maniskill.tasks import TASKS
+
+IMAGES = Path(__file__).parents[1] / "docs" / "images"
+IMAGE_SIZE = 160
+PLANNED_KINDS = [kind for kind in KINDS if kind != "policy"]
+STRIP_FRAMES = 6
+SEED = 4_000_000
+
+
+def scenes_with_each_object() -> list[Scene]:
+    """One scene an object, tables and containers in turn."""
+    chosen = []
+    for index, name in enumerate(OBJECTS):
+        having = [scene for scene in SCENES if scene.object == name]
+        chosen.append(having[index % len(having)])
+    return chosen
+
+
+def grid(pictures: Sequence[tuple[str, np.ndarray]], columns: int, path: Path) -> None:
+    """Titled pictures, row by row."""
+    rows = -(-len(pictures) // columns)
+    height, width = pictures[0][1].shape[:2]
+    figure = Figure(figsize=(1.7 * columns * width / height, 1.95 * rows))
+    panels = figure.subplots(rows, columns, squeeze=False)
+    for axes in panels.flat:
+        axes.axis("off")
+    for axes, (title, picture) in zip(panels.flat, pictures, strict=False):
+        axes.imshow(picture)
+        axes.set_title(title, fontsize=8)
+    figure.tight_layout(pad=0.4)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+
+
+def episode(simulation: Simulation, scene: Scene, kind: str, seed: int) -> np.ndarray:
+    """A planned episode's third view, (T, H, W, 3)."""
+    frame, rng = simulation.reset(scene, seed), np.random.default_rng(seed)
+    things = OBJECTS[scene.object], CONTAINERS[scene.container]
+    planner = PLANNERS[simulation.task.name](*things, simulation.current_start)
+    follower, frames = Follower(planner.plan(kind, rng), rng), [frame.images["third_view"]]
+    for _ in range(simulation.task.horizon):
+        frame = simulation.step(follower.act(simulation.tcp_position, simulation.object_position))
+        frames.append(frame.images["third_view"])
+        if frame.success:
+            break
+    return np.stack(frames)
+
+
+def strip(frames: np.ndarray) -> np.ndarray:
+    """A few evenly spaced frames beside each other."""
+    return np.concatenate(list(frames[np.linspace(0, len(frames) - 1, STRIP_FRAMES).astype(int)]), 1)
+
+
+def main() -> None:
+    """Entry point."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--folder", type=Path, default=IMAGES, help="where the pictures go")
+    folder = parser.parse_args().folder
+    scenes = scenes_with_each_object()
+    simulation = Simulation(TASKS["push"], SCENES, CAMERAS, IMAGE_SIZE)
+    things = [(s.object, simulation.reset(s, SEED).images["third_view"]) for s in scenes]
+    grid([(name.replace("_", " "), picture) for name, picture in things], 7, folder / "objects.png")
+    views, strips = [], []
+    for task, scene in zip(TASKS.values(), scenes[5:], strict=False):
+        simulation.task = task
+        frame = simulation.reset(scene, SEED)
+        name = task.name.replace("_", " ")
+        views += [(f"{name}: {camera.replace('_', ' ')}", frame.images[camera]) for camera in CAMERAS]
+        for kind in PLANNED_KINDS:
+            played = episode(simulation, scene, kind, SEED)
+            strips.append((f"{name}: {kind.replace('_', ' ')}", strip(played)))
+    grid(views, 4, folder / "tasks.png")
+    grid(strips, 2, folder / "trajectories.png")
+    simulation.close()
+
+
+if __name__ == "__main__":
+    main()
