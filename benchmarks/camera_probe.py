@@ -19,7 +19,7 @@ from torch.nn import functional as F
 from tqdm import tqdm, trange
 
 from lerobot_dataset_maniskill.planners import PLANNERS, Follower
-from lerobot_wmrl.constants import KINDS
+from lerobot_wmrl.constants import KINDS, PLAY
 from lerobot_wmrl.files import write_json
 from lerobot_wmrl.maniskill import cameras
 from lerobot_wmrl.maniskill.cameras import View
@@ -29,7 +29,7 @@ from lerobot_wmrl.maniskill.simulation import Simulation
 from lerobot_wmrl.maniskill.tasks import TASKS
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
-PLANNED_KINDS = [kind for kind in KINDS if kind != "policy"]
+PLANNED_KINDS = [kind for kind in KINDS if kind not in ("policy", PLAY)]
 CANDIDATES = {
     "corner": View((0.45, 0.35, 0.45), (-0.1, 0.0, 0.05), 1.0),
     "corner_near": View((0.34, 0.28, 0.34), (-0.02, -0.03, 0.04), 0.8),

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from lerobot_dataset_maniskill.planners import PLANNERS, Follower
-from lerobot_wmrl.constants import KINDS
+from lerobot_wmrl.constants import KINDS, PLAY
 from lerobot_wmrl.files import write_json
 from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS
 from lerobot_wmrl.maniskill.scenes import SCENES
@@ -24,7 +24,7 @@ from lerobot_wmrl.maniskill.tasks import TASKS
 from lerobot_wmrl.statistics import Proportion
 
 DOCS = Path(__file__).parents[1] / "docs"
-PLANNED_KINDS = [kind for kind in KINDS if kind != "policy"]
+PLANNED_KINDS = [kind for kind in KINDS if kind not in ("policy", PLAY)]
 FIRST_SEED = 2_000_000
 """Neither recorded nor evaluated on."""
 

@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from lerobot_dataset_maniskill.planners import PLANNERS, Follower
-from lerobot_wmrl.constants import CAMERAS, KINDS
+from lerobot_wmrl.constants import CAMERAS, KINDS, PLAY
 from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS
 from lerobot_wmrl.maniskill.scenes import SCENES, Scene
 from lerobot_wmrl.maniskill.simulation import Simulation
@@ -21,7 +21,7 @@ from lerobot_wmrl.maniskill.tasks import TASKS
 
 IMAGES = Path(__file__).parents[1] / "docs" / "images"
 IMAGE_SIZE = 160
-PLANNED_KINDS = [kind for kind in KINDS if kind != "policy"]
+PLANNED_KINDS = [kind for kind in KINDS if kind not in ("policy", PLAY)]
 STRIP_FRAMES = 6
 SEED = 4_000_000
 

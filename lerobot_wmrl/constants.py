@@ -27,7 +27,8 @@ scrape over the table, and how they stick and slip there can be neither learnt n
 TASKS: Final = ("push", "pull", "pick_place", "move_to_aim")
 """Vocabulary of the column `start.task`."""
 
-KINDS: Final = ("optimal", "waypoint", "interpolated", "disturbed", "near_miss", "policy")
+PLAY: Final = "play"
+KINDS: Final = ("optimal", "waypoint", "interpolated", "disturbed", "near_miss", "policy", PLAY)
 """Vocabulary of the column `start.kind`: how an episode's actions were made."""
 
 START_COLUMNS: Final = ("start.task", "start.scene", "start.seed", "start.kind")

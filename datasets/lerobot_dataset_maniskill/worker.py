@@ -12,8 +12,10 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.drivers import Driver, PlannerDriver, PolicyDriver
 from lerobot_dataset_maniskill.manifest import EpisodePlan, Part
+from lerobot_dataset_maniskill.planners.play import PLAY_STEPS
 from lerobot_dataset_maniskill.quiet import silence_libraries
 from lerobot_dataset_maniskill.writer import HOLD_FRAMES, Outcome, StartColumns, add_step, create_dataset
+from lerobot_wmrl.constants import PLAY
 from lerobot_wmrl.maniskill.tasks import task_of
 
 
@@ -53,20 +55,29 @@ class PartRecorder:
         dataset.finalize()
         partial.replace(self.folder / part.name)
 
+    def _steps(self, plan: EpisodePlan) -> int:
+        """At most so many rows."""
+        if plan.kind == PLAY:
+            return PLAY_STEPS
+        return self.config.maniskill.episode_length or self.simulation.task.horizon
+
     def _record_episode(self, dataset: LeRobotDataset, plan: EpisodePlan) -> tuple[bool, int]:
-        """Simulate and store one episode: to HOLD_FRAMES after success first holds, or to the horizon."""
+        """Simulate and store one episode: to HOLD_FRAMES after success first holds, or to the horizon.
+
+        Play goes on whatever happens.
+        """
         simulation = self.simulation
         simulation.task = task_of(plan.task)
         frame = simulation.reset(plan.scene, plan.seed)
         self.driver.begin(simulation, plan)
         start = StartColumns(simulation.instruction, simulation.task.index, plan)
-        steps_left = self.config.maniskill.episode_length or simulation.task.horizon
+        steps_left = self._steps(plan)
         succeeded, frames = False, 0
         while steps_left > 0:
             action = self.driver.act(simulation, frame)
             following = simulation.step(action)
             steps_left, frames = steps_left - 1, frames + 1
-            if following.success and not succeeded:
+            if following.success and not succeeded and plan.kind != PLAY:
                 succeeded, steps_left = True, HOLD_FRAMES
             outcome = Outcome(following, truncated=steps_left == 0 and not succeeded)
             add_step(dataset, start, frame, action, outcome)

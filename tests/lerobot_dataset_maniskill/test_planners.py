@@ -8,6 +8,7 @@ import pytest
 from lerobot_dataset_maniskill.planners import PLANNERS, Follower, Planner
 from lerobot_dataset_maniskill.planners.follower import CLOSED, OPEN, OPTIMAL_SPEED, Noise, Plan, Waypoint
 from lerobot_dataset_maniskill.planners.kinds import FINGER_HALF_THICKNESS
+from lerobot_dataset_maniskill.planners.play import PLAY_STEPS
 from lerobot_dataset_maniskill.planners.slide import (
     NEAR_MISSES,
     PullPlanner,
@@ -17,7 +18,7 @@ from lerobot_dataset_maniskill.planners.slide import (
     slide_partly,
     stop_short,
 )
-from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, KINDS
+from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, KINDS, PLAY
 from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS
 from lerobot_wmrl.maniskill.scenes import SCENES, Scene
 from lerobot_wmrl.maniskill.simulation import Simulation
@@ -26,7 +27,7 @@ from lerobot_wmrl.maniskill.tasks import TASKS, Push
 SCENE = SCENES[2]
 SPEC = OBJECTS[SCENE.object]
 LAG = 1 / 3
-PLANNED_KINDS = [kind for kind in KINDS if kind != "policy"]
+PLANNED_KINDS = [kind for kind in KINDS if kind not in ("policy", PLAY)]
 
 
 def planner(task: str, seed: int, scene: Scene = SCENE) -> Planner:
@@ -91,6 +92,14 @@ def test_the_gripper_stays_until_its_fingers_have_moved() -> None:
     assert gripper == [CLOSED] * 4 + [OPEN] * 3
 
 
+def test_what_cannot_be_reached_is_given_up() -> None:
+    far = np.array([1.0, 0.0, 0.1])
+    plan = Plan((Waypoint(far, patience=3), Waypoint(-far)))
+    follower = Follower(plan, np.random.default_rng(0))
+    forward = [follower.act(np.zeros(3), np.zeros(3))[0] > 0 for _ in range(5)]
+    assert forward == [True] * 3 + [False] * 2
+
+
 def test_near_misses_of_a_slide_come_in_all_forms_around_it() -> None:
     made = planner("push", 0)
     assert isinstance(made, PushPlanner)
@@ -130,6 +139,22 @@ def blind(request: pytest.FixtureRequest) -> Iterator[Simulation]:
     simulation = Simulation(TASKS[request.param], SCENES, cameras=())
     yield simulation
     simulation.close()
+
+
+def test_play_goes_on_and_moves_the_object_about(blind: Simulation) -> None:
+    ways = []
+    for seed in range(4):
+        scene, rng = SCENES[20 * seed], np.random.default_rng(seed)
+        blind.reset(scene, seed)
+        follower = Follower(planner(blind.task.name, seed, scene).plan(PLAY, rng), rng)
+        way = [blind.object_position]
+        for _ in range(PLAY_STEPS):
+            blind.step(follower.act(blind.tcp_position, blind.object_position))
+            way.append(blind.object_position)
+        ways.append(np.array(way))
+    travelled = [np.linalg.norm(np.diff(way, axis=0), axis=1).sum() for way in ways]
+    assert np.mean(travelled) > 0.2
+    assert np.mean([np.abs(way[-1, :2]).max() < 0.3 for way in ways]) >= 0.75
 
 
 def succeeds(simulation: Simulation, kind: str, seed: int) -> bool:

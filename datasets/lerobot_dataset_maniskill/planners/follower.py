@@ -28,6 +28,7 @@ class Waypoint:
         gripper: commanded all the way there.
         dwell: steps to stay once there, for the fingers to close or open.
         aim: replaces `position` by one that depends on the object's present place; never reached.
+        patience: steps after which it is given up.
     """
 
     position: np.ndarray
@@ -35,6 +36,7 @@ class Waypoint:
     gripper: float = CLOSED
     dwell: int = 0
     aim: Aim | None = None
+    patience: int | None = None
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,7 @@ class Follower:
 
     def __init__(self, plan: Plan, rng: np.random.Generator) -> None:
         self.plan, self.rng = plan, rng
-        self.current, self.stayed = 0, 0
+        self.current, self.stayed, self.tried = 0, 0, 0
 
     def act(self, tcp: np.ndarray, thing: np.ndarray) -> np.ndarray:
         """The action (7,) float32 for the TCP at `tcp` and the object at `thing`, (3,) each, in the box."""
@@ -76,14 +78,21 @@ class Follower:
         return np.clip(action, ACTION_LOW, ACTION_HIGH).astype(np.float32)
 
     def _advance(self, tcp: np.ndarray) -> Waypoint:
-        """The waypoint to go to now: the next one once this is reached and has been stayed at."""
+        """The waypoint to go to now: the next one once this was reached and stayed at, or given up."""
         waypoints = self.plan.waypoints
-        while self.current < len(waypoints) - 1 and _reached(waypoints[self.current], tcp):
-            if self.stayed < waypoints[self.current].dwell:
-                self.stayed += 1
-                break
-            self.current, self.stayed = self.current + 1, 0
+        while self.current < len(waypoints) - 1 and not self._stays(waypoints[self.current], tcp):
+            self.current, self.stayed, self.tried = self.current + 1, 0, 0
+        self.tried += 1
         return waypoints[self.current]
+
+    def _stays(self, waypoint: Waypoint, tcp: np.ndarray) -> bool:
+        """Whether there is still something to do there."""
+        if waypoint.patience is not None and self.tried >= waypoint.patience:
+            return False
+        if not _reached(waypoint, tcp):
+            return True
+        self.stayed += 1
+        return self.stayed <= waypoint.dwell
 
 
 def _reached(waypoint: Waypoint, tcp: np.ndarray) -> bool:

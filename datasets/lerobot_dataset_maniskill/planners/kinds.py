@@ -20,6 +20,7 @@ from lerobot_dataset_maniskill.planners.follower import (
     Waypoint,
     above_table,
 )
+from lerobot_dataset_maniskill.planners.play import play_waypoints
 from lerobot_wmrl.maniskill.objects import ContainerSpec, ObjectSpec
 from lerobot_wmrl.maniskill.tasks import Start
 
@@ -58,6 +59,8 @@ class Planner(ABC):
         """A plan of the given kind (`constants.KINDS` without "policy")."""
         if kind == "optimal":
             return Plan(self.essential(), speed=OPTIMAL_SPEED)
+        if kind == "play":
+            return Plan(play_waypoints(self.spec, rng), noise=Noise(rng.uniform(0.0, 0.01)))
         plan = Plan((), OPTIMAL_SPEED)
         if rng.random() >= CALM_SHARE[kind]:
             noise = Noise(rng.uniform(0.0, 0.015))
