@@ -1,5 +1,6 @@
 """What to record: the flags of `lerobot-wmrl-record`."""
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -39,6 +40,8 @@ class RecordConfig(RunConfig):
         env: task, scenes, cameras and image size (--env.type=wmrl_maniskill --env.task=push …).
         kinds: share of each trajectory kind (planned trajectories only).
         num_workers: simulating processes.
+        shard: i/n records every n-th sub-dataset from the i-th (from 0) on, for n machines.
+        merge_shards: folders of all shards: put them together as output_dir, and stop.
         part_episodes: episodes a sub-dataset, the piece of work an interruption can cost each worker.
         policy: a LeRobot policy to roll out, given as --policy.path=….
         exploration: largest standard deviation of the noise added to a policy's translations, as a share of
@@ -59,6 +62,8 @@ class RecordConfig(RunConfig):
     kinds: dict[str, float] = field(default_factory=default_kinds)
     num_workers: int = 2
     part_episodes: int = 20
+    shard: str = "0/1"
+    merge_shards: list[Path] = field(default_factory=list)
     policy: PreTrainedConfig | None = None
     exploration: float = 0.0
     push_to_hub: bool = False
@@ -88,6 +93,8 @@ class RecordConfig(RunConfig):
             raise ValueError(
                 f"--exploration={self.exploration}: a share of the action box, 0 to 1, for --policy.path only"
             )
+        if self.shard_of[1] > -(-self.num_episodes // self.part_episodes):
+            raise ValueError(f"--shard={self.shard}: there are fewer sub-datasets than shards")
         self._validate_kinds()
         self.env.selected_scenes()
         for task in self.tasks:
@@ -106,6 +113,14 @@ class RecordConfig(RunConfig):
         """The environment, once `validate` has made sure of its type."""
         assert isinstance(self.env, WmrlManiSkillEnv)
         return self.env
+
+    @property
+    def shard_of(self) -> tuple[int, int]:
+        """(i, n). ValueError if `shard` is not written so."""
+        match = re.fullmatch(r"(\d+)/(\d+)", self.shard)
+        if not match or int(match[1]) >= int(match[2]):
+            raise ValueError(f"--shard={self.shard}: write i/n, with i from 0 to n - 1, as in 0/4")
+        return int(match[1]), int(match[2])
 
     @property
     def recorded_tasks(self) -> list[str]:
@@ -129,6 +144,7 @@ class RecordConfig(RunConfig):
             "robot_mesh_detail": env.robot_mesh_detail,
             "num_episodes": self.num_episodes,
             "part_episodes": self.part_episodes,
+            "shard": list(self.shard_of),
             "seed": self.seed,
             "kinds": self.kinds if self.policy is None else {POLICY_KIND: 1.0},
             "policy": None if self.policy is None else str(self.policy.pretrained_path),

@@ -32,7 +32,7 @@ class Part:
 
 
 def planned_parts(config: RecordConfig) -> list[Part]:
-    """All parts in order; episode i has the seed `config.seed + i`.
+    """All parts of the shard in order; episode i of the whole has the seed `config.seed + i`.
 
     Consecutive seeds visit the scenes in turn, and every round of the scenes takes the next task.
     """
@@ -42,11 +42,12 @@ def planned_parts(config: RecordConfig) -> list[Part]:
         EpisodePlan(tasks[seed // len(scenes) % len(tasks)], kind, scene_for_seed(scenes, seed), seed)
         for kind, seed in zip(planned_kinds(config), seeds, strict=True)
     ]
-    size = config.part_episodes
-    return [
+    size, (shard, shards) = config.part_episodes, config.shard_of
+    parts = [
         Part(index, tuple(episodes[first : first + size]))
         for index, first in enumerate(range(0, len(episodes), size))
     ]
+    return parts[shard::shards]
 
 
 def planned_kinds(config: RecordConfig) -> list[str]:

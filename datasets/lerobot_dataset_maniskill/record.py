@@ -13,9 +13,14 @@ def run(config: RecordConfig) -> None:
         return
     from lerobot_dataset_maniskill.quiet import silence_libraries
     from lerobot_dataset_maniskill.recorder import record
+    from lerobot_dataset_maniskill.shards import merge_shards
 
     silence_libraries()
-    record(config)
+    if config.merge_shards:
+        assert config.output_dir is not None
+        merge_shards(config.merge_shards, config.output_dir, config.dataset_id)
+    else:
+        record(config)
 
 
 def main() -> None:

@@ -11,18 +11,16 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from lerobot.datasets.aggregate import aggregate_datasets
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from tqdm import tqdm
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.integrity import whole_dataset
 from lerobot_dataset_maniskill.manifest import Part, planned_parts
+from lerobot_dataset_maniskill.merging import finish, merge_folders
 from lerobot_dataset_maniskill.worker import EpisodeResult, PartRecorder, Report, serve_parts
-from lerobot_dataset_maniskill.writer import VOCABULARY_FILE, write_card, write_vocabulary
-from lerobot_wmrl.constants import ACTION_NAMES, KINDS
-from lerobot_wmrl.episodes import recorded_episodes
+from lerobot_dataset_maniskill.writer import VOCABULARY_FILE
+from lerobot_wmrl.constants import ACTION_NAMES
 from lerobot_wmrl.files import write_json
 from lerobot_wmrl.maniskill.processes import simulating_context
 from lerobot_wmrl.maniskill.renderer import render_backend
@@ -39,8 +37,8 @@ def record(config: RecordConfig) -> None:
     config.validate()
     assert config.output_dir is not None
     output_dir = config.output_dir
-    work = output_dir.parent / f".{output_dir.name}.recording"
-    if already_recorded(output_dir, config.recorded_content()):
+    work, parts = output_dir.parent / f".{output_dir.name}.recording", planned_parts(config)
+    if already_recorded(output_dir, config.recorded_content(), count_episodes(parts)):
         discard(work, config.recorded_content())
     else:
         render_backend()
@@ -48,7 +46,6 @@ def record(config: RecordConfig) -> None:
             check_weights(config.policy)
             check_fit(config.policy, config.maniskill.shown(), len(ACTION_NAMES))
         with claimed(work, config.recorded_content()):
-            parts = planned_parts(config)
             record_parts(config, work, parts)
             merge(config, work, parts)
         shutil.rmtree(work, ignore_errors=True)
@@ -56,7 +53,7 @@ def record(config: RecordConfig) -> None:
         LeRobotDataset(config.dataset_id, root=output_dir).push_to_hub(private=config.private)
 
 
-def already_recorded(output_dir: Path, content: Mapping[str, Any]) -> bool:
+def already_recorded(output_dir: Path, content: Mapping[str, Any], episodes: int) -> bool:
     """Whether `output_dir` holds exactly this recording. ValueError if it holds anything else."""
     if not output_dir.exists() or (output_dir.is_dir() and not any(output_dir.iterdir())):
         return False
@@ -64,10 +61,10 @@ def already_recorded(output_dir: Path, content: Mapping[str, Any]) -> bool:
     if not vocabulary.is_file():
         raise ValueError(f"--output_dir={output_dir} holds something else; choose a new folder")
     require_same(json.loads(vocabulary.read_text())["recording"], content, output_dir)
-    problem = whole_dataset(output_dir, content["num_episodes"])
+    problem = whole_dataset(output_dir, episodes)
     if problem:
         raise ValueError(f"--output_dir={output_dir}: {problem}; remove the folder and record again")
-    print(f"{output_dir} is already recorded: {content['num_episodes']} episodes")
+    print(f"{output_dir} is already recorded: {episodes} episodes")
     return True
 
 
@@ -131,7 +128,7 @@ def record_parts(config: RecordConfig, work: Path, parts: list[Part]) -> None:
     if not missing:
         return
     count = min(config.num_workers, len(missing))
-    with progress_bar(config, missing) as report:
+    with progress_bar(count_episodes(parts), missing) as report:
         if count == 1:
             recorder = PartRecorder(config, work)
             for part in missing:
@@ -141,11 +138,11 @@ def record_parts(config: RecordConfig, work: Path, parts: list[Part]) -> None:
 
 
 @contextmanager
-def progress_bar(config: RecordConfig, missing: list[Part]) -> Iterator[Report]:
+def progress_bar(episodes: int, missing: list[Part]) -> Iterator[Report]:
     """Shows what it is told of: episodes, the share that succeeded, frames."""
-    done = config.num_episodes - sum(len(part.episodes) for part in missing)
+    done = episodes - count_episodes(missing)
     seen: Counter[str] = Counter()
-    with tqdm(total=config.num_episodes, initial=done, unit="episode", desc="record") as bar:
+    with tqdm(total=episodes, initial=done, unit="episode", desc="record") as bar:
 
         def report(result: EpisodeResult) -> None:
             seen.update(episodes=1, success=int(result.success), frames=result.frames)
@@ -196,32 +193,16 @@ def follow_workers(open_parts: set[int], results: Any, workers: list[Any], repor
 
 
 def merge(config: RecordConfig, work: Path, parts: list[Part]) -> None:
-    """Merge with LeRobot's own tool, add vocabulary and card, and move the whole into place at once."""
+    """Put the parts together and move the whole into place at once."""
     assert config.output_dir is not None
     merged = work / "merged"
     shutil.rmtree(merged, ignore_errors=True)
-    aggregate_datasets(
-        repo_ids=[config.dataset_id] * len(parts), aggr_repo_id=config.dataset_id,
-        roots=[work / part.name for part in parts], aggr_root=merged,
-        concatenate_videos=False, concatenate_data=False,  # appending rewrites the whole file for every part
-    )  # fmt: skip
-    problem = whole_dataset(merged, config.num_episodes)
+    merge_folders([work / part.name for part in parts], merged, config.dataset_id)
+    problem = whole_dataset(merged, count_episodes(parts))
     if problem:
         raise ValueError(f"{work}: merging failed: {problem}; remove the folder and record again")
-    write_vocabulary(merged, config.recorded_content())
-    rates = success_by_kind(merged)
-    write_card(merged, config.dataset_id, config.recorded_content(), rates)
-    merged.replace(config.output_dir)
-    summary = ", ".join(f"{kind} {wins}/{total}" for kind, (wins, total) in rates.items())
-    print(f"{config.output_dir}: {config.num_episodes} episodes; successful: {summary}")
+    finish(merged, config.output_dir, config.dataset_id, config.recorded_content())
 
 
-def success_by_kind(root: Path) -> dict[str, tuple[int, int]]:
-    """Kind → (successful episodes, episodes)."""
-    table = recorded_episodes(root)
-    kinds, success = table["kind"], table["success"]
-    return {
-        name: (int(success[kinds == index].sum()), int(np.sum(kinds == index)))
-        for index, name in enumerate(KINDS)
-        if np.any(kinds == index)
-    }
+def count_episodes(parts: list[Part]) -> int:
+    return sum(len(part.episodes) for part in parts)

@@ -1,0 +1,53 @@
+"""Shards put together are the whole recording; what is no set of shards is refused."""
+
+from pathlib import Path
+
+import pytest
+
+from lerobot_dataset_maniskill.configuration import RecordConfig
+from lerobot_dataset_maniskill.manifest import planned_parts
+from lerobot_dataset_maniskill.shards import check_set
+
+NAMES = [Path("a"), Path("b"), Path("c")]
+
+
+def config(shard: str) -> RecordConfig:
+    return RecordConfig(output_dir=Path("nowhere"), num_episodes=55, part_episodes=10, shard=shard)
+
+
+def contents(*shards: tuple[int, int], **changed: object) -> list[dict[str, object]]:
+    described = [{"seed": 0, "shard": list(shard)} for shard in shards]
+    described[-1] |= changed
+    return described
+
+
+def test_shards_are_disjoint_and_together_the_whole() -> None:
+    whole = planned_parts(config("0/1"))
+    shards = [planned_parts(config(f"{index}/3")) for index in range(3)]
+    assert sorted((part for shard in shards for part in shard), key=lambda part: part.index) == whole
+
+
+@pytest.mark.parametrize("shard", ["3/3", "1", "a/b", "-1/2", "1/0"])
+def test_what_is_no_shard_is_named(shard: str) -> None:
+    with pytest.raises(ValueError, match=f"--shard={shard}: write i/n"):
+        config(shard).validate()
+
+
+def test_more_shards_than_work_are_refused() -> None:
+    with pytest.raises(ValueError, match="fewer sub-datasets than shards"):
+        config("0/7").validate()
+
+
+def test_a_complete_set_may_come_in_any_order() -> None:
+    check_set(NAMES, contents((2, 3), (0, 3), (1, 3)))
+
+
+@pytest.mark.parametrize(("described", "message"), [
+    (contents((0, 3), (1, 3)), "missing: 2/3"),
+    (contents((0, 3), (1, 3), (1, 3)), "twice: 1/3; missing: 2/3"),
+    (contents((0, 2), (1, 2), seed=7), r"b is of another recording than a \(seed differ\)"),
+    (contents((0, 2), (1, 3)), r"b is of another recording than a \(number of shards differ\)"),
+])  # fmt: skip
+def test_what_is_no_set_is_named(described: list[dict[str, object]], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        check_set(NAMES[: len(described)], described)
