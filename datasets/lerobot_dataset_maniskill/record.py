@@ -17,6 +17,7 @@ def run(config: RecordConfig) -> None:
 
     silence_libraries()
     if config.merge_shards:
+        config.validate()
         assert config.output_dir is not None
         merge_shards(config.merge_shards, config.output_dir, config.dataset_id)
     else:

@@ -35,9 +35,7 @@ def recorded(shard: Path) -> dict[str, Any]:
     """What the shard says it holds. ValueError if it is no recording."""
     vocabulary = shard / VOCABULARY_FILE
     if not vocabulary.is_file():
-        raise ValueError(
-            f"--merge_shards: {shard} is not a finished recording ({VOCABULARY_FILE} is missing)"
-        )
+        raise ValueError(f"--merge_shards: {shard} is no finished recording ({VOCABULARY_FILE} is missing)")
     return json.loads(vocabulary.read_text())["recording"]
 
 
