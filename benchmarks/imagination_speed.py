@@ -26,6 +26,7 @@ from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 
 REPETITIONS = 3
+MATMULS = 50
 
 
 def median_rate(frames: int, work: Callable[[], object]) -> float:
@@ -82,10 +83,14 @@ def network_flop(model: ActionWorldModelRewardModel) -> float:
 
 
 def matmul_rate() -> float:
-    """FLOP a second of a large float32 matrix product."""
-    a = torch.randn(4096, 512)
-    b = torch.randn(512, 2048)
-    return median_rate(1, lambda: a @ b) * 2 * 4096 * 512 * 2048
+    """FLOP a second of large float32 matrix products into memory that is there already."""
+    a, b, out = torch.randn(2048, 512), torch.randn(512, 1024), torch.empty(2048, 1024)
+
+    def multiply() -> None:
+        for _ in range(MATMULS):
+            torch.mm(a, b, out=out)
+
+    return median_rate(MATMULS, multiply) * 2 * 2048 * 512 * 1024
 
 
 def main() -> None:

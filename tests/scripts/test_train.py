@@ -1,6 +1,7 @@
 """lerobot-train clones, lerobot-wmrl-train improves, lerobot-eval measures; and bad input is named."""
 
 import json
+import shutil
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -8,8 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import EnvConfig
+from safetensors.torch import load_file
 
 from lerobot_wmrl.scripts.train import TrainConfig, check_config, main, rollout_length
 from lerobot_wmrl.tracking import read_metrics
@@ -90,6 +93,20 @@ def test_a_finished_training_is_left_alone(tmp_path: Path, monkeypatch: pytest.M
         improve(monkeypatch, *flags, *POINT, "--seed=5")
     assert stopped.value.code == 1
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
+
+
+def test_an_interrupted_training_ends_as_if_nothing_had_happened(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy = save_untrained_policy(tmp_path / "policy")
+    checkpoints = tmp_path / "rl" / "checkpoints"
+    flags = [f"--policy.path={policy}", *SHORT, f"--output_dir={tmp_path / 'rl'}", *POINT]
+    improve(monkeypatch, *flags)
+    uninterrupted = load_file(checkpoints / "last" / "pretrained_model" / "model.safetensors")
+    shutil.rmtree(checkpoints / "000002")
+    improve(monkeypatch, *flags)
+    continued = load_file(checkpoints / "last" / "pretrained_model" / "model.safetensors")
+    assert all(torch.equal(tensor, continued[name]) for name, tensor in uninterrupted.items())
 
 
 def test_a_finished_training_of_something_else_is_refused(
