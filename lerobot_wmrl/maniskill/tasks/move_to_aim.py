@@ -22,7 +22,7 @@ class MoveToAim(Task):
     def sample_start(self, rng: np.random.Generator, instruction: str) -> Start:
         object_xy = rng.uniform((-0.07, -0.03), (-0.02, 0.06))
         offset = rng.uniform((-0.07, -0.06), (0.03, 0.06))
-        way, angle = rng.uniform(0.10, 0.14), rng.uniform(-0.8, 0.8)
+        way, angle = rng.uniform(0.10, 0.14), rng.uniform(-0.4, 0.8)
         return Start(
             object_xy=object_xy,
             object_yaw=float(rng.uniform(-0.2, 0.2)),
