@@ -42,7 +42,7 @@ def test_success_is_paid_once():
 
 
 def test_bad_settings_name_the_field():
-    with pytest.raises(ValueError, match="form='relative'"):
+    with pytest.raises(ValueError, match=r"--reward\.form=relative: choose"):
         GeneralConfig(device="cpu", form="relative")
     with pytest.raises(ValueError, match=r"alpha=1\.5"):
         GeneralConfig(device="cpu", alpha=1.5)
