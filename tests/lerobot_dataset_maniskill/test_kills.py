@@ -51,7 +51,7 @@ def write_missing(config: RecordConfig, work: Path) -> None:
 
 
 def test_twenty_kills_cost_nothing_that_was_finished(tmp_path: Path) -> None:
-    config = RecordConfig(output_dir=tmp_path / "dataset", num_episodes=160, part_episodes=2)
+    config = RecordConfig(output_dir=tmp_path / "dataset", num_episodes=90, part_episodes=2)
     work, parts = tmp_path / "work", planned_parts(config)
     work.mkdir()
     rng, finished = random.Random(0), {}
@@ -72,5 +72,5 @@ def test_twenty_kills_cost_nothing_that_was_finished(tmp_path: Path) -> None:
     merge(config, work, parts)
     assert whole_dataset(tmp_path / "dataset", count_episodes(parts)) is None
     table = recorded_episodes(tmp_path / "dataset")
-    assert sorted(table["seed"]) == list(range(160))
+    assert sorted(table["seed"]) == list(range(90))
     assert set(table["length"]) == {ROWS}
