@@ -18,12 +18,11 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from tqdm import tqdm, trange
 
-from lerobot_dataset_maniskill.planners import PLANNERS, Follower
+from lerobot_dataset_maniskill.planners import follow_plan
 from lerobot_wmrl.constants import KINDS, PLAY
 from lerobot_wmrl.files import write_json
 from lerobot_wmrl.maniskill import cameras
 from lerobot_wmrl.maniskill.cameras import View
-from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS
 from lerobot_wmrl.maniskill.scenes import scenes_of
 from lerobot_wmrl.maniskill.simulation import Simulation
 from lerobot_wmrl.maniskill.tasks import TASKS
@@ -78,9 +77,10 @@ def record(views: list[str], episodes: int, image_size: int) -> Frames:
         simulation.task = tasks[episode % len(tasks)]
         scene = scenes_of("ind")[rng.integers(len(scenes_of("ind")))]
         frame = simulation.reset(scene, FIRST_SEED + episode)
-        things = OBJECTS[scene.object], CONTAINERS[scene.container]
-        planner = PLANNERS[simulation.task.name](*things, simulation.current_start)
-        follower = Follower(planner.plan(PLANNED_KINDS[rng.integers(len(PLANNED_KINDS))], rng), rng)
+        start = simulation.current_start
+        follower = follow_plan(
+            simulation.task.name, scene, start, PLANNED_KINDS[rng.integers(len(PLANNED_KINDS))], rng
+        )
         for step in range(simulation.task.horizon):
             places = simulation.tcp_position, simulation.object_position
             if step % EVERY == 0:

@@ -14,10 +14,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
-from lerobot_dataset_maniskill.planners import PLANNERS, Follower
+from lerobot_dataset_maniskill.planners import follow_plan
 from lerobot_wmrl.constants import KINDS, PLAY
 from lerobot_wmrl.files import write_json
-from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS
 from lerobot_wmrl.maniskill.scenes import SCENES
 from lerobot_wmrl.maniskill.simulation import Simulation
 from lerobot_wmrl.maniskill.tasks import TASKS
@@ -36,9 +35,8 @@ def play(simulation: Simulation, kind: str, seed: int) -> tuple[bool, Way]:
     rng = np.random.default_rng(seed)
     scene = SCENES[rng.integers(len(SCENES))]
     simulation.reset(scene, seed)
-    things = OBJECTS[scene.object], CONTAINERS[scene.container]
-    planner = PLANNERS[simulation.task.name](*things, simulation.current_start)
-    follower, way, succeeded = Follower(planner.plan(kind, rng), rng), [], False
+    start = simulation.current_start
+    follower, way, succeeded = follow_plan(simulation.task.name, scene, start, kind, rng), [], False
     for _ in range(simulation.task.horizon):
         places = simulation.tcp_position, simulation.object_position
         way.append(np.array(places))

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from lerobot_dataset_maniskill.planners import PLANNERS, Follower
+from lerobot_dataset_maniskill.planners import follow_plan
 from lerobot_wmrl.constants import CAMERAS, KINDS, PLAY
-from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS
+from lerobot_wmrl.maniskill.objects import OBJECTS
 from lerobot_wmrl.maniskill.scenes import SCENES, Scene
 from lerobot_wmrl.maniskill.simulation import Simulation
 from lerobot_wmrl.maniskill.tasks import TASKS
@@ -54,9 +54,11 @@ def grid(pictures: Sequence[tuple[str, np.ndarray]], columns: int, path: Path) -
 def episode(simulation: Simulation, scene: Scene, kind: str, seed: int) -> np.ndarray:
     """A planned episode's third view, (T, H, W, 3)."""
     frame, rng = simulation.reset(scene, seed), np.random.default_rng(seed)
-    things = OBJECTS[scene.object], CONTAINERS[scene.container]
-    planner = PLANNERS[simulation.task.name](*things, simulation.current_start)
-    follower, frames = Follower(planner.plan(kind, rng), rng), [frame.images["third_view"]]
+    start = simulation.current_start
+    follower, frames = (
+        follow_plan(simulation.task.name, scene, start, kind, rng),
+        [frame.images["third_view"]],
+    )
     for _ in range(simulation.task.horizon):
         frame = simulation.step(follower.act(simulation.tcp_position, simulation.object_position))
         frames.append(frame.images["third_view"])

@@ -7,9 +7,8 @@ import torch
 from lerobot.configs.policies import PreTrainedConfig
 
 from lerobot_dataset_maniskill.manifest import EpisodePlan
-from lerobot_dataset_maniskill.planners import PLANNERS, Follower
+from lerobot_dataset_maniskill.planners import follow_plan
 from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, KINDS
-from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS
 from lerobot_wmrl.maniskill.simulation import Frame, Simulation
 from lerobot_wmrl.policy_checkpoints import load_policy, load_processors
 
@@ -35,9 +34,8 @@ class PlannerDriver:
 
     def begin(self, simulation: Simulation, plan: EpisodePlan) -> None:
         rng = np.random.default_rng((plan.seed, KINDS.index(plan.kind), simulation.task.index))
-        things = OBJECTS[plan.scene.object], CONTAINERS[plan.scene.container]
-        planner = PLANNERS[simulation.task.name](*things, simulation.current_start)
-        self.follower = Follower(planner.plan(plan.kind, rng), rng)
+        start = simulation.current_start
+        self.follower = follow_plan(simulation.task.name, plan.scene, start, plan.kind, rng)
 
     def act(self, simulation: Simulation, frame: Frame) -> np.ndarray:
         return self.follower.act(simulation.tcp_position, simulation.object_position)

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from lerobot_dataset_maniskill.planners import PLANNERS, Follower, Planner
+from lerobot_dataset_maniskill.planners import PLANNERS, Follower, Planner, follow_plan
 from lerobot_dataset_maniskill.planners.follower import CLOSED, OPEN, OPTIMAL_SPEED, Noise, Plan, Waypoint
 from lerobot_dataset_maniskill.planners.kinds import FINGER_HALF_THICKNESS
 from lerobot_dataset_maniskill.planners.play import PLAY_STEPS
@@ -162,8 +162,7 @@ def succeeds(simulation: Simulation, kind: str, seed: int) -> bool:
     rng = np.random.default_rng(seed)
     scene = SCENES[rng.integers(len(SCENES))]
     simulation.reset(scene, seed)
-    made = planner(simulation.task.name, seed, scene)
-    follower = Follower(made.plan(kind, rng), rng)
+    follower = follow_plan(simulation.task.name, scene, simulation.current_start, kind, rng)
     for _ in range(simulation.task.horizon):
         action = follower.act(simulation.tcp_position, simulation.object_position)
         if simulation.step(action).success:
