@@ -54,11 +54,8 @@ def grid(pictures: Sequence[tuple[str, np.ndarray]], columns: int, path: Path) -
 def episode(simulation: Simulation, scene: Scene, kind: str, seed: int) -> np.ndarray:
     """A planned episode's third view, (T, H, W, 3)."""
     frame, rng = simulation.reset(scene, seed), np.random.default_rng(seed)
-    start = simulation.current_start
-    follower, frames = (
-        follow_plan(simulation.task.name, scene, start, kind, rng),
-        [frame.images["third_view"]],
-    )
+    follower = follow_plan(simulation.task.name, scene, simulation.current_start, kind, rng)
+    frames = [frame.images["third_view"]]
     for _ in range(simulation.task.horizon):
         frame = simulation.step(follower.act(simulation.tcp_position, simulation.object_position))
         frames.append(frame.images["third_view"])
