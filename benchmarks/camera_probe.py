@@ -113,12 +113,17 @@ class Probe(nn.Module):
         return self.head(F.adaptive_avg_pool2d(x, 4 if images.shape[-1] <= 64 else 8).flatten(1))
 
 
+def held_out(episode: np.ndarray) -> np.ndarray:
+    """Episodes for the test, as many of every task. (N,) bool"""
+    return episode // len(TASKS) % round(1 / TEST_SHARE) == 0
+
+
 def probe(images: np.ndarray, frames: Frames, steps: int) -> dict[str, float]:
     """Train on three quarters of the episodes, test on the others. → errors by name"""
     torch.manual_seed(0)
     pictures = torch.from_numpy(images).permute(0, 3, 1, 2)
     targets = np.column_stack([frames.places, 100 * frames.opening])
-    train = frames.episode % round(1 / TEST_SHARE) != 0
+    train = ~held_out(frames.episode)
     mean, std = targets[train].mean(0), targets[train].std(0)
     scaled = torch.from_numpy((targets - mean) / std).float()
     contact = torch.from_numpy(frames.contact).float()
@@ -169,7 +174,7 @@ def main() -> None:
         table[f"third_view + wrist {size}"] = probe(both, frames, given.steps)
     for name, errors in table.items():
         print(name, errors)
-    test = int((frames.episode % round(1 / TEST_SHARE) == 0).sum())
+    test = int(held_out(frames.episode).sum())
     write_json(given.output, {"frames": len(frames.episode), "test_frames": test, "probes": table})
 
 
