@@ -18,8 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from tqdm import tqdm, trange
 
-from lerobot_dataset_maniskill.planners import follow_plan
-from lerobot_wmrl.constants import KINDS, PLAY
+from lerobot_dataset_maniskill.planners import TASK_KINDS, follow_plan
 from lerobot_wmrl.files import write_json
 from lerobot_wmrl.maniskill import cameras
 from lerobot_wmrl.maniskill.cameras import View
@@ -28,7 +27,6 @@ from lerobot_wmrl.maniskill.simulation import Simulation
 from lerobot_wmrl.maniskill.tasks import TASKS
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
-PLANNED_KINDS = [kind for kind in KINDS if kind not in ("policy", PLAY)]
 CANDIDATES = {
     "corner": View((0.45, 0.35, 0.45), (-0.1, 0.0, 0.05), 1.0),
     "corner_near": View((0.34, 0.28, 0.34), (-0.02, -0.03, 0.04), 0.8),
@@ -79,7 +77,7 @@ def record(views: list[str], episodes: int, image_size: int) -> Frames:
         frame = simulation.reset(scene, FIRST_SEED + episode)
         start = simulation.current_start
         follower = follow_plan(
-            simulation.task.name, scene, start, PLANNED_KINDS[rng.integers(len(PLANNED_KINDS))], rng
+            simulation.task.name, scene, start, TASK_KINDS[rng.integers(len(TASK_KINDS))], rng
         )
         for step in range(simulation.task.horizon):
             places = simulation.tcp_position, simulation.object_position
@@ -97,7 +95,7 @@ def record(views: list[str], episodes: int, image_size: int) -> Frames:
 
 
 class Probe(nn.Module):
-    """A CNN that keeps where things are: strided convolutions, then a spatial soft-argmax and features."""
+    """A CNN that keeps where things are: strided convolutions, a coarse grid of features, two layers."""
 
     def __init__(self, outputs: int) -> None:
         super().__init__()

@@ -14,8 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
-from lerobot_dataset_maniskill.planners import follow_plan
-from lerobot_wmrl.constants import KINDS, PLAY
+from lerobot_dataset_maniskill.planners import TASK_KINDS, follow_plan
 from lerobot_wmrl.files import write_json
 from lerobot_wmrl.maniskill.scenes import SCENES
 from lerobot_wmrl.maniskill.simulation import Simulation
@@ -23,7 +22,6 @@ from lerobot_wmrl.maniskill.tasks import TASKS
 from lerobot_wmrl.statistics import Proportion
 
 DOCS = Path(__file__).parents[1] / "docs"
-PLANNED_KINDS = [kind for kind in KINDS if kind not in ("policy", PLAY)]
 FIRST_SEED = 2_000_000
 """Neither recorded nor evaluated on."""
 
@@ -53,7 +51,7 @@ def measure(episodes: int) -> tuple[dict[str, dict[str, Proportion]], dict[str, 
     for name, task in TASKS.items():
         simulation = Simulation(task, SCENES, cameras=())
         success[name], visited[name] = {}, {}
-        for kind in PLANNED_KINDS:
+        for kind in TASK_KINDS:
             seeds = range(FIRST_SEED, FIRST_SEED + episodes)
             played = [play(simulation, kind, seed) for seed in tqdm(seeds, desc=f"{name}, {kind}")]
             success[name][kind] = Proportion(sum(done for done, _ in played), episodes)
@@ -64,8 +62,8 @@ def measure(episodes: int) -> tuple[dict[str, dict[str, Proportion]], dict[str, 
 
 def draw(visited: dict[str, dict[str, Way]], path: Path) -> None:
     """Seen from above: a row a task, a column a kind; blue the gripper, orange the object."""
-    figure = Figure(figsize=(2.2 * len(PLANNED_KINDS), 2.2 * len(visited)))
-    panels = figure.subplots(len(visited), len(PLANNED_KINDS), sharex=True, sharey=True)
+    figure = Figure(figsize=(2.2 * len(TASK_KINDS), 2.2 * len(visited)))
+    panels = figure.subplots(len(visited), len(TASK_KINDS), sharex=True, sharey=True)
     for row, (task, kinds) in zip(panels, visited.items(), strict=True):
         for axes, (kind, places) in zip(row, kinds.items(), strict=True):
             for which, colour in ((0, "#2b6cb0"), (1, "#dd6b20")):

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from lerobot_dataset_maniskill.planners import follow_plan
-from lerobot_wmrl.constants import CAMERAS, KINDS, PLAY
+from lerobot_dataset_maniskill.planners import TASK_KINDS, follow_plan
+from lerobot_wmrl.constants import CAMERAS
 from lerobot_wmrl.maniskill.objects import OBJECTS
 from lerobot_wmrl.maniskill.scenes import SCENES, Scene
 from lerobot_wmrl.maniskill.simulation import Simulation
@@ -21,7 +21,6 @@ from lerobot_wmrl.maniskill.tasks import TASKS
 
 IMAGES = Path(__file__).parents[1] / "docs" / "images"
 IMAGE_SIZE = 160
-PLANNED_KINDS = [kind for kind in KINDS if kind not in ("policy", PLAY)]
 STRIP_FRAMES = 6
 SEED = 4_000_000
 
@@ -86,7 +85,7 @@ def main() -> None:
         frame = simulation.reset(scene, SEED)
         name = task.name.replace("_", " ")
         views += [(f"{name}: {camera.replace('_', ' ')}", frame.images[camera]) for camera in CAMERAS]
-        for kind in PLANNED_KINDS:
+        for kind in TASK_KINDS:
             played = episode(simulation, scene, kind, SEED)
             strips.append((f"{name}: {kind.replace('_', ' ')}", strip(played)))
     grid(views, 4, folder / "tasks.png")

@@ -14,7 +14,7 @@ from lerobot.configs import parser
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
 
-from lerobot_wmrl.files import write_json
+from lerobot_wmrl.files import foreign_files, write_json
 
 CONFIG_FILE = "train_config.json"
 
@@ -58,7 +58,7 @@ def require_free(output_dir: Path, config: dict[str, Any]) -> None:
                 f"--output_dir={output_dir} holds a run with other settings ({', '.join(differing)}); "
                 "choose another folder, or repeat the settings of the first run to continue it"
             )
-    elif output_dir.is_dir() and any(path.name != f".{CONFIG_FILE}.partial" for path in output_dir.iterdir()):
+    elif foreign_files(output_dir, CONFIG_FILE):
         raise ValueError(f"--output_dir={output_dir} holds something else; choose a new folder")
 
 

@@ -13,6 +13,12 @@ def write_text(path: Path, text: str) -> None:
     partial.replace(path)
 
 
+def foreign_files(folder: Path, *own: str) -> bool:
+    """Whether a folder holds anything but the files called `own`, and what a torn `write_text` left."""
+    known = {*own, *(f".{name}.partial" for name in own)}
+    return folder.is_dir() and any(path.name not in known for path in folder.iterdir())
+
+
 def write_json(path: Path, content: Any) -> None:
     """`content` as indented JSON, atomically."""
     write_text(path, json.dumps(content, indent=2) + "\n")

@@ -21,7 +21,7 @@ from lerobot_dataset_maniskill.merging import finish, merge_folders
 from lerobot_dataset_maniskill.worker import EpisodeResult, PartRecorder, Report, serve_parts
 from lerobot_dataset_maniskill.writer import VOCABULARY_FILE
 from lerobot_wmrl.constants import ACTION_NAMES
-from lerobot_wmrl.files import write_json
+from lerobot_wmrl.files import foreign_files, write_json
 from lerobot_wmrl.maniskill.processes import simulating_context
 from lerobot_wmrl.maniskill.renderer import render_backend
 from lerobot_wmrl.policy_checkpoints import check_fit, check_weights
@@ -99,7 +99,7 @@ def claimed(work: Path, content: Mapping[str, Any]) -> Iterator[None]:
         stored = work / CONTENT_FILE
         if stored.is_file():
             require_same(json.loads(stored.read_text()), content, work)
-        elif {path.name for path in work.iterdir()} - {"lock", f".{CONTENT_FILE}.partial"}:
+        elif foreign_files(work, "lock", CONTENT_FILE):
             raise ValueError(f"{work} holds something else; move it away to record here")
         else:
             write_json(stored, dict(content))

@@ -11,7 +11,7 @@ from typing import Any
 
 from lerobot_wmrl.demo.process import preload, run_measured
 from lerobot_wmrl.demo.stages import DemoConfig, Stage
-from lerobot_wmrl.files import write_json
+from lerobot_wmrl.files import foreign_files, write_json
 
 MARKER = "demo.json"
 
@@ -27,9 +27,7 @@ def claimed(config: DemoConfig) -> Iterator[None]:
     settings = {**asdict(config), "output_dir": str(config.output_dir)}
     if marker.exists():
         check_settings(json.loads(marker.read_text()), settings)
-    elif config.output_dir.exists() and any(
-        path.name != f".{MARKER}.partial" for path in config.output_dir.iterdir()
-    ):
+    elif foreign_files(config.output_dir, MARKER):
         raise ValueError(
             f"--output_dir={config.output_dir}: holds something that is not a demo; choose another folder"
         )

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from lerobot_dataset_maniskill.planners import PLANNERS, Follower, Planner, follow_plan
+from lerobot_dataset_maniskill.planners import PLANNERS, TASK_KINDS, Follower, Planner, follow_plan
 from lerobot_dataset_maniskill.planners.follower import CLOSED, OPEN, OPTIMAL_SPEED, Noise, Plan, Waypoint
 from lerobot_dataset_maniskill.planners.kinds import FINGER_HALF_THICKNESS
 from lerobot_dataset_maniskill.planners.play import PLAY_STEPS
@@ -18,7 +18,7 @@ from lerobot_dataset_maniskill.planners.slide import (
     slide_partly,
     stop_short,
 )
-from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, KINDS, PLAY
+from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, PLAY
 from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS
 from lerobot_wmrl.maniskill.scenes import SCENES, Scene
 from lerobot_wmrl.maniskill.simulation import Simulation
@@ -27,7 +27,6 @@ from lerobot_wmrl.maniskill.tasks import TASKS, Push
 SCENE = SCENES[2]
 SPEC = OBJECTS[SCENE.object]
 LAG = 1 / 3
-PLANNED_KINDS = [kind for kind in KINDS if kind not in ("policy", PLAY)]
 
 
 def planner(task: str, seed: int, scene: Scene = SCENE) -> Planner:
@@ -51,7 +50,7 @@ def test_every_task_has_a_planner() -> None:
     assert PLANNERS.keys() == TASKS.keys()
 
 
-@pytest.mark.parametrize("kind", PLANNED_KINDS)
+@pytest.mark.parametrize("kind", TASK_KINDS)
 @pytest.mark.parametrize("task", TASKS)
 def test_actions_stay_in_the_box_and_repeat_for_a_seed(task: str, kind: str) -> None:
     for seed in range(6):

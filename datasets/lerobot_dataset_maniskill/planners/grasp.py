@@ -34,9 +34,15 @@ class GraspPlanner(Planner):
     def target(self) -> np.ndarray:
         """Where the object belongs. (2,)"""
 
+    @property
     @abstractmethod
+    def margins(self) -> tuple[float, float]:
+        """Least and most distance from the target at which the object is missed, or hardly so (m)."""
+
     def beside_target(self, rng: np.random.Generator) -> np.ndarray:
-        """Where it does not belong any more, or hardly. (2,)"""
+        """Where the object does not belong any more, or hardly. (2,)"""
+        angle, outside = rng.uniform(-np.pi, np.pi), rng.uniform(*self.margins)
+        return self.target + outside * np.array([np.cos(angle), np.sin(angle)])
 
     def essential(self) -> Waypoints:
         return (*self.grasp(), *self.deliver(self.target))

@@ -21,11 +21,15 @@ from lerobot_dataset_maniskill.planners.follower import (
     above_table,
 )
 from lerobot_dataset_maniskill.planners.play import play_waypoints
+from lerobot_wmrl.constants import KINDS, PLAY
 from lerobot_wmrl.maniskill.objects import ContainerSpec, ObjectSpec
 from lerobot_wmrl.maniskill.tasks import Start
 
 FINGER_HALF_THICKNESS: Final = 0.011
 """Half of the closed fingertips' extent along x and y (m)."""
+
+TASK_KINDS: Final = tuple(kind for kind in KINDS if kind not in ("policy", PLAY))
+"""Kinds of plan that have to do with the task."""
 
 TURNED: Final = ("waypoint", "disturbed")
 """Kinds whose rotations and gripper commands are disturbed too."""
@@ -59,7 +63,7 @@ class Planner(ABC):
         """A plan of the given kind (`constants.KINDS` without "policy")."""
         if kind == "optimal":
             return Plan(self.essential(), speed=OPTIMAL_SPEED)
-        if kind == "play":
+        if kind == PLAY:
             return Plan(play_waypoints(self.spec, rng), noise=Noise(rng.uniform(0.0, 0.01)))
         plan = Plan((), OPTIMAL_SPEED)
         if rng.random() >= CALM_SHARE[kind]:
@@ -92,11 +96,7 @@ class Planner(ABC):
 def jittered(waypoints: Sequence[Waypoint], rng: np.random.Generator, sigma: float) -> Waypoints:
     """Every waypoint moved by Gaussian noise of `sigma` metres, not into the table."""
 
-    def moved(waypoint: Waypoint) -> Waypoint:
-        offset = rng.normal(0.0, sigma, 3)
-        if waypoint.aim is None:
-            return replace(waypoint, position=above_table(waypoint.position + offset))
-        aim = waypoint.aim
-        return replace(waypoint, aim=lambda thing: above_table(aim(thing) + offset))
-
-    return tuple(moved(waypoint) for waypoint in waypoints)
+    return tuple(
+        replace(waypoint, position=above_table(waypoint.position + rng.normal(0.0, sigma, 3)))
+        for waypoint in waypoints
+    )

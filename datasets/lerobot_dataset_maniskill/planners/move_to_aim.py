@@ -19,8 +19,6 @@ class MoveToAimPlanner(GraspPlanner):
     def deliver(self, target: np.ndarray) -> Waypoints:
         return (Waypoint(over(target, self.grasp_height), 0.001),)
 
-    def beside_target(self, rng: np.random.Generator) -> np.ndarray:
-        """Short of the mat's middle, beyond or beside it."""
-        angle = rng.uniform(-np.pi, np.pi)
-        outside = MoveToAim.tolerance + rng.uniform(0.0, 0.05)
-        return self.target + outside * np.array([np.cos(angle), np.sin(angle)])
+    @property
+    def margins(self) -> tuple[float, float]:
+        return MoveToAim.tolerance, MoveToAim.tolerance + 0.05

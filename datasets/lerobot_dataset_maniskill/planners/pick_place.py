@@ -32,7 +32,6 @@ class PickPlacePlanner(GraspPlanner):
             Waypoint(over(target, carry + 0.03), 0.02, OPEN),
         )
 
-    def beside_target(self, rng: np.random.Generator) -> np.ndarray:
-        angle = rng.uniform(-np.pi, np.pi)
-        outside = self.container.radius + rng.uniform(-0.01, 0.06)
-        return self.target + outside * np.array([np.cos(angle), np.sin(angle)])
+    @property
+    def margins(self) -> tuple[float, float]:
+        return self.container.radius - 0.01, self.container.radius + 0.06

@@ -60,8 +60,9 @@ class Situation:
     Args:
         start: of the episode; object_start (3,), where its object came to rest.
         spec, container: what is manipulated, and what stands beside it.
-        object_now: its centre (3,). object_speed: of
-            its centre during the last control step (m/s); the physics engine's own trembles in a firm grasp.
+        object_now: its centre (3,).
+        object_speed: of the centre during the last control step (m/s); the physics engine's own velocity
+            trembles in a firm grasp.
         tcp: of the gripper (3,). gripper_opening: 0 closed to 1 open.
     """
 

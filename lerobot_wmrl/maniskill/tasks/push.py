@@ -10,12 +10,32 @@ CONTACT_DISTANCE = 0.03
 """From the object's centre to the place behind it that the reward draws the gripper to (m)."""
 
 
+Area = tuple[tuple[float, float], tuple[float, float]]
+"""Lowest and highest (x, y), in metres."""
+
+
 class Slide(Task):
-    """The object is to move `distance` along `direction`·x, at most `lateral_limit` sideways."""
+    """The object is to move `distance` along `direction`·x, at most `lateral_limit` sideways.
+
+    It starts in `object_area`, the TCP at an offset from it in `tcp_offset` and at a height in `tcp_height`.
+    """
 
     direction: ClassVar[float]
     distance: ClassVar[float] = 0.10
     lateral_limit: ClassVar[float] = 0.05
+    object_area: ClassVar[Area]
+    tcp_offset: ClassVar[Area]
+    tcp_height: ClassVar[tuple[float, float]]
+
+    def sample_start(self, rng: np.random.Generator, instruction: str) -> Start:
+        object_xy, offset = rng.uniform(*self.object_area), rng.uniform(*self.tcp_offset)
+        return Start(
+            object_xy=object_xy,
+            object_yaw=float(rng.uniform(-0.2, 0.2)),
+            container_xy=scenery_place(rng),
+            tcp=np.array([*(object_xy + offset), rng.uniform(*self.tcp_height)]),
+            instruction=instruction,
+        )
 
     def success(self, situation: Situation) -> bool:
         forward, sideways, _ = situation.moved
@@ -37,22 +57,14 @@ class Push(Slide):
     name = "push"
     horizon = 40
     direction = 1.0
+    object_area = ((-0.05, -0.05), (0.01, 0.05))
+    tcp_offset = ((-0.16, -0.08), (-0.08, 0.08))
+    tcp_height = (0.03, 0.16)
     templates = (
         "push the {object} forward",
         "push the {object} away from the robot",
         "move the {object} forward by pushing it",
     )
-
-    def sample_start(self, rng: np.random.Generator, instruction: str) -> Start:
-        object_xy = rng.uniform((-0.05, -0.05), (0.01, 0.05))
-        offset = rng.uniform((-0.16, -0.08), (-0.08, 0.08))
-        return Start(
-            object_xy=object_xy,
-            object_yaw=float(rng.uniform(-0.2, 0.2)),
-            container_xy=scenery_place(rng),
-            tcp=np.array([*(object_xy + offset), rng.uniform(0.03, 0.16)]),
-            instruction=instruction,
-        )
 
 
 class Pull(Slide):
@@ -61,19 +73,11 @@ class Pull(Slide):
     name = "pull"
     horizon = 60
     direction = -1.0
+    object_area = ((0.0, -0.05), (0.06, 0.05))
+    tcp_offset = ((-0.14, -0.07), (-0.07, 0.07))
+    tcp_height = (0.08, 0.18)
     templates = (
         "pull the {object} back",
         "pull the {object} towards the robot",
         "move the {object} back by pulling it",
     )
-
-    def sample_start(self, rng: np.random.Generator, instruction: str) -> Start:
-        object_xy = rng.uniform((0.0, -0.05), (0.06, 0.05))
-        offset = rng.uniform((-0.14, -0.07), (-0.07, 0.07))
-        return Start(
-            object_xy=object_xy,
-            object_yaw=float(rng.uniform(-0.2, 0.2)),
-            container_xy=scenery_place(rng),
-            tcp=np.array([*(object_xy + offset), rng.uniform(0.08, 0.18)]),
-            instruction=instruction,
-        )
