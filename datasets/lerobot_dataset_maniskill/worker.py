@@ -17,6 +17,7 @@ from lerobot_dataset_maniskill.quiet import silence_libraries
 from lerobot_dataset_maniskill.writer import HOLD_FRAMES, Outcome, StartColumns, add_step, create_dataset
 from lerobot_wmrl.constants import PLAY
 from lerobot_wmrl.maniskill.tasks import task_of
+from lerobot_wmrl.progress import own_progress_lock
 
 
 @dataclass(frozen=True)
@@ -95,6 +96,7 @@ def serve_parts(config: RecordConfig, folder: Path, parts: Any, results: Any) ->
 
     torch.set_num_threads(1)
     server = os.getppid()
+    own_progress_lock()
     silence_libraries()
 
     def report(result: EpisodeResult) -> None:

@@ -21,6 +21,8 @@ from typing import BinaryIO
 
 import psutil
 
+from lerobot_wmrl.progress import own_progress_lock
+
 SAMPLE_SECONDS = 1.0
 """How often memory is sampled and progress is reported."""
 
@@ -91,6 +93,7 @@ def _run_command(command: list[str], output: int, parent: int) -> None:
     """In the forked process: become what a shell would have started."""
     os.setsid()
     _die_with(parent)
+    own_progress_lock()
     for sign in (signal.SIGTERM, signal.SIGINT):
         signal.signal(sign, signal.SIG_DFL if sign == signal.SIGTERM else signal.default_int_handler)
     for stream in (1, 2):

@@ -22,6 +22,7 @@ from lerobot_dataset_maniskill.worker import PartRecorder
 from lerobot_dataset_maniskill.writer import Outcome, StartColumns, add_step
 from lerobot_wmrl.episodes import recorded_episodes
 from lerobot_wmrl.maniskill.simulation import Frame
+from lerobot_wmrl.progress import own_progress_lock
 
 KILLS = 20
 ROWS = 6
@@ -44,7 +45,8 @@ class MadeUpRecorder(PartRecorder):
 
 
 def write_missing(config: RecordConfig, work: Path) -> None:
-    """What the command does between claiming its folder and merging."""
+    """What the command does between claiming its folder and merging, in a process of its own."""
+    own_progress_lock()
     recorder = MadeUpRecorder(config, work)
     for part in missing_parts(work, planned_parts(config)):
         recorder.record(part, lambda result: None)
