@@ -3,8 +3,8 @@
     python benchmarks/camera_probe.py --episodes=480
 
 Frames of planned episodes of all tasks and kinds, in all training scenes. A CNN is trained on some episodes
-and tested on others; the errors are means of absolute values in mm, and the accuracy of whether finger and object
-touch. Writes docs/results/cameras.json.
+and tested on others; the errors are means of absolute values in mm, and whether finger and object touch.
+Writes docs/results/cameras.json.
 """
 
 import argparse
@@ -24,6 +24,7 @@ from lerobot_wmrl.files import write_json
 from lerobot_wmrl.maniskill import cameras
 from lerobot_wmrl.maniskill.cameras import View
 from lerobot_wmrl.maniskill.processes import simulating_context
+from lerobot_wmrl.maniskill.rendering import Rendering
 from lerobot_wmrl.maniskill.scenes import scenes_of
 from lerobot_wmrl.maniskill.simulation import Simulation
 from lerobot_wmrl.maniskill.tasks import TASKS
@@ -96,7 +97,8 @@ def record_share(views: list[str], episodes: range, image_size: int) -> Frames:
     """In a process of its own: some of the episodes, at one size."""
     scenes, tasks = scenes_of("ind"), list(TASKS.values())
     cameras.VIEWS.update(CANDIDATES)
-    simulation = Simulation(tasks[0], scenes, views, image_size)
+    simulation = Simulation(tasks[0], scenes, Rendering(tuple(views), image_size))
+    every = simulation.cameras
     images: dict[str, list[np.ndarray]] = {view: [] for view in views}
     rows: list[tuple[list[float], float, bool, int]] = []
     for episode in episodes:
@@ -112,11 +114,11 @@ def record_share(views: list[str], episodes: range, image_size: int) -> Frames:
                     images[view].append(frame.images[view])
                 millimetres = [1000 * float(value) for value in (*places[1], *places[0])]
                 rows.append((millimetres, simulation.gripper_opening, touching(simulation), episode))
-            simulation.cameras = tuple(views) if (step + 1) % EVERY == 0 else ()
+            simulation.cameras = every if (step + 1) % EVERY == 0 else {}
             frame = simulation.step(follower.act(*places))
             if frame.success:
                 break
-        simulation.cameras = tuple(views)
+        simulation.cameras = every
     simulation.close()
     columns = [np.array(column) for column in zip(*rows, strict=True)]
     return Frames({view: np.stack(kept) for view, kept in images.items()}, *columns)

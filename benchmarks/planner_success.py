@@ -16,6 +16,7 @@ from tqdm import tqdm
 
 from lerobot_dataset_maniskill.planners import TASK_KINDS, follow_plan
 from lerobot_wmrl.files import write_json
+from lerobot_wmrl.maniskill.rendering import Rendering
 from lerobot_wmrl.maniskill.scenes import SCENES
 from lerobot_wmrl.maniskill.simulation import Simulation
 from lerobot_wmrl.maniskill.tasks import TASKS
@@ -49,7 +50,7 @@ def measure(episodes: int) -> tuple[dict[str, dict[str, Proportion]], dict[str, 
     success: dict[str, dict[str, Proportion]] = {}
     visited: dict[str, dict[str, Way]] = {}
     for name, task in TASKS.items():
-        simulation = Simulation(task, SCENES, cameras=())
+        simulation = Simulation(task, SCENES, Rendering(()))
         success[name], visited[name] = {}, {}
         for kind in TASK_KINDS:
             seeds = range(FIRST_SEED, FIRST_SEED + episodes)

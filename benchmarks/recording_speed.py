@@ -20,6 +20,7 @@ import numpy as np
 from lerobot_wmrl.constants import CAMERAS, ROBOT_MESH_DETAIL
 from lerobot_wmrl.files import write_json
 from lerobot_wmrl.maniskill.renderer import render_backend
+from lerobot_wmrl.maniskill.rendering import Rendering
 from lerobot_wmrl.maniskill.scenes import scenes_of
 from lerobot_wmrl.maniskill.simulation import Simulation
 from lerobot_wmrl.maniskill.tasks import TASKS
@@ -64,7 +65,9 @@ def stock_step(image_size: int, steps: int) -> float:
 def our_step(image_size: int, steps: int, robot_mesh_detail: float) -> float:
     """The recorder's simulation in one scene."""
     scenes = scenes_of("ind")[:1]
-    simulation = Simulation(TASKS["push"], scenes, CAMERAS, image_size, robot_mesh_detail)
+    simulation = Simulation(
+        TASKS["push"], scenes, Rendering(CAMERAS, image_size, robot_mesh_detail=robot_mesh_detail)
+    )
     simulation.reset(scenes[0], 0)
     still = np.zeros(7, np.float32)
     cost = cpu_seconds(lambda: simulation.step(still), steps)

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from lerobot_dataset_maniskill.planners import TASK_KINDS, follow_plan
 from lerobot_wmrl.constants import CAMERAS
 from lerobot_wmrl.maniskill.objects import OBJECTS
+from lerobot_wmrl.maniskill.rendering import Rendering
 from lerobot_wmrl.maniskill.scenes import SCENES, Scene
 from lerobot_wmrl.maniskill.simulation import Simulation
 from lerobot_wmrl.maniskill.tasks import TASKS
@@ -76,7 +77,7 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=IMAGES, help="where the pictures go")
     folder = parser.parse_args().folder
     scenes = scenes_with_each_object()
-    simulation = Simulation(TASKS["push"], SCENES, CAMERAS, IMAGE_SIZE)
+    simulation = Simulation(TASKS["push"], SCENES, Rendering(CAMERAS, IMAGE_SIZE))
     things = [(s.object, simulation.reset(s, SEED).images["third_view"]) for s in scenes]
     grid([(name.replace("_", " "), picture) for name, picture in things], 7, folder / "objects.png")
     views, strips = [], []

@@ -12,6 +12,9 @@ Flags = Mapping[str, str | int | float | bool]
 DEMO_SCENES: Final = "[0,1,2]"
 """A sponge, a can and a box: what the 600 episodes of the recipe `demo` suffice for."""
 
+DEMO_IMAGE_SIZE: Final = 64
+"""Pixels a side that two cores can learn from in minutes."""
+
 TINY_WORLD_MODEL: Final[Flags] = {
     "model.layers": 1,
     "model.width": 32,
@@ -27,7 +30,7 @@ TINY_WORLD_MODEL: Final[Flags] = {
 PRESETS: Final[dict[str, dict[str, Flags]]] = {
     "tiny": {
         "train-world-model:frame_tokenizer": {
-            "model.image_size": 64,
+            "model.image_size": DEMO_IMAGE_SIZE,
             "model.widths": "[8,16]",
             "steps": 20,
             "batch_size": 8,
@@ -65,7 +68,7 @@ PRESETS: Final[dict[str, dict[str, Flags]]] = {
     },
     "demo": {
         "train-world-model:frame_tokenizer": {
-            "model.image_size": 64,
+            "model.image_size": DEMO_IMAGE_SIZE,
             "steps": 800,
             "batch_size": 48,
             "save_freq": 100,

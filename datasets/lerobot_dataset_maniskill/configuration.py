@@ -38,6 +38,7 @@ class RecordConfig(RunConfig):
         seed: of the first episode; episode i has seed + i.
         tasks: recorded in turn; the environment's own by default.
         env: task, scenes, cameras and image size (--env.type=wmrl_maniskill --env.task=push …).
+        depth: record every camera's depth too, as LeRobot's depth maps (observation.images.<camera>_depth).
         kinds: share of each trajectory kind (planned trajectories only).
         num_workers: simulating processes.
         shard: i/n records every n-th sub-dataset from the i-th (from 0) on, for n machines.
@@ -59,6 +60,7 @@ class RecordConfig(RunConfig):
     seed: int = 0
     tasks: list[str] = field(default_factory=list)
     env: EnvConfig = field(default_factory=WmrlManiSkillEnv)
+    depth: bool = False
     kinds: dict[str, float] = field(default_factory=default_kinds)
     num_workers: int = 2
     part_episodes: int = 20
@@ -140,6 +142,9 @@ class RecordConfig(RunConfig):
             "scenes": [scene.index for scene in env.selected_scenes()],
             "cameras": list(env.cameras),
             "image_size": env.image_size,
+            "depth": self.depth,
+            "light_jitter": env.light_jitter,
+            "camera_jitter": env.camera_jitter,
             "episode_length": env.episode_length,
             "robot_mesh_detail": env.robot_mesh_detail,
             "num_episodes": self.num_episodes,

@@ -39,7 +39,7 @@ class PartRecorder:
     def __init__(self, config: RecordConfig, folder: Path) -> None:
         env = config.maniskill
         self.config, self.folder = config, folder
-        self.simulation = env.create_simulation()
+        self.simulation = env.create_simulation(config.depth)
         self.driver: Driver = (
             PlannerDriver() if config.policy is None else PolicyDriver(config.policy, config.exploration)
         )
@@ -49,7 +49,9 @@ class PartRecorder:
         partial = self.folder / f".{part.name}.{os.getpid()}.partial"
         shutil.rmtree(partial, ignore_errors=True)
         env = self.config.maniskill
-        dataset = create_dataset(partial, self.config.dataset_id, env.cameras, env.image_size)
+        dataset = create_dataset(
+            partial, self.config.dataset_id, env.cameras, env.image_size, self.config.depth
+        )
         for plan in part.episodes:
             success, frames = self._record_episode(dataset, plan)
             report(EpisodeResult(part.index, plan.kind, success, frames))

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from lerobot.configs.video import RGBEncoderConfig
+from lerobot.configs.video import DepthEncoderConfig, RGBEncoderConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_dataset_maniskill.manifest import EpisodePlan
@@ -35,13 +35,16 @@ def video_encoder() -> RGBEncoderConfig:
     return RGBEncoderConfig(vcodec="h264", pix_fmt="yuv444p", crf=12, preset="ultrafast", g=2)
 
 
-def dataset_features(cameras: Sequence[str], image_size: int) -> dict[str, dict[str, Any]]:
+def depth_encoder() -> DepthEncoderConfig:
+    """Lossless, in steps of 0.6 mm up to 2.5 m: further away is only background."""
+    return DepthEncoderConfig(depth_min=0.0, depth_max=2.5, use_log=False)
+
+
+def dataset_features(cameras: Sequence[str], image_size: int, depth: bool) -> dict[str, dict[str, Any]]:
     """LeRobot's description of the columns."""
-    picture = {
-        "dtype": "video",
-        "shape": (image_size, image_size, 3),
-        "names": ["height", "width", "channels"],
-    }
+    pictures = {f"observation.images.{camera}": _picture(image_size, 3) for camera in cameras}
+    if depth:
+        pictures |= {f"observation.images.{camera}_depth": _picture(image_size, 1) for camera in cameras}
     scalars = {
         "next.reward": "float32",
         "next.done": "bool",
@@ -50,18 +53,28 @@ def dataset_features(cameras: Sequence[str], image_size: int) -> dict[str, dict[
     }
     scalars |= dict.fromkeys(START_COLUMNS, "int64")
     return {
-        **{f"observation.images.{camera}": dict(picture) for camera in cameras},
+        **pictures,
         "observation.state": {"dtype": "float32", "shape": (len(STATE_NAMES),), "names": list(STATE_NAMES)},
         "action": {"dtype": "float32", "shape": (len(ACTION_NAMES),), "names": list(ACTION_NAMES)},
         **{name: {"dtype": dtype, "shape": (1,), "names": None} for name, dtype in scalars.items()},
     }
 
 
-def create_dataset(root: Path, repo_id: str, cameras: Sequence[str], image_size: int) -> LeRobotDataset:
+def _picture(image_size: int, channels: int) -> dict[str, Any]:
+    """A square picture; one channel is depth."""
+    shape = (image_size, image_size, channels)
+    info = {"info": {"is_depth_map": True}} if channels == 1 else {}
+    return {"dtype": "video", "shape": shape, "names": ["height", "width", "channels"], **info}
+
+
+def create_dataset(
+    root: Path, repo_id: str, cameras: Sequence[str], image_size: int, depth: bool = False
+) -> LeRobotDataset:
     """An empty dataset at `root`, which must not exist."""
     return LeRobotDataset.create(
-        repo_id, FPS, dataset_features(cameras, image_size), root=root, robot_type="panda",
-        use_videos=True, streaming_encoding=True, rgb_encoder=video_encoder(), encoder_threads=1,
+        repo_id, FPS, dataset_features(cameras, image_size, depth), root=root, robot_type="panda",
+        use_videos=True, streaming_encoding=True, encoder_threads=1,
+        rgb_encoder=video_encoder(), depth_encoder=depth_encoder(),
     )  # fmt: skip
 
 
@@ -95,6 +108,7 @@ def add_step(
     dataset.add_frame(
         {
             **{f"observation.images.{camera}": image for camera, image in before.images.items()},
+            **{f"observation.images.{camera}_depth": image for camera, image in before.depth.items()},
             "observation.state": before.state,
             "action": np.asarray(action, np.float32),
             "next.reward": np.array([outcome.frame.reward], np.float32),

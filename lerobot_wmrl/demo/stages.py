@@ -11,7 +11,7 @@ from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from lerobot_wmrl.checkpoints import LAST_CHECKPOINT, latest_checkpoint
 from lerobot_wmrl.constants import EVALUATION_SEED
 from lerobot_wmrl.demo.episodes import optimal_episodes
-from lerobot_wmrl.presets import DEMO_SCENES, Flags, format_flags, preset_flags
+from lerobot_wmrl.presets import DEMO_IMAGE_SIZE, DEMO_SCENES, Flags, format_flags, preset_flags
 
 SEED_STRIDE = 100_000
 """Demo seed s records and trains with seeds from s·SEED_STRIDE on, below EVALUATION_SEED."""
@@ -186,7 +186,13 @@ def reinforce(config: DemoConfig) -> list[str]:
 
 def evaluate(config: DemoConfig, policy: str) -> list[str]:
     """LeRobot's own evaluation, on the same held-out starts for every policy and every demo seed."""
-    real = {"env.type": "wmrl_maniskill", "env.task": "push", "env.split": "ind", "env.scenes": DEMO_SCENES}
+    real: Flags = {
+        "env.type": "wmrl_maniskill",
+        "env.task": "push",
+        "env.split": "ind",
+        "env.scenes": DEMO_SCENES,
+        "env.image_size": DEMO_IMAGE_SIZE,
+    }
     return success_rate(config, policy, real, preset="eval", folder=f"eval_{policy}")
 
 

@@ -10,7 +10,7 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
-from lerobot_wmrl.constants import ACTION_NAMES, CAMERAS, FPS, ROBOT_MESH_DETAIL, STATE_NAMES
+from lerobot_wmrl.constants import ACTION_NAMES, CAMERAS, FPS, IMAGE_SIZE, ROBOT_MESH_DETAIL, STATE_NAMES
 from lerobot_wmrl.maniskill.scenes import Scene, scenes_of
 
 if TYPE_CHECKING:
@@ -32,15 +32,19 @@ class WmrlManiSkillEnv(EnvConfig):
         image_size: pixels of each side of a picture.
         episode_length: steps after which an episode is truncated; the task's own horizon by default.
         robot_mesh_detail: share of the robot's triangles that are drawn; 1 draws all, three times slower.
+        light_jitter: how much the light varies from episode to episode, as a share (0.2 is plenty).
+        camera_jitter: how much the fixed camera is displaced from episode to episode (m; 0.01 is plenty).
     """
 
     task: str | None = "push"
     split: str = "ind"
     scenes: list[int] | None = None
     cameras: list[str] = field(default_factory=lambda: ["third_view"])
-    image_size: int = 64
+    image_size: int = IMAGE_SIZE
     episode_length: int | None = None
     robot_mesh_detail: float = ROBOT_MESH_DETAIL
+    light_jitter: float = 0.0
+    camera_jitter: float = 0.0
     fps: int = FPS
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(default_factory=dict)
@@ -71,6 +75,9 @@ class WmrlManiSkillEnv(EnvConfig):
             raise ValueError(
                 f"--env.robot_mesh_detail={self.robot_mesh_detail}: must be above 0 and at most 1"
             )
+        for name, most in (("light_jitter", 1.0), ("camera_jitter", 0.1)):
+            if not 0.0 <= getattr(self, name) <= most:
+                raise ValueError(f"--env.{name}={getattr(self, name)}: must be from 0 (off) to {most}")
 
     def selected_scenes(self) -> tuple[Scene, ...]:
         """The scenes episodes take place in. ValueError if task, split or scenes are unknown."""
@@ -97,13 +104,16 @@ class WmrlManiSkillEnv(EnvConfig):
         images = {f"{OBS_IMAGES}.{camera}": picture for camera in self.cameras}
         return {**images, OBS_STATE: (len(STATE_NAMES),)}
 
-    def create_simulation(self) -> "Simulation":
+    def create_simulation(self, depth: bool = False) -> "Simulation":
         """A simulator for these scenes and cameras, in this process."""
+        from lerobot_wmrl.maniskill.rendering import Rendering
         from lerobot_wmrl.maniskill.simulation import Simulation
 
-        return Simulation(
-            self._task(), self.selected_scenes(), self.cameras, self.image_size, self.robot_mesh_detail
-        )
+        rendering = Rendering(
+            tuple(self.cameras), self.image_size, depth,
+            self.robot_mesh_detail, self.light_jitter, self.camera_jitter,
+        )  # fmt: skip
+        return Simulation(self._task(), self.selected_scenes(), rendering)
 
     def create_envs(
         self, n_envs: int, use_async_envs: bool = False

@@ -24,6 +24,9 @@ class View:
     fov: float
 
 
+FAR = 5.0
+"""What is further away (m) is not drawn."""
+
 VIEWS = {"third_view": View((0.52, 0.0, 0.60), (0.0, -0.035, 0.035), 0.53)}
 """Fixed cameras by name; `benchmarks/camera_probe.py` measures what can be read from them."""
 
@@ -35,7 +38,7 @@ WRIST_FOV = 1.2
 
 def camera_config(name: str, image_size: int, robot: Any) -> CameraConfig:
     """The configuration of the camera `name`, square, `image_size` pixels. ValueError if unknown."""
-    frame = {"uid": name, "width": image_size, "height": image_size, "near": 0.01, "far": 5.0}
+    frame = {"uid": name, "width": image_size, "height": image_size, "near": 0.01, "far": FAR}
     if name in VIEWS:
         view = VIEWS[name]
         return CameraConfig(pose=sapien_utils.look_at(view.eye, view.target), fov=view.fov, **frame)

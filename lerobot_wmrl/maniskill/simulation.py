@@ -6,9 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, FPS, ROBOT_MESH_DETAIL, WORKSPACE_FLOOR
+from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, FPS, WORKSPACE_FLOOR
+from lerobot_wmrl.maniskill.cameras import VIEWS
 from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS
 from lerobot_wmrl.maniskill.renderer import render_backend
+from lerobot_wmrl.maniskill.rendering import Rendering, Variation
 from lerobot_wmrl.maniskill.robot import GRIPPER_OPEN
 from lerobot_wmrl.maniskill.scenes import Scene
 from lerobot_wmrl.maniskill.tabletop import TabletopEnv
@@ -21,12 +23,15 @@ class Frame:
 
     Args:
         images: camera → (H, W, 3) uint8.
+        depth: camera → (H, W, 1) uint16, millimetres along the camera's axis, 0 where nothing is; no entry
+            unless it was asked for.
         state: (8,) float32, `constants.STATE_NAMES`.
         reward: the task's rule-based reward of being here.
         success: whether the task is solved here.
     """
 
     images: dict[str, np.ndarray]
+    depth: dict[str, np.ndarray]
     state: np.ndarray
     reward: float
     success: bool
@@ -38,24 +43,16 @@ class Simulation:
     Args:
         task: what succeeds and what pays; another may be set before a reset.
         scenes: the scenes that may be asked for.
-        cameras: names from `constants.CAMERAS`; none of them is fastest.
-        image_size: pixels of each side.
-        robot_mesh_detail: share of the robot's triangles that are drawn; 1 draws ManiSkill's own meshes.
+        rendering: what pictures are taken.
     """
 
-    def __init__(
-        self,
-        task: Task,
-        scenes: Sequence[Scene],
-        cameras: Sequence[str] = ("third_view",),
-        image_size: int = 64,
-        robot_mesh_detail: float = ROBOT_MESH_DETAIL,
-    ) -> None:
-        self.task, self.cameras = task, tuple(cameras)
-        self.env = TabletopEnv(
-            scenes, cameras, image_size, robot_mesh_detail, render_backend=render_backend()
-        )
+    def __init__(self, task: Task, scenes: Sequence[Scene], rendering: Rendering = Rendering()) -> None:  # noqa: B008 (frozen)
+        self.task, self.rendering = task, rendering
+        self.env = TabletopEnv(scenes, rendering, render_backend=render_backend())
         self.env.reset(seed=0)
+        self.cameras = {name: self.env._sensors[name].camera._render_cameras[0] for name in rendering.cameras}
+        fixed = {name: camera for name, camera in self.cameras.items() if name in VIEWS}
+        self.variation = Variation(self.env.scene.sub_scenes[0], fixed, rendering)
         self._low, self._high = np.array(ACTION_LOW, np.float32), np.array(ACTION_HIGH, np.float32)
 
     def start(self, scene: Scene, seed: int) -> Start:
@@ -67,6 +64,7 @@ class Simulation:
         self.scene = scene
         self.current_start = self.start(scene, seed)
         self.env.place(scene, self.current_start)
+        self.variation.draw(seed, self.task.index, scene.index)
         self.object_start = self._object_before = self.object_position
         return self._frame()
 
@@ -110,21 +108,27 @@ class Simulation:
 
     def _frame(self) -> Frame:
         situation = self.situation()
-        return Frame(self._images(), self._state(), self.task.reward(situation), self.task.success(situation))
+        images, depth = self._pictures()
+        reward, success = self.task.reward(situation), self.task.success(situation)
+        return Frame(images, depth, self._state(), reward, success)
 
     def _state(self) -> np.ndarray:
         pose = self.env.agent.tcp._objs[0].entity.pose
         return np.array([*pose.p, *continuous(pose.q), self.gripper_opening], np.float32)
 
-    def _images(self) -> dict[str, np.ndarray]:
+    def _pictures(self) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+        """Images and depth of every camera."""
         images: dict[str, np.ndarray] = {}
+        depth: dict[str, np.ndarray] = {}
         if self.cameras:
             self.env.scene.sub_scenes[0].update_render()
-        for name in self.cameras:
-            camera = self.env._sensors[name].camera._render_cameras[0]
+        for name, camera in self.cameras.items():
             camera.take_picture()
             images[name] = np.ascontiguousarray(camera.get_picture("Color")[..., :3])
-        return images
+            if self.rendering.depth:
+                backwards = camera.get_picture("PositionSegmentation")[..., 2:3]
+                depth[name] = np.negative(backwards).astype(np.uint16)
+        return images, depth
 
 
 def continuous(quaternion: np.ndarray) -> np.ndarray:

@@ -18,6 +18,7 @@ from lerobot_wmrl.constants import FPS
 from lerobot_wmrl.maniskill.actors import build_carpet, build_container, build_object, build_table
 from lerobot_wmrl.maniskill.cameras import camera_config
 from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS
+from lerobot_wmrl.maniskill.rendering import AMBIENT, SUN, SUN_DIRECTION, Rendering
 from lerobot_wmrl.maniskill.robot import (
     BASE_POSITION,
     CONTROL_MODE,
@@ -45,13 +46,10 @@ class TabletopEnv(BaseEnv):
     def __init__(
         self,
         scenes: Sequence[Scene],
-        cameras: Sequence[str],
-        image_size: int,
-        robot_mesh_detail: float,
+        rendering: Rendering,
         **kwargs: Any,
     ) -> None:
-        self.scenes, self.cameras, self.image_size = tuple(scenes), tuple(cameras), image_size
-        self.robot_mesh_detail = robot_mesh_detail
+        self.scenes, self.rendering = tuple(scenes), rendering
         super().__init__(
             num_envs=1, obs_mode="none", reward_mode="none", control_mode=CONTROL_MODE,
             robot_uids=BaseAxesPanda.uid, sim_backend="physx_cpu", **kwargs,
@@ -63,12 +61,13 @@ class TabletopEnv(BaseEnv):
 
     @property
     def _default_sensor_configs(self) -> list[Any]:
-        return [camera_config(name, self.image_size, self.agent.robot) for name in self.cameras]
+        size, robot = self.rendering.image_size, self.agent.robot
+        return [camera_config(name, size, robot) for name in self.rendering.cameras]
 
     def _load_agent(self, options: dict, *args: Any, **kwargs: Any) -> None:
         super()._load_agent(options, sapien.Pose(p=BASE_POSITION))
-        if self.robot_mesh_detail < 1.0:
-            lighten_meshes(self.agent.robot, self.robot_mesh_detail)
+        if self.rendering.robot_mesh_detail < 1.0:
+            lighten_meshes(self.agent.robot, self.rendering.robot_mesh_detail)
 
     def _load_scene(self, options: dict) -> None:
         self.objects = {n: build_object(self.scene, OBJECTS[n]) for n in _names(self.scenes, "object")}
@@ -83,10 +82,10 @@ class TabletopEnv(BaseEnv):
         self.rest_qpos[-2:] = 0.0
 
     def _load_lighting(self, options: dict) -> None:
-        self.scene.set_ambient_light([0.45, 0.45, 0.45])
+        self.scene.set_ambient_light(AMBIENT)
         self.scene.add_directional_light(
-            direction=[-0.15, 0.1, -1.0],
-            color=[1.5, 1.5, 1.5],
+            direction=SUN_DIRECTION,
+            color=SUN,
             shadow=True,  # the gripper's shadow shows its height
             shadow_scale=0.4,
             shadow_near=-1.5,

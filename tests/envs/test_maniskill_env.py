@@ -18,7 +18,9 @@ STAY = np.array([0, 0, 0, 0, 0, 0, -1], np.float32)
 
 @pytest.fixture(scope="module")
 def env() -> Iterator[ManiSkillEnv]:
-    env = ManiSkillEnv(WmrlManiSkillEnv(episode_length=HORIZON, cameras=["third_view", "wrist"]))
+    env = ManiSkillEnv(
+        WmrlManiSkillEnv(episode_length=HORIZON, cameras=["third_view", "wrist"], image_size=64)
+    )
     yield env
     env.close()
 
@@ -51,7 +53,7 @@ def test_a_reset_without_a_seed_draws_a_training_seed(env: ManiSkillEnv) -> None
 
 
 def test_lerobot_gets_what_a_policy_is_trained_on() -> None:
-    config = WmrlManiSkillEnv(episode_length=HORIZON)
+    config = WmrlManiSkillEnv(episode_length=HORIZON, image_size=64)
     envs = config.create_envs(1)["wmrl_maniskill"][0]
     try:
         observation, _ = envs.reset(seed=[7], options={NEW_ROLLOUT_OPTION: True})
@@ -70,7 +72,7 @@ def test_lerobot_gets_what_a_policy_is_trained_on() -> None:
 
 
 def test_the_tensor_environment_keeps_the_last_observation_of_an_episode() -> None:
-    env = ManiSkillTensorEnv(WmrlManiSkillEnv(episode_length=HORIZON), 1, "cpu")
+    env = ManiSkillTensorEnv(WmrlManiSkillEnv(episode_length=HORIZON, image_size=64), 1, "cpu")
     try:
         observation, _ = env.reset(seed=[0])
         assert observation["observation.images.third_view"].shape == (1, 3, 64, 64)

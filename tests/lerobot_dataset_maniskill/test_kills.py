@@ -20,6 +20,7 @@ from lerobot_dataset_maniskill.manifest import EpisodePlan, planned_parts
 from lerobot_dataset_maniskill.recorder import count_episodes, merge, missing_parts
 from lerobot_dataset_maniskill.worker import PartRecorder
 from lerobot_dataset_maniskill.writer import Outcome, StartColumns, add_step
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.episodes import recorded_episodes
 from lerobot_wmrl.maniskill.simulation import Frame
 from lerobot_wmrl.progress import own_progress_lock
@@ -53,7 +54,9 @@ def write_missing(config: RecordConfig, work: Path) -> None:
 
 
 def test_twenty_kills_cost_nothing_that_was_finished(tmp_path: Path) -> None:
-    config = RecordConfig(output_dir=tmp_path / "dataset", num_episodes=90, part_episodes=2)
+    config = RecordConfig(
+        output_dir=tmp_path / "dataset", env=WmrlManiSkillEnv(image_size=64), num_episodes=90, part_episodes=2
+    )
     work, parts = tmp_path / "work", planned_parts(config)
     work.mkdir()
     rng, finished = random.Random(0), {}

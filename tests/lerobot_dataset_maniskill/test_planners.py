@@ -20,6 +20,7 @@ from lerobot_dataset_maniskill.planners.slide import (
 )
 from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, PLAY
 from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS
+from lerobot_wmrl.maniskill.rendering import Rendering
 from lerobot_wmrl.maniskill.scenes import SCENES, Scene
 from lerobot_wmrl.maniskill.simulation import Simulation
 from lerobot_wmrl.maniskill.tasks import TASKS, Push
@@ -135,7 +136,7 @@ def test_calm_motion_does_not_give_success_away() -> None:
 @pytest.fixture(scope="module", params=TASKS)
 def blind(request: pytest.FixtureRequest) -> Iterator[Simulation]:
     """A simulator of a task in every scene, without a camera."""
-    simulation = Simulation(TASKS[request.param], SCENES, cameras=())
+    simulation = Simulation(TASKS[request.param], SCENES, Rendering(()))
     yield simulation
     simulation.close()
 

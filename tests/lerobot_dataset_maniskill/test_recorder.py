@@ -20,6 +20,7 @@ from lerobot_dataset_maniskill.manifest import planned_parts
 from lerobot_dataset_maniskill.recorder import missing_parts, record
 from lerobot_dataset_maniskill.writer import HOLD_FRAMES
 from lerobot_wmrl.constants import KINDS, STATE_NAMES
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.episodes import recorded_episodes
 
 EPISODES, PART = 6, 2
@@ -28,14 +29,21 @@ PATIENCE_S = 480.0
 
 
 def config(root: Path, **fields: object) -> RecordConfig:
-    settings = {"num_episodes": EPISODES, "part_episodes": PART, "num_workers": 1, "kinds": KIND_SHARES}
+    settings = {
+        "env": WmrlManiSkillEnv(image_size=64),
+        "num_episodes": EPISODES,
+        "part_episodes": PART,
+        "num_workers": 1,
+        "kinds": KIND_SHARES,
+    }
     return RecordConfig(output_dir=root / "dataset", **{**settings, **fields})  # type: ignore[arg-type]
 
 
 def start_and_kill(root: Path) -> Path:
     """Start the command, `kill -9` it once its first part is whole; returns the folder of unfinished work."""
     flags = [f"--num_episodes={EPISODES}", f"--part_episodes={PART}", "--num_workers=2",
-             f"--kinds={json.dumps(KIND_SHARES)}", f"--output_dir={root / 'dataset'}"]  # fmt: skip
+             f"--kinds={json.dumps(KIND_SHARES)}", "--env.type=wmrl_maniskill", "--env.image_size=64",
+             f"--output_dir={root / 'dataset'}"]  # fmt: skip
     command = subprocess.Popen([sys.executable, "-m", "lerobot_dataset_maniskill.record", *flags])
     work = root / ".dataset.recording"
     deadline = time.monotonic() + PATIENCE_S

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from lerobot_wmrl.maniskill.rendering import Rendering
 from lerobot_wmrl.maniskill.scenes import SCENES
 from lerobot_wmrl.maniskill.simulation import Simulation
 from lerobot_wmrl.maniskill.tasks import Push
@@ -11,6 +12,6 @@ from lerobot_wmrl.maniskill.tasks import Push
 
 @pytest.fixture(scope="session")
 def simulation() -> Iterator[Simulation]:
-    simulation = Simulation(Push(), SCENES, image_size=64)
+    simulation = Simulation(Push(), SCENES, Rendering(image_size=64))
     yield simulation
     simulation.close()

@@ -6,8 +6,11 @@ from transforms3d.quaternions import qconjugate, qmult, quat2axangle
 
 from lerobot_wmrl.constants import ACTION_HIGH, WORKSPACE_FLOOR
 from lerobot_wmrl.maniskill import renderer
+from lerobot_wmrl.maniskill.cameras import VIEWS
+from lerobot_wmrl.maniskill.rendering import Rendering
 from lerobot_wmrl.maniskill.scenes import SCENES
-from lerobot_wmrl.maniskill.simulation import Simulation
+from lerobot_wmrl.maniskill.simulation import Frame, Simulation
+from lerobot_wmrl.maniskill.tasks import Push
 
 CLOSED = -1.0
 
@@ -108,7 +111,7 @@ def test_every_scene_looks_different_and_only_its_object_is_on_the_table(simulat
 
 def test_a_lighter_robot_looks_like_the_full_one(simulation: Simulation) -> None:
     light = simulation.reset(SCENES[0], 0).images["third_view"].astype(int)
-    full = Simulation(simulation.task, SCENES[:1], robot_mesh_detail=1.0)
+    full = Simulation(simulation.task, SCENES[:1], Rendering(image_size=64, robot_mesh_detail=1.0))
     try:
         picture = full.reset(SCENES[0], 0).images["third_view"].astype(int)
     finally:
@@ -126,3 +129,38 @@ def test_without_a_device_the_error_says_what_to_do(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(sapien.render, "get_device_summary", lambda: "")
     with pytest.raises(renderer.NoRendererError, match="make setup"):
         renderer.render_backend()
+
+
+def rendered(rendering: Rendering, seed: int) -> Frame:
+    """The first frame of that episode. (A simulation of its own)"""
+    simulation = Simulation(Push(), SCENES[:1], rendering)
+    try:
+        return simulation.reset(SCENES[0], seed)
+    finally:
+        simulation.close()
+
+
+def test_depth_is_what_the_camera_is_away(simulation: Simulation) -> None:
+    frame = rendered(Rendering(image_size=64, depth=True), 0)
+    depth = frame.depth["third_view"]
+    assert depth.shape == (64, 64, 1)
+    assert depth.dtype == np.uint16
+    view = VIEWS["third_view"]
+    away = np.linalg.norm(np.subtract(view.eye, view.target))
+    assert 0.6 * away < depth[32, 32, 0] / 1000 < 1.1 * away
+    assert not simulation.reset(SCENES[0], 0).depth
+
+
+def test_jitter_moves_light_and_camera_the_same_way_for_the_same_seed() -> None:
+    varied = Simulation(Push(), SCENES[:1], Rendering(image_size=64, light_jitter=0.2, camera_jitter=0.01))
+    plain = Simulation(Push(), SCENES[:1], Rendering(image_size=64))
+    try:
+        first, other, again = (varied.reset(SCENES[0], seed) for seed in (0, 1, 0))
+        calm = [plain.reset(SCENES[0], seed) for seed in (0, 1)]
+    finally:
+        varied.close()
+        plain.close()
+    np.testing.assert_array_equal(first.images["third_view"], again.images["third_view"])
+    np.testing.assert_array_equal(first.state, calm[0].state)
+    for one, two in zip((first, other), calm, strict=True):
+        assert np.abs(one.images["third_view"].astype(int) - two.images["third_view"]).mean() > 2.0
