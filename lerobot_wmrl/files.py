@@ -1,6 +1,8 @@
 """Files that are either whole or absent."""
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,18 @@ def foreign_files(folder: Path, *own: str) -> bool:
     """Whether a folder holds anything but the files called `own`, and what a torn `write_text` left."""
     known = {*own, *(f".{name}.partial" for name in own)}
     return folder.is_dir() and any(path.name not in known for path in folder.iterdir())
+
+
+@contextmanager
+def writing(flag: str, folder: Path) -> Iterator[None]:
+    """ValueError that names `flag` and the remedy if a file below `folder` cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        raise ValueError(
+            f"--{flag}={folder}: cannot be written ({error}); make room or choose another folder. "
+            "The same command continues: nothing that was finished is lost"
+        ) from error
 
 
 def write_json(path: Path, content: Any) -> None:

@@ -20,8 +20,8 @@ from lerobot_dataset_maniskill.manifest import Part, planned_parts
 from lerobot_dataset_maniskill.merging import finish, merge_folders
 from lerobot_dataset_maniskill.worker import EpisodeResult, PartRecorder, Report, serve_parts
 from lerobot_dataset_maniskill.writer import VOCABULARY_FILE
-from lerobot_wmrl.constants import ACTION_NAMES
-from lerobot_wmrl.files import foreign_files, write_json
+from lerobot_wmrl.constants import ACTION_NAMES, KINDS
+from lerobot_wmrl.files import foreign_files, write_json, writing
 from lerobot_wmrl.maniskill.processes import simulating_context
 from lerobot_wmrl.maniskill.renderer import render_backend
 from lerobot_wmrl.policy_checkpoints import check_fit, check_weights
@@ -45,7 +45,7 @@ def record(config: RecordConfig) -> None:
         if config.policy is not None:
             check_weights(config.policy)
             check_fit(config.policy, config.maniskill.shown(), len(ACTION_NAMES))
-        with claimed(work, config.recorded_content()):
+        with writing("output_dir", output_dir), claimed(work, config.recorded_content()):
             record_parts(config, work, parts)
             merge(config, work, parts)
         shutil.rmtree(work, ignore_errors=True)
@@ -139,15 +139,17 @@ def record_parts(config: RecordConfig, work: Path, parts: list[Part]) -> None:
 
 @contextmanager
 def progress_bar(episodes: int, missing: list[Part]) -> Iterator[Report]:
-    """Shows what it is told of: episodes, the share that succeeded, frames."""
+    """Shows what it is told of: episodes, time left, and the share of each kind that succeeded."""
     done = episodes - count_episodes(missing)
     seen: Counter[str] = Counter()
+    won: Counter[str] = Counter()
     with tqdm(total=episodes, initial=done, unit="episode", desc="record") as bar:
 
         def report(result: EpisodeResult) -> None:
-            seen.update(episodes=1, success=int(result.success), frames=result.frames)
+            seen[result.kind] += 1
+            won[result.kind] += result.success
+            bar.set_postfix({kind: f"{won[kind] / seen[kind]:.0%}" for kind in KINDS if seen[kind]}, False)
             bar.update()
-            bar.set_postfix(success=f"{seen['success'] / seen['episodes']:.0%}", frames=seen["frames"])
 
         yield report
 
@@ -182,7 +184,11 @@ def follow_workers(open_parts: set[int], results: Any, workers: list[Any], repor
             result = results.get(timeout=POLL_SECONDS)
         except queue.Empty:
             if not any(worker.is_alive() for worker in workers):
-                raise ValueError("the recording processes died; run the same command to continue") from None
+                ends = ", ".join(str(worker.exitcode) for worker in workers)
+                raise ValueError(
+                    f"the recording processes died (exit statuses {ends}; -9 is what a lack of memory looks "
+                    "like); run the same command to continue"
+                ) from None
             continue
         if isinstance(result, Exception):
             raise result

@@ -16,6 +16,7 @@ from lerobot_dataset_maniskill.planners.play import PLAY_STEPS
 from lerobot_dataset_maniskill.quiet import silence_libraries
 from lerobot_dataset_maniskill.writer import HOLD_FRAMES, Outcome, StartColumns, add_step, create_dataset
 from lerobot_wmrl.constants import PLAY
+from lerobot_wmrl.maniskill.processes import leave_with_command
 from lerobot_wmrl.maniskill.tasks import task_of
 from lerobot_wmrl.progress import own_progress_lock
 
@@ -27,7 +28,6 @@ class EpisodeResult:
     part: int
     kind: str
     success: bool
-    frames: int
 
 
 Report = Callable[[EpisodeResult], None]
@@ -53,8 +53,7 @@ class PartRecorder:
             partial, self.config.dataset_id, env.cameras, env.image_size, self.config.depth
         )
         for plan in part.episodes:
-            success, frames = self._record_episode(dataset, plan)
-            report(EpisodeResult(part.index, plan.kind, success, frames))
+            report(EpisodeResult(part.index, plan.kind, self._record_episode(dataset, plan)))
         dataset.finalize()
         partial.replace(self.folder / part.name)
 
@@ -64,10 +63,10 @@ class PartRecorder:
             return PLAY_STEPS
         return self.config.maniskill.episode_length or self.simulation.task.horizon
 
-    def _record_episode(self, dataset: LeRobotDataset, plan: EpisodePlan) -> tuple[bool, int]:
+    def _record_episode(self, dataset: LeRobotDataset, plan: EpisodePlan) -> bool:
         """Simulate and store one episode: to HOLD_FRAMES after success first holds, or to the horizon.
 
-        Play goes on whatever happens.
+        Play goes on whatever happens. Returns whether the episode succeeded.
         """
         simulation = self.simulation
         simulation.task = task_of(plan.task)
@@ -75,43 +74,34 @@ class PartRecorder:
         self.driver.begin(simulation, plan)
         start = StartColumns(simulation.instruction, simulation.task.index, plan)
         steps_left = self._steps(plan)
-        succeeded, frames = False, 0
+        succeeded = False
         while steps_left > 0:
             action = self.driver.act(simulation, frame)
             following = simulation.step(action)
-            steps_left, frames = steps_left - 1, frames + 1
+            steps_left -= 1
             if following.success and not succeeded and plan.kind != PLAY:
                 succeeded, steps_left = True, HOLD_FRAMES
             outcome = Outcome(following, truncated=steps_left == 0 and not succeeded)
             add_step(dataset, start, frame, action, outcome)
             frame = following
         dataset.save_episode()
-        return succeeded, frames
+        return succeeded
 
 
 def serve_parts(config: RecordConfig, folder: Path, parts: Any, results: Any) -> None:
-    """A worker process: take parts from the queue until None comes, or until the command is gone.
-
-    The command's end ends the server that this process was forked from, and so changes its parent.
-    """
+    """A worker process: take parts from the queue until None comes, or until the command is gone."""
     import torch
 
     torch.set_num_threads(1)
-    server = os.getppid()
+    leave_with_command()
     own_progress_lock()
     silence_libraries()
-
-    def report(result: EpisodeResult) -> None:
-        if os.getppid() != server:
-            os._exit(1)
-        results.put(result)
-
     try:
         recorder = PartRecorder(config, folder)
         while (part := parts.get()) is not None:
-            recorder.record(part, report)
+            recorder.record(part, results.put)
             results.put(part.index)
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         results.put(error)
     except Exception as error:
         results.put(error)

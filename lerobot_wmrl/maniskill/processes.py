@@ -1,6 +1,8 @@
 """Processes that simulate beside each other."""
 
 import multiprocessing
+import os
+import threading
 from multiprocessing.context import ForkServerContext
 
 
@@ -12,3 +14,18 @@ def simulating_context() -> ForkServerContext:
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["lerobot_wmrl.maniskill.simulation"])
     return context
+
+
+def leave_with_command() -> None:
+    """In such a process: end as soon as the command that started it has ended, however it did.
+
+    One that lived on would write into a folder that the next command continues.
+    """
+    command = multiprocessing.parent_process()
+    assert command is not None, "only for processes that multiprocessing started"
+
+    def follow() -> None:
+        command.join()
+        os._exit(1)
+
+    threading.Thread(target=follow, daemon=True).start()

@@ -7,7 +7,9 @@ whole command, simulator and all, as often as you like.
 import multiprocessing
 import os
 import random
+import resource
 import signal
+import sys
 import time
 from pathlib import Path
 
@@ -22,6 +24,7 @@ from lerobot_dataset_maniskill.worker import PartRecorder
 from lerobot_dataset_maniskill.writer import Outcome, StartColumns, add_step
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.episodes import recorded_episodes
+from lerobot_wmrl.files import writing
 from lerobot_wmrl.maniskill.simulation import Frame
 from lerobot_wmrl.progress import own_progress_lock
 
@@ -35,14 +38,14 @@ class MadeUpRecorder(PartRecorder):
     def __init__(self, config: RecordConfig, folder: Path) -> None:
         self.config, self.folder = config, folder
 
-    def _record_episode(self, dataset: LeRobotDataset, plan: EpisodePlan) -> tuple[bool, int]:
+    def _record_episode(self, dataset: LeRobotDataset, plan: EpisodePlan) -> bool:
         rng = np.random.default_rng(plan.seed)
         for row in range(ROWS):
             image = rng.integers(0, 255, (64, 64, 3), dtype=np.uint8)
-            frame = Frame({"third_view": image}, np.zeros(8, np.float32), 0.0, row == ROWS - 1)
+            frame = Frame({"third_view": image}, {}, np.zeros(8, np.float32), 0.0, row == ROWS - 1)
             add_step(dataset, StartColumns("push it", 0, plan), frame, np.zeros(7), Outcome(frame, False))
         dataset.save_episode()
-        return True, ROWS
+        return True
 
 
 def write_missing(config: RecordConfig, work: Path) -> None:
@@ -51,6 +54,32 @@ def write_missing(config: RecordConfig, work: Path) -> None:
     recorder = MadeUpRecorder(config, work)
     for part in missing_parts(work, planned_parts(config)):
         recorder.record(part, lambda result: None)
+
+
+def write_little(config: RecordConfig, work: Path, limit: int) -> None:
+    """The same where no file may grow beyond `limit` bytes. Exit status 3 if the error says what to do."""
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+    try:
+        with writing("output_dir", work):
+            write_missing(config, work)
+    except ValueError as error:
+        sys.exit(3 if "--output_dir=" in str(error) and "same command continues" in str(error) else 4)
+
+
+def test_a_disk_that_is_full_costs_only_the_unfinished_part(tmp_path: Path) -> None:
+    config = RecordConfig(
+        output_dir=tmp_path / "dataset", env=WmrlManiSkillEnv(image_size=64), num_episodes=2
+    )
+    work, parts = tmp_path / "work", planned_parts(config)
+    work.mkdir()
+    for limit, finished in ((3000, False), (1 << 30, True)):
+        process = multiprocessing.get_context("fork").Process(target=write_little, args=(config, work, limit))
+        process.start()
+        process.join()
+        assert process.exitcode == (0 if finished else 3)
+        assert (work / parts[0].name).exists() == finished
+    assert whole_dataset(work / parts[0].name, 2) is None
 
 
 def test_twenty_kills_cost_nothing_that_was_finished(tmp_path: Path) -> None:

@@ -39,29 +39,31 @@ def config(root: Path, **fields: object) -> RecordConfig:
     return RecordConfig(output_dir=root / "dataset", **{**settings, **fields})  # type: ignore[arg-type]
 
 
-def start_and_kill(root: Path) -> Path:
-    """Start the command, `kill -9` it once its first part is whole; returns the folder of unfinished work."""
+def start_and_kill(root: Path, reached: str) -> Path:
+    """Start the command and `kill -9` it once a file like `reached` exists. → its folder of unfinished work"""
     flags = [f"--num_episodes={EPISODES}", f"--part_episodes={PART}", "--num_workers=2",
              f"--kinds={json.dumps(KIND_SHARES)}", "--env.type=wmrl_maniskill", "--env.image_size=64",
              f"--output_dir={root / 'dataset'}"]  # fmt: skip
     command = subprocess.Popen([sys.executable, "-m", "lerobot_dataset_maniskill.record", *flags])
     work = root / ".dataset.recording"
     deadline = time.monotonic() + PATIENCE_S
-    while not (work / "part-00000").exists() and time.monotonic() < deadline and command.poll() is None:
+    while not any(work.glob(reached)) and time.monotonic() < deadline and command.poll() is None:
         time.sleep(0.02)
+    assert command.poll() is None, "the command ended by itself"
     workers = psutil.Process(command.pid).children(recursive=True)
     os.kill(command.pid, signal.SIGKILL)
     command.wait()
-    _, alive = psutil.wait_procs(workers, timeout=60)
+    _, alive = psutil.wait_procs(workers, timeout=PATIENCE_S)
     assert not alive, "the workers outlived the command"
     return work
 
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished dataset whose recording was killed after its first part, and whose second part was torn."""
+    """A finished dataset whose recording was killed three times, and whose second part was torn."""
     root = tmp_path_factory.mktemp("recorded")
-    work = start_and_kill(root)
+    for reached in ("recording.json", ".part-*.partial", "part-00000"):
+        work = start_and_kill(root, reached)
     first = (work / "part-00000" / "meta" / "info.json").stat().st_mtime_ns
     torn = work / ".part-00001.1.partial"
     (torn / "meta").mkdir(parents=True, exist_ok=True)
