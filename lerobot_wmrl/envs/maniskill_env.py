@@ -5,11 +5,12 @@ from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AutoresetMode
 from lerobot.envs.utils import FreezeAfterEpisodeEnd
 
 from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, EVALUATION_SEED, FPS, STATE_NAMES
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.envs.scene_results import CountingAsyncVectorEnv, CountingSyncVectorEnv
 from lerobot_wmrl.maniskill.processes import simulating_context
 from lerobot_wmrl.maniskill.scenes import scene_for_seed
 from lerobot_wmrl.maniskill.simulation import Frame
@@ -102,9 +103,12 @@ def make_env(config: WmrlManiSkillEnv, freeze: bool) -> gym.Env:
 def make_vector_env(
     config: WmrlManiSkillEnv, n_envs: int, use_async_envs: bool, freeze: bool
 ) -> gym.vector.VectorEnv:
-    """`n_envs` environments with SAME_STEP autoreset, in processes of their own if `use_async_envs`."""
+    """`n_envs` environments with SAME_STEP autoreset, in processes of their own if `use_async_envs`.
+
+    They log the success by scene when they are closed.
+    """
     factories = [partial(make_env, config, freeze)] * n_envs
     if use_async_envs and n_envs > 1:
         context = simulating_context().get_start_method()
-        return AsyncVectorEnv(factories, context=context, autoreset_mode=AutoresetMode.SAME_STEP)
-    return SyncVectorEnv(factories, autoreset_mode=AutoresetMode.SAME_STEP)
+        return CountingAsyncVectorEnv(factories, context=context, autoreset_mode=AutoresetMode.SAME_STEP)
+    return CountingSyncVectorEnv(factories, autoreset_mode=AutoresetMode.SAME_STEP)

@@ -1,0 +1,81 @@
+"""Success by scene, which lerobot-eval does not report: the environments count, and say it at the end."""
+
+import logging
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
+
+from lerobot_wmrl.maniskill.scenes import SCENES, UNSEEN_OBJECTS, Scene
+from lerobot_wmrl.statistics import Proportion
+
+
+class SceneResults:
+    """Which episodes succeeded. An episode is known by its seed and counts once."""
+
+    def __init__(self) -> None:
+        self.episodes: dict[int, tuple[Scene, bool]] = {}
+
+    def add(self, info: Mapping[str, np.ndarray], ended: np.ndarray) -> None:
+        """`info`: `seed`, `scene`, `is_success` of all rows; `ended` (B,) bool marks those that count."""
+        for row in np.flatnonzero(ended):
+            scene = SCENES[int(info["scene"][row])]
+            self.episodes[int(info["seed"][row])] = (scene, bool(info["is_success"][row]))
+
+    def table(self) -> str:
+        """One line a scene, then the groups of held-out scenes and all together, with 95 % intervals."""
+        lines = [_line(_name(scene), self._rate({scene.index})) for scene in self._scenes()]
+        for name, scenes in self._groups().items():
+            lines.append(_line(name, self._rate({scene.index for scene in scenes})))
+        return "\n".join(lines)
+
+    def _scenes(self) -> list[Scene]:
+        return sorted({scene for scene, _ in self.episodes.values()}, key=lambda scene: scene.index)
+
+    def _groups(self) -> dict[str, list[Scene]]:
+        held_out = [scene for scene in self._scenes() if scene.split == "ood"]
+        unseen = [scene for scene in held_out if scene.object in UNSEEN_OBJECTS]
+        combined = [scene for scene in held_out if scene not in unseen]
+        groups = {"unseen objects": unseen, "unseen combinations": combined, "all scenes": self._scenes()}
+        return {name: scenes for name, scenes in groups.items() if scenes}
+
+    def _rate(self, indices: set[int]) -> Proportion:
+        outcomes = [success for scene, success in self.episodes.values() if scene.index in indices]
+        return Proportion(sum(outcomes), len(outcomes))
+
+
+def _name(scene: Scene) -> str:
+    return f"{scene.index:>2} {scene.object}, {scene.container}, {scene.table}"
+
+
+def _line(name: str, rate: Proportion) -> str:
+    return f"{name:<34} {rate}"
+
+
+class _Counting:
+    """Mixed into a vector environment: counts what ends, and logs the table when it is closed."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.results = SceneResults()
+
+    def step(self, actions: Any) -> tuple[Any, ...]:
+        result: tuple[Any, ...] = super().step(actions)  # type: ignore[misc]
+        _, _, terminated, truncated, info = result
+        if "final_info" in info:
+            self.results.add(info["final_info"], terminated | truncated)
+        return result
+
+    def close_extras(self, **kwargs: Any) -> None:
+        super().close_extras(**kwargs)  # type: ignore[misc]
+        if self.results.episodes:
+            logging.info("Success by scene, n and 95%% interval:\n%s", self.results.table())
+
+
+class CountingSyncVectorEnv(_Counting, SyncVectorEnv):
+    """Environments in this process."""
+
+
+class CountingAsyncVectorEnv(_Counting, AsyncVectorEnv):
+    """Environments in processes of their own."""
