@@ -145,6 +145,7 @@ class RecordConfig(RunConfig):
             "depth": self.depth,
             "light_jitter": env.light_jitter,
             "camera_jitter": env.camera_jitter,
+            "assets": None if env.assets is None else str(env.assets),
             "episode_length": env.episode_length,
             "robot_mesh_detail": env.robot_mesh_detail,
             "num_episodes": self.num_episodes,

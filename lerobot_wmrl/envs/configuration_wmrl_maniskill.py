@@ -4,6 +4,7 @@ Imports neither the simulator nor torch networks: those come when an environment
 """
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lerobot.configs.types import FeatureType, PolicyFeature
@@ -31,6 +32,7 @@ class WmrlManiSkillEnv(EnvConfig):
         cameras: which cameras the policy sees.
         image_size: pixels of each side of a picture.
         episode_length: steps after which an episode is truncated; the task's own horizon by default.
+        assets: YAML file with meshes to use in place of objects (`lemon: {mesh: lemon.obj, scale: 0.001}`).
         robot_mesh_detail: share of the robot's triangles that are drawn; 1 draws all, three times slower.
         light_jitter: how much the light varies from episode to episode, as a share (0.2 is plenty).
         camera_jitter: how much the fixed camera is displaced from episode to episode (m; 0.01 is plenty).
@@ -42,6 +44,7 @@ class WmrlManiSkillEnv(EnvConfig):
     cameras: list[str] = field(default_factory=lambda: ["third_view"])
     image_size: int = IMAGE_SIZE
     episode_length: int | None = None
+    assets: Path | None = None
     robot_mesh_detail: float = ROBOT_MESH_DETAIL
     light_jitter: float = 0.0
     camera_jitter: float = 0.0
@@ -75,6 +78,10 @@ class WmrlManiSkillEnv(EnvConfig):
             raise ValueError(
                 f"--env.robot_mesh_detail={self.robot_mesh_detail}: must be above 0 and at most 1"
             )
+        if self.assets is not None:
+            from lerobot_wmrl.maniskill.assets import read_assets
+
+            read_assets(self.assets)
         for name, most in (("light_jitter", 1.0), ("camera_jitter", 0.1)):
             if not 0.0 <= getattr(self, name) <= most:
                 raise ValueError(f"--env.{name}={getattr(self, name)}: must be from 0 (off) to {most}")
@@ -106,9 +113,12 @@ class WmrlManiSkillEnv(EnvConfig):
 
     def create_simulation(self, depth: bool = False) -> "Simulation":
         """A simulator for these scenes and cameras, in this process."""
+        from lerobot_wmrl.maniskill.assets import use_assets
         from lerobot_wmrl.maniskill.rendering import Rendering
         from lerobot_wmrl.maniskill.simulation import Simulation
 
+        if self.assets is not None:
+            use_assets(self.assets)
         rendering = Rendering(
             tuple(self.cameras), self.image_size, depth,
             self.robot_mesh_detail, self.light_jitter, self.camera_jitter,

@@ -50,6 +50,13 @@ def build_object(scene: Any, spec: ObjectSpec) -> Any:
         builder.add_cylinder_collision(upright, radius, half_z, material=surface, density=spec.density)
         builder.add_cylinder_visual(upright, radius, half_z, material=material)
         return builder.build(name=spec.name)
+    if spec.mesh is not None:
+        scale, pose = [spec.mesh.scale] * 3, sapien.Pose(p=-np.array(spec.mesh.centre))
+        builder.add_convex_collision_from_file(
+            spec.mesh.path, scale=scale, pose=pose, material=surface, density=spec.density
+        )
+        builder.add_visual_from_file(spec.mesh.path, scale=scale, pose=pose)
+        return builder.build(name=spec.name)
     meshes = [(object_mesh(spec), material)]
     if spec.stalk is not None:
         meshes.append((stalk_mesh(spec), render_material(spec.stalk)))

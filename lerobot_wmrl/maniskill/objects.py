@@ -3,10 +3,19 @@
 from dataclasses import dataclass
 from typing import Final, Literal
 
-Shape = Literal["box", "cylinder", "ellipsoid", "revolved"]
+Shape = Literal["box", "cylinder", "ellipsoid", "revolved", "mesh"]
 Colour = tuple[float, float, float]
 Profile = tuple[tuple[float, float], ...]
 """Radius (as a share of the largest) by height (from −1 at one end to 1 at the other)."""
+
+
+@dataclass(frozen=True)
+class MeshFile:
+    """A mesh on disk: its path, the factor that makes its units metres, and its centre thereafter (m)."""
+
+    path: str
+    scale: float
+    centre: tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -20,6 +29,7 @@ class ObjectSpec:
         lies: whether it is revolved around x, not z.
         lobes: bulges around the axis, as a bell pepper has them.
         stalk: colour of a stalk at the upper (or far) end, which is only seen.
+        mesh: of the shape "mesh", which has its own colours.
     """
 
     name: str
@@ -32,6 +42,7 @@ class ObjectSpec:
     lobes: int = 0
     stalk: Colour | None = None
     density: float = 500.0
+    mesh: MeshFile | None = None
 
 
 @dataclass(frozen=True)
@@ -63,7 +74,7 @@ CUP: Profile = ((0.75, -1.0), (1.0, 1.0))
 
 GREEN: Final[Colour] = (0.10, 0.38, 0.08)
 
-OBJECTS: Final = {
+OBJECTS: Final[dict[str, ObjectSpec]] = {
     spec.name: spec
     for spec in (
         ObjectSpec("sponge", "box", (0.030, 0.034, 0.022), (0.95, 0.72, 0.08), "yellow sponge"),
@@ -103,7 +114,9 @@ OBJECTS: Final = {
         ObjectSpec("glue_stick", "cylinder", (0.018, 0.018, 0.036), (0.45, 0.12, 0.62), "purple glue stick"),
     )
 }  # fmt: skip
-"""Twenty things, told apart by shape, size and colour, each narrow enough for the gripper (8 cm)."""
+"""Twenty things, told apart by shape, size and colour, each narrow enough for the gripper (8 cm).
+
+`assets.use_assets` puts a user's own in their places."""
 
 CONTAINERS: Final = {
     spec.name: spec

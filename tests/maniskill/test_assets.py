@@ -1,0 +1,58 @@
+"""A user's mesh in place of an object: as big as it is, called what it is called, or refused with reasons."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.maniskill.assets import read_assets
+from lerobot_wmrl.maniskill.objects import OBJECTS
+from lerobot_wmrl.maniskill.scenes import SCENES
+
+
+@pytest.fixture
+def assets(tmp_path: Path) -> Iterator[Path]:
+    """A file that replaces the lemon by a capsule whose units are millimetres and whose origin is its end."""
+    capsule = trimesh.creation.capsule(height=30.0, radius=20.0)
+    capsule.apply_translation((100.0, 0.0, 0.0))
+    capsule.export(tmp_path / "capsule.obj")
+    (tmp_path / "assets.yaml").write_text("lemon: {mesh: capsule.obj, label: shiny capsule, scale: 0.001}\n")
+    before = dict(OBJECTS)
+    yield tmp_path / "assets.yaml"
+    OBJECTS.update(before)
+
+
+def test_a_mesh_takes_the_place_of_an_object(assets: Path) -> None:
+    scene = next(scene for scene in SCENES if scene.object == "lemon" and scene.split == "ind")
+    simulation = WmrlManiSkillEnv(scenes=[scene.index], assets=assets, image_size=64).create_simulation()
+    try:
+        simulation.reset(scene, 0)
+        assert "shiny capsule" in simulation.instruction
+        assert OBJECTS["lemon"].half_size == pytest.approx((0.02, 0.02, 0.035), abs=1e-4)
+        resting = [simulation.step(np.zeros(7)) for _ in range(10)]
+        assert resting[-1].images["third_view"].std() > 5
+        assert simulation.object_position[2] == pytest.approx(0.035, abs=0.005)
+        np.testing.assert_allclose(simulation.object_position, simulation.object_start, atol=0.01)
+    finally:
+        simulation.close()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("lemmon: {mesh: capsule.obj}", r"'lemmon' is unknown; did you mean lemon\?"),
+        ("lemon: {mehs: capsule.obj}", r"key of lemon 'mehs' is unknown; did you mean mesh\?"),
+        ("lemon: {mesh: nowhere.obj}", r"lemon.mesh=.*nowhere.obj cannot be loaded"),
+        ("lemon: {mesh: capsule.obj}", r"more than the gripper opens .* scale to at most 0\.00"),
+        ("lemon: {mesh: capsule.obj, scale: 0.0001}", "too low to be pushed"),
+        ("- lemon", "must hold lines like"),
+        ("lemon: {mesh", "cannot be read"),
+    ],
+)
+def test_what_cannot_be_used_is_named(assets: Path, text: str, message: str) -> None:
+    assets.write_text(text)
+    with pytest.raises(ValueError, match=rf"--env.assets=.*{message}"):
+        read_assets(assets)
