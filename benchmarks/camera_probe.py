@@ -8,6 +8,7 @@ Writes docs/results/cameras.json.
 """
 
 import argparse
+import json
 from concurrent.futures import ProcessPoolExecutor
 from itertools import pairwise
 from pathlib import Path
@@ -21,8 +22,7 @@ from tqdm import tqdm, trange
 
 from lerobot_dataset_maniskill.planners import TASK_KINDS, follow_plan
 from lerobot_wmrl.files import write_json
-from lerobot_wmrl.maniskill import cameras
-from lerobot_wmrl.maniskill.cameras import View
+from lerobot_wmrl.maniskill.cameras import VIEWS, View
 from lerobot_wmrl.maniskill.processes import simulating_context
 from lerobot_wmrl.maniskill.rendering import Rendering
 from lerobot_wmrl.maniskill.scenes import scenes_of
@@ -38,9 +38,6 @@ CANDIDATES = {
     "side_mid": View((0.0, 0.55, 0.42), (0.0, -0.035, 0.04), 0.6),
     "side_low": View((-0.02, 0.62, 0.28), (0.0, -0.03, 0.05), 0.6),
 }
-PAIRED = "wrist"
-"""The camera that others are tried together with."""
-
 FIRST_SEED = 3_000_000
 NAMES = ("object_x", "object_y", "object_z", "tcp_x", "tcp_y", "tcp_z")
 EVERY = 5
@@ -96,7 +93,7 @@ def joined(parts: list[Frames]) -> Frames:
 def record_share(views: list[str], episodes: range, image_size: int) -> Frames:
     """In a process of its own: some of the episodes, at one size."""
     scenes, tasks = scenes_of("ind"), list(TASKS.values())
-    cameras.VIEWS.update(CANDIDATES)
+    VIEWS.update(CANDIDATES)
     simulation = Simulation(tasks[0], scenes, Rendering(tuple(views), image_size))
     every = simulation.cameras
     images: dict[str, list[np.ndarray]] = {view: [] for view in views}
@@ -190,31 +187,22 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=2500, help="optimiser steps of each probe")
     parser.add_argument("--sizes", type=int, nargs="+", default=[64, 128], help="pixels a side")
     parser.add_argument(
-        "--pairs", nargs="*", default=[], choices=list(CANDIDATES), help="views to try with the wrist camera"
-    )
-    parser.add_argument("--output", type=Path, default=RESULTS / "cameras.json", help="JSON file")
+        "--cameras", nargs="+", default=[*CANDIDATES, "wrist"],
+        help="what is probed: cameras, or several together, as in front_steep+wrist",
+    )  # fmt: skip
+    parser.add_argument("--output", type=Path, default=RESULTS / "cameras.json", help="JSON file to add to")
     given = parser.parse_args()
-    views, table = [*CANDIDATES, PAIRED], {}
-    recorded = record(views, given.episodes, given.sizes)
-    for size, frames in recorded.items():
-        for view in tqdm(views, desc=f"{size} px"):
-            table[f"{view} {size}"] = probe(frames.images[view], frames, given.steps)
-            print(view, size, table[f"{view} {size}"], flush=True)
-        for view in given.pairs:
-            both = np.concatenate([frames.images[view], frames.images[PAIRED]], axis=2)
-            table[f"{view} + {PAIRED} {size}"] = probe(both, frames, given.steps)
-    for name, errors in table.items():
+    views = sorted({view for cameras in given.cameras for view in cameras.split("+")})
+    result = json.loads(given.output.read_text()) if given.output.exists() else {"probes": {}}
+    for size, frames in record(views, given.episodes, given.sizes).items():
+        test = int(held_out(frames.episode).sum())
+        data = {"frames": len(frames.episode), "test_frames": test, "steps": given.steps}
+        for cameras in tqdm(given.cameras, desc=f"{size} px"):
+            images = np.concatenate([frames.images[view] for view in cameras.split("+")], axis=2)
+            result["probes"][f"{cameras} {size}"] = {**probe(images, frames, given.steps), **data}
+            write_json(given.output, result)
+    for name, errors in result["probes"].items():
         print(name, errors)
-    test = int(held_out(frames.episode).sum())
-    write_json(
-        given.output,
-        {
-            "frames": len(frames.episode),
-            "test_frames": test,
-            "touching": round(float(frames.contact.mean()), 3),
-            "probes": table,
-        },
-    )
 
 
 if __name__ == "__main__":
