@@ -3,8 +3,8 @@
     python benchmarks/camera_probe.py --episodes=480
 
 Frames of planned episodes of all tasks and kinds, in all training scenes. A CNN is trained on some episodes
-and tested on others; the errors are means of absolute values in mm, and the accuracy of whether finger and object
-touch. Writes docs/results/cameras.json.
+and tested on others; the errors are means of absolute values in mm, and the accuracy is of whether finger and
+object touch. Writes docs/results/cameras.json.
 """
 
 import argparse
