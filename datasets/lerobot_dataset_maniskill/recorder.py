@@ -11,7 +11,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from tqdm import tqdm
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
@@ -48,8 +47,6 @@ def record(config: RecordConfig) -> None:
             record_parts(config, work, parts)
             merge(config, work, parts)
         shutil.rmtree(work, ignore_errors=True)
-    if config.push_to_hub:
-        LeRobotDataset(config.dataset_id, root=root).push_to_hub(private=config.private)
 
 
 def already_recorded(output_dir: Path, content: Mapping[str, Any], episodes: int) -> bool:
