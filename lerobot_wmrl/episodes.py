@@ -5,6 +5,8 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 
+from lerobot_wmrl.constants import START_COLUMNS
+
 
 def parquet_files(root: Path) -> list[Path]:
     """The files that hold a dataset's rows, in order."""
@@ -12,8 +14,8 @@ def parquet_files(root: Path) -> list[Path]:
 
 
 def recorded_episodes(root: Path) -> dict[str, np.ndarray]:
-    """Columns (E,) one row an episode: episode, kind, seed, scene, length in rows, success at any row."""
-    columns = ["episode_index", "start.kind", "start.seed", "start.scene", "next.success"]
+    """Columns (E,) one row an episode: episode, task, kind, seed, scene, length in rows, success in any."""
+    columns = ["episode_index", *START_COLUMNS, "next.success"]
     rows = [pq.read_table(path, columns=columns).to_pydict() for path in parquet_files(root)]
     stacked = {
         name: np.concatenate([np.asarray(part[name]).reshape(-1) for part in rows]) for name in columns
@@ -23,6 +25,7 @@ def recorded_episodes(root: Path) -> dict[str, np.ndarray]:
     np.logical_or.at(success, inverse, stacked["next.success"].astype(bool))
     return {
         "episode": episodes,
+        "task": stacked["start.task"][first],
         "kind": stacked["start.kind"][first],
         "seed": stacked["start.seed"][first],
         "scene": stacked["start.scene"][first],

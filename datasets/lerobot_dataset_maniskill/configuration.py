@@ -5,6 +5,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
+from huggingface_hub import get_token
+from huggingface_hub.errors import HFValidationError
+from huggingface_hub.utils import validate_repo_id
 from lerobot.configs import parser
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
@@ -16,6 +19,9 @@ from lerobot_wmrl.maniskill.tasks import task_of
 from lerobot_wmrl.policy_checkpoints import read_policy_config
 
 POLICY_KIND = "policy"
+
+LOCAL = "local"
+"""Namespace of datasets that have no name on the hub."""
 
 
 def default_kinds() -> dict[str, float]:
@@ -33,7 +39,7 @@ class RecordConfig(RunConfig):
 
     Args:
         output_dir: root of the dataset; it appears when everything is recorded.
-        repo_id: name of the dataset; local/<folder> by default.
+        repo_id: name of the dataset, user/name to publish it; local/<folder> by default.
         num_episodes: how many to record.
         seed: of the first episode; episode i has seed + i.
         tasks: recorded in turn; the environment's own by default.
@@ -47,7 +53,7 @@ class RecordConfig(RunConfig):
         policy: a LeRobot policy to roll out, given as --policy.path=….
         exploration: largest standard deviation of the noise added to a policy's translations, as a share of
             the action box; each episode draws its own level up to it, and the noise lasts a while.
-        push_to_hub: publish the dataset as repo_id when it is complete.
+        push_to_hub: publish the dataset as repo_id on the Hugging Face hub when it is complete.
         private: publish it privately.
         list_scenes: print the table of scenes and stop.
     """
@@ -98,6 +104,8 @@ class RecordConfig(RunConfig):
         if self.shard_of[1] > -(-self.num_episodes // self.part_episodes):
             raise ValueError(f"--shard={self.shard}: there are fewer sub-datasets than shards")
         self._validate_kinds()
+        if self.push_to_hub:
+            self._validate_publishing()
         self.env.selected_scenes()
         for task in self.tasks:
             task_of(task)
@@ -109,6 +117,27 @@ class RecordConfig(RunConfig):
             raise ValueError(
                 f"--kinds={self.kinds}: give shares of {', '.join(planned)}, at least one above 0"
             )
+
+    def _validate_publishing(self) -> None:
+        """What can be known before anything is recorded: the dataset's name, and that there is a token."""
+        namespace, _, name = self.dataset_id.partition("/")
+        if not name or namespace == LOCAL:
+            raise ValueError(
+                f"--push_to_hub=true: the dataset is called {self.dataset_id}; "
+                "give its name on the hub, --repo_id=user/name"
+            )
+        try:
+            validate_repo_id(self.dataset_id)
+        except HFValidationError as error:
+            raise ValueError(f"--repo_id={self.repo_id}: {error}") from error
+        if get_token() is None:
+            raise ValueError("--push_to_hub=true: nobody is logged in to the hub here; run `hf auth login`")
+
+    @property
+    def root(self) -> Path:
+        """Of the dataset, once `validate` has made sure that it is given."""
+        assert self.output_dir is not None
+        return self.output_dir
 
     @property
     def maniskill(self) -> WmrlManiSkillEnv:
@@ -131,8 +160,7 @@ class RecordConfig(RunConfig):
 
     @property
     def dataset_id(self) -> str:
-        assert self.output_dir is not None
-        return self.repo_id or f"local/{self.output_dir.name}"
+        return self.repo_id or f"{LOCAL}/{self.root.name}"
 
     def recorded_content(self) -> dict[str, Any]:
         """What decides the episodes, and so whether a folder continues this recording. JSON values only."""

@@ -1,5 +1,6 @@
 """Which episodes a recording consists of: a pure function of its configuration, so it can be resumed."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,12 +35,12 @@ class Part:
 def planned_parts(config: RecordConfig) -> list[Part]:
     """All parts of the shard in order; episode i of the whole has the seed `config.seed + i`.
 
-    Consecutive seeds visit the scenes in turn, and every round of the scenes takes the next task.
+    Consecutive seeds visit scenes and tasks in turn; every round of the scenes gives each the next task.
     """
     scenes, tasks = config.maniskill.selected_scenes(), config.recorded_tasks
     seeds = range(config.seed, config.seed + config.num_episodes)
     episodes = [
-        EpisodePlan(tasks[seed // len(scenes) % len(tasks)], kind, scene_for_seed(scenes, seed), seed)
+        EpisodePlan(task_for_seed(tasks, len(scenes), seed), kind, scene_for_seed(scenes, seed), seed)
         for kind, seed in zip(planned_kinds(config), seeds, strict=True)
     ]
     size, (shard, shards) = config.part_episodes, config.shard_of
@@ -48,6 +49,11 @@ def planned_parts(config: RecordConfig) -> list[Part]:
         for index, first in enumerate(range(0, len(episodes), size))
     ]
     return parts[shard::shards]
+
+
+def task_for_seed(tasks: Sequence[str], scenes: int, seed: int) -> str:
+    """The task of an episode seed where `scenes` scenes are visited in turn."""
+    return tasks[(seed % scenes + seed // scenes) % len(tasks)]
 
 
 def planned_kinds(config: RecordConfig) -> list[str]:

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from lerobot.datasets.aggregate import aggregate_datasets
 
-from lerobot_dataset_maniskill.writer import write_card, write_vocabulary
+from lerobot_dataset_maniskill.card import write_card
+from lerobot_dataset_maniskill.writer import write_vocabulary
 from lerobot_wmrl.constants import KINDS
 from lerobot_wmrl.episodes import recorded_episodes
 
@@ -21,19 +22,18 @@ def merge_folders(folders: Sequence[Path], target: Path, repo_id: str) -> None:
 
 
 def finish(merged: Path, output_dir: Path, repo_id: str, content: Mapping[str, Any]) -> None:
-    """Add vocabulary and card, move the whole into place at once, and say what it holds."""
+    """Add vocabulary, pictures and card, move the whole into place at once, and say what it holds."""
     write_vocabulary(merged, content)
-    rates = success_by_kind(merged)
-    write_card(merged, repo_id, content, rates)
+    table = recorded_episodes(merged)
+    write_card(merged, repo_id, table)
     merged.replace(output_dir)
-    episodes = sum(total for _, total in rates.values())
+    rates = success_by_kind(table)
     summary = ", ".join(f"{kind} {wins}/{total}" for kind, (wins, total) in rates.items())
-    print(f"{output_dir}: {episodes} episodes; successful: {summary}")
+    print(f"{output_dir}: {len(table['episode'])} episodes; successful: {summary}")
 
 
-def success_by_kind(root: Path) -> dict[str, tuple[int, int]]:
-    """Kind → (successful episodes, episodes)."""
-    table = recorded_episodes(root)
+def success_by_kind(table: Mapping[str, np.ndarray]) -> dict[str, tuple[int, int]]:
+    """Kind → (successful episodes, episodes), of `lerobot_wmrl.episodes.recorded_episodes`."""
     kinds, success = table["kind"], table["success"]
     return {
         name: (int(success[kinds == index].sum()), int(np.sum(kinds == index)))

@@ -1,5 +1,7 @@
 """`lerobot-wmrl-record`: trajectories in ManiSkill → a LeRobotDataset."""
 
+from huggingface_hub import HfApi
+
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.recipe_files import expand_recipes
 from lerobot_wmrl.command import run_command
@@ -7,10 +9,11 @@ from lerobot_wmrl.maniskill.scenes import describe_scenes
 
 
 def run(config: RecordConfig) -> None:
-    """Print the scenes, or record."""
+    """Print the scenes, or record and publish."""
     if config.list_scenes:
         print(describe_scenes())
         return
+    from lerobot_dataset_maniskill.publishing import publish
     from lerobot_dataset_maniskill.quiet import silence_libraries
     from lerobot_dataset_maniskill.recorder import record
     from lerobot_dataset_maniskill.shards import merge_shards
@@ -18,10 +21,11 @@ def run(config: RecordConfig) -> None:
     silence_libraries()
     if config.merge_shards:
         config.validate()
-        assert config.output_dir is not None
-        merge_shards(config.merge_shards, config.output_dir, config.dataset_id)
+        merge_shards(config.merge_shards, config.root, config.dataset_id)
     else:
         record(config)
+    if config.push_to_hub:
+        publish(HfApi(), config.root, config.dataset_id, config.private)
 
 
 def main() -> None:

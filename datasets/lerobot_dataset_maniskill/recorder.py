@@ -11,7 +11,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from tqdm import tqdm
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
@@ -35,22 +34,19 @@ GRACE_SECONDS = 10.0
 def record(config: RecordConfig) -> None:
     """Record everything that is missing, then merge. Complete already: says so."""
     config.validate()
-    assert config.output_dir is not None
-    output_dir = config.output_dir
-    work, parts = output_dir.parent / f".{output_dir.name}.recording", planned_parts(config)
-    if already_recorded(output_dir, config.recorded_content(), count_episodes(parts)):
+    root = config.root
+    work, parts = root.parent / f".{root.name}.recording", planned_parts(config)
+    if already_recorded(root, config.recorded_content(), count_episodes(parts)):
         discard(work, config.recorded_content())
     else:
         render_backend()
         if config.policy is not None:
             check_weights(config.policy)
             check_fit(config.policy, config.maniskill.shown(), len(ACTION_NAMES))
-        with writing("output_dir", output_dir), claimed(work, config.recorded_content()):
+        with writing("output_dir", root), claimed(work, config.recorded_content()):
             record_parts(config, work, parts)
             merge(config, work, parts)
         shutil.rmtree(work, ignore_errors=True)
-    if config.push_to_hub:
-        LeRobotDataset(config.dataset_id, root=output_dir).push_to_hub(private=config.private)
 
 
 def already_recorded(output_dir: Path, content: Mapping[str, Any], episodes: int) -> bool:
@@ -200,14 +196,13 @@ def follow_workers(open_parts: set[int], results: Any, workers: list[Any], repor
 
 def merge(config: RecordConfig, work: Path, parts: list[Part]) -> None:
     """Put the parts together and move the whole into place at once."""
-    assert config.output_dir is not None
     merged = work / "merged"
     shutil.rmtree(merged, ignore_errors=True)
     merge_folders([work / part.name for part in parts], merged, config.dataset_id)
     problem = whole_dataset(merged, count_episodes(parts))
     if problem:
         raise ValueError(f"{work}: merging failed: {problem}; remove the folder and record again")
-    finish(merged, config.output_dir, config.dataset_id, config.recorded_content())
+    finish(merged, config.root, config.dataset_id, config.recorded_content())
 
 
 def count_episodes(parts: list[Part]) -> int:

@@ -8,6 +8,7 @@ from typing import Any
 
 from lerobot_dataset_maniskill.integrity import whole_dataset
 from lerobot_dataset_maniskill.merging import finish, merge_folders
+from lerobot_dataset_maniskill.recorder import already_recorded
 from lerobot_dataset_maniskill.writer import VOCABULARY_FILE
 
 WHOLE = [0, 1]
@@ -15,16 +16,19 @@ WHOLE = [0, 1]
 
 
 def merge_shards(shards: Sequence[Path], output_dir: Path, repo_id: str) -> None:
-    """One dataset from the recordings `--shard=0/n` … `--shard=n-1/n`. ValueError if they are no such set."""
-    if output_dir.exists():
-        raise ValueError(f"--output_dir={output_dir} exists already; choose a new folder")
+    """One dataset from the recordings `--shard=0/n` … `--shard=n-1/n`. Complete already: says so.
+
+    ValueError if they are no such set, or if `output_dir` holds anything else.
+    """
     contents = [recorded(shard) for shard in shards]
     check_set(shards, contents)
+    content = {**contents[0], "shard": WHOLE}
+    if already_recorded(output_dir, content, content["num_episodes"]):
+        return
     order = sorted(range(len(shards)), key=lambda index: contents[index]["shard"][0])
     merged = output_dir.with_name(f".{output_dir.name}.merging")
     shutil.rmtree(merged, ignore_errors=True)
     merge_folders([shards[index] for index in order], merged, repo_id)
-    content = {**contents[0], "shard": WHOLE}
     problem = whole_dataset(merged, content["num_episodes"])
     if problem:
         raise ValueError(f"--merge_shards: {problem}; are all shards whole?")

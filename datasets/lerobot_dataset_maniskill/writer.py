@@ -1,4 +1,4 @@
-"""The LeRobotDataset side: features, one row a control step, vocabulary and card."""
+"""The LeRobotDataset side: features, one row a control step, vocabulary."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from lerobot_wmrl.constants import (
     STATE_NAMES,
     TASKS,
 )
-from lerobot_wmrl.files import write_json, write_text
+from lerobot_wmrl.files import write_json
 from lerobot_wmrl.maniskill.scenes import SCENES
 from lerobot_wmrl.maniskill.simulation import Frame
 
@@ -137,51 +137,3 @@ def write_vocabulary(root: Path, recording: Mapping[str, Any]) -> None:
             "recording": dict(recording),
         },
     )
-
-
-def write_card(
-    root: Path, repo_id: str, recording: Mapping[str, Any], rates: Mapping[str, tuple[int, int]]
-) -> None:
-    """README.md: what the dataset holds. `rates`: kind → (successes, episodes)."""
-    rows = "\n".join(f"| {kind} | {total} | {wins} |" for kind, (wins, total) in rates.items())
-    scenes = "\n".join(f"| {s.index} | {s.object} | {s.container} | {s.table} | {s.split} |" for s in SCENES)
-    card = CARD.format(
-        name=repo_id,
-        recorded_tasks=", ".join(f"`{task}`" for task in recording["tasks"]),
-        fps=FPS,
-        rows=rows,
-        scenes=scenes,
-        recorded=recording["scenes"],
-        low=list(ACTION_LOW),
-        high=list(ACTION_HIGH),
-        hold=HOLD_FRAMES,
-        tasks=", ".join(TASKS),
-        kinds=", ".join(KINDS),
-    )
-    write_text(root / "README.md", card)
-
-
-CARD = """---
-tags: [LeRobot, ManiSkill]
-task_categories: [robotics]
----
-# {name}
-
-ManiSkill trajectories ({recorded_tasks}), {fps} Hz, recorded by `lerobot-wmrl-record`.
-
-| kind | episodes | successful |
-|---|---|---|
-{rows}
-
-`action`: commanded TCP delta (m), rotation (rad) in base axes, gripper in [-1, 1] (+1 opens), inside the box
-from {low} to {high}.
-`next.done` and `next.success` say whether success holds in the frame the row's action led to; an episode
-goes on {hold} rows after success. A failed episode ends with `next.truncated`.
-`start.task` ({tasks}), `start.scene`, `start.seed` and `start.kind` ({kinds}) rebuild an episode's start.
-
-Scenes (recorded: {recorded}):
-
-| index | object | container | table | split |
-|---|---|---|---|---|
-{scenes}
-"""

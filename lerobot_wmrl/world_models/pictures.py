@@ -8,15 +8,14 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-from PIL import Image
 
+from lerobot_wmrl.strips import GAP, enlarged, evenly_spaced, in_a_row
 from lerobot_wmrl.world_models.evaluation import Replay, decode
 from lerobot_wmrl.world_models.frame_cache import frames_to_tensor
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 
 SCALE = 3
 STRIP_FRAMES = 8
-GAP = 2
 
 
 def side_by_side(model: ActionWorldModelRewardModel, run: Replay, index: int) -> np.ndarray:
@@ -36,16 +35,13 @@ def side_by_side(model: ActionWorldModelRewardModel, run: Replay, index: int) ->
 
 def save_animation(frames: np.ndarray, path: Path) -> None:
     """(T, H, W, 3) uint8 as a GIF at 10 frames a second."""
-    images = [_enlarge(frame) for frame in frames]
+    images = [enlarged(frame, SCALE) for frame in frames]
     images[0].save(path, save_all=True, append_images=images[1:], duration=100, loop=0)
 
 
 def save_strip(frames: np.ndarray, path: Path) -> None:
     """A few evenly spaced frames of (T, H, W, 3) in one row."""
-    chosen = frames[np.linspace(0, len(frames) - 1, min(STRIP_FRAMES, len(frames))).astype(int)]
-    gap = np.full((chosen.shape[1], GAP, 3), 255, np.uint8)
-    row = [part for frame in chosen for part in (frame, gap)][:-1]
-    _enlarge(np.concatenate(row, 1)).save(path)
+    enlarged(in_a_row(frames[evenly_spaced(len(frames), STRIP_FRAMES)]), SCALE).save(path)
 
 
 def save_goals(curves: dict[str, dict[str, Any]], path: Path) -> None:
@@ -92,8 +88,3 @@ def _save(figure: Any, path: Path) -> None:
     figure.tight_layout()
     figure.savefig(path, dpi=110)
     plt.close(figure)
-
-
-def _enlarge(frame: np.ndarray) -> Image.Image:
-    image = Image.fromarray(frame)
-    return image.resize((SCALE * image.width, SCALE * image.height), Image.Resampling.NEAREST)

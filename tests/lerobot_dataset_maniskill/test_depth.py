@@ -20,6 +20,7 @@ def test_a_stored_start_and_its_depth_are_rebuilt_from_scene_and_seed(tmp_path: 
     record(config)
     dataset = LeRobotDataset("local/dataset", root=tmp_path / "dataset")
     assert set(dataset.meta.depth_keys) == {f"observation.images.{name}_depth" for name in env.cameras}
+    assert "_depth`: LeRobot depth maps" in (tmp_path / "dataset" / "README.md").read_text()
     row = dataset[0]
     simulation = env.create_simulation(depth=True)
     try:

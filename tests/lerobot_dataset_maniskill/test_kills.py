@@ -13,47 +13,23 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.integrity import whole_dataset
-from lerobot_dataset_maniskill.manifest import EpisodePlan, planned_parts
-from lerobot_dataset_maniskill.recorder import count_episodes, merge, missing_parts
-from lerobot_dataset_maniskill.worker import PartRecorder
-from lerobot_dataset_maniskill.writer import Outcome, StartColumns, add_step
+from lerobot_dataset_maniskill.manifest import planned_parts
+from lerobot_dataset_maniskill.recorder import count_episodes, merge
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.episodes import recorded_episodes
 from lerobot_wmrl.files import writing
-from lerobot_wmrl.maniskill.simulation import Frame
 from lerobot_wmrl.progress import own_progress_lock
+from tests.lerobot_dataset_maniskill.made_up import ROWS, write_missing
 
 KILLS = 20
-ROWS = 6
 
 
-class MadeUpRecorder(PartRecorder):
-    """The recorder's own files, from pictures of noise."""
-
-    def __init__(self, config: RecordConfig, folder: Path) -> None:
-        self.config, self.folder = config, folder
-
-    def _record_episode(self, dataset: LeRobotDataset, plan: EpisodePlan) -> bool:
-        rng = np.random.default_rng(plan.seed)
-        for row in range(ROWS):
-            image = rng.integers(0, 255, (64, 64, 3), dtype=np.uint8)
-            frame = Frame({"third_view": image}, {}, np.zeros(8, np.float32), 0.0, row == ROWS - 1)
-            add_step(dataset, StartColumns("push it", 0, plan), frame, np.zeros(7), Outcome(frame, False))
-        dataset.save_episode()
-        return True
-
-
-def write_missing(config: RecordConfig, work: Path) -> None:
-    """What the command does between claiming its folder and merging, in a process of its own."""
+def write_in_own_process(config: RecordConfig, work: Path) -> None:
+    """What is killed."""
     own_progress_lock()
-    recorder = MadeUpRecorder(config, work)
-    for part in missing_parts(work, planned_parts(config)):
-        recorder.record(part, lambda result: None)
+    write_missing(config, work)
 
 
 def write_little(config: RecordConfig, work: Path, limit: int) -> None:
@@ -90,7 +66,9 @@ def test_twenty_kills_cost_nothing_that_was_finished(tmp_path: Path) -> None:
     work.mkdir()
     rng, finished = random.Random(0), {}
     for _ in range(KILLS):
-        process = multiprocessing.get_context("fork").Process(target=write_missing, args=(config, work))
+        process = multiprocessing.get_context("fork").Process(
+            target=write_in_own_process, args=(config, work)
+        )
         process.start()
         time.sleep(rng.uniform(0.01, 0.7))
         if process.pid is not None and process.is_alive():

@@ -40,11 +40,15 @@ def test_no_held_out_scene_is_recorded_by_default() -> None:
     assert {plan.scene.split for part in parts for plan in part.episodes} == {"ind"}
 
 
-def test_every_task_meets_every_scene() -> None:
-    env, tasks = WmrlManiSkillEnv(scenes=[0, 1, 2]), ["push", "pull"]
-    parts = planned_parts(config(num_episodes=12, env=env, tasks=tasks))
-    met = Counter((plan.task, plan.scene.index) for part in parts for plan in part.episodes)
-    assert met == {(task, scene): 2 for task in tasks for scene in (0, 1, 2)}
+@pytest.mark.parametrize("scenes", [[0, 1, 2], [0, 1], [0, 1, 2, 5]])
+def test_every_task_meets_every_scene_and_a_short_recording_has_every_task(scenes: list[int]) -> None:
+    env, tasks = WmrlManiSkillEnv(scenes=scenes), ["push", "pull"]
+    parts = planned_parts(config(num_episodes=4 * len(scenes), env=env, tasks=tasks))
+    plans = [plan for part in parts for plan in part.episodes]
+    assert Counter((plan.task, plan.scene.index) for plan in plans) == {
+        (task, scene): 2 for task in tasks for scene in scenes
+    }
+    assert {plan.task for plan in plans[:2]} == set(tasks)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,9 @@ import pytest
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.manifest import planned_parts
-from lerobot_dataset_maniskill.shards import check_set
+from lerobot_dataset_maniskill.shards import check_set, merge_shards
+from lerobot_wmrl.episodes import recorded_episodes
+from tests.lerobot_dataset_maniskill.made_up import record_made_up
 
 NAMES = [Path("a"), Path("b"), Path("c")]
 
@@ -51,3 +53,20 @@ def test_a_complete_set_may_come_in_any_order() -> None:
 def test_what_is_no_set_is_named(described: list[dict[str, object]], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         check_set(NAMES[: len(described)], described)
+
+
+def test_merged_shards_are_the_whole_and_merged_again_say_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shards = [tmp_path / f"shard-{index}" for index in range(2)]
+    for index, shard in enumerate(shards):
+        record_made_up(
+            RecordConfig(output_dir=shard, num_episodes=5, part_episodes=2, shard=f"{index}/2", seed=7)
+        )
+    merge_shards(shards, tmp_path / "whole", "local/whole")
+    assert sorted(recorded_episodes(tmp_path / "whole")["seed"]) == list(range(7, 12))
+    capsys.readouterr()
+    merge_shards(shards, tmp_path / "whole", "local/whole")
+    assert "is already recorded: 5 episodes" in capsys.readouterr().out
+    with pytest.raises(ValueError, match=r"shard-1 holds a recording with other settings"):
+        merge_shards(shards, shards[1], "local/whole")

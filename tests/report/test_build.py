@@ -54,6 +54,7 @@ def write_dataset(root: Path) -> None:
     """Four episodes of three rows; the first and the last succeed, at their last row."""
     kinds = [KINDS.index(kind) for kind in ("optimal", "optimal", "near_miss", "optimal")]
     starts = {
+        "start.task": [0, 0, 0, 0],
         "start.kind": kinds,
         "start.seed": range(4),
         "start.scene": [0, 0, 1, 1],

@@ -1,0 +1,178 @@
+"""The dataset card, README.md: what was recorded, what it looks like, what the columns mean, how to load it.
+
+Everything in it is read from the dataset's own files, so that it can be written again under another name.
+"""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lerobot_dataset_maniskill.examples import chosen_examples, write_pictures
+from lerobot_dataset_maniskill.writer import VOCABULARY_FILE
+from lerobot_wmrl.constants import FPS, KINDS, TASKS
+from lerobot_wmrl.episodes import recorded_episodes
+from lerobot_wmrl.files import write_text
+from lerobot_wmrl.statistics import Proportion
+
+CARD_FILE = Path("README.md")
+
+KIND_MEANINGS = {
+    "optimal": "a planner's straight way",
+    "waypoint": "a planner's way by an unrelated point",
+    "interpolated": "a planner's way off the straight lines",
+    "disturbed": "a planner whose points are a little off, so that some episodes fail",
+    "near_miss": "a planner that misses on purpose",
+    "policy": "a policy's attempts",
+    "play": "wandering, pushing and lifting without a reset",
+}
+"""How the actions of each of `constants.KINDS` were made."""
+
+
+def name_card(root: Path, repo_id: str) -> None:
+    """Write pictures and card, unless the card is of this name already: somebody may have added to it."""
+    card = root / CARD_FILE
+    if not card.is_file() or title(repo_id) not in card.read_text().splitlines():
+        write_card(root, repo_id, recorded_episodes(root))
+
+
+def write_card(root: Path, repo_id: str, table: Mapping[str, np.ndarray]) -> None:
+    """The pictures, then the card, of the dataset at `root`, called `repo_id`.
+
+    `table` is `lerobot_wmrl.episodes.recorded_episodes`.
+    """
+    write_pictures(root, repo_id, table)
+    vocabulary = json.loads((root / VOCABULARY_FILE).read_text())
+    text = CARD.format(
+        title=title(repo_id),
+        name=repo_id,
+        fps=FPS,
+        episodes=len(table["episode"]),
+        frames=table["length"].sum(),
+        minutes=table["length"].sum() / FPS / 60,
+        success=markdown_table(SUCCESS_HEAD, success_rows(table)),
+        meanings="\n".join(f"- `{kind}`: {KIND_MEANINGS[kind]}" for kind in recorded_kinds(table)),
+        pictures="\n\n".join(picture_lines(table)),
+        scenes=markdown_table(SCENES_HEAD, scene_rows(table, vocabulary["scenes"])),
+        size=vocabulary["image_size"],
+        cameras=", ".join(f"`observation.images.{camera}`" for camera in vocabulary["cameras"]),
+        depth=DEPTH if vocabulary["recording"]["depth"] else "",
+        low=vocabulary["action_low"],
+        high=vocabulary["action_high"],
+        hold=vocabulary["hold_frames"],
+        tasks=", ".join(TASKS),
+        kinds=", ".join(KINDS),
+    )
+    write_text(root / CARD_FILE, text)
+
+
+def title(repo_id: str) -> str:
+    return f"# {repo_id}"
+
+
+def recorded_kinds(table: Mapping[str, np.ndarray]) -> list[str]:
+    """Names of the kinds of which there are episodes."""
+    return [KINDS[kind] for kind in np.unique(table["kind"])]
+
+
+SUCCESS_HEAD = ("task", "kind", "episodes", "successful", "success rate (95 % interval)")
+
+
+def success_rows(table: Mapping[str, np.ndarray]) -> Iterator[tuple[Any, ...]]:
+    """A row for each task and kind of which there are episodes."""
+    for task, kind in sorted({*zip(table["task"].tolist(), table["kind"].tolist(), strict=True)}):
+        success = table["success"][(table["task"] == task) & (table["kind"] == kind)]
+        rate = Proportion(int(success.sum()), len(success))
+        low, high = rate.interval
+        shown = f"{rate.share:.0%} ({low:.0%}–{high:.0%})"
+        yield TASKS[task], KINDS[kind], rate.n, rate.k, shown
+
+
+def picture_lines(table: Mapping[str, np.ndarray]) -> Iterator[str]:
+    """Every example's picture, with what it shows."""
+    for example in chosen_examples(table):
+        end = "from its start to success" if example.success else "which fails"
+        caption = f"`{example.task}`: episode {example.episode} ({example.kind}), {end}"
+        yield f"![{example.task}]({example.path.as_posix()})\n\n*{caption}.*"
+
+
+SCENES_HEAD = ("scene", "object", "container", "table", "split", "episodes")
+
+
+def scene_rows(
+    table: Mapping[str, np.ndarray], scenes: Sequence[Mapping[str, Any]]
+) -> Iterator[tuple[Any, ...]]:
+    """A row for each scene that was recorded. `scenes` is the vocabulary's, by index."""
+    for index, episodes in zip(*np.unique(table["scene"], return_counts=True), strict=True):
+        scene = scenes[index]
+        yield index, *(scene[part] for part in ("object", "container", "table", "split")), episodes
+
+
+def markdown_table(head: Sequence[str], rows: Iterator[tuple[Any, ...]]) -> str:
+    """Head and rows, one a line."""
+    cells = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(str(cell) for cell in row)} |" for row in cells)
+
+
+DEPTH = "- `observation.images.<camera>_depth`: LeRobot depth maps, millimetres along the camera's axis.\n"
+
+CARD = """---
+license: apache-2.0
+task_categories: [robotics]
+tags: [LeRobot, ManiSkill, panda]
+configs:
+- config_name: default
+  data_files: data/*/*.parquet
+---
+{title}
+
+ManiSkill trajectories recorded by `lerobot-wmrl-record`: {episodes} episodes, {frames} frames
+({minutes:.1f} minutes at {fps} Hz).
+
+{success}
+
+An episode is successful if success holds in any of its rows. The kind says how its actions were made:
+
+{meanings}
+
+{pictures}
+
+## Load it
+
+With pictures, as a [LeRobot](https://github.com/huggingface/lerobot) dataset:
+
+```python
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+dataset = LeRobotDataset("{name}")  # of a copy on disk: root="its folder"
+```
+
+The columns without pictures:
+
+```python
+import datasets
+
+rows = datasets.load_dataset("{name}", split="train")
+```
+
+## Scenes
+
+Those with split `ind` may be trained on; those with `ood` are held out.
+
+{scenes}
+
+## Columns
+
+- {cameras}: video of {size}x{size} pixels.
+{depth}- `observation.state`: TCP position (m), TCP quaternion (wxyz), gripper opening in [0, 1].
+- `action`: commanded TCP delta (m), rotation (rad) in base axes, gripper in [-1, 1] (+1 opens), inside the
+  box from {low} to {high}.
+- `next.done` and `next.success` say whether success holds in the frame the row's action led to; an episode
+  goes on {hold} rows after success. A failed episode ends with `next.truncated`.
+- `start.task` ({tasks}), `start.scene`, `start.seed` and
+  `start.kind` ({kinds}) rebuild an episode's start.
+
+`meta/wmrl.json` holds these vocabularies and the settings of the recording.
+"""

@@ -1,0 +1,73 @@
+"""A finished recording on the Hugging Face hub, with its own card, which LeRobot's push would replace."""
+
+from contextlib import suppress
+from pathlib import Path
+
+import httpx
+from huggingface_hub import HfApi
+from huggingface_hub.constants import REPO_TYPE_DATASET
+from huggingface_hub.errors import HfHubHTTPError, RevisionNotFoundError
+from lerobot.datasets.dataset_metadata import CODEBASE_VERSION
+
+from lerobot_dataset_maniskill.card import CARD_FILE, name_card
+from lerobot_dataset_maniskill.examples import MEDIA
+
+PUBLISHED = [str(CARD_FILE), *(f"{folder}/*" for folder in ("data", "meta", "videos", MEDIA))]
+"""What a dataset consists of: it is uploaded, and removed from the hub where it is not here."""
+
+DENIED = (401, 403, 404)
+"""HTTP's answers to a token that may not write; the hub does not say that what one may not see exists."""
+
+
+def publish(api: HfApi, root: Path, repo_id: str, private: bool) -> None:
+    """Make the hub's dataset `repo_id` the one at `root`. Published already: changes nothing there.
+
+    ValueError says what the hub refuses, or that it cannot be reached.
+    """
+    name_card(root, repo_id)
+    try:
+        create(api, repo_id, private)
+        api.upload_folder(
+            repo_id=repo_id, repo_type=REPO_TYPE_DATASET, folder_path=root,
+            allow_patterns=PUBLISHED, delete_patterns=PUBLISHED,
+        )  # fmt: skip
+        tag_version(api, repo_id)
+    except (httpx.HTTPError, OSError, RuntimeError) as error:
+        raise ValueError(
+            f"--push_to_hub=true: {repo_id} is not published: {reason(error)}. "
+            f"The recording is whole in {root}; the same command again only publishes it"
+        ) from error
+    print(f"published: {api.endpoint}/datasets/{repo_id}")
+
+
+def create(api: HfApi, repo_id: str, private: bool) -> None:
+    """Make sure of the repository. ValueError if it is public already and was to be private.
+
+    Unless it is to be private, a new one is as visible as its organisation makes new ones.
+    """
+    api.create_repo(repo_id, repo_type=REPO_TYPE_DATASET, private=private or None, exist_ok=True)
+    if private and not api.dataset_info(repo_id).private:
+        raise ValueError(
+            f"--private=true: {repo_id} is public on the hub already; make it private there, "
+            "or choose another --repo_id"
+        )
+
+
+def tag_version(api: HfApi, repo_id: str) -> None:
+    """Tag the head with the version of LeRobot's format, by which LeRobotDataset finds it."""
+    with suppress(RevisionNotFoundError):
+        api.delete_tag(repo_id, tag=CODEBASE_VERSION, repo_type=REPO_TYPE_DATASET)
+    api.create_tag(repo_id, tag=CODEBASE_VERSION, repo_type=REPO_TYPE_DATASET)
+
+
+def reason(error: Exception) -> str:
+    """Why publishing failed, and what helps."""
+    if isinstance(error, (httpx.TransportError, ConnectionError)):
+        return f"the hub cannot be reached ({error})"
+    if not isinstance(error, HfHubHTTPError):
+        return f"the upload failed ({error})"
+    status = error.response.status_code
+    refusal = f"the hub refuses ({status}, {error.server_message or error.response.reason_phrase})"
+    if status in DENIED:
+        return f"{refusal}; log in with a token that may write there: `hf auth login`"
+    return refusal
