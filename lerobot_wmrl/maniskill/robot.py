@@ -1,6 +1,7 @@
 """The robot: ManiSkill's Panda, commanded by delta poses in metres and radians along the base's axes."""
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import fast_simplification
@@ -9,6 +10,7 @@ import sapien
 from mani_skill.agents.controllers import PDEEPoseControllerConfig
 from mani_skill.agents.registration import register_agent
 from mani_skill.agents.robots.panda.panda import Panda
+from sapien.wrapper.pinocchio_model import PinocchioModel
 
 CONTROL_MODE = "base_delta_pose"
 BASE_POSITION = (-0.615, 0.0, 0.0)
@@ -48,19 +50,52 @@ class BaseAxesPanda(Panda):
         }
 
 
+class InverseKinematics:
+    """Joint positions of a gripper that points down, sought from the rest position, on the CPU.
+
+    The same for one robot and for many, whatever they are simulated on: starts must not depend on it.
+    """
+
+    def __init__(self, agent: Panda) -> None:
+        joints = [joint.name for joint in agent.robot.active_joints]
+        links = [link.name for link in agent.robot.links]
+        self.model = PinocchioModel(Path(agent.urdf_path).read_text(), [0.0, 0.0, -9.81])
+        self.model.set_joint_order(joints)
+        self.model.set_link_order(links)
+        self.end_link = links.index(agent.ee_link_name)
+        self.movable = np.array([name in agent.arm_joint_names for name in joints])
+        self.rest = np.array(agent.keyframes["rest"].qpos, np.float64)
+        self.rest[-2:] = 0.0
+
+    def solve(self, tcp: np.ndarray, finger: float) -> np.ndarray:
+        """(9,) joint positions for the TCP at `tcp` (3,), fingers at `finger` (m). RuntimeError if none."""
+        target = sapien.Pose(p=np.asarray(tcp) - np.array(BASE_POSITION), q=[0.0, 1.0, 0.0, 0.0])
+        qpos, solved, _ = self.model.compute_inverse_kinematics(
+            self.end_link, target, initial_qpos=self.rest, active_qmask=self.movable, max_iterations=200
+        )
+        if not solved:
+            raise RuntimeError(f"inverse kinematics failed for the start position {np.round(tcp, 3)}")
+        qpos[-2:] = finger
+        return qpos
+
+
 def lighten_meshes(robot: Any, detail: float) -> None:
     """Replace the robot's visual meshes by decimated ones, `detail` of their triangles.
 
     Software rendering is bound by vertices: 4 % of the triangles draw several times faster and look the same
     at 64 px.
     """
+    known: dict[tuple[str, int, int], tuple[np.ndarray, ...]] = {}  # robots beside each other are alike
     for name, body in _render_bodies(robot):
         share = min(1.0, 3.0 * detail) if name in FINE_LINKS else detail
         light = sapien.render.RenderBodyComponent()
-        for shape in body.render_shapes:
-            for part in shape.parts:
+        for which, shape in enumerate(body.render_shapes):
+            for number, part in enumerate(shape.parts):
                 if len(part.triangles):
-                    mesh = _decimated(part, share)
+                    key = (name, which, number)
+                    if key not in known:
+                        known[key] = _decimated(part, share)
+                    mesh = sapien.render.RenderShapeTriangleMesh(*known[key], part.material)
                     mesh.local_pose = shape.local_pose
                     light.attach(mesh)
         body.disable()
@@ -75,20 +110,16 @@ def _render_bodies(robot: Any) -> Iterator[tuple[str, Any]]:
                 yield link.name, component
 
 
-def _decimated(part: Any, share: float, smallest: int = 120) -> Any:
-    """One mesh part with `share` of its triangles (at least `smallest`) and smooth normals."""
+def _decimated(part: Any, share: float, smallest: int = 120) -> tuple[np.ndarray, ...]:
+    """A mesh part with `share` of its triangles, at least `smallest`: vertices, triangles, normals, no uv."""
     vertices, inverse = np.unique(np.asarray(part.vertices, np.float32).round(5), axis=0, return_inverse=True)
     triangles = inverse.reshape(-1)[np.asarray(part.triangles)].astype(np.int32)
     reduction = 1.0 - max(smallest, share * len(triangles)) / len(triangles)
     if reduction > 0:
         vertices, triangles = fast_simplification.simplify(vertices, triangles, reduction)
-    return sapien.render.RenderShapeTriangleMesh(
-        vertices.astype(np.float32),
-        triangles.astype(np.uint32),
-        _vertex_normals(vertices, triangles),
-        np.zeros((0, 2), np.float32),
-        part.material,
-    )
+    normals = _vertex_normals(vertices, triangles)
+    no_texture = np.zeros((0, 2), np.float32)
+    return vertices.astype(np.float32), triangles.astype(np.uint32), normals, no_texture
 
 
 def _vertex_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:

@@ -37,6 +37,32 @@ class Frame:
     success: bool
 
 
+class Episode:
+    """What is to be remembered of an episode in order to judge it.
+
+    Args:
+        task, scene, seed: which together decide its start.
+    """
+
+    object_start: np.ndarray
+    object_before: np.ndarray
+
+    def __init__(self, task: Task, scene: Scene, seed: int) -> None:
+        self.scene, self.seed, self.start = scene, seed, task.start(scene, seed)
+
+    def begin(self, position: np.ndarray) -> None:
+        """The object has been put at `position` (3,)."""
+        self.object_start = self.object_before = position
+
+    def situation(self, position: np.ndarray, tcp: np.ndarray, opening: float) -> Situation:
+        """What the task judges when the object is at `position` (3,), the TCP at `tcp` (3,)."""
+        return Situation(
+            self.start, OBJECTS[self.scene.object], CONTAINERS[self.scene.container],
+            self.object_start, position, tcp, opening,
+            float(np.linalg.norm(position - self.object_before)) * FPS,
+        )  # fmt: skip
+
+
 class Simulation:
     """A ManiSkill table that plays episodes of one task in some scenes.
 
@@ -55,26 +81,25 @@ class Simulation:
         self.variation = Variation(self.env.scene.sub_scenes[0], fixed, rendering)
         self._low, self._high = np.array(ACTION_LOW, np.float32), np.array(ACTION_HIGH, np.float32)
 
-    def start(self, scene: Scene, seed: int) -> Start:
-        """The start of this scene and seed, as a plan: nothing is moved."""
-        return self.task.start(scene, seed)
-
     def reset(self, scene: Scene, seed: int) -> Frame:
         """Rebuild the start of (task, scene, seed). The same arguments give the same frame."""
-        self.scene = scene
-        self.current_start = self.start(scene, seed)
-        self.env.place(scene, self.current_start)
+        self.episode = Episode(self.task, scene, seed)
+        self.env.place(scene, self.episode.start)
         self.variation.draw(seed, self.task.index, scene.index)
-        self.object_start = self._object_before = self.object_position
+        self.episode.begin(self.object_position)
         return self._frame()
 
     def step(self, action: np.ndarray) -> Frame:
         """Apply one action (7,), clipped to the action box and to the workspace, for one control step."""
         clipped = np.clip(np.asarray(action, np.float32), self._low, self._high)
         clipped[2] = max(clipped[2], WORKSPACE_FLOOR - self.tcp_position[2])
-        self._object_before = self.object_position
+        self.episode.object_before = self.object_position
         self.env.step(torch.from_numpy(clipped)[None])
         return self._frame()
+
+    @property
+    def current_start(self) -> Start:
+        return self.episode.start
 
     @property
     def instruction(self) -> str:
@@ -97,11 +122,7 @@ class Simulation:
 
     def situation(self) -> Situation:
         """What the task judges now."""
-        return Situation(
-            self.current_start, OBJECTS[self.scene.object], CONTAINERS[self.scene.container],
-            self.object_start, self.object_position, self.tcp_position, self.gripper_opening,
-            float(np.linalg.norm(self.object_position - self._object_before)) * FPS,
-        )  # fmt: skip
+        return self.episode.situation(self.object_position, self.tcp_position, self.gripper_opening)
 
     def close(self) -> None:
         self.env.close()

@@ -24,6 +24,7 @@ from lerobot_wmrl.maniskill.robot import (
     CONTROL_MODE,
     GRIPPER_OPEN,
     BaseAxesPanda,
+    InverseKinematics,
     lighten_meshes,
 )
 from lerobot_wmrl.maniskill.scenes import Scene
@@ -32,6 +33,8 @@ from lerobot_wmrl.maniskill.tasks import Start
 PHYSICS_STEPS = 4
 """Physics steps a control step."""
 
+TABLE_PLACE = (-0.1, 0.0, -0.05)
+CARPET = "carpet"
 PARKING = (-3.0, 3.0, 0.3)
 ANGULAR_DAMPING = 5.0
 """Round objects come to rest."""
@@ -47,12 +50,14 @@ class TabletopEnv(BaseEnv):
         self,
         scenes: Sequence[Scene],
         rendering: Rendering,
+        num_envs: int = 1,
+        sim_backend: str = "physx_cpu",
         **kwargs: Any,
     ) -> None:
         self.scenes, self.rendering = tuple(scenes), rendering
         super().__init__(
-            num_envs=1, obs_mode="none", reward_mode="none", control_mode=CONTROL_MODE,
-            robot_uids=BaseAxesPanda.uid, sim_backend="physx_cpu", **kwargs,
+            num_envs=num_envs, obs_mode="none", reward_mode="none", control_mode=CONTROL_MODE,
+            robot_uids=BaseAxesPanda.uid, sim_backend=sim_backend, **kwargs,
         )  # fmt: skip
 
     @property
@@ -74,12 +79,12 @@ class TabletopEnv(BaseEnv):
         self.containers = {
             n: build_container(self.scene, CONTAINERS[n]) for n in _names(self.scenes, "container")
         }
-        self.carpets = {"carpet": build_carpet(self.scene)}
+        self.carpets = {CARPET: build_carpet(self.scene)}
         self.tables = {n: build_table(self.scene, n) for n in _names(self.scenes, "table")}
         for actor in self.objects.values():
-            actor._bodies[0].set_angular_damping(ANGULAR_DAMPING)
-        self.rest_qpos = self.agent.keyframes["rest"].qpos.copy()
-        self.rest_qpos[-2:] = 0.0
+            for body in actor._bodies:
+                body.set_angular_damping(ANGULAR_DAMPING)
+        self.inverse_kinematics = InverseKinematics(self.agent)
 
     def _load_lighting(self, options: dict) -> None:
         self.scene.set_ambient_light(AMBIENT)
@@ -98,49 +103,46 @@ class TabletopEnv(BaseEnv):
 
     def place(self, scene: Scene, start: Start) -> None:
         """Put the scene's things and the robot where the episode starts, at rest."""
-        _show_only(self.tables, scene.table, sapien.Pose(p=[-0.1, 0, -0.05]))
-        _show_only(self.containers, scene.container, sapien.Pose(p=[*start.container_xy, 0.0]))
-        carpet_xy = PARKING[:2] if start.carpet_xy is None else start.carpet_xy
-        shown = None if start.carpet_xy is None else "carpet"
-        _show_only(self.carpets, shown, sapien.Pose(p=[*carpet_xy, 0.0]))
-        height = OBJECTS[scene.object].half_size[2]
-        pose = sapien.Pose(p=[*start.object_xy, height], q=euler2quat(0, 0, start.object_yaw))
-        _show_only(self.objects, scene.object, pose)
+        places = arrangement(scene, start)
+        for actors in (self.tables, self.containers, self.carpets, self.objects):
+            _show_only(actors, places)
         self.active = self.objects[scene.object]
-        self._place_robot(start.tcp, GRIPPER_OPEN if start.gripper_open else 0.0)
-
-    def _place_robot(self, tcp: np.ndarray, finger: float) -> None:
-        """Solve inverse kinematics from rest, so that the gripper points down at `tcp` (3,)."""
-        arm = self.agent.controller.controllers["arm"]
-        model = arm.kinematics.pmodel
-        target = sapien.Pose(p=np.asarray(tcp) - np.array(BASE_POSITION), q=[0.0, 1.0, 0.0, 0.0])
-        link = arm.kinematics.end_link_idx
-        qpos, solved, _ = model.compute_inverse_kinematics(
-            link, target, initial_qpos=self.rest_qpos, active_qmask=arm.kinematics.qmask, max_iterations=200
-        )
-        if not solved:
-            raise RuntimeError(f"inverse kinematics failed for the start position {np.round(tcp, 3)}")
-        qpos[-2:] = finger
-        self.agent.reset(qpos)
+        self.agent.reset(self.start_qpos(start))
         self.agent.controller.reset()
+
+    def start_qpos(self, start: Start) -> np.ndarray:
+        """(9,) the robot's joint positions at the start."""
+        return self.inverse_kinematics.solve(start.tcp, GRIPPER_OPEN if start.gripper_open else 0.0)
+
+
+def arrangement(scene: Scene, start: Start) -> dict[str, sapien.Pose]:
+    """What stands on the table, and the table itself, by name, with its pose."""
+    height = OBJECTS[scene.object].half_size[2]
+    places = {
+        scene.table: sapien.Pose(p=TABLE_PLACE),
+        scene.container: sapien.Pose(p=[*start.container_xy, 0.0]),
+        scene.object: sapien.Pose(p=[*start.object_xy, height], q=euler2quat(0, 0, start.object_yaw)),
+    }
+    if start.carpet_xy is not None:
+        places[CARPET] = sapien.Pose(p=[*start.carpet_xy, 0.0])
+    return places
 
 
 def _names(scenes: Sequence[Scene], field: str) -> list[str]:
     return sorted({getattr(scene, field) for scene in scenes})
 
 
-def _show_only(actors: dict[str, Any], shown: str | None, pose: sapien.Pose) -> None:
-    """Put `shown`, if any, at `pose` at rest, and park the others: hidden, immovable and far away."""
+def _show_only(actors: dict[str, Any], places: dict[str, sapien.Pose]) -> None:
+    """Put those of `places` there, at rest, and park the others: hidden, immovable and far away."""
     for place, (name, actor) in enumerate(actors.items()):
         entity = actor._objs[0]
         body = entity.find_component_by_type(sapien.physx.PhysxRigidDynamicComponent)
         visual = entity.find_component_by_type(sapien.render.RenderBodyComponent)
-        visual.visibility = float(name == shown)
-        entity.set_pose(
-            pose if name == shown else sapien.Pose(p=[PARKING[0], PARKING[1] + 3.0 * place, PARKING[2]])
-        )
+        visual.visibility = float(name in places)
+        parked = sapien.Pose(p=[PARKING[0], PARKING[1] + 3.0 * place, PARKING[2]])
+        entity.set_pose(places.get(name, parked))
         if actor.px_body_type == "dynamic":
-            body.set_kinematic(name != shown)
-            if name == shown:
+            body.set_kinematic(name not in places)
+            if name in places:
                 body.set_linear_velocity(np.zeros(3))
                 body.set_angular_velocity(np.zeros(3))

@@ -35,7 +35,7 @@ def test_a_mesh_takes_the_place_of_an_object(assets: Path) -> None:
         resting = [simulation.step(np.zeros(7)) for _ in range(10)]
         assert resting[-1].images["third_view"].std() > 5
         assert simulation.object_position[2] == pytest.approx(0.035, abs=0.005)
-        np.testing.assert_allclose(simulation.object_position, simulation.object_start, atol=0.01)
+        np.testing.assert_allclose(simulation.object_position, simulation.episode.object_start, atol=0.01)
     finally:
         simulation.close()
 

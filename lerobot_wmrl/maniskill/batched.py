@@ -1,0 +1,186 @@
+"""Many episodes in one simulation: ManiSkill's batched physics and rendering, for CUDA.
+
+On the CPU a batch has one episode; that serves to compare it with `simulation.Simulation`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import sapien
+import torch
+from mani_skill.utils.structs.pose import Pose
+from torch import Tensor
+
+from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, WORKSPACE_FLOOR
+from lerobot_wmrl.maniskill.renderer import render_backend
+from lerobot_wmrl.maniskill.rendering import Rendering
+from lerobot_wmrl.maniskill.robot import GRIPPER_OPEN
+from lerobot_wmrl.maniskill.scenes import Scene
+from lerobot_wmrl.maniskill.simulation import Episode
+from lerobot_wmrl.maniskill.tabletop import TabletopEnv, arrangement
+from lerobot_wmrl.maniskill.tasks import Task
+
+SHELF = -6.0
+"""Height (m) at which objects that no episode needs lie on a shelf, further down than a camera sees."""
+
+SHELF_HALF_SIZE = (1.0, 1.0, 0.05)
+SHELF_SPACING = 0.35
+CELLAR = -9.0
+"""Height (m) below which tables, containers and mats that no episode needs hang."""
+
+
+class BatchedTabletopEnv(TabletopEnv):
+    """Tables beside each other, each with everything that any scene needs."""
+
+    def _load_scene(self, options: dict) -> None:
+        super()._load_scene(options)
+        builder = self.scene.create_actor_builder()
+        builder.add_box_collision(half_size=SHELF_HALF_SIZE)
+        builder.initial_pose = sapien.Pose(p=[0.0, 0.0, SHELF - SHELF_HALF_SIZE[2]])
+        builder.build_static(name="shelf")
+        self.parking = _parking([*self.objects], [*self.tables, *self.containers, *self.carpets])
+
+    def place_rows(self, rows: Sequence[int], episodes: Sequence["Episode"]) -> None:
+        """Put what the episodes need on the tables `rows`, at rest, and everything else away."""
+        self.scene._reset_mask = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+        self.scene._reset_mask[list(rows)] = True
+        layouts = [arrangement(episode.scene, episode.start) for episode in episodes]
+        for name, actor in {**self.tables, **self.containers, **self.carpets, **self.objects}.items():
+            poses = [layout.get(name, self.parking[name]) for layout in layouts]
+            actor.set_pose(Pose.create(torch.tensor(np.array([[*p.p, *p.q] for p in poses]))).to(self.device))
+        for actor in self.objects.values():
+            actor.set_linear_velocity(torch.zeros(3, device=self.device))
+            actor.set_angular_velocity(torch.zeros(3, device=self.device))
+        qpos = np.stack([self.start_qpos(episode.start) for episode in episodes])
+        self.agent.reset(torch.tensor(qpos, dtype=torch.float32, device=self.device))
+        self._apply()
+        self.agent.controller.reset()
+        self.scene._reset_mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+
+    def _apply(self) -> None:
+        """On CUDA, poses are set in buffers that have to be applied and read again."""
+        if self.gpu_sim_enabled:
+            self.scene._gpu_apply_all()
+            self.scene.px.gpu_update_articulation_kinematics()
+            self.scene._gpu_fetch_all()
+
+
+def _parking(lying: Sequence[str], hanging: Sequence[str]) -> dict[str, sapien.Pose]:
+    """Where each thing is when no episode needs it: what falls on the shelf, what does not below it."""
+    side = int(np.ceil(np.sqrt(len(lying))))
+    offset = SHELF_SPACING * (side - 1) / 2
+    places = {
+        name: sapien.Pose(
+            p=[SHELF_SPACING * (i % side) - offset, SHELF_SPACING * (i // side) - offset, SHELF + 0.05]
+        )
+        for i, name in enumerate(lying)
+    }
+    return places | {name: sapien.Pose(p=[0.0, 0.0, CELLAR - i]) for i, name in enumerate(hanging)}
+
+
+@dataclass(frozen=True)
+class BatchedFrame:
+    """What is known at one control step of B episodes: images camera → (B, H, W, 3) uint8 and state (B, 8),
+    on the simulation's device; reward (B,) float32 and success (B,) bool."""
+
+    images: dict[str, Tensor]
+    state: Tensor
+    reward: Tensor
+    success: Tensor
+
+
+class BatchedSimulation:
+    """As `Simulation`, with B episodes of one task at once.
+
+    Args:
+        task, scenes, rendering: as there; light and cameras do not vary here.
+        num_envs: B; one on the CPU.
+        device: "cuda" or "cpu".
+    """
+
+    def __init__(
+        self, task: Task, scenes: Sequence[Scene], rendering: Rendering, num_envs: int, device: str
+    ) -> None:
+        self.task, self.rendering = task, rendering
+        backend = "physx_cuda" if device.startswith("cuda") else "physx_cpu"
+        self.env = BatchedTabletopEnv(scenes, rendering, num_envs, backend, render_backend=render_backend())
+        self.env.reset(seed=0)
+        self.device = self.env.device
+        self.names = [*self.env.objects]
+        self.episodes: list[Episode | None] = [None] * num_envs
+        self._low = torch.tensor(ACTION_LOW, device=self.device)
+        self._high = torch.tensor(ACTION_HIGH, device=self.device)
+
+    def reset(self, scenes: Sequence[Scene], seeds: Sequence[int], rows: Sequence[int]) -> BatchedFrame:
+        """Rebuild the starts of (task, scene, seed) in these rows; the others go on."""
+        started = [Episode(self.task, scene, seed) for scene, seed in zip(scenes, seeds, strict=True)]
+        for row, episode in zip(rows, started, strict=True):
+            self.episodes[row] = episode
+        self.env.place_rows(rows, started)
+        positions = self.object_positions().cpu().numpy()
+        for row, episode in zip(rows, started, strict=True):
+            episode.begin(positions[row])
+        return self._frame()
+
+    def step(self, actions: Tensor) -> BatchedFrame:
+        """Apply actions (B, 7), clipped to the action box and to the workspace, for one control step."""
+        clipped = actions.to(self.device).clamp(self._low, self._high)
+        floor = WORKSPACE_FLOOR - self.tcp_poses()[:, 2]
+        clipped[:, 2] = torch.maximum(clipped[:, 2], floor)
+        for episode, position in zip(self.episodes, self.object_positions().cpu().numpy(), strict=True):
+            if episode is not None:
+                episode.object_before = position
+        self.env.step(clipped)
+        return self._frame()
+
+    def object_positions(self) -> Tensor:
+        """(B, 3) centres of the objects."""
+        every = torch.stack([self.env.objects[name].pose.p for name in self.names], 1)
+        active = [self.names.index(e.scene.object) if e is not None else 0 for e in self.episodes]
+        return every[torch.arange(len(active), device=self.device), torch.tensor(active, device=self.device)]
+
+    def tcp_poses(self) -> Tensor:
+        """(B, 7) position and quaternion (wxyz)."""
+        return self.env.agent.tcp.pose.raw_pose
+
+    def close(self) -> None:
+        self.env.close()
+
+    def _frame(self) -> BatchedFrame:
+        opening = (self.env.agent.robot.qpos[:, -1] / GRIPPER_OPEN).clamp(0.0, 1.0)
+        poses = self.tcp_poses()
+        judged = [
+            self._judge(episode, *row)
+            for episode, *row in zip(
+                self.episodes, self.object_positions().cpu().numpy().astype(np.float64),
+                poses[:, :3].cpu().numpy().astype(np.float64), opening.cpu().tolist(), strict=True,
+            )
+        ]  # fmt: skip
+        reward, success = zip(*judged, strict=True)
+        quaternion = torch.where(poses[:, 4:5] < 0, -poses[:, 3:], poses[:, 3:])
+        state = torch.cat([poses[:, :3], quaternion, opening[:, None]], 1).float()
+        return BatchedFrame(
+            self._images(), state,
+            torch.tensor(reward, dtype=torch.float32, device=self.device),
+            torch.tensor(success, device=self.device),
+        )  # fmt: skip
+
+    def _judge(
+        self, episode: Episode | None, thing: np.ndarray, tcp: np.ndarray, opening: float
+    ) -> tuple[float, bool]:
+        if episode is None:
+            return 0.0, False
+        situation = episode.situation(thing, tcp, opening)
+        return self.task.reward(situation), self.task.success(situation)
+
+    def _images(self) -> dict[str, Tensor]:
+        if self.rendering.cameras:
+            self.env.scene.update_render(update_sensors=True, update_human_render_cameras=False)
+        images = {}
+        for name in self.rendering.cameras:
+            sensor: Any = self.env._sensors[name]
+            sensor.capture()
+            images[name] = sensor.get_obs(rgb=True, depth=False, position=False, segmentation=False)["rgb"]
+        return images
