@@ -17,6 +17,7 @@ from lerobot_wmrl.maniskill.scenes import Scene, scenes_of
 if TYPE_CHECKING:
     import gymnasium as gym
 
+    from lerobot_wmrl.maniskill.batched import BatchedSimulation
     from lerobot_wmrl.maniskill.simulation import Simulation
 
 
@@ -34,6 +35,8 @@ class WmrlManiSkillEnv(EnvConfig):
         episode_length: steps after which an episode is truncated; the task's own horizon by default.
         assets: YAML file with meshes to use in place of objects (`lemon: {mesh: lemon.obj, scale: 0.001}`).
         robot_mesh_detail: share of the robot's triangles that are drawn; 1 draws all, three times slower.
+        batched: whether episodes share one simulation on CUDA; by default where there is one, else each has
+            a process of its own.
         light_jitter: how much the light varies from episode to episode, as a share (0.2 is plenty).
         camera_jitter: how much the fixed camera is displaced from episode to episode (m; 0.01 is plenty).
     """
@@ -46,6 +49,7 @@ class WmrlManiSkillEnv(EnvConfig):
     episode_length: int | None = None
     assets: Path | None = None
     robot_mesh_detail: float = ROBOT_MESH_DETAIL
+    batched: bool | None = None
     light_jitter: float = 0.0
     camera_jitter: float = 0.0
     fps: int = FPS
@@ -113,28 +117,68 @@ class WmrlManiSkillEnv(EnvConfig):
 
     def create_simulation(self, depth: bool = False) -> "Simulation":
         """A simulator for these scenes and cameras, in this process."""
-        from lerobot_wmrl.maniskill.assets import use_assets
-        from lerobot_wmrl.maniskill.rendering import Rendering
         from lerobot_wmrl.maniskill.simulation import Simulation
+
+        self._use_assets()
+        return Simulation(self._task(), self.selected_scenes(), self._rendering(depth))
+
+    def create_batched_simulation(self, n_envs: int, device: str) -> "BatchedSimulation":
+        """The same for `n_envs` episodes at once. ValueError if light or cameras are to vary."""
+        from lerobot_wmrl.maniskill.batched import BatchedSimulation
+
+        if self.light_jitter or self.camera_jitter:
+            raise ValueError(
+                "--env.light_jitter and --env.camera_jitter vary nothing in a batched simulation: leave them "
+                "at 0, or choose --env.batched=false"
+            )
+        self._use_assets()
+        scenes = self.selected_scenes()
+        return BatchedSimulation(self._task(), scenes, self._rendering(depth=False), n_envs, device)
+
+    def _use_assets(self) -> None:
+        from lerobot_wmrl.maniskill.assets import use_assets
 
         if self.assets is not None:
             use_assets(self.assets)
-        rendering = Rendering(
+
+    def _rendering(self, depth: bool) -> Any:
+        from lerobot_wmrl.maniskill.rendering import Rendering
+
+        return Rendering(
             tuple(self.cameras), self.image_size, depth,
             self.robot_mesh_detail, self.light_jitter, self.camera_jitter,
         )  # fmt: skip
-        return Simulation(self._task(), self.selected_scenes(), rendering)
 
     def create_envs(
         self, n_envs: int, use_async_envs: bool = False
     ) -> dict[str, dict[int, "gym.vector.VectorEnv"]]:
         """What lerobot-eval asks for: {suite: {task id: environment}}."""
+        if self.runs_batched():
+            from lerobot_wmrl.envs.batched_maniskill_env import BatchedManiSkillEnv
+            from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
+
+            return {self.type: {0: EvaluationAdapter(BatchedManiSkillEnv(self, n_envs, "cuda", False))}}
         from lerobot_wmrl.envs.maniskill_env import make_vector_env
 
         return {self.type: {0: make_vector_env(self, n_envs, use_async_envs, freeze=True)}}
 
     def create_tensor_env(self, n_envs: int, device: str) -> "gym.vector.VectorEnv":
         """The same world with tensors inside, for reinforcement learning."""
+        if self.runs_batched():
+            from lerobot_wmrl.envs.batched_maniskill_env import BatchedManiSkillEnv
+
+            return BatchedManiSkillEnv(self, n_envs, "cuda", restart=True)
         from lerobot_wmrl.envs.maniskill_tensor_env import ManiSkillTensorEnv
 
         return ManiSkillTensorEnv(self, n_envs, device)
+
+    def runs_batched(self) -> bool:
+        """Whether episodes share one simulation on CUDA: `batched`, or by default where SAPIEN can render
+        on it."""
+        if self.batched is not None:
+            return self.batched
+        import torch
+
+        from lerobot_wmrl.maniskill.renderer import render_backend
+
+        return torch.cuda.is_available() and render_backend() == "gpu"

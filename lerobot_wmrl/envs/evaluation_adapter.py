@@ -89,4 +89,4 @@ class EvaluationAdapter(gym.vector.VectorEnv):
         return self.call(name)
 
     def close(self, **kwargs: Any) -> None:
-        """Nothing to release."""
+        self.env.close(**kwargs)

@@ -12,7 +12,7 @@ from lerobot_wmrl.statistics import Proportion
 
 
 class SceneResults:
-    """Which episodes succeeded. An episode is known by its seed and counts once."""
+    """Which episodes succeeded. An episode is known by its seed, and counts when it first ends."""
 
     def __init__(self) -> None:
         self.episodes: dict[int, tuple[Scene, bool]] = {}
@@ -21,7 +21,7 @@ class SceneResults:
         """`info`: `seed`, `scene`, `is_success` of all rows; `ended` (B,) bool marks those that count."""
         for row in np.flatnonzero(ended):
             scene = SCENES[int(info["scene"][row])]
-            self.episodes[int(info["seed"][row])] = (scene, bool(info["is_success"][row]))
+            self.episodes.setdefault(int(info["seed"][row]), (scene, bool(info["is_success"][row])))
 
     def table(self) -> str:
         """One line a scene, then the groups of held-out scenes and all together, with 95 % intervals."""

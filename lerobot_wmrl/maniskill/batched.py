@@ -135,6 +135,10 @@ class BatchedSimulation:
         self.env.step(clipped)
         return self._frame()
 
+    def running(self) -> list[Episode]:
+        """The episodes of all rows, once every row has one."""
+        return [episode for episode in self.episodes if episode is not None]
+
     def object_positions(self) -> Tensor:
         """(B, 3) centres of the objects."""
         every = torch.stack([self.env.objects[name].pose.p for name in self.names], 1)

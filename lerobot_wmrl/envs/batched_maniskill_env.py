@@ -1,0 +1,108 @@
+"""The simulator as one batch on CUDA, behind the tensor interface that the world model has too."""
+
+import logging
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from gymnasium.vector import AutoresetMode
+from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
+from torch import Tensor
+
+from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, EVALUATION_SEED, FPS, STATE_NAMES
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.envs.scene_results import SceneResults
+from lerobot_wmrl.maniskill.batched import BatchedFrame
+from lerobot_wmrl.maniskill.scenes import scene_for_seed
+
+
+class BatchedManiSkillEnv(gym.vector.VectorEnv):
+    """B episodes in one simulation; observations and results as `maniskill_tensor_env.ManiSkillTensorEnv`.
+
+    Args:
+        restart: whether an episode that ended is followed by the next at once (SAME_STEP autoreset, with
+            `final_obs` and `final_info`). Without it, its table is left alone until all are reset, and
+            closing logs the success by scene: what lerobot-eval needs.
+    """
+
+    metadata = {"render_fps": FPS, "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012 (gymnasium's own)
+
+    def __init__(self, config: WmrlManiSkillEnv, n_envs: int, device: str, restart: bool) -> None:
+        self.config, self.num_envs, self.restart = config, n_envs, restart
+        self.scenes, self.results = config.selected_scenes(), SceneResults()
+        self.simulation = config.create_batched_simulation(n_envs, device)
+        self.device, self.max_episode_steps = self.simulation.device, config.horizon
+        self.single_action_space = gym.spaces.Box(
+            np.array(ACTION_LOW, np.float32), np.array(ACTION_HIGH, np.float32)
+        )
+        picture = gym.spaces.Box(0.0, 1.0, (3, config.image_size, config.image_size), np.float32)
+        images = {f"{OBS_IMAGES}.{camera}": picture for camera in config.cameras}
+        state = gym.spaces.Box(-np.inf, np.inf, (len(STATE_NAMES),), np.float32)
+        self.single_observation_space = gym.spaces.Dict({**images, OBS_STATE: state})
+        self.action_space = gym.vector.utils.batch_space(self.single_action_space, n_envs)
+        self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, n_envs)
+
+    def reset(
+        self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Begin B episodes: a seed each, the seeds from an int on, or drawn training seeds."""
+        if isinstance(seed, int):
+            seed = range(seed, seed + self.num_envs)
+        self._rng = np.random.default_rng(None if seed is None else seed[0])
+        frame = self._begin(self._draw(self.num_envs) if seed is None else seed, range(self.num_envs))
+        return self._observation(frame), {}
+
+    def step(self, action: Tensor) -> tuple[dict[str, Any], Tensor, Tensor, Tensor, dict[str, Any]]:
+        """One control step of every episode."""
+        frame = self.simulation.step(action)
+        self._elapsed += 1
+        terminated = frame.success
+        truncated = (self._elapsed >= self.max_episode_steps) & ~terminated
+        observation, reward, info = self._observation(frame), frame.reward, {}
+        ended = terminated | truncated
+        if bool(ended.any()):
+            info = {
+                "final_obs": observation,
+                "final_info": {"is_success": terminated, "episode_length": self._elapsed.clone()},
+            }
+            self._finish(ended, terminated)
+            if self.restart:
+                rows = ended.nonzero()[:, 0].tolist()
+                observation = self._observation(self._begin(self._draw(len(rows)), rows))
+        return observation, reward, terminated, truncated, info
+
+    def close_extras(self, **kwargs: Any) -> None:
+        self.simulation.close()
+        if self.results.episodes and not self.restart:
+            logging.info("Success by scene, n and 95%% interval:\n%s", self.results.table())
+
+    def _draw(self, count: int) -> list[int]:
+        """Training seeds."""
+        return [int(seed) for seed in self._rng.integers(EVALUATION_SEED, size=count)]
+
+    def _begin(self, seeds: Sequence[int], rows: Sequence[int]) -> BatchedFrame:
+        """New episodes in these rows."""
+        if len(rows) == self.num_envs:
+            self._elapsed = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
+        self._elapsed[list(rows)] = 0
+        scenes = [scene_for_seed(self.scenes, seed) for seed in seeds]
+        return self.simulation.reset(scenes, seeds, rows)
+
+    def _finish(self, ended: Tensor, succeeded: Tensor) -> None:
+        episodes = self.simulation.running()
+        columns = {
+            "seed": np.array([episode.seed for episode in episodes]),
+            "scene": np.array([episode.scene.index for episode in episodes]),
+            "is_success": succeeded.cpu().numpy(),
+        }
+        self.results.add(columns, ended.cpu().numpy())
+
+    def _observation(self, frame: BatchedFrame) -> dict[str, Any]:
+        images = {
+            f"{OBS_IMAGES}.{camera}": image.permute(0, 3, 1, 2).float() / 255.0
+            for camera, image in frame.images.items()
+        }
+        instructions = [episode.start.instruction for episode in self.simulation.running()]
+        return {**images, OBS_STATE: frame.state, "task": instructions}
