@@ -22,10 +22,10 @@ TABLE_TOP: Final = -0.001
 MARGIN: Final = 0.01
 """Kept from the container and the object (m), for the follower cuts the corners of a way."""
 
-SPACING: Final = 0.02
+SPACING: Final = 0.03
 """Between two points of a way (m)."""
 
-VIA_TOLERANCE: Final = 0.012
+VIA_TOLERANCE: Final = 0.018
 VIA_PATIENCE: Final = 8
 """Steps after which a point of a way is given up: it takes 2 or 3, and nothing depends on it."""
 
