@@ -1,20 +1,24 @@
-"""Success of the planners by task and kind of trajectory, and where their episodes go.
+"""Success of the planners by task and kind of trajectory, how long they think, and where their episodes go.
 
-    python benchmarks/planner_success.py --episodes=200
+    python benchmarks/planner_success.py --planner=cartesian --episodes=200
 
 Episodes take place in random scenes of both splits, without pictures. Writes docs/results/planners.json, and
 docs/images/workspace.png: where the gripper and the object have been, optimal episodes against the others.
+With --planner=mplib these are planners_mplib.json and workspace_mplib.png.
 """
 
 import argparse
+import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
-from lerobot_dataset_maniskill.planners import TASK_KINDS, follow_plan
+from lerobot_dataset_maniskill.planners import MOTIONS, TASK_KINDS, Motion, follow_plan
 from lerobot_wmrl.files import write_json
 from lerobot_wmrl.maniskill.rendering import Rendering
 from lerobot_wmrl.maniskill.scenes import SCENES
@@ -29,46 +33,60 @@ FIRST_SEED = 2_000_000
 Way = np.ndarray
 
 
-def play(simulation: Simulation, kind: str, seed: int) -> tuple[bool, Way]:
-    """One planned episode: its success, and the way of TCP and object (T, 2, 3)."""
+@dataclass(frozen=True)
+class Measured:
+    """Episodes of one task and kind: successes, positions of TCP and object (N, 2, 3), CPU time of a plan."""
+
+    success: Proportion
+    visited: Way
+    planning_ms: float
+
+    def as_json(self) -> dict[str, Any]:
+        return {**self.success.as_json(), "planning_ms": round(self.planning_ms, 2)}
+
+
+def play(simulation: Simulation, motion: Motion, kind: str, seed: int) -> tuple[bool, Way, float]:
+    """One planned episode: its success, the way of TCP and object (T, 2, 3), and CPU seconds of its plan."""
     rng = np.random.default_rng(seed)
     scene = SCENES[rng.integers(len(SCENES))]
     simulation.reset(scene, seed)
-    start = simulation.current_start
-    follower, way, succeeded = follow_plan(simulation.task.name, scene, start, kind, rng), [], False
+    start, began = simulation.current_start, time.process_time()
+    follower = follow_plan(simulation.task.name, scene, start, kind, rng, motion)
+    planning_s, way, succeeded = time.process_time() - began, [], False
     for _ in range(simulation.task.horizon):
         places = simulation.tcp_position, simulation.object_position
         way.append(np.array(places))
         succeeded = simulation.step(follower.act(*places)).success
         if succeeded:
             break
-    return succeeded, np.array(way)
+    return succeeded, np.array(way), planning_s
 
 
-def measure(episodes: int) -> tuple[dict[str, dict[str, Proportion]], dict[str, dict[str, Way]]]:
-    """Success by task and kind, and all positions, each (N, 2, 3)."""
-    success: dict[str, dict[str, Proportion]] = {}
-    visited: dict[str, dict[str, Way]] = {}
+def measure(planner: str, episodes: int) -> dict[str, dict[str, Measured]]:
+    """By task and kind."""
+    measured: dict[str, dict[str, Measured]] = {}
+    motion = MOTIONS[planner]()
     for name, task in TASKS.items():
         simulation = Simulation(task, SCENES, Rendering(()))
-        success[name], visited[name] = {}, {}
+        measured[name] = {}
         for kind in TASK_KINDS:
             seeds = range(FIRST_SEED, FIRST_SEED + episodes)
-            played = [play(simulation, kind, seed) for seed in tqdm(seeds, desc=f"{name}, {kind}")]
-            success[name][kind] = Proportion(sum(done for done, _ in played), episodes)
-            visited[name][kind] = np.concatenate([way for _, way in played])
+            played = [play(simulation, motion, kind, seed) for seed in tqdm(seeds, desc=f"{name}, {kind}")]
+            done, ways, seconds = zip(*played, strict=True)
+            success = Proportion(sum(done), episodes)
+            measured[name][kind] = Measured(success, np.concatenate(ways), 1e3 * float(np.mean(seconds)))
         simulation.close()
-    return success, visited
+    return measured
 
 
-def draw(visited: dict[str, dict[str, Way]], path: Path) -> None:
+def draw(measured: dict[str, dict[str, Measured]], path: Path) -> None:
     """Seen from above: a row a task, a column a kind; blue the gripper, orange the object."""
-    figure = Figure(figsize=(2.2 * len(TASK_KINDS), 2.2 * len(visited)))
-    panels = figure.subplots(len(visited), len(TASK_KINDS), sharex=True, sharey=True)
-    for row, (task, kinds) in zip(panels, visited.items(), strict=True):
-        for axes, (kind, places) in zip(row, kinds.items(), strict=True):
+    figure = Figure(figsize=(2.2 * len(TASK_KINDS), 2.2 * len(measured)))
+    panels = figure.subplots(len(measured), len(TASK_KINDS), sharex=True, sharey=True)
+    for row, (task, kinds) in zip(panels, measured.items(), strict=True):
+        for axes, (kind, here) in zip(row, kinds.items(), strict=True):
             for which, colour in ((0, "#2b6cb0"), (1, "#dd6b20")):
-                x, y = places[:, which, :2].T
+                x, y = here.visited[:, which, :2].T
                 axes.plot(-y, x, ".", color=colour, markersize=0.6, alpha=0.3)
             axes.set_title(f"{task}: {kind.replace('_', ' ')}", fontsize=8)
             axes.set_aspect("equal")
@@ -84,15 +102,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.add_argument("--planner", choices=MOTIONS, default="cartesian", help="as of lerobot-wmrl-record")
     parser.add_argument("--episodes", type=int, default=200, help="of each task and kind")
     parser.add_argument("--docs", type=Path, default=DOCS, help="folder of results and images")
     given = parser.parse_args(arguments)
-    success, visited = measure(given.episodes)
-    table = {task: {kind: rate.as_json() for kind, rate in row.items()} for task, row in success.items()}
-    write_json(given.docs / "results" / "planners.json", {"first_seed": FIRST_SEED, "success": table})
-    draw(visited, given.docs / "images" / "workspace.png")
-    for task, row in success.items():
-        print(task, *(f"{kind} {rate.k}/{rate.n}" for kind, rate in row.items()))
+    suffix = "" if given.planner == "cartesian" else f"_{given.planner}"
+    measured = measure(given.planner, given.episodes)
+    table = {task: {kind: here.as_json() for kind, here in row.items()} for task, row in measured.items()}
+    content = {"first_seed": FIRST_SEED, "planner": given.planner, "success": table}
+    write_json(given.docs / "results" / f"planners{suffix}.json", content)
+    draw(measured, given.docs / "images" / f"workspace{suffix}.png")
+    for task, row in measured.items():
+        print(task, *(f"{kind} {here.success.k}/{here.success.n}" for kind, here in row.items()))
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from lerobot.configs import parser
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 
+from lerobot_dataset_maniskill.planners import MOTIONS
 from lerobot_wmrl.command import RunConfig
 from lerobot_wmrl.constants import EVALUATION_SEED, KINDS
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
@@ -46,6 +47,9 @@ class RecordConfig(RunConfig):
         env: task, scenes, cameras and image size (--env.type=wmrl_maniskill --env.task=push …).
         depth: record every camera's depth too, as LeRobot's depth maps (observation.images.<camera>_depth).
         kinds: share of each trajectory kind (planned trajectories only).
+        planner: how the gripper gets from one waypoint of a planned trajectory to the next. cartesian: in
+            straight lines. mplib: as MPLib plans it in joint space, around the table, the container and,
+            before it is to be touched, the object.
         num_workers: simulating processes.
         shard: i/n records every n-th sub-dataset from the i-th (from 0) on, for n machines.
         merge_shards: folders of all shards: put them together as output_dir, and stop.
@@ -68,6 +72,7 @@ class RecordConfig(RunConfig):
     env: EnvConfig = field(default_factory=WmrlManiSkillEnv)
     depth: bool = False
     kinds: dict[str, float] = field(default_factory=default_kinds)
+    planner: str = "cartesian"
     num_workers: int = 2
     part_episodes: int = 20
     shard: str = "0/1"
@@ -103,6 +108,8 @@ class RecordConfig(RunConfig):
             )
         if self.shard_of[1] > -(-self.num_episodes // self.part_episodes):
             raise ValueError(f"--shard={self.shard}: there are fewer sub-datasets than shards")
+        if self.planner not in MOTIONS:
+            raise ValueError(f"--planner={self.planner}: unknown; choose one of {', '.join(MOTIONS)}")
         self._validate_kinds()
         if self.push_to_hub:
             self._validate_publishing()
@@ -181,6 +188,7 @@ class RecordConfig(RunConfig):
             "shard": list(self.shard_of),
             "seed": self.seed,
             "kinds": self.kinds if self.policy is None else {POLICY_KIND: 1.0},
+            "planner": self.planner if self.policy is None else None,
             "policy": None if self.policy is None else str(self.policy.pretrained_path),
             "exploration": self.exploration,
         }

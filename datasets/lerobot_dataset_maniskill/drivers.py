@@ -7,7 +7,7 @@ import torch
 from lerobot.configs.policies import PreTrainedConfig
 
 from lerobot_dataset_maniskill.manifest import EpisodePlan
-from lerobot_dataset_maniskill.planners import follow_plan
+from lerobot_dataset_maniskill.planners import MOTIONS, follow_plan
 from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, KINDS
 from lerobot_wmrl.maniskill.simulation import Frame, Simulation
 from lerobot_wmrl.policy_checkpoints import load_policy, load_processors
@@ -30,12 +30,15 @@ class Driver(Protocol):
 
 
 class PlannerDriver:
-    """Follows a scripted plan that depends on the episode's seed and kind only."""
+    """Follows a plan that depends on the episode's seed and kind only, by one of `planners.MOTIONS`."""
+
+    def __init__(self, planner: str) -> None:
+        self.motion = MOTIONS[planner]()
 
     def begin(self, simulation: Simulation, plan: EpisodePlan) -> None:
         rng = np.random.default_rng((plan.seed, KINDS.index(plan.kind), simulation.task.index))
         start = simulation.current_start
-        self.follower = follow_plan(simulation.task.name, plan.scene, start, plan.kind, rng)
+        self.follower = follow_plan(simulation.task.name, plan.scene, start, plan.kind, rng, self.motion)
 
     def act(self, simulation: Simulation, frame: Frame) -> np.ndarray:
         return self.follower.act(simulation.tcp_position, simulation.object_position)

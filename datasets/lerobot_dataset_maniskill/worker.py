@@ -41,7 +41,9 @@ class PartRecorder:
         self.config, self.folder = config, folder
         self.simulation = env.create_simulation(config.depth)
         self.driver: Driver = (
-            PlannerDriver() if config.policy is None else PolicyDriver(config.policy, config.exploration)
+            PlannerDriver(config.planner)
+            if config.policy is None
+            else PolicyDriver(config.policy, config.exploration)
         )
 
     def record(self, part: Part, report: Report) -> None:

@@ -58,6 +58,7 @@ def test_every_task_meets_every_scene_and_a_short_recording_has_every_task(scene
         ({"num_workers": 0}, "--num_workers=0"),
         ({"kinds": {"perfect": 1.0}}, "--kinds="),
         ({"kinds": {"optimal": 0.0}}, "--kinds="),
+        ({"planner": "rrt"}, "--planner=rrt: unknown; choose one of cartesian, mplib"),
         ({"env": WmrlManiSkillEnv(task="juggle")}, "task='juggle'"),
         ({"tasks": ["push", "juggle"]}, "task='juggle'"),
         ({"env": WmrlManiSkillEnv(scenes=[99])}, r"scenes=\[99\]"),

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from lerobot_dataset_maniskill.planners import PLANNERS, TASK_KINDS, Follower, Planner, follow_plan
+from lerobot_dataset_maniskill.planners import MOTIONS, PLANNERS, TASK_KINDS, Follower, Planner, follow_plan
 from lerobot_dataset_maniskill.planners.follower import CLOSED, OPEN, OPTIMAL_SPEED, Noise, Plan, Waypoint
 from lerobot_dataset_maniskill.planners.kinds import FINGER_HALF_THICKNESS
 from lerobot_dataset_maniskill.planners.play import PLAY_STEPS
@@ -157,12 +157,13 @@ def test_play_goes_on_and_moves_the_object_about(blind: Simulation) -> None:
     assert np.mean([np.abs(way[-1, :2]).max() < 0.3 for way in ways]) >= 0.75
 
 
-def succeeds(simulation: Simulation, kind: str, seed: int) -> bool:
+def succeeds(simulation: Simulation, kind: str, seed: int, planner: str = "cartesian") -> bool:
     """Play the planned episode in the simulator."""
     rng = np.random.default_rng(seed)
     scene = SCENES[rng.integers(len(SCENES))]
     simulation.reset(scene, seed)
-    follower = follow_plan(simulation.task.name, scene, simulation.current_start, kind, rng)
+    motion = MOTIONS[planner]()
+    follower = follow_plan(simulation.task.name, scene, simulation.current_start, kind, rng, motion)
     for _ in range(simulation.task.horizon):
         action = follower.act(simulation.tcp_position, simulation.object_position)
         if simulation.step(action).success:
@@ -176,3 +177,7 @@ def test_optimal_plans_succeed_and_near_misses_mostly_fail(blind: Simulation) ->
     near_misses = sum(succeeds(blind, "near_miss", seed) for seed in range(30))
     assert optimal >= 39
     assert 1 <= near_misses <= 20
+
+
+def test_optimal_plans_of_mplib_succeed(blind: Simulation) -> None:
+    assert all(succeeds(blind, "optimal", seed, "mplib") for seed in range(5))

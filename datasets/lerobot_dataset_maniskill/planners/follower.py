@@ -29,6 +29,7 @@ class Waypoint:
         dwell: steps to stay once there, for the fingers to close or open.
         aim: replaces `position` by one that depends on the object's present place; never reached.
         patience: steps after which it is given up.
+        clear: whether the way there is to keep clear of the object.
     """
 
     position: np.ndarray
@@ -37,6 +38,7 @@ class Waypoint:
     dwell: int = 0
     aim: Aim | None = None
     patience: int | None = None
+    clear: bool = False
 
 
 @dataclass(frozen=True)

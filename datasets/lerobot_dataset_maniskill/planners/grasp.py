@@ -1,6 +1,7 @@
 """Grasping from above along y, where every object is narrow enough for the gripper."""
 
 from abc import abstractmethod
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -52,7 +53,7 @@ class GraspPlanner(Planner):
         xy = self.start.object_xy + offset
         low = self.grasp_height if height is None else height
         return (
-            Waypoint(over(xy, self.top + ABOVE), 0.015, OPEN),
+            Waypoint(over(xy, self.top + ABOVE), 0.015, OPEN, clear=True),
             Waypoint(over(xy, low), 0.007, OPEN),
             Waypoint(over(xy, low), 0.02, CLOSED, dwell=CLOSING_STEPS),
         )
@@ -73,7 +74,7 @@ class GraspPlanner(Planner):
             return (*self.grasp(height=self.top + rng.uniform(-0.004, 0.03)), *delivery)
         if form == 2:
             high, low, close = self.grasp()
-            return (Waypoint(high.position, 0.015), Waypoint(low.position, 0.03), close, *delivery)
+            return (replace(high, gripper=CLOSED), Waypoint(low.position, 0.03), close, *delivery)
         if form == 3:
             return (*self.grasp()[:-1], *delivery)
         return (*self.grasp(), *self.deliver(self.beside_target(rng)))

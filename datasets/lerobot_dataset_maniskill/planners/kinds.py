@@ -76,7 +76,7 @@ class Planner(ABC):
     def waypoint(self, rng: np.random.Generator) -> Waypoints:
         """An unrelated waypoint first, then the essential ones."""
         essential = jittered(self.essential(), rng, 0.006)
-        return (Waypoint(self.detour(rng), 0.025, essential[0].gripper), *essential)
+        return (Waypoint(self.detour(rng), 0.025, essential[0].gripper, clear=True), *essential)
 
     def interpolated(self, rng: np.random.Generator) -> Waypoints:
         """New points between the start and the essential waypoints, each moved off the straight line."""
@@ -84,7 +84,7 @@ class Planner(ABC):
         first = self.start.tcp
         for waypoint in self.essential():
             between = first + rng.uniform(0.3, 0.7) * (waypoint.position - first) + rng.normal(0.0, 0.013, 3)
-            points += [Waypoint(above_table(between), 0.02, waypoint.gripper), waypoint]
+            points += [replace(waypoint, position=above_table(between), tolerance=0.02, dwell=0), waypoint]
             first = waypoint.position
         return tuple(points)
 

@@ -41,11 +41,12 @@ class SlidePlanner(Planner):
 
     def approach(self, sideways: float = 0.0, height: float | None = None) -> Waypoints:
         """To the place behind the object."""
-        behind = Waypoint(self.at(-BEHIND, sideways, height), 0.016)
+        behind = Waypoint(self.at(-BEHIND, sideways, height), 0.016, clear=True)
         if not self.over_it:
             return (behind,)
         clear = 2.0 * self.spec.half_size[2] + CLEARANCE
-        return (Waypoint(self.at(-BEHIND, sideways, max(clear, behind.position[2])), 0.02), behind)
+        above = self.at(-BEHIND, sideways, max(clear, behind.position[2]))
+        return (Waypoint(above, 0.02, clear=True), behind)
 
     def essential(self) -> Waypoints:
         return (*self.approach(), Waypoint(self.at(self.task.distance + MARGIN), 0.006))
