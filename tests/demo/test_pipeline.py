@@ -80,7 +80,7 @@ def test_a_stage_ends_when_the_demo_is_stopped(sign: signal.Signals, tmp_path: P
     process = subprocess.Popen([sys.executable, "-c", runner], stdout=subprocess.DEVNULL)
     wait_until(lambda: pid_file.exists() and pid_file.read_text() != "")
     process.send_signal(sign)
-    process.wait(15)
+    process.wait(30)  # 15 if the stage has to be killed
     wait_until(lambda: tree_memory(int(pid_file.read_text())) == 0)
 
 
