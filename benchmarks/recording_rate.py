@@ -2,7 +2,8 @@
 
     python benchmarks/recording_rate.py
 
-All tasks, two cameras of 128x128 pixels, video encoding included; starting the processes is not. Writes
+All tasks, two cameras of 128x128 pixels, video encoding and a dataset for every
+episode included; starting the processes is not. Writes
 docs/results/recording_rate.json.
 """
 
@@ -47,8 +48,9 @@ def kind_rate(kind: str, episodes: int) -> float:
             if index == WARM_UP:
                 began = time.perf_counter()
             process.record(part, lambda result: None)
+        seconds = time.perf_counter() - began
         process.simulation.close()
-    return 60 * episodes / (time.perf_counter() - began)
+    return 60 * episodes / seconds
 
 
 def worker_rate(workers: int, episodes: int) -> float:

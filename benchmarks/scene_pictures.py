@@ -19,6 +19,7 @@ from lerobot_wmrl.maniskill.rendering import Rendering
 from lerobot_wmrl.maniskill.scenes import SCENES, Scene
 from lerobot_wmrl.maniskill.simulation import Simulation
 from lerobot_wmrl.maniskill.tasks import TASKS
+from lerobot_wmrl.strips import evenly_spaced, in_a_row
 
 IMAGES = Path(__file__).parents[1] / "docs" / "images"
 IMAGE_SIZE = 160
@@ -66,7 +67,7 @@ def episode(simulation: Simulation, scene: Scene, kind: str, seed: int) -> np.nd
 
 def strip(frames: np.ndarray) -> np.ndarray:
     """A few evenly spaced frames beside each other."""
-    return np.concatenate(list(frames[np.linspace(0, len(frames) - 1, STRIP_FRAMES).astype(int)]), 1)
+    return in_a_row(frames[evenly_spaced(len(frames), STRIP_FRAMES)])
 
 
 def main() -> None:

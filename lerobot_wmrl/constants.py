@@ -3,7 +3,7 @@
 from typing import Final
 
 ROBOT_MESH_DETAIL: Final = 0.04
-"""Share of the robot's triangles that are drawn: three times faster, and the same picture at 64 pixels."""
+"""Share of the robot's triangles that are drawn: three times faster, the same picture at 64 and 128 px."""
 
 IMAGE_SIZE: Final = 128
 """Pixels of each side of a picture, unless told otherwise."""

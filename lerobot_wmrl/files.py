@@ -3,8 +3,12 @@
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from errno import EACCES, EDQUOT, EFBIG, ENOSPC, EPERM, EROFS
 from pathlib import Path
 from typing import Any
+
+NOT_WRITABLE = (EACCES, EDQUOT, EFBIG, ENOSPC, EPERM, EROFS)
+"""What the system says of a disk that is full or must not be written."""
 
 
 def write_text(path: Path, text: str) -> None:
@@ -23,10 +27,12 @@ def foreign_files(folder: Path, *own: str) -> bool:
 
 @contextmanager
 def writing(flag: str, folder: Path) -> Iterator[None]:
-    """ValueError that names `flag` and the remedy if a file below `folder` cannot be written."""
+    """ValueError that names `flag` and the remedy if the disk is full or must not be written."""
     try:
         yield
     except OSError as error:
+        if error.errno not in NOT_WRITABLE:
+            raise
         raise ValueError(
             f"--{flag}={folder}: cannot be written ({error}); make room or choose another folder. "
             "The same command continues: nothing that was finished is lost"

@@ -133,6 +133,11 @@ class RecordConfig(RunConfig):
                 f"--push_to_hub=true: the dataset is called {self.dataset_id}; "
                 "give its name on the hub, --repo_id=user/name"
             )
+        if self.shard_of[1] > 1 and not self.merge_shards:
+            raise ValueError(
+                f"--push_to_hub=true: --shard={self.shard} is only a part; record all shards, then publish "
+                "with --merge_shards"
+            )
         try:
             validate_repo_id(self.dataset_id)
         except HFValidationError as error:
@@ -180,7 +185,7 @@ class RecordConfig(RunConfig):
             "depth": self.depth,
             "light_jitter": env.light_jitter,
             "camera_jitter": env.camera_jitter,
-            "assets": None if env.assets is None else str(env.assets),
+            "assets": env.described_assets(),
             "episode_length": env.episode_length,
             "robot_mesh_detail": env.robot_mesh_detail,
             "num_episodes": self.num_episodes,

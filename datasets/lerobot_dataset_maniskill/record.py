@@ -5,6 +5,7 @@ from huggingface_hub import HfApi
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.recipe_files import expand_recipes
 from lerobot_wmrl.command import run_command
+from lerobot_wmrl.files import writing
 from lerobot_wmrl.maniskill.scenes import describe_scenes
 
 
@@ -21,7 +22,8 @@ def run(config: RecordConfig) -> None:
     silence_libraries()
     if config.merge_shards:
         config.validate()
-        merge_shards(config.merge_shards, config.root, config.dataset_id)
+        with writing("output_dir", config.root):
+            merge_shards(config.merge_shards, config.root, config.dataset_id)
     else:
         record(config)
     if config.push_to_hub:

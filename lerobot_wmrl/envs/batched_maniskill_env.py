@@ -1,6 +1,5 @@
 """The simulator as one batch on CUDA, behind the tensor interface that the world model has too."""
 
-import logging
 from collections.abc import Sequence
 from typing import Any
 
@@ -34,6 +33,8 @@ class BatchedManiSkillEnv(gym.vector.VectorEnv):
         self.scenes, self.results = config.selected_scenes(), SceneResults()
         self.simulation = config.create_batched_simulation(n_envs, device)
         self.device, self.max_episode_steps = self.simulation.device, config.horizon
+        self._elapsed = torch.zeros(n_envs, dtype=torch.long, device=self.device)
+        self._rng = np.random.default_rng()
         self.single_action_space = gym.spaces.Box(
             np.array(ACTION_LOW, np.float32), np.array(ACTION_HIGH, np.float32)
         )
@@ -50,7 +51,8 @@ class BatchedManiSkillEnv(gym.vector.VectorEnv):
         """Begin B episodes: a seed each, the seeds from an int on, or drawn training seeds."""
         if isinstance(seed, int):
             seed = range(seed, seed + self.num_envs)
-        self._rng = np.random.default_rng(None if seed is None else seed[0])
+        if seed is not None:
+            self._rng = np.random.default_rng(seed[0])
         frame = self._begin(self._draw(self.num_envs) if seed is None else seed, range(self.num_envs))
         return self._observation(frame), {}
 
@@ -67,16 +69,16 @@ class BatchedManiSkillEnv(gym.vector.VectorEnv):
                 "final_obs": observation,
                 "final_info": {"is_success": terminated, "episode_length": self._elapsed.clone()},
             }
-            self._finish(ended, terminated)
             if self.restart:
                 rows = ended.nonzero()[:, 0].tolist()
                 observation = self._observation(self._begin(self._draw(len(rows)), rows))
+            else:
+                self._count(ended, terminated)
         return observation, reward, terminated, truncated, info
 
     def close_extras(self, **kwargs: Any) -> None:
         self.simulation.close()
-        if self.results.episodes and not self.restart:
-            logging.info("Success by scene, n and 95%% interval:\n%s", self.results.table())
+        self.results.log()
 
     def _draw(self, count: int) -> list[int]:
         """Training seeds."""
@@ -84,14 +86,12 @@ class BatchedManiSkillEnv(gym.vector.VectorEnv):
 
     def _begin(self, seeds: Sequence[int], rows: Sequence[int]) -> BatchedFrame:
         """New episodes in these rows."""
-        if len(rows) == self.num_envs:
-            self._elapsed = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
         self._elapsed[list(rows)] = 0
         scenes = [scene_for_seed(self.scenes, seed) for seed in seeds]
         return self.simulation.reset(scenes, seeds, rows)
 
-    def _finish(self, ended: Tensor, succeeded: Tensor) -> None:
-        episodes = self.simulation.running()
+    def _count(self, ended: Tensor, succeeded: Tensor) -> None:
+        episodes = self.simulation.episodes
         columns = {
             "seed": np.array([episode.seed for episode in episodes]),
             "scene": np.array([episode.scene.index for episode in episodes]),
@@ -104,5 +104,5 @@ class BatchedManiSkillEnv(gym.vector.VectorEnv):
             f"{OBS_IMAGES}.{camera}": image.permute(0, 3, 1, 2).float() / 255.0
             for camera, image in frame.images.items()
         }
-        instructions = [episode.start.instruction for episode in self.simulation.running()]
+        instructions = [episode.start.instruction for episode in self.simulation.episodes]
         return {**images, OBS_STATE: frame.state, "task": instructions}

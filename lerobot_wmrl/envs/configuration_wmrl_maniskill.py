@@ -135,6 +135,14 @@ class WmrlManiSkillEnv(EnvConfig):
         scenes = self.selected_scenes()
         return BatchedSimulation(self._task(), scenes, self._rendering(depth=False), n_envs, device)
 
+    def described_assets(self) -> dict[str, Any] | None:
+        """What the user's own meshes are, without where they lie; None if there are none."""
+        if self.assets is None:
+            return None
+        from lerobot_wmrl.maniskill.assets import describe_assets
+
+        return describe_assets(self.assets)
+
     def _use_assets(self) -> None:
         from lerobot_wmrl.maniskill.assets import use_assets
 
@@ -153,7 +161,7 @@ class WmrlManiSkillEnv(EnvConfig):
         self, n_envs: int, use_async_envs: bool = False
     ) -> dict[str, dict[int, "gym.vector.VectorEnv"]]:
         """What lerobot-eval asks for: {suite: {task id: environment}}."""
-        if self.runs_batched():
+        if self.runs_batched("cuda"):
             from lerobot_wmrl.envs.batched_maniskill_env import BatchedManiSkillEnv
             from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
 
@@ -163,22 +171,25 @@ class WmrlManiSkillEnv(EnvConfig):
         return {self.type: {0: make_vector_env(self, n_envs, use_async_envs, freeze=True)}}
 
     def create_tensor_env(self, n_envs: int, device: str) -> "gym.vector.VectorEnv":
-        """The same world with tensors inside, for reinforcement learning."""
-        if self.runs_batched():
+        """The same world with tensors on `device` inside, for reinforcement learning."""
+        if self.runs_batched(device):
             from lerobot_wmrl.envs.batched_maniskill_env import BatchedManiSkillEnv
 
-            return BatchedManiSkillEnv(self, n_envs, "cuda", restart=True)
+            return BatchedManiSkillEnv(self, n_envs, device, restart=True)
         from lerobot_wmrl.envs.maniskill_tensor_env import ManiSkillTensorEnv
 
         return ManiSkillTensorEnv(self, n_envs, device)
 
-    def runs_batched(self) -> bool:
-        """Whether episodes share one simulation on CUDA: `batched`, or by default where SAPIEN can render
-        on it."""
-        if self.batched is not None:
-            return self.batched
+    def runs_batched(self, device: str) -> bool:
+        """Whether episodes share one simulation on `device`: where SAPIEN can render on CUDA, unless told
+        otherwise. ValueError if they are to and cannot."""
         import torch
 
         from lerobot_wmrl.maniskill.renderer import render_backend
 
-        return torch.cuda.is_available() and render_backend() == "gpu"
+        possible = device.startswith("cuda") and torch.cuda.is_available() and render_backend() == "gpu"
+        if self.batched and not possible:
+            raise ValueError(
+                f"--env.batched=true: SAPIEN cannot simulate and render on {device} here; leave the flag out"
+            )
+        return possible if self.batched is None else self.batched

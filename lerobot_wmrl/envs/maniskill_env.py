@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from lerobot.envs.utils import FreezeAfterEpisodeEnd
 
 from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, EVALUATION_SEED, FPS, STATE_NAMES
@@ -105,10 +105,13 @@ def make_vector_env(
 ) -> gym.vector.VectorEnv:
     """`n_envs` environments with SAME_STEP autoreset, in processes of their own if `use_async_envs`.
 
-    They log the success by scene when they are closed.
+    With `freeze`, as lerobot-eval wants it, they log the success by scene when they are closed.
     """
     factories = [partial(make_env, config, freeze)] * n_envs
     if use_async_envs and n_envs > 1:
         context = simulating_context().get_start_method()
-        return CountingAsyncVectorEnv(factories, context=context, autoreset_mode=AutoresetMode.SAME_STEP)
-    return CountingSyncVectorEnv(factories, autoreset_mode=AutoresetMode.SAME_STEP)
+        kind = CountingAsyncVectorEnv if freeze else AsyncVectorEnv
+        return kind(factories, context=context, autoreset_mode=AutoresetMode.SAME_STEP)
+    return (CountingSyncVectorEnv if freeze else SyncVectorEnv)(
+        factories, autoreset_mode=AutoresetMode.SAME_STEP
+    )

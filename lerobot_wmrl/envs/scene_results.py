@@ -1,4 +1,7 @@
-"""Success by scene, which lerobot-eval does not report: the environments count, and say it at the end."""
+"""Success by scene, which lerobot-eval does not report: the environments count, and say it at the end.
+
+They count whole batches, of which lerobot-eval leaves out what is beyond its number of episodes.
+"""
 
 import logging
 from collections.abc import Mapping
@@ -22,6 +25,11 @@ class SceneResults:
         for row in np.flatnonzero(ended):
             scene = SCENES[int(info["scene"][row])]
             self.episodes.setdefault(int(info["seed"][row]), (scene, bool(info["is_success"][row])))
+
+    def log(self) -> None:
+        """Say it, if there was an episode."""
+        if self.episodes:
+            logging.info("Success by scene, of all %d episodes:\n%s", len(self.episodes), self.table())
 
     def table(self) -> str:
         """One line a scene, then the groups of held-out scenes and all together, with 95 % intervals."""
@@ -69,8 +77,7 @@ class _Counting:
 
     def close_extras(self, **kwargs: Any) -> None:
         super().close_extras(**kwargs)  # type: ignore[misc]
-        if self.results.episodes:
-            logging.info("Success by scene, n and 95%% interval:\n%s", self.results.table())
+        self.results.log()
 
 
 class CountingSyncVectorEnv(_Counting, SyncVectorEnv):

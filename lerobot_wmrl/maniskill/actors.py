@@ -34,13 +34,16 @@ def render_material(colour: Colour) -> Any:
     return sapien.render.RenderMaterial(base_color=[*colour, 1.0], roughness=0.9, specular=0.1, metallic=0.0)
 
 
-def build_object(scene: Any, spec: ObjectSpec) -> Any:
-    """A dynamic actor of `spec` in a ManiSkill scene. What is round collides as its convex hull."""
+def build_object(scene: Any, spec: ObjectSpec, place: sapien.Pose) -> Any:
+    """A dynamic actor of `spec` at `place` in a ManiSkill scene. What is round collides as its convex hull.
+
+    No two actors are to be built in one place: physics on CUDA starts by looking for contacts.
+    """
     builder = scene.create_actor_builder()
     surface = sapien.physx.PhysxMaterial(OBJECT_FRICTION, OBJECT_FRICTION, 0.0)
     material = render_material(spec.colour)
     radius, _, half_z = spec.half_size
-    builder.initial_pose = sapien.Pose(p=[0, 0, half_z])
+    builder.initial_pose = place
     if spec.shape == "box":
         builder.add_box_collision(half_size=spec.half_size, material=surface, density=spec.density)
         builder.add_box_visual(half_size=spec.half_size, material=material)
@@ -67,14 +70,14 @@ def build_object(scene: Any, spec: ObjectSpec) -> Any:
         return builder.build(name=spec.name)
 
 
-def build_container(scene: Any, spec: ContainerSpec) -> Any:
+def build_container(scene: Any, spec: ContainerSpec, place: sapien.Pose) -> Any:
     """A kinematic actor of `spec`: a floor to lie on and a ring of tilted boxes as its wall."""
     builder = scene.create_actor_builder()
     floor = sapien.Pose(p=[0, 0, BOWL_WALL / 2], q=UPRIGHT)
     builder.add_cylinder_collision(floor, FLOOR_SHARE * spec.radius, BOWL_WALL / 2)
     for pose, half_size in wall_boxes(spec):
         builder.add_box_collision(pose, half_size=half_size)
-    builder.initial_pose = sapien.Pose()
+    builder.initial_pose = place
     with _files([container_mesh(spec)]) as files:
         builder.add_visual_from_file(files[0], material=render_material(spec.colour))
         return builder.build_kinematic(name=spec.name)
@@ -96,23 +99,22 @@ def wall_boxes(spec: ContainerSpec) -> Iterator[tuple[Any, list[float]]]:
         yield sapien.Pose(p=place, q=turn), half_size
 
 
-def build_carpet(scene: Any) -> Any:
+def build_carpet(scene: Any, place: sapien.Pose) -> Any:
     """The mat of move_to_aim: only seen, so that nothing catches on its edge."""
     builder = scene.create_actor_builder()
     pose = sapien.Pose(p=[0, 0, CARPET_THICKNESS / 2], q=UPRIGHT)
     builder.add_cylinder_visual(pose, CARPET_RADIUS, CARPET_THICKNESS / 2, render_material(CARPET_COLOUR))
-    builder.initial_pose = sapien.Pose()
+    builder.initial_pose = place
     return builder.build_kinematic(name="carpet")
 
 
-def build_table(scene: Any, name: str) -> Any:
-    """The table: one box whose top is z = 0, in one plain colour."""
+def build_table(scene: Any, name: str, place: sapien.Pose) -> Any:
+    """The table: one box, in one plain colour. Its top is 5 cm above `place`."""
     half_size = (0.9, 1.2, 0.05)
-    pose = sapien.Pose(p=[-0.1, 0, -half_size[2]])
     builder = scene.create_actor_builder()
     builder.add_box_collision(half_size=half_size)
     builder.add_box_visual(half_size=half_size, material=render_material(TABLES[name]))
-    builder.initial_pose = pose
+    builder.initial_pose = place
     return builder.build_kinematic(name=f"table_{name}")
 
 

@@ -1,6 +1,7 @@
 """A user's own meshes (YCB or others) in place of the objects made by code."""
 
 import difflib
+import hashlib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -12,8 +13,8 @@ import yaml
 from lerobot_wmrl.maniskill.objects import OBJECTS, MeshFile, ObjectSpec
 
 KEYS: Final = ("mesh", "label", "scale", "density")
-GRIPPER_WIDTH: Final = 0.08
-"""What the fingers can take hold of, and a little less is needed to do so (m)."""
+WIDEST: Final = 0.072
+"""What the fingers, which open 8 cm, can get around (m)."""
 
 LOWEST: Final = 0.02
 """An object must be so high (m) for a closed gripper to push it."""
@@ -39,12 +40,26 @@ def read_assets(path: Path) -> dict[str, ObjectSpec]:
     return {name: _specification(path, str(name), entry) for name, entry in content.items()}
 
 
+def describe_assets(path: Path) -> dict[str, dict[str, Any]]:
+    """What decides what the episodes look like, wherever the files lie: JSON values, by object name."""
+    described = {}
+    for name, spec in read_assets(path).items():
+        assert spec.mesh is not None
+        described[name] = {
+            "label": spec.label, "density": spec.density, "half_size": [round(x, 6) for x in spec.half_size],
+            "scale": spec.mesh.scale, "sha256": hashlib.sha256(Path(spec.mesh.path).read_bytes()).hexdigest(),
+        }  # fmt: skip
+    return described
+
+
 def _specification(path: Path, name: str, entry: dict[str, Any]) -> ObjectSpec:
     _check_name(path, "object", name, tuple(OBJECTS))
     for key in entry:
         _check_name(path, f"key of {name}", str(key), KEYS)
-    file = path.parent / str(entry.get("mesh", ""))
-    scale = float(entry.get("scale", 1.0))
+    if "mesh" not in entry:
+        raise ValueError(f"--env.assets={path}: {name} has no mesh; add `mesh: its file`")
+    file = path.parent / str(entry["mesh"])
+    scale, density = (_positive(path, name, entry, *pair) for pair in (("scale", 1.0), ("density", 500.0)))
     try:
         low, high = scale * np.asarray(trimesh.load(file, force="mesh").bounds)
     except Exception as error:  # whatever a mesh format's reader raises
@@ -55,8 +70,15 @@ def _specification(path: Path, name: str, entry: dict[str, Any]) -> ObjectSpec:
     return replace(
         OBJECTS[name], shape="mesh", half_size=tuple(half_size.tolist()),
         mesh=MeshFile(str(file.resolve()), scale, tuple(centre.tolist())),
-        label=str(entry.get("label", OBJECTS[name].label)), density=float(entry.get("density", 500.0)),
+        label=str(entry.get("label", OBJECTS[name].label)), density=density,
     )  # fmt: skip
+
+
+def _positive(path: Path, name: str, entry: dict[str, Any], key: str, default: float) -> float:
+    value = entry.get(key, default)
+    if not isinstance(value, int | float) or not 0 < value < np.inf:
+        raise ValueError(f"--env.assets={path}: {name}.{key}={value!r} must be a number above 0")
+    return float(value)
 
 
 def _check_name(path: Path, what: str, name: str, known: tuple[str, ...]) -> None:
@@ -69,11 +91,11 @@ def _check_name(path: Path, what: str, name: str, known: tuple[str, ...]) -> Non
 
 def _check_size(path: Path, name: str, half_size: np.ndarray, scale: float) -> None:
     width, height = 2 * half_size[1], 2 * half_size[2]
-    if width > GRIPPER_WIDTH:
-        fitting = scale * 0.9 * GRIPPER_WIDTH / width
+    if width > WIDEST:
         raise ValueError(
-            f"--env.assets={path}: {name} is {100 * width:.1f} cm wide along y, more than the gripper opens "
-            f"({100 * GRIPPER_WIDTH:.0f} cm); turn the mesh, or set its scale to at most {fitting:.3g}"
+            f"--env.assets={path}: {name} is {100 * width:.1f} cm wide along y, more than the gripper gets "
+            f"around ({100 * WIDEST:.1f} cm); turn the mesh, or set its scale to at most "
+            f"{scale * WIDEST / width:.3g}"
         )
     if height < LOWEST:
         raise ValueError(

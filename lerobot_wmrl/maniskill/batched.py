@@ -14,19 +14,23 @@ from mani_skill.utils.structs.pose import Pose
 from torch import Tensor
 
 from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, WORKSPACE_FLOOR
+from lerobot_wmrl.maniskill.objects import OBJECTS
 from lerobot_wmrl.maniskill.renderer import render_backend
 from lerobot_wmrl.maniskill.rendering import Rendering
 from lerobot_wmrl.maniskill.robot import GRIPPER_OPEN
 from lerobot_wmrl.maniskill.scenes import Scene
 from lerobot_wmrl.maniskill.simulation import Episode
 from lerobot_wmrl.maniskill.tabletop import TabletopEnv, arrangement
-from lerobot_wmrl.maniskill.tasks import Task
+from lerobot_wmrl.maniskill.tasks import Situation, Task
 
 SHELF = -6.0
 """Height (m) at which objects that no episode needs lie on a shelf, further down than a camera sees."""
 
 SHELF_HALF_SIZE = (1.0, 1.0, 0.05)
 SHELF_SPACING = 0.35
+SHELF_GAP = 0.01
+"""Objects are put so far above the shelf (m)."""
+
 CELLAR = -9.0
 """Height (m) below which tables, containers and mats that no episode needs hang."""
 
@@ -40,10 +44,19 @@ class BatchedTabletopEnv(TabletopEnv):
         builder.add_box_collision(half_size=SHELF_HALF_SIZE)
         builder.initial_pose = sapien.Pose(p=[0.0, 0.0, SHELF - SHELF_HALF_SIZE[2]])
         builder.build_static(name="shelf")
-        self.parking = _parking([*self.objects], [*self.tables, *self.containers, *self.carpets])
 
-    def place_rows(self, rows: Sequence[int], episodes: Sequence["Episode"]) -> None:
-        """Put what the episodes need on the tables `rows`, at rest, and everything else away."""
+    def parking_places(self, movable: Sequence[str], fixed: Sequence[str]) -> dict[str, sapien.Pose]:
+        """Objects lie on the shelf, everything else hangs below it."""
+        side = int(np.ceil(np.sqrt(len(movable))))
+        offset = SHELF_SPACING * (side - 1) / 2
+        places = {name: sapien.Pose(p=[0.0, 0.0, CELLAR - index]) for index, name in enumerate(fixed)}
+        for index, name in enumerate(movable):
+            x, y = (SHELF_SPACING * cell - offset for cell in divmod(index, side))
+            places[name] = sapien.Pose(p=[x, y, SHELF + OBJECTS[name].half_size[2] + SHELF_GAP])
+        return places
+
+    def place_rows(self, rows: Sequence[int], episodes: Sequence[Episode]) -> None:
+        """Put what the episodes need on the tables `rows` (ascending), at rest, and everything else away."""
         self.scene._reset_mask = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self.scene._reset_mask[list(rows)] = True
         layouts = [arrangement(episode.scene, episode.start) for episode in episodes]
@@ -67,19 +80,6 @@ class BatchedTabletopEnv(TabletopEnv):
             self.scene._gpu_fetch_all()
 
 
-def _parking(lying: Sequence[str], hanging: Sequence[str]) -> dict[str, sapien.Pose]:
-    """Where each thing is when no episode needs it: what falls on the shelf, what does not below it."""
-    side = int(np.ceil(np.sqrt(len(lying))))
-    offset = SHELF_SPACING * (side - 1) / 2
-    places = {
-        name: sapien.Pose(
-            p=[SHELF_SPACING * (i % side) - offset, SHELF_SPACING * (i // side) - offset, SHELF + 0.05]
-        )
-        for i, name in enumerate(lying)
-    }
-    return places | {name: sapien.Pose(p=[0.0, 0.0, CELLAR - i]) for i, name in enumerate(hanging)}
-
-
 @dataclass(frozen=True)
 class BatchedFrame:
     """What is known at one control step of B episodes: images camera → (B, H, W, 3) uint8 and state (B, 8),
@@ -97,25 +97,30 @@ class BatchedSimulation:
     Args:
         task, scenes, rendering: as there; light and cameras do not vary here.
         num_envs: B; one on the CPU.
-        device: "cuda" or "cpu".
+        device: "cpu", "cuda" or "cuda:1" and so on, of physics and pictures.
     """
 
     def __init__(
         self, task: Task, scenes: Sequence[Scene], rendering: Rendering, num_envs: int, device: str
     ) -> None:
         self.task, self.rendering = task, rendering
-        backend = "physx_cuda" if device.startswith("cuda") else "physx_cpu"
-        self.env = BatchedTabletopEnv(scenes, rendering, num_envs, backend, render_backend=render_backend())
+        renderer = f"sapien_{device}" if device.startswith("cuda") else render_backend()
+        self.env = BatchedTabletopEnv(scenes, rendering, num_envs, f"physx_{device}", render_backend=renderer)
         self.env.reset(seed=0)
         self.device = self.env.device
         self.names = [*self.env.objects]
-        self.episodes: list[Episode | None] = [None] * num_envs
+        self.episodes: list[Episode] = []
         self._low = torch.tensor(ACTION_LOW, device=self.device)
         self._high = torch.tensor(ACTION_HIGH, device=self.device)
 
     def reset(self, scenes: Sequence[Scene], seeds: Sequence[int], rows: Sequence[int]) -> BatchedFrame:
-        """Rebuild the starts of (task, scene, seed) in these rows; the others go on."""
+        """Rebuild the starts of (task, scene, seed) in these rows, in ascending order; the others go on.
+
+        The first time in all rows.
+        """
         started = [Episode(self.task, scene, seed) for scene, seed in zip(scenes, seeds, strict=True)]
+        if len(started) == self.env.num_envs:
+            self.episodes = [*started]
         for row, episode in zip(rows, started, strict=True):
             self.episodes[row] = episode
         self.env.place_rows(rows, started)
@@ -130,20 +135,15 @@ class BatchedSimulation:
         floor = WORKSPACE_FLOOR - self.tcp_poses()[:, 2]
         clipped[:, 2] = torch.maximum(clipped[:, 2], floor)
         for episode, position in zip(self.episodes, self.object_positions().cpu().numpy(), strict=True):
-            if episode is not None:
-                episode.object_before = position
+            episode.object_before = position
         self.env.step(clipped)
         return self._frame()
-
-    def running(self) -> list[Episode]:
-        """The episodes of all rows, once every row has one."""
-        return [episode for episode in self.episodes if episode is not None]
 
     def object_positions(self) -> Tensor:
         """(B, 3) centres of the objects."""
         every = torch.stack([self.env.objects[name].pose.p for name in self.names], 1)
-        active = [self.names.index(e.scene.object) if e is not None else 0 for e in self.episodes]
-        return every[torch.arange(len(active), device=self.device), torch.tensor(active, device=self.device)]
+        active = torch.tensor([self.names.index(e.scene.object) for e in self.episodes], device=self.device)
+        return every[torch.arange(len(active), device=self.device), active]
 
     def tcp_poses(self) -> Tensor:
         """(B, 7) position and quaternion (wxyz)."""
@@ -156,12 +156,9 @@ class BatchedSimulation:
         opening = (self.env.agent.robot.qpos[:, -1] / GRIPPER_OPEN).clamp(0.0, 1.0)
         poses = self.tcp_poses()
         judged = [
-            self._judge(episode, *row)
-            for episode, *row in zip(
-                self.episodes, self.object_positions().cpu().numpy().astype(np.float64),
-                poses[:, :3].cpu().numpy().astype(np.float64), opening.cpu().tolist(), strict=True,
-            )
-        ]  # fmt: skip
+            (self.task.reward(situation), self.task.success(situation))
+            for situation in self._situations(poses[:, :3], opening)
+        ]
         reward, success = zip(*judged, strict=True)
         quaternion = torch.where(poses[:, 4:5] < 0, -poses[:, 3:], poses[:, 3:])
         state = torch.cat([poses[:, :3], quaternion, opening[:, None]], 1).float()
@@ -171,13 +168,13 @@ class BatchedSimulation:
             torch.tensor(success, device=self.device),
         )  # fmt: skip
 
-    def _judge(
-        self, episode: Episode | None, thing: np.ndarray, tcp: np.ndarray, opening: float
-    ) -> tuple[float, bool]:
-        if episode is None:
-            return 0.0, False
-        situation = episode.situation(thing, tcp, opening)
-        return self.task.reward(situation), self.task.success(situation)
+    def _situations(self, tcp: Tensor, opening: Tensor) -> list[Situation]:
+        """What the task judges, row by row. tcp (B, 3), opening (B,)"""
+        things, places = (
+            values.cpu().numpy().astype(np.float64) for values in (self.object_positions(), tcp)
+        )
+        rows = zip(self.episodes, things, places, opening.tolist(), strict=True)
+        return [episode.situation(*row) for episode, *row in rows]
 
     def _images(self) -> dict[str, Tensor]:
         if self.rendering.cameras:
@@ -186,5 +183,6 @@ class BatchedSimulation:
         for name in self.rendering.cameras:
             sensor: Any = self.env._sensors[name]
             sensor.capture()
-            images[name] = sensor.get_obs(rgb=True, depth=False, position=False, segmentation=False)["rgb"]
+            shown = sensor.get_obs(rgb=True, depth=False, position=False, segmentation=False)["rgb"]
+            images[name] = shown.to(self.device).clone()  # the next picture is taken into the same memory
         return images

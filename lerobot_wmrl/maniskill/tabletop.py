@@ -75,16 +75,25 @@ class TabletopEnv(BaseEnv):
             lighten_meshes(self.agent.robot, self.rendering.robot_mesh_detail)
 
     def _load_scene(self, options: dict) -> None:
-        self.objects = {n: build_object(self.scene, OBJECTS[n]) for n in _names(self.scenes, "object")}
-        self.containers = {
-            n: build_container(self.scene, CONTAINERS[n]) for n in _names(self.scenes, "container")
-        }
-        self.carpets = {CARPET: build_carpet(self.scene)}
-        self.tables = {n: build_table(self.scene, n) for n in _names(self.scenes, "table")}
+        names = {kind: _names(self.scenes, kind) for kind in ("object", "container", "table")}
+        self.parking = self.parking_places(names["object"], [*names["container"], *names["table"], CARPET])
+        places, scene = self.parking, self.scene
+        self.objects = {n: build_object(scene, OBJECTS[n], places[n]) for n in names["object"]}
+        self.containers = {n: build_container(scene, CONTAINERS[n], places[n]) for n in names["container"]}
+        self.carpets = {CARPET: build_carpet(scene, places[CARPET])}
+        self.tables = {n: build_table(scene, n, places[n]) for n in names["table"]}
         for actor in self.objects.values():
             for body in actor._bodies:
                 body.set_angular_damping(ANGULAR_DAMPING)
         self.inverse_kinematics = InverseKinematics(self.agent)
+
+    def parking_places(self, movable: Sequence[str], fixed: Sequence[str]) -> dict[str, sapien.Pose]:
+        """Where each thing is while no episode needs it: objects, and what never moves by itself."""
+        names = [*movable, *fixed]
+        return {
+            name: sapien.Pose(p=[PARKING[0], PARKING[1] + 3.0 * index, PARKING[2]])
+            for index, name in enumerate(names)
+        }
 
     def _load_lighting(self, options: dict) -> None:
         self.scene.set_ambient_light(AMBIENT)
@@ -105,7 +114,7 @@ class TabletopEnv(BaseEnv):
         """Put the scene's things and the robot where the episode starts, at rest."""
         places = arrangement(scene, start)
         for actors in (self.tables, self.containers, self.carpets, self.objects):
-            _show_only(actors, places)
+            _show_only(actors, places, self.parking)
         self.active = self.objects[scene.object]
         self.agent.reset(self.start_qpos(start))
         self.agent.controller.reset()
@@ -132,15 +141,16 @@ def _names(scenes: Sequence[Scene], field: str) -> list[str]:
     return sorted({getattr(scene, field) for scene in scenes})
 
 
-def _show_only(actors: dict[str, Any], places: dict[str, sapien.Pose]) -> None:
+def _show_only(
+    actors: dict[str, Any], places: dict[str, sapien.Pose], parking: dict[str, sapien.Pose]
+) -> None:
     """Put those of `places` there, at rest, and park the others: hidden, immovable and far away."""
-    for place, (name, actor) in enumerate(actors.items()):
+    for name, actor in actors.items():
         entity = actor._objs[0]
         body = entity.find_component_by_type(sapien.physx.PhysxRigidDynamicComponent)
         visual = entity.find_component_by_type(sapien.render.RenderBodyComponent)
         visual.visibility = float(name in places)
-        parked = sapien.Pose(p=[PARKING[0], PARKING[1] + 3.0 * place, PARKING[2]])
-        entity.set_pose(places.get(name, parked))
+        entity.set_pose(places.get(name, parking[name]))
         if actor.px_body_type == "dynamic":
             body.set_kinematic(name not in places)
             if name in places:

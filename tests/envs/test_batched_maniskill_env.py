@@ -12,6 +12,10 @@ from lerobot_wmrl.envs.batched_maniskill_env import BatchedManiSkillEnv
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
 from lerobot_wmrl.envs.maniskill_tensor_env import ManiSkillTensorEnv
+from lerobot_wmrl.maniskill.batched import BatchedFrame
+from lerobot_wmrl.maniskill.scenes import Scene
+from lerobot_wmrl.maniskill.simulation import Episode
+from lerobot_wmrl.maniskill.tasks import TASKS
 
 HORIZON = 3
 CONFIG = WmrlManiSkillEnv(episode_length=HORIZON, image_size=32, split="ood")
@@ -66,3 +70,61 @@ def test_lerobot_eval_gets_arrays_and_the_success_by_scene(
 def test_jitter_is_refused() -> None:
     with pytest.raises(ValueError, match=r"--env.light_jitter.*--env.batched=false"):
         WmrlManiSkillEnv(light_jitter=0.1).create_batched_simulation(1, "cpu")
+
+
+class MadeUpSimulation:
+    """Three rows without physics: an episode succeeds when its third action component has added up to 1."""
+
+    device = torch.device("cpu")
+
+    def __init__(self, scenes: tuple[Scene, ...]) -> None:
+        self.episodes = [Episode(TASKS["push"], scenes[0], 0)] * 3
+        self.height = torch.zeros(3)
+
+    def reset(self, scenes: list[Scene], seeds: list[int], rows: list[int]) -> BatchedFrame:
+        assert list(rows) == sorted(rows)
+        for scene, seed, row in zip(scenes, seeds, rows, strict=True):
+            self.episodes[row] = Episode(TASKS["push"], scene, seed)
+            self.height[row] = 0.0
+        return self._frame()
+
+    def step(self, action: torch.Tensor) -> BatchedFrame:
+        self.height = self.height + action[:, 2]
+        return self._frame()
+
+    def _frame(self) -> BatchedFrame:
+        images = {"third_view": torch.zeros(3, 32, 32, 3, dtype=torch.uint8)}
+        state = self.height[:, None].repeat(1, 8)
+        return BatchedFrame(images, state, self.height, self.height >= 1.0)
+
+
+def test_one_row_ends_and_the_others_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    scenes = CONFIG.selected_scenes()
+    monkeypatch.setattr(
+        WmrlManiSkillEnv, "create_batched_simulation", lambda config, n, device: MadeUpSimulation(scenes)
+    )
+    env = BatchedManiSkillEnv(WmrlManiSkillEnv(episode_length=5, image_size=32, split="ood"), 3, "cpu", True)
+    before, _ = env.reset(seed=[7, 8, 9])
+    lift = torch.zeros(3, 7)
+    lift[1, 2] = 0.5
+    env.step(lift)
+    observation, _, terminated, truncated, info = env.step(lift)
+    assert terminated.tolist() == [False, True, False]
+    assert not truncated.any()
+    assert info["final_info"]["episode_length"].tolist() == [2, 2, 2]
+    assert info["final_obs"]["observation.state"][:, 0].tolist() == [0.0, 1.0, 0.0]
+    assert observation["observation.state"][:, 0].tolist() == [0.0, 0.0, 0.0]
+    seeds = [episode.seed for episode in env.simulation.episodes]
+    assert (seeds[0], seeds[2]) == (7, 9)
+    assert seeds[1] != 8
+    assert seeds[1] < EVALUATION_SEED
+    assert [observation["task"][row] for row in (0, 2)] == [before["task"][row] for row in (0, 2)]
+    assert observation["task"][1] == env.simulation.episodes[1].start.instruction
+    for _ in range(3):
+        truncated = env.step(torch.zeros(3, 7))[3]
+    assert truncated.tolist() == [True, False, True]
+
+
+def test_batched_without_cuda_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"--env.batched=true: .* leave the flag out"):
+        WmrlManiSkillEnv(batched=True).create_tensor_env(1, "cpu")

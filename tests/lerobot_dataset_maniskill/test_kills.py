@@ -11,6 +11,7 @@ import resource
 import signal
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
@@ -44,18 +45,22 @@ def write_little(config: RecordConfig, work: Path, limit: int) -> None:
 
 
 def test_a_disk_that_is_full_costs_only_the_unfinished_part(tmp_path: Path) -> None:
-    config = RecordConfig(
-        output_dir=tmp_path / "dataset", env=WmrlManiSkillEnv(image_size=64), num_episodes=2
-    )
+    env = WmrlManiSkillEnv(image_size=64)
+    config = RecordConfig(tmp_path / "dataset", env=env, num_episodes=3, part_episodes=1)
     work, parts = tmp_path / "work", planned_parts(config)
     work.mkdir()
-    for limit, finished in ((3000, False), (1 << 30, True)):
+    write_missing(replace(config, num_episodes=1), work)
+    first = (work / parts[0].name / "meta" / "info.json").stat().st_mtime_ns
+    for limit, finished in ((3000, 1), (1 << 30, 3)):
         process = multiprocessing.get_context("fork").Process(target=write_little, args=(config, work, limit))
         process.start()
         process.join()
-        assert process.exitcode == (0 if finished else 3)
-        assert (work / parts[0].name).exists() == finished
-    assert whole_dataset(work / parts[0].name, 2) is None
+        assert process.exitcode == (0 if finished == 3 else 3)
+        assert [part.name for part in parts if (work / part.name).exists()] == [
+            part.name for part in parts[:finished]
+        ]
+    assert (work / parts[0].name / "meta" / "info.json").stat().st_mtime_ns == first
+    assert all(whole_dataset(work / part.name, 1) is None for part in parts)
 
 
 def test_twenty_kills_cost_nothing_that_was_finished(tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
 """The batched simulation against the single one: the same starts, pictures and judgements.
 
-Without CUDA a batch holds one episode, which goes through the same code as many.
+Without CUDA a batch holds one episode: masks and rows are tested with the environment, on a made-up table.
 """
 
 from collections.abc import Iterator

@@ -1,7 +1,6 @@
 """Ways between waypoints that lead around what stands on the table."""
 
 import logging
-from collections import Counter
 from dataclasses import replace
 from typing import Final
 
@@ -39,13 +38,12 @@ class JointSpaceMotion:
     A leg that is to keep clear of the object (`Waypoint.clear`) is planned in joint space. The others push,
     grasp or carry it: they stay straight lines where table and container permit, and are planned where not.
     A leg stays a straight line, too, if there is no way, as to a place inside the container, or if an end of
-    it depends on where the object will be. `legs` counts what became of them.
+    it depends on where the object will be.
     """
 
     def __init__(self) -> None:
         self.arm = PlanningArm()
         self.arm.put("table", fcl.Box(*TABLE_SIZE), np.array([0.0, 0.0, TABLE_TOP - TABLE_SIZE[2] / 2]))
-        self.legs: Counter[str] = Counter()
 
     def __call__(self, plan: Plan, spec: ObjectSpec, container: ContainerSpec, start: Start) -> Plan:
         self._put_container(container, start)
@@ -95,6 +93,5 @@ class JointSpaceMotion:
             else:
                 way = self.arm.way(first, last)
                 what = "no way" if way is None else "planned"
-        self.legs[what] += 1
         logging.debug("mplib: from %s to %s: %s", place, waypoint.position, what)
         return way
