@@ -68,7 +68,13 @@ class CnnConfig(PreTrainedConfig):
         return (self.input_features or {}).get(OBS_STATE) if self.use_state else None
 
     def validate_features(self) -> None:
-        """ValueError unless there is a one-dimensional action and something to look at."""
+        """ValueError unless there is a one-dimensional action and something to look at.
+
+        Depth maps, pictures of one channel, are left out: environments do not show them.
+        """
+        inputs = self.input_features or {}
+        for key in [key for key, feature in inputs.items() if _is_depth(feature)]:
+            del inputs[key]
         action = self.action_feature
         if action is None or len(action.shape) != 1:
             raise ValueError(f"output_features={self.output_features}: needs `{ACTION}` with one dimension")
@@ -99,3 +105,7 @@ class CnnConfig(PreTrainedConfig):
     @property
     def reward_delta_indices(self) -> None:
         return None
+
+
+def _is_depth(feature: PolicyFeature) -> bool:
+    return feature.type is FeatureType.VISUAL and len(feature.shape) == 3 and feature.shape[0] == 1

@@ -238,3 +238,14 @@ def test_cameras_do_not_share_weights_and_state_can_be_left_out() -> None:
     assert not torch.allclose(action, policy.select_action(swapped), atol=1e-4)
     observation["observation.state"] = torch.full((6, 8), 9.0)
     assert torch.equal(action, policy.select_action(observation))
+
+
+def test_depth_maps_are_left_out() -> None:
+    inputs = dict(build().config.input_features or {})
+    depth = PolicyFeature(type=FeatureType.VISUAL, shape=(1, 32, 32))
+    config = CnnConfig(
+        device="cpu",
+        input_features={**inputs, "observation.images.camera0_depth": depth},
+        output_features=build().config.output_features,
+    )
+    assert CnnPolicy(config).config.input_features == inputs
