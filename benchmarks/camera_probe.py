@@ -48,28 +48,32 @@ TEST_SHARE = 0.25
 TOUCHING = 0.002
 """Finger and object touch if the gap between them is smaller (m): a quarter of a pixel at 64 px."""
 
+APART = 0.006
+"""From so large a gap on (m) they are clearly apart; in between, one picture can hardly tell."""
+
 
 class Frames(NamedTuple):
-    """images {view: (N, H, W, 3) uint8}; places (N, 6) in mm; opening (N,); contact (N,); episode (N,)."""
+    """images {view: (N, H, W, 3) uint8}; places (N, 6) in mm; opening (N,); gap (N,) in m; episode (N,)."""
 
     images: dict[str, np.ndarray]
     places: np.ndarray
     opening: np.ndarray
-    contact: np.ndarray
+    gap: np.ndarray
     episode: np.ndarray
 
 
-def touching(simulation: Simulation) -> bool:
-    """Whether a finger touches the object."""
+def gap(simulation: Simulation) -> float:
+    """Between the object and the nearest finger (m); infinite where physics sees no contact coming."""
     thing = simulation.env.active._objs[0]
     contacts = simulation.env.scene.sub_scenes[0].physx_system.get_contacts()
-    return any(_touches(contact, thing) for contact in contacts)
+    gaps = [point.separation for contact in contacts if _meet(contact, thing) for point in contact.points]
+    return float(min(gaps, default=np.inf))
 
 
-def _touches(contact: Any, thing: Any) -> bool:
+def _meet(contact: Any, thing: Any) -> bool:
+    """Whether the contact is one of a finger and the object."""
     entities = [body.entity for body in contact.bodies]
-    meets = thing in entities and any("finger" in entity.name for entity in entities)
-    return meets and any(point.separation < TOUCHING for point in contact.points)
+    return thing in entities and any("finger" in entity.name for entity in entities)
 
 
 def record(views: list[str], episodes: int, sizes: list[int]) -> dict[int, Frames]:
@@ -97,7 +101,7 @@ def record_share(views: list[str], episodes: range, image_size: int) -> Frames:
     simulation = Simulation(tasks[0], scenes, Rendering(tuple(views), image_size))
     every = simulation.cameras
     images: dict[str, list[np.ndarray]] = {view: [] for view in views}
-    rows: list[tuple[list[float], float, bool, int]] = []
+    rows: list[tuple[list[float], float, float, int]] = []
     for episode in episodes:
         rng = np.random.default_rng(FIRST_SEED + episode)
         simulation.task = tasks[episode % len(tasks)]
@@ -110,7 +114,7 @@ def record_share(views: list[str], episodes: range, image_size: int) -> Frames:
                 for view in views:
                     images[view].append(frame.images[view])
                 millimetres = [1000 * float(value) for value in (*places[1], *places[0])]
-                rows.append((millimetres, simulation.gripper_opening, touching(simulation), episode))
+                rows.append((millimetres, simulation.gripper_opening, gap(simulation), episode))
             simulation.cameras = every if (step + 1) % EVERY == 0 else {}
             frame = simulation.step(follower.act(*places))
             if frame.success:
@@ -143,7 +147,7 @@ def held_out(episode: np.ndarray) -> np.ndarray:
     return episode // len(TASKS) % round(1 / TEST_SHARE) == 0
 
 
-def probe(images: np.ndarray, frames: Frames, steps: int) -> dict[str, float]:
+def probe(images: np.ndarray, frames: Frames, steps: int) -> dict[str, Any]:
     """Train on three quarters of the episodes, test on the others. → errors by name"""
     torch.manual_seed(0)
     pictures = torch.from_numpy(images).permute(0, 3, 1, 2)
@@ -151,7 +155,7 @@ def probe(images: np.ndarray, frames: Frames, steps: int) -> dict[str, float]:
     train = ~held_out(frames.episode)
     mean, std = targets[train].mean(0), targets[train].std(0)
     scaled = torch.from_numpy((targets - mean) / std).float()
-    contact = torch.from_numpy(frames.contact).float()
+    contact = torch.from_numpy(frames.gap < TOUCHING).float()
     model = Probe(images.shape[1], targets.shape[1] + 1)
     model(pictures[:1].float() / 255)
     optimizer = torch.optim.AdamW(model.parameters(), 2e-3, weight_decay=1e-3)
@@ -168,13 +172,28 @@ def probe(images: np.ndarray, frames: Frames, steps: int) -> dict[str, float]:
         schedule.step()
     with torch.no_grad():
         output = torch.cat([model(part.float() / 255) for part in pictures[~train].split(256)])
-    error = ((output[:, :-1] - scaled[~train]).abs().mean(0).numpy()) * std
-    right = ((output[:, -1] > 0) == frames.contact[~train]).float().mean()
-    result = {f"{name}_mm": round(float(value), 1) for name, value in zip(NAMES, error, strict=False)}
+    error = (output[:, :-1] - scaled[~train]).abs().numpy() * std
+    right = ((output[:, -1] > 0) == (contact[~train] > 0)).numpy()
+    return summary(error, right, frames.gap[~train], frames.episode[~train] % len(TASKS))
+
+
+def summary(error: np.ndarray, right: np.ndarray, gaps: np.ndarray, task: np.ndarray) -> dict[str, Any]:
+    """Mean errors (N, 7), the share of right answers to whether there is contact, and both by task."""
+    clear = (gaps < TOUCHING) | (gaps > APART)
+    means = {f"{name}_mm": float(value) for name, value in zip(NAMES, error.mean(0), strict=False)}
+    by_task = {
+        name: {
+            "object_xy_mm": round(float(error[task == index, :2].mean()), 1),
+            "contact_accuracy": round(float(right[task == index].mean()), 3),
+        }
+        for index, name in enumerate(TASKS)
+    }
     return {
-        **result,
-        "opening_percent": round(float(error[-1]), 1),
-        "contact_accuracy": round(float(right), 3),
+        **{name: round(value, 1) for name, value in means.items()},
+        "opening_percent": round(float(error[:, -1].mean()), 1),
+        "contact_accuracy": round(float(right.mean()), 3),
+        "clear_contact_accuracy": round(float(right[clear].mean()), 3),
+        "by_task": by_task,
     }
 
 
@@ -199,7 +218,8 @@ def main() -> None:
         data = {"frames": len(frames.episode), "test_frames": test, "steps": given.steps}
         for cameras in tqdm(given.cameras, desc=f"{size} px"):
             images = np.concatenate([frames.images[view] for view in cameras.split("+")], axis=2)
-            result["probes"][f"{cameras} {size}"] = {**probe(images, frames, given.steps), **data}
+            name = f"{cameras}, {size} px, {given.episodes} episodes"
+            result["probes"][name] = {**probe(images, frames, given.steps), **data}
             write_json(given.output, result)
     for name, errors in result["probes"].items():
         print(name, errors)
