@@ -35,8 +35,7 @@ class WmrlManiSkillEnv(EnvConfig):
         episode_length: steps after which an episode is truncated; the task's own horizon by default.
         assets: YAML file with meshes to use in place of objects (`lemon: {mesh: lemon.obj, scale: 0.001}`).
         robot_mesh_detail: share of the robot's triangles that are drawn; 1 draws all, three times slower.
-        batched: whether episodes share one simulation on CUDA; by default where there is one, else each has
-            a process of its own.
+        batched: whether episodes share one simulation on CUDA, instead of having a process each.
         light_jitter: how much the light varies from episode to episode, as a share (0.2 is plenty).
         camera_jitter: how much the fixed camera is displaced from episode to episode (m; 0.01 is plenty).
     """
@@ -49,7 +48,7 @@ class WmrlManiSkillEnv(EnvConfig):
     episode_length: int | None = None
     assets: Path | None = None
     robot_mesh_detail: float = ROBOT_MESH_DETAIL
-    batched: bool | None = None
+    batched: bool = False
     light_jitter: float = 0.0
     camera_jitter: float = 0.0
     fps: int = FPS
@@ -129,7 +128,7 @@ class WmrlManiSkillEnv(EnvConfig):
         if self.light_jitter or self.camera_jitter:
             raise ValueError(
                 "--env.light_jitter and --env.camera_jitter vary nothing in a batched simulation: leave them "
-                "at 0, or choose --env.batched=false"
+                "at 0, or leave out --env.batched=true"
             )
         self._use_assets()
         scenes = self.selected_scenes()
@@ -181,15 +180,15 @@ class WmrlManiSkillEnv(EnvConfig):
         return ManiSkillTensorEnv(self, n_envs, device)
 
     def runs_batched(self, device: str) -> bool:
-        """Whether episodes share one simulation on `device`: where SAPIEN can render on CUDA, unless told
-        otherwise. ValueError if they are to and cannot."""
+        """Whether episodes share one simulation on `device`. ValueError if they are to and cannot."""
+        if not self.batched:
+            return False
         import torch
 
         from lerobot_wmrl.maniskill.renderer import render_backend
 
-        possible = device.startswith("cuda") and torch.cuda.is_available() and render_backend() == "gpu"
-        if self.batched and not possible:
+        if not (device.startswith("cuda") and torch.cuda.is_available() and render_backend() == "gpu"):
             raise ValueError(
                 f"--env.batched=true: SAPIEN cannot simulate and render on {device} here; leave the flag out"
             )
-        return possible if self.batched is None else self.batched
+        return True

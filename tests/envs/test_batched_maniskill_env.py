@@ -68,7 +68,7 @@ def test_lerobot_eval_gets_arrays_and_the_success_by_scene(
 
 
 def test_jitter_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"--env.light_jitter.*--env.batched=false"):
+    with pytest.raises(ValueError, match=r"--env.light_jitter.*--env.batched=true"):
         WmrlManiSkillEnv(light_jitter=0.1).create_batched_simulation(1, "cpu")
 
 
