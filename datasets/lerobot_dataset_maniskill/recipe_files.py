@@ -1,6 +1,5 @@
 """Recipes: YAML files that say what a dataset contains, read as the flags of `lerobot-wmrl-record`."""
 
-import difflib
 import importlib.resources
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,6 +11,7 @@ import yaml
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.suggestion import suggestion
 
 NESTED = {"env": {"type", *(field.name for field in fields(WmrlManiSkillEnv))}}
 KEYS = {field.name for field in fields(RecordConfig)} | set(NESTED)
@@ -65,8 +65,7 @@ def _flat(content: Mapping[str, Any], path: Path) -> Iterator[tuple[str, Any]]:
 def _check_key(key: str, known: set[str], path: Path, prefix: str = "") -> None:
     if key in known:
         return
-    near = difflib.get_close_matches(key, known, 1)
-    hint = f"did you mean {prefix}{near[0]}?" if near else f"choose from {', '.join(sorted(known))}"
+    hint = suggestion(key, sorted(known), prefix)
     raise ValueError(f"--recipe={path}: the key {prefix}{key} is unknown; {hint}")
 
 

@@ -34,16 +34,16 @@ GRACE_SECONDS = 10.0
 def record(config: RecordConfig) -> None:
     """Record everything that is missing, then merge. Complete already: says so."""
     config.validate()
-    root = config.root
+    root, content = config.root, config.recorded_content()
     work, parts = root.parent / f".{root.name}.recording", planned_parts(config)
-    if already_recorded(root, config.recorded_content(), count_episodes(parts)):
-        discard(work, config.recorded_content())
+    if already_recorded(root, content, count_episodes(parts)):
+        discard(work, content)
     else:
         render_backend()
         if config.policy is not None:
             check_weights(config.policy)
             check_fit(config.policy, config.maniskill.shown(), len(ACTION_NAMES))
-        with writing("output_dir", root), claimed(work, config.recorded_content()):
+        with writing("output_dir", root), claimed(work, content):
             record_parts(config, work, parts)
             merge(config, work, parts)
         shutil.rmtree(work, ignore_errors=True)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, EVALUATION_SEED, FPS, STATE_NAMES
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.envs.maniskill_tensor_env import image_observations
 from lerobot_wmrl.envs.scene_results import SceneResults
 from lerobot_wmrl.maniskill.batched import BatchedFrame
 from lerobot_wmrl.maniskill.scenes import scene_for_seed
@@ -100,9 +101,5 @@ class BatchedManiSkillEnv(gym.vector.VectorEnv):
         self.results.add(columns, ended.cpu().numpy())
 
     def _observation(self, frame: BatchedFrame) -> dict[str, Any]:
-        images = {
-            f"{OBS_IMAGES}.{camera}": image.permute(0, 3, 1, 2).float() / 255.0
-            for camera, image in frame.images.items()
-        }
         instructions = [episode.start.instruction for episode in self.simulation.episodes]
-        return {**images, OBS_STATE: frame.state, "task": instructions}
+        return {**image_observations(frame.images), OBS_STATE: frame.state, "task": instructions}

@@ -1,11 +1,13 @@
 """The simulator behind the tensor interface of reinforcement learning; the world model has the same."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode
+from lerobot.utils.constants import OBS_IMAGES
 from torch import Tensor
 
 from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, FPS
@@ -67,15 +69,20 @@ class ManiSkillTensorEnv(gym.vector.VectorEnv):
         return torch.from_numpy(np.asarray(values)).to(self.device)
 
     def _tensors(self, observation: dict[str, Any], instructions: list[str]) -> dict[str, Any]:
-        images = {
-            f"observation.images.{camera}": self._vector(image).permute(0, 3, 1, 2).float() / 255.0
-            for camera, image in observation["pixels"].items()
-        }
+        pictures = {camera: self._vector(image) for camera, image in observation["pixels"].items()}
         return {
-            **images,
+            **image_observations(pictures),
             "observation.state": self._vector(observation["agent_pos"]),
             "task": list(instructions),
         }
+
+
+def image_observations(pictures: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """camera → (B, H, W, 3) uint8 becomes `observation.images.<camera>` → (B, 3, H, W) float32 in [0, 1]."""
+    return {
+        f"{OBS_IMAGES}.{camera}": picture.permute(0, 3, 1, 2).float() / 255.0
+        for camera, picture in pictures.items()
+    }
 
 
 def _final_observation(

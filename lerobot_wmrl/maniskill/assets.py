@@ -1,6 +1,5 @@
 """A user's own meshes (YCB or others) in place of the objects made by code."""
 
-import difflib
 import hashlib
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +10,7 @@ import trimesh
 import yaml
 
 from lerobot_wmrl.maniskill.objects import OBJECTS, MeshFile, ObjectSpec
+from lerobot_wmrl.suggestion import suggestion
 
 KEYS: Final = ("mesh", "label", "scale", "density")
 WIDEST: Final = 0.072
@@ -84,9 +84,7 @@ def _positive(path: Path, name: str, entry: dict[str, Any], key: str, default: f
 def _check_name(path: Path, what: str, name: str, known: tuple[str, ...]) -> None:
     if name in known:
         return
-    near = difflib.get_close_matches(name, known, 1)
-    hint = f"did you mean {near[0]}?" if near else f"choose from {', '.join(known)}"
-    raise ValueError(f"--env.assets={path}: the {what} {name!r} is unknown; {hint}")
+    raise ValueError(f"--env.assets={path}: the {what} {name!r} is unknown; {suggestion(name, known)}")
 
 
 def _check_size(path: Path, name: str, half_size: np.ndarray, scale: float) -> None:

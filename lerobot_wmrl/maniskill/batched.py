@@ -119,10 +119,8 @@ class BatchedSimulation:
         The first time in all rows.
         """
         started = [Episode(self.task, scene, seed) for scene, seed in zip(scenes, seeds, strict=True)]
-        if len(started) == self.env.num_envs:
-            self.episodes = [*started]
-        for row, episode in zip(rows, started, strict=True):
-            self.episodes[row] = episode
+        running = {**dict(enumerate(self.episodes)), **dict(zip(rows, started, strict=True))}
+        self.episodes = [running[row] for row in range(self.env.num_envs)]
         self.env.place_rows(rows, started)
         positions = self.object_positions().cpu().numpy()
         for row, episode in zip(rows, started, strict=True):

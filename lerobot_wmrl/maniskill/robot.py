@@ -14,6 +14,9 @@ from sapien.wrapper.pinocchio_model import PinocchioModel
 
 CONTROL_MODE = "base_delta_pose"
 BASE_POSITION = (-0.615, 0.0, 0.0)
+POINTING_DOWN = (0.0, 1.0, 0.0, 0.0)
+"""The gripper's quaternion (wxyz) when it does."""
+
 GRIPPER_OPEN = 0.04
 """Finger joint position (m) of the open gripper."""
 
@@ -69,7 +72,7 @@ class InverseKinematics:
 
     def solve(self, tcp: np.ndarray, finger: float) -> np.ndarray:
         """(9,) joint positions for the TCP at `tcp` (3,), fingers at `finger` (m). RuntimeError if none."""
-        target = sapien.Pose(p=np.asarray(tcp) - np.array(BASE_POSITION), q=[0.0, 1.0, 0.0, 0.0])
+        target = sapien.Pose(p=np.asarray(tcp) - np.array(BASE_POSITION), q=POINTING_DOWN)
         qpos, solved, _ = self.model.compute_inverse_kinematics(
             self.end_link, target, initial_qpos=self.rest, active_qmask=self.movable, max_iterations=200
         )

@@ -9,9 +9,8 @@ from transforms3d.euler import euler2quat
 
 from lerobot_dataset_maniskill.planners.joint_space.polyline import resampled
 from lerobot_dataset_maniskill.planners.joint_space.seed import seed_ompl
-from lerobot_wmrl.maniskill.robot import BASE_POSITION, BaseAxesPanda
+from lerobot_wmrl.maniskill.robot import BASE_POSITION, POINTING_DOWN, BaseAxesPanda
 
-POINTING_DOWN: Final = (0.0, 1.0, 0.0, 0.0)
 SEED: Final = 1
 LONGEST_MOTION: Final = 0.1
 """Of the joints, between two samples of a search (rad). Longer ones make ways that wave the arm about."""
