@@ -21,6 +21,10 @@ CLEARANCE: Final = 0.035
 """Between the fingertips and the object's top when the gripper passes over it (m)."""
 
 
+FARTHEST: Final = 0.16
+"""The largest x of a detour (m): beyond it the arm is stretched out and gets no further."""
+
+
 class SlidePlanner(Planner):
     """Push (`over_it` False) or pull (`over_it` True: the gripper has to get to the far side first)."""
 
@@ -54,9 +58,10 @@ class SlidePlanner(Planner):
     def detour(self, rng: np.random.Generator) -> np.ndarray:
         """Behind the object or beside that place; for a pull above it."""
         lowest = 2.0 * self.spec.half_size[2] + CLEARANCE if self.over_it else 0.02
-        return self.at(
+        place = self.at(
             rng.uniform(-0.14, -0.03), rng.uniform(-0.10, 0.10), rng.uniform(lowest, max(0.17, lowest))
         )
+        return np.minimum(place, (FARTHEST, np.inf, np.inf))
 
     def near_miss(self, rng: np.random.Generator) -> Waypoints:
         """Over, beside, short of, not far enough, or too much to one side; then rest or leave."""
