@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from lerobot_wmrl.world_models.next_frame import STATE_STEP, CodeBook, Prediction
+from lerobot_wmrl.world_models.codebook import CodeBook
+from lerobot_wmrl.world_models.next_frame import STATE_STEP, Prediction
 
 MOTION_LEVELS = 3
 """A token moves when its factors change by so many levels in all; less is mostly the codes' own flicker."""

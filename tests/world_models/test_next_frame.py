@@ -2,7 +2,8 @@ import torch
 from torch.nn import functional as F
 from vector_quantize_pytorch import FSQ
 
-from lerobot_wmrl.world_models.next_frame import CodeBook, NextFrameNetwork
+from lerobot_wmrl.world_models.codebook import CodeBook
+from lerobot_wmrl.world_models.next_frame import NextFrameNetwork
 
 LEVELS = (8, 5, 3)
 
