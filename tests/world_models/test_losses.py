@@ -2,8 +2,8 @@ from types import SimpleNamespace
 
 import torch
 
-from lerobot_wmrl.world_models.losses import Clip, corrupt_digits, force_predictions, next_frame_loss
 from lerobot_wmrl.world_models.codebook import CodeBook
+from lerobot_wmrl.world_models.losses import Clip, corrupt_digits, force_predictions, next_frame_loss
 from lerobot_wmrl.world_models.next_frame import Prediction
 
 CONFIG = SimpleNamespace(motion_weight=3.0, done_weight=1.0, done_positive_weight=2.0, state_weight=1.0)
