@@ -59,7 +59,6 @@ class RecordConfig(RunConfig):
             the action box; each episode draws its own level up to it, and the noise lasts a while.
         push_to_hub: publish the dataset as repo_id on the Hugging Face hub when it is complete.
         private: publish it privately.
-        list_scenes: print the table of scenes and stop.
     """
 
     path_fields: ClassVar[list[str]] = ["policy"]
@@ -81,7 +80,7 @@ class RecordConfig(RunConfig):
     exploration: float = 0.0
     push_to_hub: bool = False
     private: bool = False
-    list_scenes: bool = False
+    list_scenes: bool = False  # print the table of scenes and stop
 
     def __post_init__(self) -> None:
         path = parser.get_path_arg("policy")

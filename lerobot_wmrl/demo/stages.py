@@ -40,7 +40,6 @@ class DemoConfig:
         sft_episodes: optimal episodes the first policy is cloned from.
         explore_episodes: episodes of that policy, disturbed, that the world models learn from as well.
         eval_episodes: held-out episodes of each success rate.
-        rollout_episodes: real episodes of each policy that are replayed in the world model.
     """
 
     output_dir: Path = Path("outputs/demo")
@@ -49,7 +48,7 @@ class DemoConfig:
     sft_episodes: int = 12
     explore_episodes: int = 240
     eval_episodes: int = 100
-    rollout_episodes: int = 60
+    rollout_episodes: int = 60  # real episodes of each policy that are replayed in the world model
 
     def check(self) -> None:
         """ValueError names a setting that cannot be."""
