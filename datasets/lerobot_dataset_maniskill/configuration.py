@@ -37,50 +37,66 @@ class RecordConfig(RunConfig):
     Planned trajectories by default; with --policy.path=… the real rollouts of that policy. The same command
     again continues an interrupted recording, or reports that it is complete.
     `--preset=tiny` or `--preset=demo` stands for the flags of that size; flags further right override it.
-
-    Args:
-        output_dir: root of the dataset; it appears when everything is recorded.
-        repo_id: name of the dataset, user/name to publish it; local/<folder> by default.
-        num_episodes: how many to record.
-        seed: of the first episode; episode i has seed + i.
-        tasks: recorded in turn; the environment's own by default.
-        env: task, scenes, cameras and image size (--env.type=wmrl_maniskill --env.task=push …).
-        depth: record every camera's depth too, as LeRobot's depth maps (observation.images.<camera>_depth).
-        kinds: share of each trajectory kind (planned trajectories only).
-        planner: how the gripper gets from one waypoint of a planned trajectory to the next. cartesian: in
-            straight lines. mplib: as MPLib plans it in joint space, around the table, the container and,
-            before it is to be touched, the object.
-        num_workers: simulating processes.
-        shard: i/n records every n-th sub-dataset from the i-th (from 0) on, for n machines.
-        merge_shards: folders of all shards: put them together as output_dir, and stop.
-        part_episodes: episodes a sub-dataset, the piece of work an interruption can cost each worker.
-        policy: a LeRobot policy to roll out, given as --policy.path=….
-        exploration: largest standard deviation of the noise added to a policy's translations, as a share of
-            the action box; each episode draws its own level up to it, and the noise lasts a while.
-        push_to_hub: publish the dataset as repo_id on the Hugging Face hub when it is complete.
-        private: publish it privately.
     """
 
     path_fields: ClassVar[list[str]] = ["policy"]
 
     output_dir: Path | None = None
+    """Root of the dataset; it appears when everything is recorded."""
+
     repo_id: str | None = None
+    """Name of the dataset, user/name to publish it; local/<folder> by default."""
+
     num_episodes: int = 100
+    """How many to record."""
+
     seed: int = 0
+    """Of the first episode; episode i has seed + i."""
+
     tasks: list[str] = field(default_factory=list)
+    """Recorded in turn; the environment's own by default."""
+
     env: EnvConfig = field(default_factory=WmrlManiSkillEnv)
+    """Task, scenes, cameras and image size (--env.type=wmrl_maniskill --env.task=push …)."""
+
     depth: bool = False
+    """Record every camera's depth too, as LeRobot's depth maps (observation.images.<camera>_depth)."""
+
     kinds: dict[str, float] = field(default_factory=default_kinds)
+    """Share of each trajectory kind (planned trajectories only)."""
+
     planner: str = "cartesian"
+    """How the gripper gets from one waypoint of a planned trajectory to the next. cartesian: in straight
+    lines. mplib: as MPLib plans it in joint space, around the table, the container and, before it is to be
+    touched, the object."""
+
     num_workers: int = 2
+    """Simulating processes."""
+
     part_episodes: int = 20
+    """Episodes a sub-dataset, the piece of work an interruption can cost each worker."""
+
     shard: str = "0/1"
+    """i/n records every n-th sub-dataset from the i-th (from 0) on, for n machines."""
+
     merge_shards: list[Path] = field(default_factory=list)
+    """Folders of all shards: put them together as output_dir, and stop."""
+
     policy: PreTrainedConfig | None = None
+    """A LeRobot policy to roll out, given as --policy.path=…."""
+
     exploration: float = 0.0
+    """Largest standard deviation of the noise added to a policy's translations, as a share of the action box;
+    each episode draws its own level up to it, and the noise lasts a while."""
+
     push_to_hub: bool = False
+    """Publish the dataset as repo_id on the Hugging Face hub when it is complete."""
+
     private: bool = False
-    list_scenes: bool = False  # print the table of scenes and stop
+    """Publish it privately."""
+
+    list_scenes: bool = False
+    """Print the table of scenes and stop."""
 
     def __post_init__(self) -> None:
         path = parser.get_path_arg("policy")

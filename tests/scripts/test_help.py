@@ -15,6 +15,6 @@ def test_help_explains_and_shows_no_source_code(config: type, capsys: pytest.Cap
     with pytest.raises(SystemExit):
         draccus.parse(config, args=["--help"])
     text = capsys.readouterr().out
-    assert "Args:" in text
+    assert "(default:" in text
     assert "def " not in text
     assert "default_factory" not in text
