@@ -17,13 +17,16 @@ import gymnasium as gym
 import mani_skill.envs  # noqa: F401 (registers PushCube)
 import numpy as np
 
-from lerobot_wmrl.constants import CAMERAS, ROBOT_MESH_DETAIL
+from lerobot_wmrl.constants import ROBOT_MESH_DETAIL
 from lerobot_wmrl.files import write_json
 from lerobot_wmrl.maniskill.renderer import render_backend
 from lerobot_wmrl.maniskill.rendering import Rendering
 from lerobot_wmrl.maniskill.scenes import scenes_of
 from lerobot_wmrl.maniskill.simulation import Simulation
 from lerobot_wmrl.maniskill.tasks import TASKS
+
+CAMERAS = ("third_view", "wrist")
+"""As many as ManiSkill's own recording has."""
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
 REPETITIONS = 3

@@ -90,7 +90,7 @@ def main() -> None:
         for kind in TASK_KINDS:
             played = episode(simulation, scene, kind, SEED)
             strips.append((f"{name}: {kind.replace('_', ' ')}", strip(played)))
-    grid(views, 4, folder / "tasks.png")
+    grid(views, 2 * len(CAMERAS), folder / "tasks.png")
     grid(strips, 2, folder / "trajectories.png")
     simulation.close()
 

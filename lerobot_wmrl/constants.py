@@ -11,7 +11,7 @@ IMAGE_SIZE: Final = 128
 FPS: Final = 25
 """Control and recording rate in Hz."""
 
-CAMERAS: Final = ("third_view", "wrist")
+CAMERAS: Final = ("third_view", "side_view", "wrist")
 
 STATE_NAMES: Final = ("tcp_x", "tcp_y", "tcp_z", "tcp_qw", "tcp_qx", "tcp_qy", "tcp_qz", "gripper_opening")
 """`observation.state`: TCP position (m), TCP quaternion wxyz, gripper opening in [0, 1]."""

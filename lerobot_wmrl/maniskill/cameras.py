@@ -3,6 +3,8 @@
 The third view looks back at the robot from the front, steeply: how far the gripper is to the object's side
 is a distance in the picture, and a pushed object comes towards the camera, in front of the hand. From an
 oblique view a gripper that passes before the object looks like one that pushes it: world models believed it.
+The side view stands beside the table: it sees how far an object is pushed or pulled, and what the hand hides
+from the front.
 """
 
 from dataclasses import dataclass
@@ -27,7 +29,10 @@ class View:
 FAR = 5.0
 """What is further away (m) is not drawn."""
 
-VIEWS = {"third_view": View((0.52, 0.0, 0.60), (0.0, -0.035, 0.035), 0.53)}
+VIEWS = {
+    "third_view": View((0.52, 0.0, 0.60), (0.0, -0.035, 0.035), 0.53),
+    "side_view": View((0.0, 0.55, 0.42), (0.0, -0.035, 0.04), 0.6),
+}
 """Fixed cameras by name; `benchmarks/camera_probe.py` measures what can be read from them."""
 
 WRIST_POSITION = (0.08, 0.0, 0.0)

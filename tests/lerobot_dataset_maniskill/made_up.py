@@ -11,7 +11,7 @@ from lerobot_dataset_maniskill.manifest import EpisodePlan, planned_parts
 from lerobot_dataset_maniskill.recorder import merge, missing_parts
 from lerobot_dataset_maniskill.worker import PartRecorder
 from lerobot_dataset_maniskill.writer import Outcome, StartColumns, add_step
-from lerobot_wmrl.constants import CAMERAS, TASKS
+from lerobot_wmrl.constants import TASKS
 from lerobot_wmrl.maniskill.simulation import Frame
 
 ROWS = 10
@@ -46,7 +46,7 @@ class MadeUpRecorder(PartRecorder):
         env, images = self.config.maniskill, {}
         for camera in env.cameras:
             images[camera] = rng.integers(0, NOISE, (env.image_size, env.image_size, 3), dtype=np.uint8)
-            images[camera][..., CAMERAS.index(camera)] += BRIGHTER * row
+            images[camera][..., env.cameras.index(camera)] += BRIGHTER * row
         return Frame(images, {}, np.zeros(8, np.float32), 0.0, success)
 
 
