@@ -16,7 +16,7 @@ from transformers import (
 )
 
 SIZES: dict[str, Any] = {"d_model": 24, "d_kv": 8, "d_ff": 32, "num_layers": 1, "num_heads": 2}
-WORDS = ("push", "pull", "the", "red", "green", "square", "forward", "back")
+WORDS = ("push", "pull", "the", "red", "green", "square", "forward", "back", "it")
 
 
 def word_tokenizer() -> T5Tokenizer:
@@ -34,7 +34,7 @@ FAMILY: dict[str, tuple[Any, Any, Any]] = {
 
 
 def save_t5(folder: Path, kind: str = "t5") -> Path:
-    """A small encoder of this kind with its tokenizer in `folder`; dropout as configured by default, 0.1."""
+    """A small encoder of this kind with its tokenizer in `folder`. Its dropout is T5's own, 0.1."""
     torch.manual_seed(1)
     model, config, tokenizer = FAMILY[kind]
     tokens = tokenizer()
