@@ -78,6 +78,7 @@ def synthetic_dataset(
     length: int = 20,
     size: int = 32,
     cameras: tuple[str, ...] = ("third_view",),
+    instruction: str = "push the red square forward",
 ) -> LeRobotDataset:
     """A LeRobotDataset at `root` (must not exist) with the contract's columns; every third episode fails."""
     dataset = LeRobotDataset.create(
@@ -95,7 +96,7 @@ def synthetic_dataset(
                 dtype = np.float32 if key == "next.reward" else None
                 frame[key] = value if isinstance(value, np.ndarray) else np.array([value], dtype)
             pictures = {f"observation.images.{camera}": image for camera in cameras}
-            dataset.add_frame({**frame, **pictures, "task": "push the red square forward"})
+            dataset.add_frame({**frame, **pictures, "task": instruction})
         dataset.save_episode()
     dataset.finalize()
     vocabulary = {

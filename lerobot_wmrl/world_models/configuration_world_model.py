@@ -111,9 +111,22 @@ class TextWorldModelConfig(WorldModelConfig):
     """Imagines the golden trajectory of an instruction: c = i in eq. 1. Learns from optimal successes.
 
     Args:
+        text_encoder: id or folder of a pretrained T5 (T5, flan-T5, ByT5, mT5, umT5) that reads the
+            instruction, frozen. A trained checkpoint carries it in its own folder `text_encoder`. None: a
+            small T5 over ByT5's bytes, trained along.
         goal_threshold: θ of eq. 6, the done probability at which a frame becomes the goal frame.
         goal_horizon: frames imagined in search of it.
     """
 
+    text_encoder: str | None = None
     goal_threshold: float = 0.5
     goal_horizon: int = 40
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 < self.goal_threshold < 1:
+            raise ValueError(
+                f"--model.goal_threshold={self.goal_threshold}: must be a probability between 0 and 1"
+            )
+        if self.goal_horizon < 1:
+            raise ValueError(f"--model.goal_horizon={self.goal_horizon}: must be at least 1 frame")

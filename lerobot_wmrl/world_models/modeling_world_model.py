@@ -6,9 +6,11 @@ Trained from token clips (`loss`) or from a LeRobotDataset's batches (`forward`)
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from lerobot.configs.rewards import RewardModelConfig
 from lerobot.rewards.pretrained import PreTrainedRewardModel
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
@@ -21,7 +23,9 @@ from lerobot_wmrl.world_models.configuration_world_model import (
     WorldModelConfig,
 )
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
+from lerobot_wmrl.world_models.frozen_t5 import CHECKPOINT_FOLDER, FrozenT5
 from lerobot_wmrl.world_models.goal import imagine_goal, similarity_to_goal
+from lerobot_wmrl.world_models.instructions import check_one_each
 from lerobot_wmrl.world_models.losses import (
     Clip,
     corrupt_digits,
@@ -32,7 +36,7 @@ from lerobot_wmrl.world_models.losses import (
 from lerobot_wmrl.world_models.modeling_frame_tokenizer import stack_cameras
 from lerobot_wmrl.world_models.next_frame import NextFrameNetwork, Prediction
 from lerobot_wmrl.world_models.st_transformer import TemporalCache
-from lerobot_wmrl.world_models.text_encoder import ByteTextEncoder
+from lerobot_wmrl.world_models.text_encoder import make_text_encoder
 
 Condition = tuple[Tensor, Tensor | None]
 """Condition tokens (B, T or 1, M, D) and their mask."""
@@ -196,7 +200,7 @@ class WorldModelRewardModel(PreTrainedRewardModel):
         cache = self.network.transformer.make_cache(
             batch, self.network.transformer_tokens, tokens.device, torch.float32
         )
-        condition = self.encode_instructions(instructions) if instructions is not None else None
+        condition = self.encode_instructions(instructions, batch) if instructions is not None else None
         digits = self.network.codebook.digits(tokens)[:, None]
         return ImaginationState(digits, self.normalize_state(proprioception)[:, None], cache, condition)
 
@@ -232,8 +236,8 @@ class WorldModelRewardModel(PreTrainedRewardModel):
         """Actions (B, T, A) in dataset units → condition tokens."""
         raise NotImplementedError(f"{self.name} is not conditioned on actions")
 
-    def encode_instructions(self, instructions: Sequence[str]) -> Condition:
-        """Instructions → condition tokens."""
+    def encode_instructions(self, instructions: Sequence[str], batch: int) -> Condition:
+        """One instruction for each of `batch` episodes → condition tokens."""
         raise NotImplementedError(f"{self.name} is not conditioned on text")
 
 
@@ -276,15 +280,38 @@ class TextWorldModelRewardModel(WorldModelRewardModel):
     config_class = TextWorldModelConfig
     name = "text_world_model"
 
-    def __init__(self, config: TextWorldModelConfig, **kwargs: Any) -> None:
-        super().__init__(config, **kwargs)
-        self.text_encoder = ByteTextEncoder(config.width)
+    def __init__(
+        self, config: TextWorldModelConfig, *, dataset_meta: Any = None, t5: FrozenT5 | None = None,
+        **kwargs: Any,
+    ) -> None:  # fmt: skip
+        super().__init__(config, dataset_meta=dataset_meta, **kwargs)
+        if config.text_encoder is not None:
+            t5 = t5 or FrozenT5.load(config.text_encoder)
+            config.text_encoder = CHECKPOINT_FOLDER
+        self.text_encoder = make_text_encoder(config.width, t5)
+        if dataset_meta is not None:
+            self.text_encoder.check(dataset_meta.tasks.index)
 
-    def encode_instructions(self, instructions: Sequence[str]) -> Condition:
+    @classmethod
+    def from_pretrained(
+        cls, pretrained_name_or_path: str | Path, *, config: Any = None, **kwargs: Any
+    ) -> "TextWorldModelRewardModel":
+        """Load a checkpoint: a folder or a hub id, with its frozen T5 if it was trained with one."""
+        config = config or RewardModelConfig.from_pretrained(pretrained_name_or_path, **kwargs)
+        if config.text_encoder is not None:
+            kwargs["t5"] = FrozenT5.load_carried(pretrained_name_or_path, kwargs.get("revision"))
+        return super().from_pretrained(pretrained_name_or_path, config=config, **kwargs)
+
+    def _save_pretrained(self, save_directory: Path) -> None:
+        self.text_encoder.save(save_directory / CHECKPOINT_FOLDER)
+        super()._save_pretrained(save_directory)
+
+    def encode_instructions(self, instructions: Sequence[str], batch: int) -> Condition:
+        check_one_each(instructions, batch)
         return self.text_encoder(instructions)
 
     def condition(self, clip: Clip) -> Condition:
-        return self.encode_instructions(clip.instructions)
+        return self.encode_instructions(clip.instructions, len(clip.tokens))
 
     @torch.no_grad()
     def compute_reward(self, batch: dict[str, Any]) -> Tensor:

@@ -84,6 +84,14 @@ def test_done_must_hold_for_k_frames_and_is_paid_once(env):
     assert torch.equal(info["final_info"]["is_success"], flags)
 
 
+def test_goals_that_were_never_reached_are_counted(env):
+    """Eq. 6 without a frame that reaches θ: the metric is the share of environments with a reached goal."""
+    env.reset(seed=list(range(B)))
+    env.starts = env.starts._replace(goal_reached=torch.arange(len(env.starts.tokens)) % 2 == 0)
+    *_, info = env.step(torch.zeros(B, 7))
+    assert info["reward_parts"]["goal_reached"].tolist() == [True, False, True, False]
+
+
 def test_an_episode_that_restarts_forgets_what_came_before(env):
     always_done(env, torch.tensor([True, False, False, False]))
     env.reset(seed=0)

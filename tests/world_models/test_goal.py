@@ -1,0 +1,77 @@
+import pytest
+import torch
+from torch import Tensor
+
+from lerobot_wmrl.world_models.configuration_world_model import TextWorldModelConfig
+from lerobot_wmrl.world_models.goal import Goal, imagine_goal
+from lerobot_wmrl.world_models.modeling_world_model import TextWorldModelRewardModel
+from tests.world_models.made_up_clips import STATE, random_frames, text_model
+
+B, HORIZON = 8, 6
+INSTRUCTIONS = ["push"] * B
+
+
+@pytest.fixture(scope="module")
+def model() -> TextWorldModelRewardModel:
+    """Random weights, large enough for done probabilities that rise and fall in each imagination."""
+    model = text_model(temperature=2.0).eval()
+    for parameter in model.network.parameters():
+        torch.nn.init.normal_(parameter, std=0.2)
+    return model
+
+
+def imagine(model: TextWorldModelRewardModel, threshold: float, horizon: int = HORIZON) -> Goal:
+    torch.manual_seed(5)
+    model.config.goal_threshold, model.config.goal_horizon = threshold, horizon
+    return imagine_goal(model, random_frames(B), torch.zeros(B, STATE), INSTRUCTIONS)
+
+
+def trajectory(model: TextWorldModelRewardModel) -> tuple[Tensor, Tensor]:
+    """The whole imagination: done probabilities (B, HORIZON) and the tokens they speak of (B, HORIZON, S)."""
+    torch.manual_seed(5)
+    state = model.start(random_frames(B), torch.zeros(B, STATE), INSTRUCTIONS)
+    steps = [model.step(state) for _ in range(HORIZON)]
+    return (
+        torch.stack([step.done_logit.sigmoid() for step in steps], 1),
+        torch.stack([step.tokens for step in steps], 1),
+    )
+
+
+def test_the_goal_is_the_first_frame_whose_done_reaches_the_threshold_else_the_likeliest(model):
+    """Eq. 6 by its definition, at a threshold that half of the imaginations reach."""
+    probability, tokens = trajectory(model)
+    threshold = probability.max(1).values.median().item()
+    goal = imagine(model, threshold)
+    for row in range(B):
+        reaching = (probability[row] >= threshold).nonzero().flatten()
+        expected = reaching[0] if len(reaching) else probability[row].argmax()
+        assert torch.equal(goal.tokens[row], tokens[row, expected])
+        assert goal.reached[row] == bool(len(reaching))
+    assert goal.reached.any()
+    assert not goal.reached.all()
+
+
+def test_a_later_frame_of_higher_probability_does_not_replace_the_first_that_reached(model):
+    probability, tokens = trajectory(model)
+    row = int((probability.argmax(1) > 0).nonzero()[0])
+    threshold = probability[row, 0].item()
+    goal = imagine(model, threshold)
+    assert torch.equal(goal.tokens[row], tokens[row, 0])
+    assert goal.reached[row]
+
+
+def test_the_search_ends_at_the_horizon(model):
+    _, tokens = trajectory(model)
+    goal = imagine(model, 0.9999, horizon=1)
+    assert torch.equal(goal.tokens, tokens[:, 0])
+    assert not goal.reached.any()
+
+
+@pytest.mark.parametrize(("setting", "message"), [
+    ({"goal_horizon": 0}, r"--model\.goal_horizon=0: must be at least 1"),
+    ({"goal_threshold": 0.0}, r"--model\.goal_threshold=0\.0: must be a probability"),
+    ({"goal_threshold": 1.5}, r"--model\.goal_threshold=1\.5: must be a probability"),
+])  # fmt: skip
+def test_impossible_goals_are_named(setting, message):
+    with pytest.raises(ValueError, match=message):
+        TextWorldModelConfig(device="cpu", **setting)

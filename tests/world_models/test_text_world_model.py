@@ -1,0 +1,159 @@
+"""The text world model around its text encoder: what it learns, and checkpoints that travel."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from huggingface_hub import HfApi, constants
+from safetensors.torch import load_file
+from transformers import BertConfig
+
+from lerobot_wmrl.checkpoints import resolve_checkpoint
+from lerobot_wmrl.command import CONFIG_FILE
+from lerobot_wmrl.world_models.checkpoint import load_model
+from lerobot_wmrl.world_models.goal import imagine_goal
+from tests.hub_server import WRITE_TOKEN, running_hub
+from tests.trained import run_training, text_config
+from tests.world_models.made_up_clips import ARRIVAL, INSTRUCTIONS, STATE, fit, made_up_clip, text_model
+from tests.world_models.pretrained_t5 import save_t5
+
+LEROBOT_PUBLISHES = (".safetensors", ".json", ".yaml", ".md")
+"""Endings of the files that `push_model_to_hub` uploads."""
+
+WEIGHTS = "checkpoints/last/pretrained_model/model.safetensors"
+
+LOAD = """
+import sys
+import lerobot_env_wmrl
+from lerobot_wmrl.world_models.checkpoint import load_model
+
+model = load_model("somebody/golden", "text_world_model")
+print(model.encode_instructions(sys.argv[1:], 2)[0].flatten().tolist())
+"""
+
+
+@pytest.fixture(scope="module")
+def trained(small_dataset, trained_models, tmp_path_factory) -> Path:
+    """Output folder of a training with a frozen T5 whose own folder is gone afterwards."""
+    folder = tmp_path_factory.mktemp("frozen")
+    config = text_config(trained_models["frame_tokenizer"], text_encoder=str(save_t5(folder / "t5", "byt5")))
+    output_dir = run_training(config, Path(small_dataset.root), folder / "run", steps=2)
+    shutil.rmtree(folder / "t5")
+    return output_dir
+
+
+@pytest.mark.parametrize("kind", [None, "t5"])
+def test_two_instructions_lead_from_one_start_to_two_goals(kind, tmp_path):
+    model = text_model(text_encoder=kind and str(save_t5(tmp_path, kind)))
+    clip = made_up_clip()
+    fit(model, clip, steps=100)
+    for rows in ([0, 1], [1, 0]):
+        goal = imagine_goal(model, clip.tokens[rows, 0], clip.state[rows, 0], [INSTRUCTIONS[r] for r in rows])
+        assert goal.reached.all()
+        right = (goal.tokens == clip.tokens[rows, ARRIVAL]).float().mean(1)
+        assert (right > 0.9).all()
+
+
+def test_training_leaves_a_frozen_t5_as_it_is(tmp_path):
+    model = text_model(text_encoder=str(save_t5(tmp_path)))
+    before = {name: value.clone() for name, value in model.text_encoder.t5.model.state_dict().items()}
+    projection = model.text_encoder.project.weight.clone()
+    fit(model, made_up_clip(), steps=3)
+    after = model.text_encoder.t5.model.state_dict()
+    assert all(torch.equal(value, after[name]) for name, value in before.items())
+    assert not torch.equal(projection, model.text_encoder.project.weight)
+
+
+def test_one_instruction_for_two_episodes_is_refused():
+    model, clip = text_model(), made_up_clip()
+    for wrong in (INSTRUCTIONS[:1], [*INSTRUCTIONS, "push"]):
+        with pytest.raises(ValueError, match=f"task: {len(wrong)} instructions for 2 episodes"):
+            imagine_goal(model, clip.tokens[:, 0], torch.zeros(2, STATE), wrong)
+        with pytest.raises(ValueError, match=f"task: {len(wrong)} instructions for 2 episodes"):
+            model.loss(clip._replace(instructions=wrong))
+
+
+def test_a_checkpoint_carries_its_frozen_t5_in_files_that_lerobot_publishes(trained, tmp_path):
+    folder = resolve_checkpoint(trained)
+    moved = shutil.copytree(folder, tmp_path / "elsewhere")
+    files = [path for path in moved.rglob("*") if path.is_file()]
+    assert all(path.suffix in LEROBOT_PUBLISHES for path in files)
+    assert moved / "text_encoder" / "model.safetensors" in files
+    assert json.loads((moved / "config.json").read_text())["text_encoder"] == "text_encoder"
+    first, again = (load_model(path, "text_world_model") for path in (folder, moved))
+    assert torch.equal(first.text_encoder(INSTRUCTIONS)[0], again.text_encoder(INSTRUCTIONS)[0])
+
+
+def test_training_goes_on_where_the_t5s_own_folder_is_gone(trained, small_dataset, tmp_path):
+    output_dir = shutil.copytree(trained, tmp_path / "run", symlinks=True)
+    shutil.rmtree(output_dir / "checkpoints" / "000002")
+    given = json.loads((output_dir / CONFIG_FILE).read_text())["model"]
+    config = text_config(given["tokenizer_path"], text_encoder=given["text_encoder"])
+    run_training(config, Path(small_dataset.root), output_dir, steps=2)
+    expected, resumed = load_file(trained / WEIGHTS), load_file(output_dir / WEIGHTS)
+    assert all(torch.equal(expected[name], resumed[name]) for name in expected)
+
+
+def test_it_loads_from_the_hub_by_its_id(trained, tmp_path, monkeypatch):
+    monkeypatch.setattr(constants, "HF_HUB_DISABLE_XET", True)
+    model = load_model(trained, "text_world_model")
+    with running_hub() as hub:
+        api = HfApi(hub.url, WRITE_TOKEN)
+        api.create_repo("somebody/golden")
+        api.upload_folder(
+            repo_id="somebody/golden", folder_path=resolve_checkpoint(trained),
+            allow_patterns=[f"*{suffix}" for suffix in LEROBOT_PUBLISHES],
+        )  # fmt: skip
+        own = {"HF_ENDPOINT": hub.url, "HF_HOME": str(tmp_path), "HF_HUB_DISABLE_XET": "1"}
+        done = subprocess.run(
+            [sys.executable, "-c", LOAD, *INSTRUCTIONS], env={**os.environ, **own}, capture_output=True,
+            text=True, timeout=120,
+        )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    condition = model.encode_instructions(INSTRUCTIONS, 2)[0]
+    assert json.loads(done.stdout.splitlines()[-1]) == pytest.approx(condition.flatten().tolist(), abs=1e-5)
+
+
+def test_a_checkpoint_that_lost_its_t5_is_named(trained, tmp_path):
+    lost = shutil.copytree(resolve_checkpoint(trained), tmp_path / "lost")
+    shutil.rmtree(lost / "text_encoder")
+    with pytest.raises(ValueError, match=r"lost: the text encoder in its folder text_encoder cannot be read"):
+        load_model(lost, "text_world_model")
+
+
+def test_what_is_no_t5_is_named_and_nothing_is_written(small_dataset, trained_models, tmp_path):
+    root, tokenizer = Path(small_dataset.root), trained_models["frame_tokenizer"]
+    BertConfig().save_pretrained(tmp_path / "bert")
+    t5 = save_t5(tmp_path / "t5", "byt5")
+    no_tokenizer = shutil.copytree(t5, tmp_path / "no_tokenizer")
+    for path in no_tokenizer.glob("*token*"):
+        path.unlink()
+    torn = shutil.copytree(t5, tmp_path / "torn")
+    os.truncate(torn / "model.safetensors", 1000)
+    for folder, reason in {
+        tmp_path / "bert": "it is of type 'bert'",
+        no_tokenizer: r"its tokenizer knows \d+ tokens, the encoder 384",
+        torn: "header",
+        tmp_path / "nowhere": "",
+    }.items():
+        message = rf"--model\.text_encoder={folder}: no T5 encoder .*{reason}.* give the id of one on the hub"
+        with pytest.raises(ValueError, match=message):
+            run_training(text_config(tokenizer, text_encoder=str(folder)), root, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("task", "message"), [("", "an instruction is empty"), ("x" * 10_000, "at most 512")]
+)
+def test_a_dataset_with_a_bad_instruction_is_named_and_nothing_is_written(
+    task, message, make_synthetic_dataset, trained_models, tmp_path
+):
+    root = Path(make_synthetic_dataset(tmp_path / "data", episodes=1, instruction=task).root)
+    with pytest.raises(ValueError, match=message):
+        run_training(text_config(trained_models["frame_tokenizer"]), root, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
