@@ -79,6 +79,7 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     from lerobot_wmrl.world_models.episode_table import choose_episodes, open_dataset, read_episodes
     from lerobot_wmrl.world_models.evaluation import accuracy_by_step, replay, success_agreement
     from lerobot_wmrl.world_models.frame_cache import cached_frames
+    from lerobot_wmrl.world_models.reconstruction import reconstruction_metrics
 
     check_config(cfg)
     model = load_model(cfg.model.path, "action_world_model", cfg.device)
@@ -91,7 +92,11 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     agreement = success_agreement(run, cfg.done_threshold, cfg.done_frames)
     accuracy = accuracy_by_step(model, run)
     draw(cfg, model, run, accuracy)
-    write_json(cfg.output_dir / "metrics.json", {**agreement, **accuracy, "dataset": cfg.dataset.root})
+    tokenizer = reconstruction_metrics(model, table, frames, episodes)
+    write_json(
+        cfg.output_dir / "metrics.json",
+        {**agreement, **accuracy, "tokenizer": tokenizer, "dataset": cfg.dataset.root},
+    )
     print(
         f"{len(episodes)} real episodes replayed: {agreement['false_successes']} of "
         f"{agreement['real_failures']} failures were called successes, "

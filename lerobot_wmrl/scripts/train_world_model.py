@@ -68,11 +68,12 @@ def check_tokenizer_path(model: RewardModelConfig) -> None:
 
 
 def train_world_model(cfg: TrainWorldModelConfig) -> None:
-    """Build or reload the model, cache the data, train."""
+    """Build or reload the model, cache the data, train; a tokenizer's held-out accuracy goes beside it."""
     from lerobot.utils.random_utils import set_seed
 
     from lerobot_wmrl.checkpoints import latest_checkpoint
     from lerobot_wmrl.world_models.episode_table import open_dataset, read_episodes
+    from lerobot_wmrl.world_models.reconstruction import write_reconstruction
     from lerobot_wmrl.world_models.training import build_model, make_sampler, train
 
     check_config(cfg)
@@ -91,6 +92,8 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
     sampler = make_sampler(model, table, cfg.batch_size, cfg.seed)
     claim_output_dir(cfg.output_dir, given)
     train(model, sampler, cfg, cfg.save_pretrained)
+    if isinstance(cfg.model, FrameTokenizerConfig):
+        write_reconstruction(model, table, cfg.output_dir)
 
 
 def main() -> None:

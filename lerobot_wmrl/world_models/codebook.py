@@ -1,18 +1,33 @@
-"""What a token is made of: one digit a code factor, and the logits over them.
+"""What a token is made of: one digit a code factor, the logits over them, and what the digits stand for.
 
-Codes are handled factor by factor: a token of FSQ levels (8, 5, 5, 5) costs 23 logits instead of 1000, and
-near misses of a level are near misses of the embedding.
+Codes are handled factor by factor: a token of FSQ levels (8, 5, 5, 5) costs 23 logits instead of 1000, one of
+18 LFQ bits as two factors of 512 costs 1024 instead of 262,144. Near misses of a code are near misses of the
+embedding, since networks see the code's values and not its index.
 """
 
+import math
 from collections.abc import Sequence
+from typing import Final
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+LARGEST_TOKEN: Final = 2**31
+"""Tokens are cached as int32."""
+
+LARGEST_BINARY_FACTOR: Final = 2**12
+"""LFQ's entropy term holds a probability for every code of a factor at every token of the batch."""
+
 
 class CodeBook(nn.Module):
-    """Arithmetic between tokens, their digits (one level index a factor) and grids of code values."""
+    """Finite scalar quantisation: a factor is one value in [−1, 1], its digit the index of its level.
+
+    Arithmetic between tokens, their digits (one a factor) and the values that they stand for.
+
+    Args:
+        levels: codes of each factor. A token is the number whose digits in this mixed radix they are.
+    """
 
     factor_of_logit: Tensor
     level_of_logit: Tensor
@@ -21,6 +36,7 @@ class CodeBook(nn.Module):
 
     def __init__(self, levels: Sequence[int]) -> None:
         super().__init__()
+        check_levels(levels)
         self.level_counts = tuple(levels)
         factors = [factor for factor, count in enumerate(levels) for _ in range(count)]
         within = [level for count in levels for level in range(count)]
@@ -33,20 +49,34 @@ class CodeBook(nn.Module):
             self.register_buffer(name, torch.tensor(values), persistent=False)
         self.register_buffer("basis", basis, persistent=False)
 
+    @property
+    def channels(self) -> int:
+        """K, values that a token stands for."""
+        return len(self.level_counts)
+
     def digits(self, tokens: Tensor) -> Tensor:
-        """Tokens (…) → level indices (…, C)."""
+        """Tokens (…) → digits (…, C)."""
         return tokens[..., None] // self.basis % self.levels
 
     def tokens(self, digits: Tensor) -> Tensor:
-        """Level indices (…, C) → tokens (…)."""
+        """Digits (…, C) → tokens (…)."""
         return (digits * self.basis).sum(-1)
 
     def values(self, digits: Tensor) -> Tensor:
-        """Level indices (…, C) → values in [−1, 1] (…, C)."""
+        """Digits (…, C) → values in [−1, 1] (…, K)."""
         return digits * 2.0 / (self.levels - 1) - 1.0
 
+    def distance(self, digits: Tensor, other: Tensor) -> Tensor:
+        """Steps between two codes, levels summed over factors: digits (…, C) twice → (…)."""
+        return (digits - other).abs().sum(-1)
+
+    def neighbors(self, digits: Tensor) -> Tensor:
+        """Each digit (…, C) one step further, at random: one level up or down, if there is one."""
+        shift = torch.randint_like(digits, 0, 2) * 2 - 1
+        return (digits + shift).clamp_min(0).minimum(self.levels - 1)
+
     def one_hot(self, digits: Tensor) -> Tensor:
-        """Level indices (…, C) → (…, V), one 1 a factor."""
+        """Digits (…, C) → (…, V), one 1 a factor."""
         return (digits[..., self.factor_of_logit] == self.level_of_logit).float()
 
     def cross_entropy(self, logits: Tensor, digits: Tensor) -> Tensor:
@@ -63,8 +93,69 @@ class CodeBook(nn.Module):
         return torch.stack(parts).mean((0, 2))
 
     def sample(self, logits: Tensor, temperature: float, generator: torch.Generator | None) -> Tensor:
-        """Gumbel-argmax at a temperature on the logits (0: the most likely level). (…, V) → digits (…, C)."""
+        """Gumbel-argmax at a temperature on the logits (0: the most likely code). (…, V) → digits (…, C)."""
         if temperature > 0:
             uniform = torch.rand(logits.shape, device=logits.device, generator=generator).clamp_min(1e-9)
             logits = logits / temperature - (-uniform.log()).log()
         return torch.stack([part.argmax(-1) for part in logits.split(self.level_counts, -1)], -1)
+
+
+class BinaryCodeBook(CodeBook):
+    """Lookup-free quantisation (Yu et al. 2024, eq. 3): a factor of 2^b codes is b signs.
+
+    Its digit has them as bits, the first sign as the highest.
+    """
+
+    place: Tensor
+
+    def __init__(self, levels: Sequence[int]) -> None:
+        super().__init__(levels)
+        check_binary_levels(levels)
+        self.bits = levels[0].bit_length() - 1
+        self.register_buffer("place", torch.arange(self.bits - 1, -1, -1), persistent=False)
+
+    @property
+    def channels(self) -> int:
+        return len(self.level_counts) * self.bits
+
+    def values(self, digits: Tensor) -> Tensor:
+        """Digits (…, C) → signs, −1 or 1, (…, K)."""
+        return ((digits[..., None] >> self.place) & 1).flatten(-2) * 2.0 - 1.0
+
+    def distance(self, digits: Tensor, other: Tensor) -> Tensor:
+        """Hamming distance: signs that differ. Digits (…, C) twice → (…)."""
+        return (self.values(digits) != self.values(other)).sum(-1)
+
+    def neighbors(self, digits: Tensor) -> Tensor:
+        """Each digit (…, C) with one of its signs, at random, flipped."""
+        return digits ^ (1 << torch.randint_like(digits, 0, self.bits))
+
+
+CODEBOOKS: Final[dict[str, type[CodeBook]]] = {"fsq": CodeBook, "lfq": BinaryCodeBook}
+
+
+def make_codebook(quantizer: str, levels: Sequence[int]) -> CodeBook:
+    """The code book of `fsq` or `lfq`. ValueError for another name, or levels it cannot have."""
+    if quantizer not in CODEBOOKS:
+        raise ValueError(f"--model.quantizer={quantizer}: choose one of {', '.join(CODEBOOKS)}")
+    return CODEBOOKS[quantizer](levels)
+
+
+def check_levels(levels: Sequence[int]) -> None:
+    """ValueError unless every factor is a choice, and a token a number that can be stored."""
+    if not levels or min(levels) < 2:
+        raise ValueError(f"--model.levels={list(levels)}: give at least one factor, each of 2 or more levels")
+    if math.prod(levels) > LARGEST_TOKEN:
+        raise ValueError(
+            f"--model.levels={list(levels)}: {math.prod(levels)} codes are more than 2^31; give fewer factors"
+        )
+
+
+def check_binary_levels(levels: Sequence[int]) -> None:
+    """ValueError unless all factors are the same, not too large, power of two."""
+    size = levels[0]
+    if len(set(levels)) > 1 or size & (size - 1) or size > LARGEST_BINARY_FACTOR:
+        raise ValueError(
+            f"--model.levels={list(levels)}: with --model.quantizer=lfq all factors must be the same power "
+            f"of two, at most {LARGEST_BINARY_FACTOR}; [512,512] is 18 bits in two factors"
+        )

@@ -15,17 +15,31 @@ class FrameTokenizerConfig(RewardModelConfig):
     Args:
         cameras: camera names whose frames make one time step.
         image_size: side of the square frames in the dataset, in pixels.
-        widths: channels from fine to coarse; each further entry halves the token grid.
-        levels: levels of each code factor (finite scalar quantisation).
+        widths: channels from fine to coarse. A token is 4x4 pixels with one entry; each further entry doubles
+            its side, and the last one's work costs a fourth of what it would one entry before.
+        quantizer: `fsq` (finite scalar quantisation) or `lfq` (MAGVIT-2's lookup-free quantisation).
+        levels: codes of each factor of a token; with `lfq` the same power of two for all, such as [512,512]
+            for 18 bits.
         motion_weight: how much more a pixel counts in the loss once it differs from the episode's start.
+        perceptual_weight: of LPIPS in the loss. Needs torchvision's VGG-16 in its cache; 0 does without.
     """
 
     cameras: list[str] = field(default_factory=lambda: ["third_view"])
     image_size: int = 128
     widths: list[int] = field(default_factory=lambda: [48, 96])
+    quantizer: str = "fsq"
     levels: list[int] = field(default_factory=lambda: [5, 5, 5, 5, 5, 5])
     motion_weight: float = 4.0
+    perceptual_weight: float = 0.0
     learning_rate: float = 2e-3
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("motion_weight", "perceptual_weight"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"--model.{name}={getattr(self, name)}: must not be negative")
+        if not self.cameras or len(set(self.cameras)) < len(self.cameras):
+            raise ValueError(f"--model.cameras={self.cameras}: give at least one camera, each once")
 
     def get_optimizer_preset(self) -> AdamWConfig:
         return AdamWConfig(lr=self.learning_rate, weight_decay=1e-4, grad_clip_norm=1.0)

@@ -13,7 +13,8 @@ class WorldModelConfig(RewardModelConfig):
 
     Args:
         tokenizer_path: frame tokenizer checkpoint to start from; a trained world model carries its own copy.
-        cameras, image_size, tokenizer_widths, levels: of that tokenizer, filled in from its checkpoint.
+        cameras, image_size, tokenizer_widths, levels, quantizer: of that tokenizer, filled in from its
+            checkpoint.
         state_size: width of `observation.state`, 0 to do without proprioception; filled in from the dataset.
         layers, width, heads: of the spatial-temporal transformer.
         window: frames the model remembers.
@@ -25,7 +26,7 @@ class WorldModelConfig(RewardModelConfig):
             believe in motion: it then pushes objects that the hand misses.
         done_weight, done_positive_weight, state_weight: of the other losses, beside the tokens' one.
         self_forcing: share of input frames replaced by the model's own predictions in training.
-        token_noise: share of input code factors moved by one level in training.
+        token_noise: share of input code factors moved by one step in training: a level of FSQ, a sign of LFQ.
         temperature: of sampling in imagination; 0 takes the most likely code.
     """
 
@@ -34,6 +35,7 @@ class WorldModelConfig(RewardModelConfig):
     image_size: int = 128
     tokenizer_widths: list[int] = field(default_factory=lambda: [48, 96])
     levels: list[int] = field(default_factory=lambda: [5, 5, 5, 5, 5, 5])
+    quantizer: str = "fsq"
     state_size: int = 8
 
     layers: int = 4

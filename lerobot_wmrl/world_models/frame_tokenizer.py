@@ -1,22 +1,28 @@
-"""Frame tokenizer: RGB frames to a grid of discrete tokens and back (MAGVIT-2's role, FSQ codes).
+"""Frame tokenizer: RGB frames to a grid of discrete tokens and back (MAGVIT-2's role).
 
-A token is the index of one finite-scalar-quantised vector (Mentzer et al. 2023, eq. 1): no auxiliary
-losses and no dead codes. Several cameras share the weights; their grids are concatenated.
+A token is the index of one quantised vector (`quantizer.py`). Several cameras share the weights; their grids
+are concatenated.
 """
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
-from vector_quantize_pytorch import FSQ
+
+from lerobot_wmrl.world_models.codebook import make_codebook
+from lerobot_wmrl.world_models.quantizer import make_quantizer
 
 PATCH = 4
+NORM_GROUPS = 8
 
 MOTION_THRESHOLD = 0.08
 """A pixel has moved when a colour, in [0, 1], differs by more from the episode's first frame."""
+
+ImageLoss = Callable[[Tensor, Tensor], Tensor]
+"""Reconstructions and images (F, 3, H, W) in [−1, 1] → a loss ()."""
 
 
 class Decoded(NamedTuple):
@@ -31,7 +37,7 @@ class ResidualBlock(nn.Module):
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.norm = nn.GroupNorm(8, channels)
+        self.norm = nn.GroupNorm(NORM_GROUPS, channels)
         self.conv_in = nn.Conv2d(channels, channels, 3, padding=1)
         self.conv_out = nn.Conv2d(channels, channels, 3, padding=1)
 
@@ -84,25 +90,34 @@ class FrameTokenizer(nn.Module):
     Args:
         image_size: side of the square frames, a multiple of `4 · 2^(len(widths) − 1)`.
         widths: channels from fine to coarse; each further entry halves the grid.
-        levels: FSQ levels of each code factor; a token is one of their product.
+        levels: codes of each factor; a token is one of their product.
         num_cameras: frames a time step, N.
+        quantizer: `fsq` or `lfq`.
     """
 
     def __init__(
-        self, image_size: int, widths: Sequence[int], levels: Sequence[int], num_cameras: int = 1
+        self,
+        image_size: int,
+        widths: Sequence[int],
+        levels: Sequence[int],
+        num_cameras: int = 1,
+        quantizer: str = "fsq",
     ) -> None:
         super().__init__()
+        check_widths(widths)
         self.downsample = PATCH * 2 ** (len(widths) - 1)
-        if image_size % self.downsample:
+        if image_size < 1 or image_size % self.downsample:
             raise ValueError(
-                f"image_size={image_size} is not a multiple of the tokenizer's grid {self.downsample}"
+                f"--model.image_size={image_size}: must be a multiple of {self.downsample}, a token's side "
+                f"with --model.widths={list(widths)}"
             )
         self.image_size = image_size
         self.grid = image_size // self.downsample
         self.num_cameras = num_cameras
-        self.encoder = Encoder(widths, len(levels))
-        self.decoder = Decoder(widths, len(levels))
-        self.quantizer = FSQ(list(levels))
+        channels = make_codebook(quantizer, levels).channels
+        self.encoder = Encoder(widths, channels)
+        self.decoder = Decoder(widths, channels)
+        self.quantizer = make_quantizer(quantizer, levels)
         self.whiten = nn.ModuleList(
             nn.BatchNorm2d(channels, affine=False) for channels in (widths[-1], widths[0])
         )
@@ -113,15 +128,13 @@ class FrameTokenizer(nn.Module):
         return self.num_cameras * self.grid**2
 
     def encode(self, images: Tensor) -> Tensor:
-        """Images (B, N, 3, H, W) in [0, 1] → tokens (B, S) int64."""
-        _, indices = self.quantizer(self.encoder(images.flatten(0, 1) * 2 - 1))
-        return indices.reshape(images.shape[0], -1).long()
+        """Images (B, N, 3, H, W) in [0, 1] → tokens (B, S) int64. ValueError for other cameras or sizes."""
+        self._check_images(images)
+        return self.quantizer(self.encoder(images.flatten(0, 1) * 2 - 1)).tokens.reshape(len(images), -1)
 
     def decode_with_features(self, tokens: Tensor) -> Decoded:
         """Tokens (B, S) → images and the whitened feature maps from which similarity is measured."""
-        pixels, features = self.decoder(
-            self.quantizer.indices_to_codes(tokens.reshape(-1, self.grid, self.grid))
-        )
+        pixels, features = self.decoder(self.quantizer.codes(tokens.reshape(-1, self.grid, self.grid)))
         images = ((pixels + 1) / 2).clamp(0, 1).unflatten(0, (len(tokens), self.num_cameras))
         return Decoded(images, self._whitened(features))
 
@@ -129,16 +142,30 @@ class FrameTokenizer(nn.Module):
         """Tokens (B, S) → images (B, N, 3, H, W) in [0, 1]."""
         return self.decode_with_features(tokens).images
 
+    def _check_images(self, images: Tensor) -> None:
+        expected = (self.num_cameras, 3, self.image_size, self.image_size)
+        if images.shape[1:] != expected:
+            raise ValueError(
+                f"images of shape {tuple(images.shape)}: this tokenizer takes (B, N, 3, H, W) = "
+                f"(B, {', '.join(map(str, expected))}); resize them or train a tokenizer for them"
+            )
+
     def _whitened(self, features: list[Tensor]) -> list[Tensor]:
         """Zero mean and unit variance a channel over the training frames: without it what all frames share
         hides how they differ. The statistics are learnt in training and fixed afterwards."""
         return [whiten(feature) for whiten, feature in zip(self.whiten, features, strict=True)]
 
-    def forward(self, images: Tensor, weight: Tensor | None = None) -> tuple[Tensor, dict[str, float]]:
-        """Reconstruction loss: weighted L1 plus L2, images (B, N, 3, H, W), weight (B, N, 1, H, W)."""
+    def forward(
+        self, images: Tensor, weight: Tensor | None = None, perceptual: ImageLoss | None = None
+    ) -> tuple[Tensor, dict[str, float]]:
+        """Reconstruction loss: weighted L1 plus L2, plus the quantizer's and the perceptual one.
+
+        images (B, N, 3, H, W) in [0, 1], weight (B, N, 1, H, W).
+        """
+        self._check_images(images)
         flat = images.flatten(0, 1) * 2 - 1
-        codes, _ = self.quantizer(self.encoder(flat))
-        pixels, features = self.decoder(codes)
+        quantized = self.quantizer(self.encoder(flat))
+        pixels, features = self.decoder(quantized.codes)
         if self.training:
             self._whitened([feature.detach() for feature in features])
         error = pixels - flat
@@ -146,7 +173,20 @@ class FrameTokenizer(nn.Module):
         if weight is not None:
             weighted = weighted * weight.flatten(0, 1)
         mse = error.detach().square().mean() / 4
-        return weighted.mean(), {"psnr": float(-10 * torch.log10(mse))}
+        loss, metrics = weighted.mean() + quantized.loss, {"psnr": float(-10 * torch.log10(mse))}
+        if perceptual is not None:
+            term = perceptual(pixels, flat)
+            loss, metrics["perceptual_loss"] = loss + term, term.item()
+        return loss, metrics | quantized.metrics
+
+
+def check_widths(widths: Sequence[int]) -> None:
+    """ValueError unless there are widths, and the coarsest can be normalised in groups."""
+    if not widths or min(widths) < 1 or widths[-1] % NORM_GROUPS:
+        raise ValueError(
+            f"--model.widths={list(widths)}: give the channels from fine to coarse, the last a multiple of "
+            f"{NORM_GROUPS}; each further entry halves the token grid"
+        )
 
 
 def motion_weight(images: Tensor, reference: Tensor, strength: float) -> Tensor:

@@ -10,7 +10,8 @@ from lerobot_wmrl.world_models.codebook import CodeBook
 from lerobot_wmrl.world_models.next_frame import STATE_STEP, Prediction
 
 MOTION_LEVELS = 3
-"""A token moves when its factors change by so many levels in all; less is mostly the codes' own flicker."""
+"""A token moves when its code changes by so many steps, FSQ's levels or LFQ's signs; less is mostly the
+codes' own flicker."""
 
 STATE_PRECISION = 0.1
 """Where the state loss turns from squared to absolute, in `STATE_STEP`s: about a millimetre of the TCP."""
@@ -32,13 +33,12 @@ class Clip(NamedTuple):
     instructions: list[str]
 
 
-def corrupt_digits(digits: Tensor, levels: Tensor, share: float) -> Tensor:
-    """Move a share of the code factors (…, C) by one level, so that small errors are met in training."""
+def corrupt_digits(digits: Tensor, codebook: CodeBook, share: float) -> Tensor:
+    """Move a share of the code factors (…, C) by one step, so that small errors are met in training."""
     if share <= 0:
         return digits
-    shift = torch.randint_like(digits, 0, 2) * 2 - 1
-    hit = torch.rand(digits.shape, device=digits.device) < share
-    return (digits + shift * hit).clamp_min(0).minimum(levels - 1)
+    neighbors = codebook.neighbors(digits)
+    return torch.where(torch.rand(digits.shape, device=digits.device) < share, neighbors, digits)
 
 
 def forced_share(target: float, progress: float) -> float:
@@ -67,7 +67,7 @@ def next_frame_loss(
     """
     target, known = digits[:, 1:], (clip.valid[:, 1:] & clip.valid[:, :-1])[..., None]
     valid = known.float()
-    moved = (target - digits[:, :-1]).abs().sum(-1) >= MOTION_LEVELS
+    moved = codebook.distance(target, digits[:, :-1]) >= MOTION_LEVELS
     weight = (1 + config.motion_weight * moved) * valid
     logits = prediction.logits[:, :-1]
     token_loss = (codebook.cross_entropy(logits, target) * weight).sum() / weight.sum().clamp_min(1)

@@ -9,8 +9,9 @@ from torch import Tensor
 
 from lerobot_wmrl.world_models.compatibility import check_cameras
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
-from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer, motion_weight
+from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer, ImageLoss, motion_weight
 from lerobot_wmrl.world_models.goal import similarity_to_goal
+from lerobot_wmrl.world_models.perceptual import PerceptualLoss, lpips_network, require_backbone
 
 
 def stack_cameras(batch: dict[str, Tensor], keys: Sequence[str]) -> Tensor:
@@ -35,7 +36,11 @@ class FrameTokenizerRewardModel(PreTrainedRewardModel):
         self.config: FrameTokenizerConfig = config
         if dataset_meta is not None:
             check_cameras(config, dataset_meta.features)
-        self.tokenizer = FrameTokenizer(config.image_size, config.widths, config.levels, len(config.cameras))
+            if config.perceptual_weight:
+                require_backbone()
+        self.tokenizer = FrameTokenizer(
+            config.image_size, config.widths, config.levels, len(config.cameras), config.quantizer
+        )
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
         """Reconstruction loss of images (B, 3, H, W); `reference.*`: the episodes' first frames, if known."""
@@ -44,7 +49,12 @@ class FrameTokenizerRewardModel(PreTrainedRewardModel):
         if f"reference.{self.config.cameras[0]}" in batch:
             reference = stack_cameras(batch, [f"reference.{camera}" for camera in self.config.cameras])
             weight = motion_weight(images, reference, self.config.motion_weight)
-        return self.tokenizer(images, weight)
+        return self.tokenizer(images, weight, self._perceptual_loss(images.device))
+
+    def _perceptual_loss(self, device: torch.device) -> ImageLoss | None:
+        """Not a module of this model: a checkpoint neither contains nor needs LPIPS's network."""
+        weight = self.config.perceptual_weight
+        return PerceptualLoss(lpips_network(device), weight) if weight else None
 
     @torch.no_grad()
     def compute_reward(self, batch: dict[str, Tensor]) -> Tensor:

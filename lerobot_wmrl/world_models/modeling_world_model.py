@@ -91,7 +91,7 @@ class WorldModelRewardModel(PreTrainedRewardModel):
         if dataset_meta is not None:
             self._adopt_features(dataset_meta.features)
         self.tokenizer = FrameTokenizer(
-            config.image_size, config.tokenizer_widths, config.levels, len(config.cameras)
+            config.image_size, config.tokenizer_widths, config.levels, len(config.cameras), config.quantizer
         ).requires_grad_(False)
         if source is not None:
             self.tokenizer.load_state_dict(source.tokenizer.state_dict())
@@ -103,6 +103,7 @@ class WorldModelRewardModel(PreTrainedRewardModel):
             levels=config.levels, grid=self.tokenizer.grid, num_cameras=len(config.cameras),
             state_size=config.state_size, patch=config.patch, layers=config.layers, width=config.width,
             heads=config.heads, window=config.window, code_width=config.code_width,
+            quantizer=config.quantizer,
         )  # fmt: skip
         self._register_statistics("state", OBS_STATE, config.state_size, dataset_stats)
 
@@ -117,6 +118,7 @@ class WorldModelRewardModel(PreTrainedRewardModel):
         source = load_model(self.config.tokenizer_path, "frame_tokenizer")
         self.config.cameras, self.config.image_size = source.config.cameras, source.config.image_size
         self.config.tokenizer_widths, self.config.levels = source.config.widths, source.config.levels
+        self.config.quantizer = source.config.quantizer
         self.config.tokenizer_path = None
         return source
 
@@ -153,7 +155,7 @@ class WorldModelRewardModel(PreTrainedRewardModel):
         condition = self.condition(clip)
         digits, state = self.network.codebook.digits(clip.tokens), self.normalize_state(clip.state)
         seen, seen_state = (
-            corrupt_digits(digits, self.network.codebook.levels, self.config.token_noise),
+            corrupt_digits(digits, self.network.codebook, self.config.token_noise),
             state,
         )
         share = forced_share(self.config.self_forcing, self.training_progress)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from lerobot_wmrl.world_models.codebook import CodeBook
+from lerobot_wmrl.world_models.codebook import make_codebook
 from lerobot_wmrl.world_models.st_transformer import SpatialTemporalTransformer, TemporalCache
 
 STATE_STEP = 0.1
@@ -33,14 +33,14 @@ class Prediction(NamedTuple):
 class FrameEmbedding(nn.Module):
     """Code grids to transformer tokens: a 3x3 convolution, then non-overlapping patches of the grid."""
 
-    def __init__(self, factors: int, grid: int, patch: int, code_width: int, width: int) -> None:
+    def __init__(self, channels: int, grid: int, patch: int, code_width: int, width: int) -> None:
         super().__init__()
-        self.local = nn.Conv2d(factors, code_width, 3, padding=1)
+        self.local = nn.Conv2d(channels, code_width, 3, padding=1)
         self.patches = nn.Conv2d(code_width, width, patch, stride=patch)
         self.position = nn.Parameter(torch.randn((grid // patch) ** 2, width) * 0.02)
 
     def forward(self, values: Tensor) -> tuple[Tensor, Tensor]:
-        """values (F, C, g, g) → tokens (F, (g/patch)², D) and the local features (F, code_width, g, g)."""
+        """values (F, K, g, g) → tokens (F, (g/patch)², D) and the local features (F, code_width, g, g)."""
         local = F.silu(self.local(values))
         return self.patches(local).flatten(2).transpose(1, 2) + self.position, local
 
@@ -80,19 +80,20 @@ class NextFrameNetwork(nn.Module):
     visual tokens, and is where done and the next state are read from.
 
     Args:
-        levels: FSQ levels. grid: side of a camera's token grid. num_cameras: grids a frame.
+        levels: codes of each factor. quantizer: what they stand for, `fsq` or `lfq`.
+        grid: side of a camera's token grid. num_cameras: grids a frame.
         state_size: P, 0 without proprioception. patch: side of the token patches that form one
         transformer token.
     """
 
     def __init__(
         self, *, levels: Sequence[int], grid: int, num_cameras: int, state_size: int, patch: int,
-        layers: int, width: int, heads: int, window: int, code_width: int,
+        layers: int, width: int, heads: int, window: int, code_width: int, quantizer: str = "fsq",
     ) -> None:  # fmt: skip
         super().__init__()
-        self.codebook = CodeBook(levels)
+        self.codebook = make_codebook(quantizer, levels)
         self.grid, self.num_cameras, self.patch = grid, num_cameras, patch
-        self.embedding = FrameEmbedding(len(levels), grid, patch, code_width, width)
+        self.embedding = FrameEmbedding(self.codebook.channels, grid, patch, code_width, width)
         self.camera = nn.Parameter(torch.randn(num_cameras, 1, width) * 0.02)
         self.register = nn.Parameter(torch.randn(width) * 0.02)
         self.state_in = nn.Linear(state_size, width)

@@ -59,6 +59,56 @@ def test_motion_counts_more_than_background(frames):
     assert weight[0, 0, 0, 28, 28] == 1
 
 
-def test_a_size_off_the_grid_is_refused():
-    with pytest.raises(ValueError, match="image_size=30"):
-        FrameTokenizer(30, (16, 32), (5, 5))
+@pytest.mark.parametrize("image_size", [64, 96, 128, 256])
+@pytest.mark.parametrize("quantizer", ["fsq", "lfq"])
+def test_any_square_resolution_and_several_cameras(image_size, quantizer):
+    tokenizer = FrameTokenizer(image_size, (8, 8, 8), (16, 16), 2, quantizer).eval()
+    images = torch.rand(1, 2, 3, image_size, image_size)
+    with torch.no_grad():
+        tokens = tokenizer.encode(images)
+        decoded = tokenizer.decode(tokens)
+    assert tokens.shape == (1, tokenizer.tokens_per_frame) == (1, 2 * (image_size // 16) ** 2)
+    assert decoded.shape == images.shape
+    half = tokens.shape[1] // 2
+    swapped = tokenizer.decode(torch.cat([tokens[:, half:], tokens[:, :half]], 1))
+    torch.testing.assert_close(swapped, decoded.flip(1))
+
+
+def test_fsq_learns_and_reconstructs_as_it_did_before_there_was_a_choice_of_quantizers():
+    """Written down before; if a change of the numbers is meant, write the new ones down."""
+    torch.manual_seed(0)
+    tokenizer = FrameTokenizer(32, (16, 32), (8, 5, 3))
+    optimizer = torch.optim.Adam(tokenizer.parameters(), 3e-3)
+    images = torch.rand(4, 1, 3, 32, 32)
+    for _ in range(10):
+        loss, _ = tokenizer(images)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    assert loss.item() == pytest.approx(0.7862725853919983, rel=1e-5)
+    tokens = tokenizer.eval().encode(images)[0]
+    assert tokens.tolist() == [77, 42, 75, 52, 62, 47, 59, 61, 69, 87, 60, 54, 69, 60, 67, 77]
+
+
+@pytest.mark.parametrize(("settings", "message"), [
+    ({"image_size": 30}, r"--model\.image_size=30: must be a multiple of 8"),
+    ({"widths": (16, 36)}, r"--model\.widths=\[16, 36\]: .*the last a multiple of 8"),
+    ({"widths": ()}, r"--model\.widths=\[\]"),
+    ({"levels": (5, 1)}, r"--model\.levels=\[5, 1\]: .*each of 2 or more"),
+    ({"levels": (2**16, 2**16)}, r"--model\.levels=.*more than 2\^31"),
+    ({"quantizer": "lfq"}, r"--model\.levels=\[5, 5\]: with --model\.quantizer=lfq .*power of two"),
+    ({"quantizer": "lfq", "levels": (8, 4)}, r"--model\.levels=\[8, 4\]: .*the same power"),
+    ({"quantizer": "lfq", "levels": (2**13,)}, r"--model\.levels=\[8192\]: .*at most 4096"),
+    ({"quantizer": "vq"}, r"--model\.quantizer=vq: choose one of fsq, lfq"),
+])  # fmt: skip
+def test_impossible_settings_are_named(settings, message):
+    with pytest.raises(ValueError, match=message):
+        FrameTokenizer(**{"image_size": 32, "widths": (16, 32), "levels": (5, 5), **settings})
+
+
+@pytest.mark.parametrize("shape", [(2, 1, 3, 48, 48), (2, 2, 3, 32, 32), (2, 3, 32, 32)])
+def test_other_frames_than_the_tokenizers_are_named(shape):
+    tokenizer = FrameTokenizer(32, (8, 8), (5, 5))
+    for use in (tokenizer.encode, tokenizer):
+        with pytest.raises(ValueError, match=r"this tokenizer takes .* \(B, 1, 3, 32, 32\)"):
+            use(torch.rand(shape))

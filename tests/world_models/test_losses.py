@@ -74,6 +74,6 @@ def test_forcing_replaces_later_frames_only_and_only_by_predictions():
 
 def test_corruption_moves_a_share_of_the_factors_by_one_level():
     digits = torch.randint(1, 3, (20_000, 2))
-    noisy = corrupt_digits(digits, torch.tensor([4, 4]), 0.1)
+    noisy = corrupt_digits(digits, CodeBook((4, 4)), 0.1)
     assert (noisy - digits).abs().max() == 1
     assert 0.09 < (noisy != digits).float().mean() < 0.11

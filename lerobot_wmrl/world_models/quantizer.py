@@ -1,0 +1,79 @@
+"""Quantisers of the frame tokenizer: vectors to codes and tokens, without a table of learnt codes.
+
+FSQ (Mentzer et al. 2023, eq. 1) rounds every factor to its levels: no auxiliary losses and no dead codes. LFQ
+(MAGVIT-2, Yu et al. 2024, eqs. 3-5) keeps the signs, and pays for undecided vectors and unused codes.
+"""
+
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+from torch import Tensor, nn
+from vector_quantize_pytorch import FSQ, LFQ
+
+from lerobot_wmrl.world_models.codebook import BinaryCodeBook, make_codebook
+
+ENTROPY_WEIGHT: Final = 0.1
+"""Of LFQ's entropy term, as in MAGVIT-2: of a token's code (low: decided) minus of all codes (high: used)."""
+
+COMMITMENT_WEIGHT: Final = 0.25
+"""Of the squared distance between a vector and its signs."""
+
+
+class Quantized(NamedTuple):
+    """Of F vector grids: codes (F, K, g, g), through which gradients pass as if nothing was rounded; tokens
+    (F, g, g) int64; loss (), 0 outside training; metrics to log in training."""
+
+    codes: Tensor
+    tokens: Tensor
+    loss: Tensor
+    metrics: dict[str, float]
+
+
+class FiniteScalarQuantizer(nn.Module):
+    """FSQ: one channel a factor."""
+
+    def __init__(self, levels: Sequence[int]) -> None:
+        super().__init__()
+        self.fsq = FSQ(list(levels))
+
+    def forward(self, vectors: Tensor) -> Quantized:
+        """Vectors (F, K, g, g) → their codes and tokens."""
+        codes, tokens = self.fsq(vectors)
+        return Quantized(codes, tokens.long(), codes.new_zeros(()), {})
+
+    def codes(self, tokens: Tensor) -> Tensor:
+        """Tokens (F, g, g) → codes (F, K, g, g)."""
+        return self.fsq.indices_to_codes(tokens)
+
+
+class LookupFreeQuantizer(nn.Module):
+    """LFQ: a factor of 2^b codes takes b channels; entropies are those of a factor, not of whole tokens."""
+
+    def __init__(self, levels: Sequence[int]) -> None:
+        super().__init__()
+        self.codebook = BinaryCodeBook(levels)
+        self.lfq = LFQ(
+            codebook_size=levels[0], num_codebooks=len(levels), keep_num_codebooks_dim=True,
+            entropy_loss_weight=ENTROPY_WEIGHT, commitment_loss_weight=COMMITMENT_WEIGHT,
+        )  # fmt: skip
+
+    def forward(self, vectors: Tensor) -> Quantized:
+        """Vectors (F, K, g, g) → their codes and tokens; in training also the loss (eqs. 4, 5) in nats."""
+        (codes, digits, loss), parts = self.lfq(vectors, return_loss_breakdown=True)
+        metrics = {
+            "quantizer_loss": loss.item(),
+            "token_entropy": parts.per_sample_entropy.item(),
+            "code_entropy": parts.batch_entropy.item(),
+            "commitment_loss": parts.commitment.item(),
+        }
+        return Quantized(codes, self.codebook.tokens(digits.long()), loss, metrics if self.training else {})
+
+    def codes(self, tokens: Tensor) -> Tensor:
+        """Tokens (F, g, g) → codes (F, K, g, g)."""
+        return self.lfq.indices_to_codes(self.codebook.digits(tokens))
+
+
+def make_quantizer(name: str, levels: Sequence[int]) -> FiniteScalarQuantizer | LookupFreeQuantizer:
+    """The quantiser `fsq` or `lfq`. ValueError for another name, or levels it cannot have."""
+    make_codebook(name, levels)
+    return FiniteScalarQuantizer(levels) if name == "fsq" else LookupFreeQuantizer(levels)

@@ -1,0 +1,49 @@
+"""The perceptual term: where it goes, and what is said when its network cannot be had."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
+from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
+from lerobot_wmrl.world_models.perceptual import PerceptualLoss
+from tests.trained import run_training
+
+
+class GradientDistance(torch.nn.Module):
+    """How far horizontal differences of colours are apart: another image distance than L1 or L2."""
+
+    def forward(self, reconstruction: torch.Tensor, images: torch.Tensor) -> torch.Tensor:
+        return (reconstruction - images).diff(dim=-1).abs().mean((1, 2, 3))
+
+
+def test_the_term_adds_its_weight_times_the_distance_and_teaches_both_halves():
+    torch.manual_seed(0)
+    tokenizer, images = FrameTokenizer(32, (8, 8), (5, 5)), torch.rand(2, 1, 3, 32, 32)
+    plain, metrics = tokenizer(images)
+    assert "perceptual_loss" not in metrics
+    loss, metrics = tokenizer(images, perceptual=PerceptualLoss(GradientDistance(), 3.0))
+    term = loss - plain
+    assert metrics["perceptual_loss"] == pytest.approx(term.item(), rel=1e-4)
+    single = tokenizer(images, perceptual=PerceptualLoss(GradientDistance(), 1.0))[1]["perceptual_loss"]
+    assert metrics["perceptual_loss"] == pytest.approx(3 * single, rel=1e-5)
+    term.backward()
+    for half in (tokenizer.encoder, tokenizer.decoder):
+        assert any(p.grad is not None and p.grad.abs().sum() > 0 for p in half.parameters())
+
+
+def test_a_missing_backbone_is_named_before_anything_is_written(small_dataset, tmp_path, monkeypatch):
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    config = FrameTokenizerConfig(image_size=32, widths=[8, 16], perceptual_weight=1.0, device="cpu")
+    message = r"--model\.perceptual_weight: .*torch/hub/checkpoints/vgg16-.*\.pth is missing.*vgg16\(weights="
+    with pytest.raises(ValueError, match=message):
+        run_training(config, Path(small_dataset.root), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+    assert not (tmp_path / "torch").exists()
+
+
+@pytest.mark.parametrize("name", ["perceptual_weight", "motion_weight"])
+def test_negative_weights_are_named(name):
+    with pytest.raises(ValueError, match=rf"--model\.{name}=-1\.0: must not be negative"):
+        FrameTokenizerConfig(**{name: -1.0}, device="cpu")

@@ -1,0 +1,111 @@
+"""Lookup-free quantisation, from the tokenizer's loss to an imagined frame."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch.nn import functional as F
+
+from lerobot_wmrl.tracking import read_metrics
+from lerobot_wmrl.world_models.checkpoint import load_model
+from lerobot_wmrl.world_models.codebook import BinaryCodeBook, CodeBook
+from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
+from lerobot_wmrl.world_models.losses import corrupt_digits
+from lerobot_wmrl.world_models.next_frame import NextFrameNetwork
+from lerobot_wmrl.world_models.quantizer import COMMITMENT_WEIGHT, ENTROPY_WEIGHT, LookupFreeQuantizer
+from tests.trained import action_config, run_training
+
+LEVELS = (16, 16, 16)
+
+
+def test_lfq_keeps_the_signs_and_its_tokens_name_them():
+    quantizer, codebook = LookupFreeQuantizer(LEVELS).eval(), BinaryCodeBook(LEVELS)
+    vectors = torch.randn(2, 12, 4, 4)
+    quantized = quantizer(vectors)
+    assert torch.equal(quantized.codes, vectors.sign())
+    assert torch.equal(quantizer.codes(quantized.tokens), vectors.sign())
+    values = codebook.values(codebook.digits(quantized.tokens))
+    assert torch.equal(values.permute(0, 3, 1, 2), vectors.sign())
+    assert quantized.loss == 0
+
+
+def test_every_token_is_its_digits_and_every_digit_other_signs():
+    codebook = BinaryCodeBook((8, 8))
+    tokens = torch.arange(64)
+    digits = codebook.digits(tokens)
+    assert torch.equal(codebook.tokens(digits), tokens)
+    assert codebook.channels == 6
+    assert len(codebook.values(digits).unique(dim=0)) == 64
+
+
+def test_the_loss_is_eq_4_and_5_of_magvit_2():
+    """Of a factor: entropy of each token's code minus that of all tokens' mean, at temperature 1/100."""
+    quantizer, vectors = LookupFreeQuantizer((4, 4)), torch.randn(3, 4, 2, 2) / 100
+    signs = torch.tensor([[-1.0, -1], [-1, 1], [1, -1], [1, 1]])
+    factors = vectors.permute(0, 2, 3, 1).reshape(-1, 2, 2)
+    probability = (2 * 100 * factors @ signs.T).softmax(-1)
+    token, code = (torch.special.entr(p).sum(-1).mean() for p in (probability, probability.mean(0)))
+    commitment = (vectors - vectors.sign()).square().mean()
+    quantized = quantizer(vectors)
+    expected = ENTROPY_WEIGHT * (token - code) + COMMITMENT_WEIGHT * commitment
+    torch.testing.assert_close(quantized.loss, expected, atol=1e-4, rtol=1e-4)
+    assert quantized.metrics["token_entropy"] == pytest.approx(token.item(), abs=1e-3)
+    assert quantized.metrics["code_entropy"] == pytest.approx(code.item(), abs=1e-3)
+    assert quantized.metrics["commitment_loss"] == pytest.approx(commitment.item(), rel=1e-4)
+
+
+@pytest.mark.parametrize("codebook", [CodeBook((8, 5, 3)), BinaryCodeBook((8, 8, 8))])
+def test_neighbors_are_one_step_away(codebook):
+    digits = codebook.digits(torch.randint(0, 120, (4000,)))
+    neighbors = codebook.neighbors(digits)
+    factors = len(codebook.level_counts)
+    alone = torch.where(torch.eye(factors, dtype=torch.bool)[:, None], neighbors, digits)
+    steps = codebook.distance(alone, digits)
+    assert steps.max() == 1
+    assert codebook.distance(neighbors, digits).le(factors).all()
+    assert 0.4 < (corrupt_digits(digits, codebook, 0.5) != digits).float().mean() / steps.float().mean() < 0.6
+
+
+def test_lfq_neighbors_flip_every_sign_as_often():
+    codebook, digits = BinaryCodeBook((8,)), torch.full((6000, 1), 5)
+    flipped = codebook.values(digits) != codebook.values(codebook.neighbors(digits))
+    assert torch.equal(flipped.sum(-1), torch.ones(6000, dtype=torch.long))
+    torch.testing.assert_close(flipped.float().mean(0), torch.full((3,), 1 / 3), atol=0.03, rtol=0)
+
+
+def test_the_copy_bias_is_that_of_the_present_code():
+    torch.manual_seed(0)
+    model = NextFrameNetwork(
+        levels=LEVELS, grid=4, num_cameras=1, state_size=0, patch=2, layers=1, width=16, heads=2, window=4,
+        code_width=8, quantizer="lfq",
+    )  # fmt: skip
+    torch.nn.init.zeros_(model.head.out.weight)
+    digits = model.codebook.digits(torch.randint(0, 16**3, (2, 3, 16)))
+    prediction = model(digits, torch.zeros(2, 3, 0), torch.zeros(2, 3, 1, 16))
+    bias = model.head.out.bias
+    present = prediction.logits - bias[: 3 * 16]
+    gate = F.softplus(bias[3 * 16 :])
+    expected = model.codebook.one_hot(digits) * gate[model.codebook.factor_of_logit]
+    torch.testing.assert_close(present, expected)
+
+
+def test_a_world_model_takes_its_quantizer_from_the_tokenizer(small_dataset, tmp_path):
+    """Trained on LFQ tokens, saved, loaded and imagined in."""
+    root = Path(small_dataset.root)
+    config = FrameTokenizerConfig(
+        image_size=32, widths=[8, 16], quantizer="lfq", levels=list(LEVELS), device="cpu"
+    )
+    tokenizer = run_training(config, root, tmp_path / "tokenizer", steps=4)
+    logged = read_metrics(tokenizer)[-1]
+    assert logged.keys() >= {"quantizer_loss", "token_entropy", "code_entropy", "commitment_loss"}
+    folder = run_training(action_config(tokenizer), root, tmp_path / "action")
+    model = load_model(folder, "action_world_model")
+    assert (model.config.quantizer, tuple(model.config.levels)) == ("lfq", LEVELS)
+    trained = load_model(tokenizer, "frame_tokenizer").tokenizer
+    images = torch.rand(3, 1, 3, 32, 32)
+    tokens = model.tokenizer.encode(images)
+    assert torch.equal(tokens, trained.encode(images))
+    imagined = model.step(model.start(tokens, torch.zeros(3, 8)), torch.zeros(3, 7))
+    assert imagined.tokens.shape == tokens.shape
+    assert imagined.tokens.max() < 16**3
+    assert model.tokenizer.decode(imagined.tokens).shape == images.shape
