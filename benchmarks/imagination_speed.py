@@ -23,6 +23,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.files import write_json
 from lerobot_wmrl.world_models.checkpoint import load_model
+from lerobot_wmrl.world_models.context import Context
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 
 REPETITIONS = 3
@@ -40,16 +41,23 @@ def median_rate(frames: int, work: Callable[[], object]) -> float:
     return float(np.median(rates))
 
 
+def blank_context(model: ActionWorldModelRewardModel, batch: int) -> Context:
+    """What decoding needs, if the tokenizer is conditioned on first frames."""
+    size = model.config.image_size
+    return model.tokenizer.context(torch.zeros(batch, model.tokenizer.num_cameras, 3, size, size))
+
+
 def imagination_rate(model: ActionWorldModelRewardModel, batch: int, steps: int) -> float:
     """Frames a second of `batch` imaginations, decoded to pictures."""
     tokens = torch.zeros(batch, model.tokenizer.tokens_per_frame, dtype=torch.long)
     state, action = model.state_mean.expand(batch, -1), model.action_mean.expand(batch, -1)
+    context = blank_context(model, batch)
 
     @torch.no_grad()
     def roll() -> None:
         imagination = model.start(tokens, state)
         for _ in range(steps):
-            model.tokenizer.decode(model.step(imagination, action).tokens)
+            model.tokenizer.decode(model.step(imagination, action).tokens, context)
 
     return median_rate(batch * steps, roll)
 
@@ -76,9 +84,9 @@ def network_flop(model: ActionWorldModelRewardModel) -> float:
     from torch.utils.flop_counter import FlopCounterMode
 
     tokens = torch.zeros(1, model.tokenizer.tokens_per_frame, dtype=torch.long)
-    imagination = model.start(tokens, model.state_mean[None])
+    imagination, context = model.start(tokens, model.state_mean[None]), blank_context(model, 1)
     with FlopCounterMode(display=False) as counter, torch.no_grad():
-        model.tokenizer.decode(model.step(imagination, model.action_mean[None]).tokens)
+        model.tokenizer.decode(model.step(imagination, model.action_mean[None]).tokens, context)
     return float(counter.get_total_flops())
 
 

@@ -29,20 +29,23 @@ def reward_along_episode(
     """
     rows = slice(table.start[episode], table.start[episode] + table.length[episode])
     device = model.state_mean.device
-    tokens = model.tokenizer.encode(frames_to_tensor(frame_store[rows]).to(device))
+    images = frames_to_tensor(frame_store[rows]).to(device)
+    start = model.tokenizer.context(images[:1])
+    context = start[[0] * len(images)]
+    tokens = model.tokenizer.encode(images, context)
     state, action = (torch.from_numpy(column[rows]).to(device) for column in (table.state, table.action))
     known = torch.ones(1, len(tokens), dtype=torch.bool, device=device)
     instruction = [table.instructions[episode]]
     clip = Clip(tokens[None], state[None], action[None], known.float(), known, known, instruction)
     done_logit = model.predict(clip).done_logit[0, :-1]
-    goal = imagine_goal(text_model, tokens[:1], state[:1], instruction)
+    goal = imagine_goal(text_model, tokens[:1], state[:1], instruction, start)
     features = [layer.repeat(len(tokens), 1, 1, 1) for layer in goal.features]
-    closeness = similarity_to_goal(model.tokenizer, tokens, features)
+    closeness = similarity_to_goal(model.tokenizer, tokens, features, context)
     paid = success_once(done_logit, threshold, frames)
     earned = general_reward(
         paid, closeness[1:], closeness[:-1], alpha=reward.alpha, form=reward.form, gamma=reward.gamma
     )
-    picture = model.tokenizer.decode(goal.tokens)[0].permute(0, 2, 3, 1)
+    picture = model.tokenizer.decode(goal.tokens, start)[0].permute(0, 2, 3, 1)
     return {
         "done_probability": done_logit.sigmoid().tolist(),
         "similarity": closeness[1:].tolist(),

@@ -7,7 +7,7 @@ embedding, since networks see the code's values and not its index.
 
 import math
 from collections.abc import Sequence
-from typing import Final
+from typing import ClassVar, Final
 
 import torch
 from torch import Tensor, nn
@@ -29,6 +29,7 @@ class CodeBook(nn.Module):
         levels: codes of each factor. A token is the number whose digits in this mixed radix they are.
     """
 
+    fewest_levels: ClassVar[int] = 3
     factor_of_logit: Tensor
     level_of_logit: Tensor
     levels: Tensor
@@ -36,7 +37,7 @@ class CodeBook(nn.Module):
 
     def __init__(self, levels: Sequence[int]) -> None:
         super().__init__()
-        check_levels(levels)
+        check_levels(levels, self.fewest_levels)
         self.level_counts = tuple(levels)
         factors = [factor for factor, count in enumerate(levels) for _ in range(count)]
         within = [level for count in levels for level in range(count)]
@@ -106,6 +107,7 @@ class BinaryCodeBook(CodeBook):
     Its digit has them as bits, the first sign as the highest.
     """
 
+    fewest_levels: ClassVar[int] = 2
     place: Tensor
 
     def __init__(self, levels: Sequence[int]) -> None:
@@ -141,10 +143,12 @@ def make_codebook(quantizer: str, levels: Sequence[int]) -> CodeBook:
     return CODEBOOKS[quantizer](levels)
 
 
-def check_levels(levels: Sequence[int]) -> None:
-    """ValueError unless every factor is a choice, and a token a number that can be stored."""
-    if not levels or min(levels) < 2:
-        raise ValueError(f"--model.levels={list(levels)}: give at least one factor, each of 2 or more levels")
+def check_levels(levels: Sequence[int], fewest: int) -> None:
+    """ValueError unless every factor has `fewest` levels or more, and tokens can be stored."""
+    if not levels or min(levels) < fewest:
+        raise ValueError(
+            f"--model.levels={list(levels)}: give at least one factor, each of {fewest} or more levels"
+        )
     if math.prod(levels) > LARGEST_TOKEN:
         raise ValueError(
             f"--model.levels={list(levels)}: {math.prod(levels)} codes are more than 2^31; give fewer factors"

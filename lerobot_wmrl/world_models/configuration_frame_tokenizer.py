@@ -21,6 +21,7 @@ class FrameTokenizerConfig(RewardModelConfig):
         levels: codes of each factor of a token; with `lfq` the same power of two for all, such as [512,512]
             for 18 bits.
         motion_weight: how much more a pixel counts in the loss once it differs from the episode's start.
+        context: give encoder and decoder the episode's first frame, so that tokens need carry only motion.
         perceptual_weight: of LPIPS in the loss. Needs torchvision's VGG-16 in its cache; 0 does without.
     """
 
@@ -29,6 +30,7 @@ class FrameTokenizerConfig(RewardModelConfig):
     widths: list[int] = field(default_factory=lambda: [48, 96])
     quantizer: str = "fsq"
     levels: list[int] = field(default_factory=lambda: [5, 5, 5, 5, 5, 5])
+    context: bool = False
     motion_weight: float = 4.0
     perceptual_weight: float = 0.0
     learning_rate: float = 2e-3

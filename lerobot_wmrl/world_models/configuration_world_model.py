@@ -13,8 +13,8 @@ class WorldModelConfig(RewardModelConfig):
 
     Args:
         tokenizer_path: frame tokenizer checkpoint to start from; a trained world model carries its own copy.
-        cameras, image_size, tokenizer_widths, levels, quantizer: of that tokenizer, filled in from its
-            checkpoint.
+        cameras, image_size, tokenizer_widths, levels, quantizer, tokenizer_context: of that tokenizer, filled
+            in from its checkpoint.
         state_size: width of `observation.state`, 0 to do without proprioception; filled in from the dataset.
         layers, width, heads: of the spatial-temporal transformer.
         window: frames the model remembers.
@@ -36,6 +36,7 @@ class WorldModelConfig(RewardModelConfig):
     tokenizer_widths: list[int] = field(default_factory=lambda: [48, 96])
     levels: list[int] = field(default_factory=lambda: [5, 5, 5, 5, 5, 5])
     quantizer: str = "fsq"
+    tokenizer_context: bool = False
     state_size: int = 8
 
     layers: int = 4

@@ -11,6 +11,7 @@ from tqdm import trange
 
 from lerobot_wmrl.constants import STATE_NAMES
 from lerobot_wmrl.statistics import Proportion
+from lerobot_wmrl.world_models.context import Context
 from lerobot_wmrl.world_models.episode_table import EpisodeTable
 from lerobot_wmrl.world_models.frame_cache import frames_to_tensor
 from lerobot_wmrl.world_models.frame_tokenizer import MOTION_THRESHOLD
@@ -35,6 +36,7 @@ class OpenLoop(NamedTuple):
 class Replay:
     """Real episodes and what the model made of them; row t of `imagined` belongs to real frame t + 1.
 
+    context: the tokenizer's, of E first frames, if it is conditioned on one;
     valid (E, T): real frame t + 1 exists; acted (E, T): action t exists; done (E, T): real success.
     """
 
@@ -43,6 +45,7 @@ class Replay:
     episodes: np.ndarray
     imagined: OpenLoop
     shuffled: OpenLoop
+    context: Context
     valid: np.ndarray
     acted: np.ndarray
     done: np.ndarray
@@ -85,15 +88,17 @@ def replay(
     first = frames_to_tensor(frames[table.start[episodes]]).to(model.state_mean.device)
     state = torch.from_numpy(table.state[table.start[episodes]]).to(first.device)
     actions = torch.from_numpy(table.action[rows]).to(first.device)
+    context = model.tokenizer.context(first)
     runs: list[list[OpenLoop]] = [[], []]
     for begin in trange(0, len(episodes), BATCH, desc="Replaying episodes", unit="batch"):
         part = slice(begin, begin + BATCH)
-        tokens = model.tokenizer.encode(first[part])
+        tokens = model.tokenizer.encode(first[part], context[part])
         for run, given in zip(runs, (actions, actions.roll(1, 0)), strict=True):
             run.append(open_loop(model, tokens, state[part], given[part]))
     own, other = (OpenLoop(*map(torch.cat, zip(*run, strict=True))) for run in runs)
     valid = steps + 1 < length[:, None]
-    return Replay(table, frames, episodes, own, other, valid, acted, table.done[rows] & acted)
+    done = table.done[rows] & acted
+    return Replay(table, frames, episodes, own, other, context, valid, acted, done)
 
 
 def accuracy_by_step(model: ActionWorldModelRewardModel, run: Replay) -> dict[str, Any]:
@@ -105,12 +110,12 @@ def accuracy_by_step(model: ActionWorldModelRewardModel, run: Replay) -> dict[st
         if not keep.any():
             break
         real = run.real_frames(step + 1)[keep].astype(np.float32) / 255
-        error = (decode(model, run.imagined.tokens[keep, step]) - real) ** 2
+        error = (decode(model, run.imagined.tokens[keep, step], run.context[keep]) - real) ** 2
         moved = (np.abs(real - start[keep]).max(-1) > MOTION_THRESHOLD)[..., None]
         psnr.append(_db(error.mean((1, 2, 3, 4))).mean())
         moving.append(float(_db((error * moved).sum() / max(1, 3 * moved.sum()))))
         if step + 1 == DELTA_PSNR_STEP:
-            other = (decode(model, run.shuffled.tokens[keep, step]) - real) ** 2
+            other = (decode(model, run.shuffled.tokens[keep, step], run.context[keep]) - real) ** 2
             delta.append((_db(error.mean((1, 2, 3, 4))) - _db(other.mean((1, 2, 3, 4)))).mean())
         if knows_tcp(run):
             imagined = run.imagined.proprioception[keep, step, :3].cpu().numpy()
@@ -165,9 +170,9 @@ def success_agreement(run: Replay, threshold: float, frames: int) -> dict[str, A
 
 
 @torch.no_grad()
-def decode(model: ActionWorldModelRewardModel, tokens: Tensor) -> np.ndarray:
+def decode(model: ActionWorldModelRewardModel, tokens: Tensor, context: Context) -> np.ndarray:
     """Tokens (E, S) → frames (E, N, H, W, 3) float in [0, 1]."""
-    return model.tokenizer.decode(tokens).permute(0, 1, 3, 4, 2).cpu().numpy()
+    return model.tokenizer.decode(tokens, context).permute(0, 1, 3, 4, 2).cpu().numpy()
 
 
 def _db(mse: np.ndarray) -> np.ndarray:

@@ -48,17 +48,25 @@ def cached_frames(dataset: LeRobotDataset, camera_keys: Sequence[str]) -> np.nda
 def cached_tokens(
     dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer: FrameTokenizer
 ) -> np.ndarray:
-    """All frames' tokens as a read-only memory map, int32 (rows, S); encoded on the first call."""
+    """All frames' tokens as a read-only memory map, int32 (rows, S); encoded on the first call.
+
+    A context-conditioned tokenizer is given the first frame of each row's episode.
+    """
     frames = cached_frames(dataset, camera_keys)
     weights = hashlib.sha256(b"".join(p.detach().cpu().numpy().tobytes() for p in tokenizer.parameters()))
     key = _digest([weights.hexdigest(), *_file_stamps(dataset)])
     device = next(tokenizer.parameters()).device
+    episodes = dataset.meta.episodes
+    starts = np.repeat(np.asarray(episodes["dataset_from_index"]), np.asarray(episodes["length"]))
 
     def fill(target: np.ndarray) -> None:
         for begin in tqdm(range(0, len(frames), ENCODE_BATCH), desc="Encoding tokens", unit="batch"):
-            images = frames_to_tensor(frames[begin : begin + ENCODE_BATCH]).to(device)
+            part = slice(begin, begin + ENCODE_BATCH)
+            first, episode = np.unique(starts[part], return_inverse=True)
+            start, images = (frames_to_tensor(frames[rows]).to(device) for rows in (first, part))
             with torch.no_grad():
-                target[begin : begin + ENCODE_BATCH] = tokenizer.encode(images).cpu().numpy()
+                context = tokenizer.context(start)[episode]
+                target[part] = tokenizer.encode(images, context).cpu().numpy()
 
     shape = (len(frames), tokenizer.tokens_per_frame)
     return _memory_map(cache_dir(dataset) / f"tokens-{key}.npy", shape, np.int32, fill)

@@ -1,10 +1,9 @@
 """Frame tokenizer: RGB frames to a grid of discrete tokens and back (MAGVIT-2's role).
 
 A token is the index of one quantised vector (`quantizer.py`). Several cameras share the weights; their grids
-are concatenated.
+are concatenated. As an option both directions are given the episode's first frame (`context.py`).
 """
 
-import itertools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -12,11 +11,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from lerobot_wmrl.world_models.autoencoder import PATCH, Decoder, Encoder, check_widths
 from lerobot_wmrl.world_models.codebook import make_codebook
+from lerobot_wmrl.world_models.context import NO_CONTEXT, Context, ContextEncoder
 from lerobot_wmrl.world_models.quantizer import make_quantizer
-
-PATCH = 4
-NORM_GROUPS = 8
 
 MOTION_THRESHOLD = 0.08
 """A pixel has moved when a colour, in [0, 1], differs by more from the episode's first frame."""
@@ -32,60 +30,10 @@ class Decoded(NamedTuple):
     features: list[Tensor]
 
 
-class ResidualBlock(nn.Module):
-    """Two 3x3 convolutions with a skip. (B, C, h, w) → (B, C, h, w)."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.norm = nn.GroupNorm(NORM_GROUPS, channels)
-        self.conv_in = nn.Conv2d(channels, channels, 3, padding=1)
-        self.conv_out = nn.Conv2d(channels, channels, 3, padding=1)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return x + self.conv_out(F.silu(self.conv_in(F.silu(self.norm(x)))))
-
-
-class Encoder(nn.Module):
-    """(B, 3, H, W) → (B, C, H/f, W/f), most of the work at the coarse grid."""
-
-    def __init__(self, widths: Sequence[int], code_size: int) -> None:
-        super().__init__()
-        self.stem = nn.Conv2d(3 * PATCH**2, widths[0], 3, padding=1)
-        self.downs = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in itertools.pairwise(widths))
-        self.block = ResidualBlock(widths[-1])
-        self.head = nn.Conv2d(widths[-1], code_size, 1)
-
-    def forward(self, images: Tensor) -> Tensor:
-        x = self.stem(F.pixel_unshuffle(images, PATCH))
-        for down in self.downs:
-            x = down(F.silu(x))
-        return self.head(F.silu(self.block(x)))
-
-
-class Decoder(nn.Module):
-    """(B, C, H/f, W/f) → (B, 3, H, W): the encoder's mirror image, with sub-pixel upsampling."""
-
-    def __init__(self, widths: Sequence[int], code_size: int) -> None:
-        super().__init__()
-        coarse_to_fine = list(reversed(widths))
-        self.stem = nn.Conv2d(code_size, coarse_to_fine[0], 3, padding=1)
-        self.block = ResidualBlock(coarse_to_fine[0])
-        self.ups = nn.ModuleList(nn.Conv2d(a, 4 * b, 1) for a, b in itertools.pairwise(coarse_to_fine))
-        self.smooth = nn.Conv2d(widths[0], widths[0], 3, padding=1)
-        self.head = nn.Conv2d(widths[0], 3 * PATCH**2, 3, padding=1)
-
-    def forward(self, codes: Tensor) -> tuple[Tensor, list[Tensor]]:
-        x = self.block(self.stem(codes))
-        features = [x]
-        for up in self.ups:
-            x = F.pixel_shuffle(up(F.silu(x)), 2)
-        x = x + self.smooth(F.silu(x))
-        features.append(x)
-        return F.pixel_shuffle(self.head(F.silu(x)), PATCH), features
-
-
 class FrameTokenizer(nn.Module):
-    """Encode and decode are a pure pair: `decode(encode(images))` is the reconstruction.
+    """Encode and decode are a pure pair: `decode(encode(images, c), c)` is the reconstruction.
+
+    With the option `context`, c is `context` of the first frames of their episodes; else it is left out.
 
     Args:
         image_size: side of the square frames, a multiple of `4 · 2^(len(widths) − 1)`.
@@ -93,6 +41,7 @@ class FrameTokenizer(nn.Module):
         levels: codes of each factor; a token is one of their product.
         num_cameras: frames a time step, N.
         quantizer: `fsq` or `lfq`.
+        context: whether tokens are conditioned on the episode's first frame.
     """
 
     def __init__(
@@ -102,6 +51,7 @@ class FrameTokenizer(nn.Module):
         levels: Sequence[int],
         num_cameras: int = 1,
         quantizer: str = "fsq",
+        context: bool = False,
     ) -> None:
         super().__init__()
         check_widths(widths)
@@ -115,32 +65,42 @@ class FrameTokenizer(nn.Module):
         self.grid = image_size // self.downsample
         self.num_cameras = num_cameras
         channels = make_codebook(quantizer, levels).channels
-        self.encoder = Encoder(widths, channels)
-        self.decoder = Decoder(widths, channels)
+        self.encoder = Encoder(widths, channels, context)
+        self.decoder = Decoder(widths, channels, context)
         self.quantizer = make_quantizer(quantizer, levels)
         self.whiten = nn.ModuleList(
             nn.BatchNorm2d(channels, affine=False) for channels in (widths[-1], widths[0])
         )
+        self.context_encoder = ContextEncoder(widths, PATCH) if context else None
 
     @property
     def tokens_per_frame(self) -> int:
         """S, over all cameras."""
         return self.num_cameras * self.grid**2
 
-    def encode(self, images: Tensor) -> Tensor:
+    def context(self, images: Tensor) -> Context:
+        """First frames (B, N, 3, H, W) in [0, 1] → their context, empty without the option."""
+        self._check_images(images)
+        return NO_CONTEXT if self.context_encoder is None else self.context_encoder(images)
+
+    def encode(self, images: Tensor, context: Context = NO_CONTEXT) -> Tensor:
         """Images (B, N, 3, H, W) in [0, 1] → tokens (B, S) int64. ValueError for other cameras or sizes."""
         self._check_images(images)
-        return self.quantizer(self.encoder(images.flatten(0, 1) * 2 - 1)).tokens.reshape(len(images), -1)
+        self._check_context(context, len(images))
+        vectors = self.encoder(images.flatten(0, 1) * 2 - 1, context.flat())
+        return self.quantizer(vectors).tokens.reshape(len(images), -1)
 
-    def decode_with_features(self, tokens: Tensor) -> Decoded:
+    def decode_with_features(self, tokens: Tensor, context: Context = NO_CONTEXT) -> Decoded:
         """Tokens (B, S) → images and the whitened feature maps from which similarity is measured."""
-        pixels, features = self.decoder(self.quantizer.codes(tokens.reshape(-1, self.grid, self.grid)))
+        self._check_context(context, len(tokens))
+        codes = self.quantizer.codes(tokens.reshape(-1, self.grid, self.grid))
+        pixels, features = self.decoder(codes, context.flat())
         images = ((pixels + 1) / 2).clamp(0, 1).unflatten(0, (len(tokens), self.num_cameras))
         return Decoded(images, self._whitened(features))
 
-    def decode(self, tokens: Tensor) -> Tensor:
+    def decode(self, tokens: Tensor, context: Context = NO_CONTEXT) -> Tensor:
         """Tokens (B, S) → images (B, N, 3, H, W) in [0, 1]."""
-        return self.decode_with_features(tokens).images
+        return self.decode_with_features(tokens, context).images
 
     def _check_images(self, images: Tensor) -> None:
         expected = (self.num_cameras, 3, self.image_size, self.image_size)
@@ -150,22 +110,35 @@ class FrameTokenizer(nn.Module):
                 f"(B, {', '.join(map(str, expected))}); resize them or train a tokenizer for them"
             )
 
+    def _check_context(self, context: Context, batch: int) -> None:
+        wanted = 0 if self.context_encoder is None else batch
+        if len(context) != wanted:
+            raise ValueError(
+                f"the context of {len(context)} first frames: this tokenizer needs that of {wanted} for a "
+                f"batch of {batch}; give what `context` returns for the first frame of every row's episode"
+            )
+
     def _whitened(self, features: list[Tensor]) -> list[Tensor]:
         """Zero mean and unit variance a channel over the training frames: without it what all frames share
         hides how they differ. The statistics are learnt in training and fixed afterwards."""
         return [whiten(feature) for whiten, feature in zip(self.whiten, features, strict=True)]
 
     def forward(
-        self, images: Tensor, weight: Tensor | None = None, perceptual: ImageLoss | None = None
+        self,
+        images: Tensor,
+        weight: Tensor | None = None,
+        perceptual: ImageLoss | None = None,
+        context: Context = NO_CONTEXT,
     ) -> tuple[Tensor, dict[str, float]]:
         """Reconstruction loss: weighted L1 plus L2, plus the quantizer's and the perceptual one.
 
         images (B, N, 3, H, W) in [0, 1], weight (B, N, 1, H, W).
         """
         self._check_images(images)
-        flat = images.flatten(0, 1) * 2 - 1
-        quantized = self.quantizer(self.encoder(flat))
-        pixels, features = self.decoder(quantized.codes)
+        self._check_context(context, len(images))
+        flat, seen = images.flatten(0, 1) * 2 - 1, context.flat()
+        quantized = self.quantizer(self.encoder(flat, seen))
+        pixels, features = self.decoder(quantized.codes, seen)
         if self.training:
             self._whitened([feature.detach() for feature in features])
         error = pixels - flat
@@ -178,15 +151,6 @@ class FrameTokenizer(nn.Module):
             term = perceptual(pixels, flat)
             loss, metrics["perceptual_loss"] = loss + term, term.item()
         return loss, metrics | quantized.metrics
-
-
-def check_widths(widths: Sequence[int]) -> None:
-    """ValueError unless there are widths, and the coarsest can be normalised in groups."""
-    if not widths or min(widths) < 1 or widths[-1] % NORM_GROUPS:
-        raise ValueError(
-            f"--model.widths={list(widths)}: give the channels from fine to coarse, the last a multiple of "
-            f"{NORM_GROUPS}; each further entry halves the token grid"
-        )
 
 
 def motion_weight(images: Tensor, reference: Tensor, strength: float) -> Tensor:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from lerobot_wmrl.world_models.context import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer, feature_distance
 
 if TYPE_CHECKING:
@@ -22,11 +23,16 @@ class Goal(NamedTuple):
 
 @torch.no_grad()
 def imagine_goal(
-    model: "TextWorldModelRewardModel", tokens: Tensor, proprioception: Tensor, instructions: Sequence[str]
+    model: "TextWorldModelRewardModel",
+    tokens: Tensor,
+    proprioception: Tensor,
+    instructions: Sequence[str],
+    context: Context = NO_CONTEXT,
 ) -> Goal:
     """Eq. 6: the first imagined frame whose done probability reaches θ, else the one of the largest.
 
-    tokens (B, S) of the start frames, proprioception (B, P), one instruction each.
+    tokens (B, S) of the start frames, proprioception (B, P), one instruction each, and the start frames'
+    context if the tokenizer is conditioned on it.
     """
     state = model.start(tokens, proprioception, instructions)
     goal, best = tokens, torch.full((tokens.shape[0],), -1.0, device=tokens.device)
@@ -40,12 +46,15 @@ def imagine_goal(
         reached = reached | (probability >= model.config.goal_threshold)
         if bool(reached.all()):
             break
-    return Goal(goal, model.tokenizer.decode_with_features(goal).features, reached)
+    return Goal(goal, model.tokenizer.decode_with_features(goal, context).features, reached)
 
 
-def similarity_to_goal(tokenizer: FrameTokenizer, tokens: Tensor, goal_features: Sequence[Tensor]) -> Tensor:
+def similarity_to_goal(
+    tokenizer: FrameTokenizer, tokens: Tensor, goal_features: Sequence[Tensor], context: Context = NO_CONTEXT
+) -> Tensor:
     """Eq. 5 with 1 − LPIPS's formula on tokenizer features: tokens (B, S) → similarity in [0, 1] (B,)."""
-    return similarity(tokenizer.decode_with_features(tokens).features, goal_features, tokens.shape[0])
+    features = tokenizer.decode_with_features(tokens, context).features
+    return similarity(features, goal_features, tokens.shape[0])
 
 
 def similarity(features: Sequence[Tensor], goal_features: Sequence[Tensor], batch: int) -> Tensor:

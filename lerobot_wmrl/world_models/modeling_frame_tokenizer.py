@@ -9,6 +9,7 @@ from torch import Tensor
 
 from lerobot_wmrl.world_models.compatibility import check_cameras
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
+from lerobot_wmrl.world_models.context import NO_CONTEXT
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer, ImageLoss, motion_weight
 from lerobot_wmrl.world_models.goal import similarity_to_goal
 from lerobot_wmrl.world_models.perceptual import PerceptualLoss, lpips_network, require_backbone
@@ -39,17 +40,30 @@ class FrameTokenizerRewardModel(PreTrainedRewardModel):
             if config.perceptual_weight:
                 require_backbone()
         self.tokenizer = FrameTokenizer(
-            config.image_size, config.widths, config.levels, len(config.cameras), config.quantizer
-        )
+            config.image_size, config.widths, config.levels, len(config.cameras), config.quantizer,
+            config.context,
+        )  # fmt: skip
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
         """Reconstruction loss of images (B, 3, H, W); `reference.*`: the episodes' first frames, if known."""
-        images = stack_cameras(batch, self.config.camera_keys)
-        weight = None
-        if f"reference.{self.config.cameras[0]}" in batch:
-            reference = stack_cameras(batch, [f"reference.{camera}" for camera in self.config.cameras])
+        images, reference = stack_cameras(batch, self.config.camera_keys), self._reference(batch)
+        weight, context = None, NO_CONTEXT
+        if reference is not None:
             weight = motion_weight(images, reference, self.config.motion_weight)
-        return self.tokenizer(images, weight, self._perceptual_loss(images.device))
+            context = self.tokenizer.context(reference)
+        return self.tokenizer(images, weight, self._perceptual_loss(images.device), context)
+
+    def _reference(self, batch: dict[str, Tensor]) -> Tensor | None:
+        """The first frames of the episodes, if the batch has them. ValueError if they are needed."""
+        keys = [f"reference.{camera}" for camera in self.config.cameras]
+        if keys[0] in batch:
+            return stack_cameras(batch, keys)
+        if self.config.context:
+            raise ValueError(
+                f"--model.context=true: the batch lacks {keys}, the first frames of the episodes; train with "
+                "lerobot-wmrl-train-world-model, which adds them"
+            )
+        return None
 
     def _perceptual_loss(self, device: torch.device) -> ImageLoss | None:
         """Not a module of this model: a checkpoint neither contains nor needs LPIPS's network."""
@@ -58,8 +72,14 @@ class FrameTokenizerRewardModel(PreTrainedRewardModel):
 
     @torch.no_grad()
     def compute_reward(self, batch: dict[str, Tensor]) -> Tensor:
-        """Similarity in [0, 1] of `observation.images.*` (B, 3, H, W) to `goal.*`. → (B,)"""
-        images = stack_cameras(batch, self.config.camera_keys)
+        """Similarity in [0, 1] of `observation.images.*` (B, 3, H, W) to `goal.*`. → (B,)
+
+        A context-conditioned tokenizer also needs `reference.*`, the first frames of the episodes.
+        """
+        images, reference = stack_cameras(batch, self.config.camera_keys), self._reference(batch)
         goal = stack_cameras(batch, [f"goal.{camera}" for camera in self.config.cameras])
-        goal_features = self.tokenizer.decode_with_features(self.tokenizer.encode(goal)).features
-        return similarity_to_goal(self.tokenizer, self.tokenizer.encode(images), goal_features)
+        context = NO_CONTEXT if reference is None else self.tokenizer.context(reference)
+        goal_tokens = self.tokenizer.encode(goal, context)
+        goal_features = self.tokenizer.decode_with_features(goal_tokens, context).features
+        tokens = self.tokenizer.encode(images, context)
+        return similarity_to_goal(self.tokenizer, tokens, goal_features, context)

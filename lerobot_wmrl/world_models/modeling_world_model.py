@@ -22,6 +22,7 @@ from lerobot_wmrl.world_models.configuration_world_model import (
     TextWorldModelConfig,
     WorldModelConfig,
 )
+from lerobot_wmrl.world_models.context import Context
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
 from lerobot_wmrl.world_models.frozen_t5 import CHECKPOINT_FOLDER, FrozenT5
 from lerobot_wmrl.world_models.goal import imagine_goal, similarity_to_goal
@@ -91,8 +92,9 @@ class WorldModelRewardModel(PreTrainedRewardModel):
         if dataset_meta is not None:
             self._adopt_features(dataset_meta.features)
         self.tokenizer = FrameTokenizer(
-            config.image_size, config.tokenizer_widths, config.levels, len(config.cameras), config.quantizer
-        ).requires_grad_(False)
+            config.image_size, config.tokenizer_widths, config.levels, len(config.cameras), config.quantizer,
+            config.tokenizer_context,
+        ).requires_grad_(False)  # fmt: skip
         if source is not None:
             self.tokenizer.load_state_dict(source.tokenizer.state_dict())
         if self.tokenizer.grid % config.patch:
@@ -118,7 +120,7 @@ class WorldModelRewardModel(PreTrainedRewardModel):
         source = load_model(self.config.tokenizer_path, "frame_tokenizer")
         self.config.cameras, self.config.image_size = source.config.cameras, source.config.image_size
         self.config.tokenizer_widths, self.config.levels = source.config.widths, source.config.levels
-        self.config.quantizer = source.config.quantizer
+        self.config.quantizer, self.config.tokenizer_context = source.config.quantizer, source.config.context
         self.config.tokenizer_path = None
         return source
 
@@ -174,8 +176,9 @@ class WorldModelRewardModel(PreTrainedRewardModel):
     def clip_from_batch(self, batch: dict[str, Any]) -> Clip:
         """Tokenise a batch of windows. Only the last frame has a done label, if any."""
         images = stack_cameras(batch, self.config.camera_keys)
-        tokens = self.tokenizer.encode(images.flatten(0, 1)).unflatten(0, images.shape[:2])
-        shape = tokens.shape[:2]
+        shape = images.shape[:2]
+        context = self._context(batch)[torch.arange(shape[0]).repeat_interleave(shape[1])]
+        tokens = self.tokenizer.encode(images.flatten(0, 1), context).unflatten(0, shape)
         padded = batch.get(f"{self.config.camera_keys[0]}_is_pad", torch.zeros(shape, dtype=torch.bool))
         done, known = torch.zeros(shape, device=tokens.device), torch.zeros(shape, dtype=torch.bool)
         if "next.done" in batch:
@@ -187,6 +190,10 @@ class WorldModelRewardModel(PreTrainedRewardModel):
             tokens, state, batch[ACTION], done, ~padded.to(tokens.device), known.to(tokens.device),
             list(batch.get("task", [""] * shape[0])),
         )  # fmt: skip
+
+    def _context(self, batch: dict[str, Any]) -> Context:
+        """Of the windows' first frames, since a window does not hold its episode's. B rows, or none."""
+        return self.tokenizer.context(stack_cameras(batch, self.config.camera_keys)[:, 0])
 
     @torch.no_grad()
     def predict(self, clip: Clip) -> Prediction:
@@ -318,6 +325,6 @@ class TextWorldModelRewardModel(WorldModelRewardModel):
     @torch.no_grad()
     def compute_reward(self, batch: dict[str, Any]) -> Tensor:
         """Similarity of the window's last frame to the goal imagined from its first one. → (B,)"""
-        clip = self.clip_from_batch(batch)
-        goal = imagine_goal(self, clip.tokens[:, 0], clip.state[:, 0], clip.instructions)
-        return similarity_to_goal(self.tokenizer, clip.tokens[:, -1], goal.features)
+        clip, context = self.clip_from_batch(batch), self._context(batch)
+        goal = imagine_goal(self, clip.tokens[:, 0], clip.state[:, 0], clip.instructions, context)
+        return similarity_to_goal(self.tokenizer, clip.tokens[:, -1], goal.features, context)

@@ -8,6 +8,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+import torch
 
 from lerobot_wmrl.strips import GAP, enlarged, evenly_spaced, in_a_row
 from lerobot_wmrl.world_models.evaluation import Replay, decode
@@ -22,13 +23,11 @@ def side_by_side(model: ActionWorldModelRewardModel, run: Replay, index: int) ->
     """One episode: real frames above, imagined ones below. → (T, 2H + gap, N·W, 3) uint8"""
     length = int(run.table.length[run.episodes[index]])
     real = np.stack([run.real_frames(step)[index] for step in range(length)])
-    imagined = (decode(model, run.imagined.tokens[index, : length - 1]) * 255).round().astype(np.uint8)
     first = frames_to_tensor(real[:1]).to(model.state_mean.device)
-    start = (decode(model, model.tokenizer.encode(first)) * 255).round().astype(np.uint8)
-    rows = [
-        np.concatenate(list(cameras.swapaxes(0, 1)), 2)
-        for cameras in (real, np.concatenate([start, imagined]))
-    ]
+    start = model.tokenizer.encode(first, run.context[[index]])
+    tokens = torch.cat([start, run.imagined.tokens[index, : length - 1]])
+    imagined = (decode(model, tokens, run.context[[index] * length]) * 255).round().astype(np.uint8)
+    rows = [np.concatenate(list(cameras.swapaxes(0, 1)), 2) for cameras in (real, imagined)]
     gap = np.full((length, GAP, *rows[0].shape[2:]), 255, np.uint8)
     return np.concatenate([rows[0], gap, rows[1]], 1)
 

@@ -66,8 +66,9 @@ def reconstruct(model: Any, frames: np.ndarray, rows: np.ndarray, starts: np.nda
     for begin in trange(0, len(rows), BATCH, desc="Reconstructing frames", unit="batch"):
         part = slice(begin, begin + BATCH)
         real, start = (frames_to_tensor(frames[index[part]]).to(device) for index in (rows, starts))
-        tokens = model.tokenizer.encode(real)
-        error = (model.tokenizer.decode(tokens) - real).square()
+        context = model.tokenizer.context(start)
+        tokens = model.tokenizer.encode(real, context)
+        error = (model.tokenizer.decode(tokens, context) - real).square()
         moved = ((real - start).abs().amax(2, keepdim=True) > MOTION_THRESHOLD).expand_as(error)
         sums = (error * moved).sum((2, 3, 4)), moved.sum((2, 3, 4))
         parts.append((tokens, error.mean((2, 3, 4)), *sums))

@@ -72,9 +72,9 @@ def test_where_no_episode_is_held_out_it_says_so(trained_models):
 
 
 def test_code_use_counts_codes_and_their_evenness():
-    use = code_use(CodeBook((4, 2)), torch.tensor([[0, 1, 2, 3], [0, 1, 2, 3]]))
-    assert use["codes"] == {"size": 8, "used": 0.5, "perplexity": 4.0}
+    use = code_use(CodeBook((4, 3)), torch.tensor([[0, 1, 2, 3], [0, 1, 2, 3]]))
+    assert use["codes"] == {"size": 12, "used": pytest.approx(1 / 3), "perplexity": 4.0}
     assert use["code_factors"][0] == {"size": 4, "used": 1.0, "perplexity": 4.0}
-    assert use["code_factors"][1] == {"size": 2, "used": 0.5, "perplexity": 1.0}
+    assert use["code_factors"][1] == {"size": 3, "used": pytest.approx(1 / 3), "perplexity": 1.0}
     uneven = code_use(BinaryCodeBook((2, 2)), torch.tensor([0, 0, 0, 1]))["codes"]["perplexity"]
     assert uneven == pytest.approx(np.exp(-0.75 * np.log(0.75) - 0.25 * np.log(0.25)), abs=0.01)

@@ -1,0 +1,83 @@
+"""Convolutional encoder and decoder of the frame tokenizer, most of their work at the coarse grid."""
+
+import itertools
+from collections.abc import Sequence
+
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from lerobot_wmrl.world_models.context import Fusion
+
+PATCH = 4
+NORM_GROUPS = 8
+
+
+class ResidualBlock(nn.Module):
+    """Two 3x3 convolutions with a skip. (B, C, h, w) → (B, C, h, w)."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.norm = nn.GroupNorm(NORM_GROUPS, channels)
+        self.conv_in = nn.Conv2d(channels, channels, 3, padding=1)
+        self.conv_out = nn.Conv2d(channels, channels, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x + self.conv_out(F.silu(self.conv_in(F.silu(self.norm(x)))))
+
+
+class Encoder(nn.Module):
+    """(F, 3, H, W) → (F, C, H/f, W/f); given a context [(F, c, h, w), …] it sees the coarsest scale."""
+
+    def __init__(self, widths: Sequence[int], code_size: int, context: bool) -> None:
+        super().__init__()
+        self.stem = nn.Conv2d(3 * PATCH**2, widths[0], 3, padding=1)
+        self.downs = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in itertools.pairwise(widths))
+        self.block = ResidualBlock(widths[-1])
+        self.head = nn.Conv2d(widths[-1], code_size, 1)
+        self.fusion = Fusion(widths[-1]) if context else None
+
+    def forward(self, images: Tensor, context: Sequence[Tensor]) -> Tensor:
+        x = self.stem(F.pixel_unshuffle(images, PATCH))
+        for down in self.downs:
+            x = down(F.silu(x))
+        if self.fusion is not None:
+            x = self.fusion(x, context[0])
+        return self.head(F.silu(self.block(x)))
+
+
+class Decoder(nn.Module):
+    """(F, C, H/f, W/f) → (F, 3, H, W): the encoder's mirror image, with sub-pixel upsampling.
+
+    Given a context [(F, c, h, w), …] it sees every scale, from coarse to fine.
+    """
+
+    def __init__(self, widths: Sequence[int], code_size: int, context: bool) -> None:
+        super().__init__()
+        coarse_to_fine = list(reversed(widths))
+        self.stem = nn.Conv2d(code_size, coarse_to_fine[0], 3, padding=1)
+        self.block = ResidualBlock(coarse_to_fine[0])
+        self.ups = nn.ModuleList(nn.Conv2d(a, 4 * b, 1) for a, b in itertools.pairwise(coarse_to_fine))
+        self.smooth = nn.Conv2d(widths[0], widths[0], 3, padding=1)
+        self.head = nn.Conv2d(widths[0], 3 * PATCH**2, 3, padding=1)
+        self.fusions = nn.ModuleList(Fusion(channels) for channels in coarse_to_fine if context)
+
+    def forward(self, codes: Tensor, context: Sequence[Tensor]) -> tuple[Tensor, list[Tensor]]:
+        x = self.block(self._fuse(self.stem(codes), context, 0))
+        features = [x]
+        for scale, up in enumerate(self.ups, 1):
+            x = self._fuse(F.pixel_shuffle(up(F.silu(x)), 2), context, scale)
+        x = x + self.smooth(F.silu(x))
+        features.append(x)
+        return F.pixel_shuffle(self.head(F.silu(x)), PATCH), features
+
+    def _fuse(self, x: Tensor, context: Sequence[Tensor], scale: int) -> Tensor:
+        return self.fusions[scale](x, context[scale]) if self.fusions else x
+
+
+def check_widths(widths: Sequence[int]) -> None:
+    """ValueError unless there are widths, and the coarsest can be normalised in groups."""
+    if not widths or min(widths) < 1 or widths[-1] % NORM_GROUPS:
+        raise ValueError(
+            f"--model.widths={list(widths)}: give the channels from fine to coarse, the last a multiple of "
+            f"{NORM_GROUPS}; each further entry halves the token grid"
+        )

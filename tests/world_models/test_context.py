@@ -1,0 +1,182 @@
+"""The context-conditioned tokenizer: all is read and written beside the first frame."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from lerobot_wmrl.dataset_source import DatasetSource
+from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
+from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
+from lerobot_wmrl.world_models.checkpoint import load_model
+from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
+from lerobot_wmrl.world_models.context import NO_CONTEXT
+from lerobot_wmrl.world_models.episode_table import read_episodes
+from lerobot_wmrl.world_models.evaluation import decode, replay
+from lerobot_wmrl.world_models.frame_cache import cached_frames, cached_tokens, frames_to_tensor
+from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
+from tests.trained import action_config, run_training, text_config
+
+CAMERA = "observation.images.third_view"
+
+
+@pytest.fixture(scope="module")
+def models(small_dataset, tmp_path_factory) -> dict[str, Path]:
+    """A conditioned tokenizer and both world models on it, a few steps each."""
+    root, folder = Path(small_dataset.root), tmp_path_factory.mktemp("conditioned")
+    config = FrameTokenizerConfig(image_size=32, widths=[8, 16], levels=[5, 4], context=True, device="cpu")
+    tokenizer = run_training(config, root, folder / "frame_tokenizer")
+    return {
+        "frame_tokenizer": tokenizer,
+        "action_world_model": run_training(action_config(tokenizer), root, folder / "action"),
+        "text_world_model": run_training(text_config(tokenizer), root, folder / "text"),
+    }
+
+
+@pytest.fixture(scope="module")
+def table(small_dataset):
+    return read_episodes(small_dataset)
+
+
+@pytest.fixture(scope="module")
+def frames(small_dataset) -> np.ndarray:
+    return cached_frames(small_dataset, [CAMERA])
+
+
+def scenes() -> tuple[torch.Tensor, torch.Tensor]:
+    """Sixteen scenes of random stripes, and the same with a white square somewhere. (16, 1, 3, 32, 32)"""
+    generator = torch.Generator().manual_seed(0)
+    start = torch.rand(16, 1, 3, 32, 1, generator=generator).expand(-1, -1, -1, -1, 32).contiguous()
+    frames = start.clone()
+    for index in range(16):
+        row, column = 8 * (index // 4), 8 * (index % 4)
+        frames[index, :, :, row : row + 8, column : column + 8] = 1.0
+    return start, frames
+
+
+@torch.no_grad()
+def test_static_detail_comes_from_the_first_frame_and_not_through_the_tokens():
+    """Three codes a token cannot describe the stripes; what moved they can."""
+    start, frames = scenes()
+    errors = {}
+    for conditioned in (False, True):
+        torch.manual_seed(0)
+        tokenizer = FrameTokenizer(32, (16, 32), (3,), context=conditioned)
+        optimizer = torch.optim.Adam(tokenizer.parameters(), 5e-3)
+        with torch.enable_grad():
+            for _ in range(100):
+                loss, _ = tokenizer(frames, context=tokenizer.context(start))
+                optimizer.zero_grad()
+                loss.backward()
+                optimizer.step()
+        tokenizer.eval()
+        context = tokenizer.context(start)
+        decoded = tokenizer.decode(tokenizer.encode(frames, context), context)
+        errors[conditioned] = (decoded - frames).square().mean().item()
+    assert errors[True] < errors[False] / 3
+
+
+@torch.no_grad()
+def test_a_row_is_decoded_beside_its_own_context():
+    start, frames = scenes()
+    tokenizer = FrameTokenizer(32, (8, 16), (5, 4), context=True).eval()
+    context = tokenizer.context(start)
+    tokens = tokenizer.encode(frames, context)
+    order = torch.randperm(16)
+    torch.testing.assert_close(
+        tokenizer.decode(tokens[order], context[order]), tokenizer.decode(tokens, context)[order]
+    )
+    assert not torch.allclose(tokenizer.decode(tokens, context[order]), tokenizer.decode(tokens, context))
+
+
+def test_a_missing_superfluous_or_short_context_is_named():
+    start, frames = scenes()
+    plain, conditioned = FrameTokenizer(32, (8, 8), (5,)), FrameTokenizer(32, (8, 8), (5,), context=True)
+    context = conditioned.context(start)
+    tokens = plain.encode(frames)
+    assert plain.context(start) is NO_CONTEXT
+    for call in (
+        lambda: conditioned.encode(frames), lambda: conditioned.decode(tokens),
+        lambda: conditioned(frames), lambda: conditioned.decode(tokens, context[:3]),
+        lambda: plain.encode(frames, context),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=r"the context of \d+ first frames: this tokenizer needs"):
+            call()
+
+
+@torch.no_grad()
+def test_cached_tokens_are_those_beside_the_episodes_first_frame(models, small_dataset, table, frames):
+    tokenizer = load_model(models["frame_tokenizer"], "frame_tokenizer").tokenizer
+    tokens = cached_tokens(small_dataset, [CAMERA], tokenizer)
+    for start, length in zip(table.start, table.length, strict=True):
+        images = frames_to_tensor(frames[start : start + length])
+        context = tokenizer.context(images[:1])[[0] * length]
+        assert np.array_equal(tokens[start : start + length], tokenizer.encode(images, context))
+
+
+@torch.no_grad()
+def test_environments_decode_beside_their_own_start_also_after_a_restart(models, small_dataset):
+    config = WorldModelEnv(
+        world_model_path=str(models["action_world_model"]),
+        text_world_model_path=str(models["text_world_model"]),
+        dataset=StartFrames(str(small_dataset.root), split="all"), episode_length=3,
+    )  # fmt: skip
+    env = config.create_tensor_env(4)
+    tokenizer, starts = env.model.tokenizer, env.starts
+    assert len(starts.context) == len(starts.tokens)
+    env.reset(seed=0)
+    before = env._start_index.clone()
+    for step in range(4):
+        observation, *_, info = env.step(torch.zeros(4, 7))
+        if step == 2:
+            assert torch.equal(observation[CAMERA], starts.images[env._start_index][:, 0])
+            observation = info["final_obs"]
+        tokens = env.model.network.codebook.tokens(env._imagination.digits[:, 0])
+        start = before if step < 3 else env._start_index
+        if step != 2:
+            expected = tokenizer.decode(tokens, starts.context[start])[:, 0]
+            torch.testing.assert_close(observation[CAMERA], expected)
+    assert not torch.equal(before, env._start_index)
+
+
+def test_evaluation_decodes_beside_the_start_and_runs_whole(models, small_dataset, table, frames, tmp_path):
+    model = load_model(models["action_world_model"], "action_world_model")
+    run = replay(model, table, frames, np.array([3, 1]))
+    first = frames_to_tensor(frames[table.start[[3, 1]]])
+    expected = model.tokenizer.decode(run.imagined.tokens[:, 0], model.tokenizer.context(first))
+    decoded = decode(model, run.imagined.tokens[:, 0], run.context)
+    assert np.array_equal(decoded, expected.detach().permute(0, 1, 3, 4, 2).numpy())
+    eval_world_model(
+        EvalWorldModelConfig(
+            model=Checkpoint(str(models["action_world_model"])),
+            text_model=Checkpoint(str(models["text_world_model"])),
+            dataset=DatasetSource(str(small_dataset.root)), output_dir=tmp_path / "evaluation",
+        )
+    )  # fmt: skip
+    assert (tmp_path / "evaluation" / "goal_frames.png").is_file()
+
+
+@torch.no_grad()
+def test_rewards_of_batches_take_the_context_from_the_batch(models):
+    """A window's own first frame for the text world model, `reference.*` for the tokenizer."""
+    images = torch.rand(2, 4, 3, 32, 32)
+    text = load_model(models["text_world_model"], "text_world_model")
+    batch = {
+        CAMERA: images,
+        "observation.state": torch.zeros(2, 4, 8),
+        "action": torch.zeros(2, 4, 7),
+        "task": ["a", "b"],
+    }
+    clip = text.clip_from_batch(batch)
+    context = text.tokenizer.context(images[:, :1])
+    assert torch.equal(clip.tokens[:, 2], text.tokenizer.encode(images[:, 2:3], context))
+    assert text.compute_reward(batch).shape == (2,)
+    tokenizer = load_model(models["frame_tokenizer"], "frame_tokenizer")
+    frame = {CAMERA: images[:, 1], "goal.third_view": images[:, 1], "reference.third_view": images[:, 0]}
+    torch.testing.assert_close(tokenizer.compute_reward(frame), torch.ones(2))
+    del frame["reference.third_view"]
+    with pytest.raises(
+        ValueError, match=r"--model\.context=true: the batch lacks \['reference\.third_view'\]"
+    ):
+        tokenizer(frame)
