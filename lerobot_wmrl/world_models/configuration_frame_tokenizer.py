@@ -15,8 +15,8 @@ class FrameTokenizerConfig(RewardModelConfig):
     Args:
         cameras: camera names whose frames make one time step.
         image_size: side of the square frames in the dataset, in pixels.
-        widths: channels from fine to coarse. A token is 4x4 pixels with one entry; each further entry doubles
-            its side, and the last one's work costs a fourth of what it would one entry before.
+        widths: channels from fine to coarse. With one entry a token is 4x4 pixels; each further entry doubles
+            its side. The last scale does most of the work.
         quantizer: `fsq` (finite scalar quantisation) or `lfq` (MAGVIT-2's lookup-free quantisation).
         levels: codes of each factor of a token; with `lfq` the same power of two for all, such as [512,512]
             for 18 bits.
