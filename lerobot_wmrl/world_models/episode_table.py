@@ -116,7 +116,7 @@ def choose_episodes(
     """Indices of at most `at_most` episodes, evenly spread, that belong to every split named in `split`.
 
     Splits, joined by commas: `train`, `validation` (as in the training of world models), `all`, and if the
-    scenes `unseen` in training are given, `ind` (all others) and `ood` (those). ValueError names what cannot be.
+    scenes `unseen` in training are given, `ind` (all others) and `ood` (those). ValueError if there is none.
     """
     masks = {"train": ~table.validation, "validation": table.validation, "all": table.length > 0}
     if unseen is not None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from lerobot_wmrl.world_models.evaluation.image_metrics import psnr
 from lerobot_wmrl.world_models.evaluation.replay import Source
 from lerobot_wmrl.world_models.evaluation.success_probe import TrainedProbe, is_held_out
 from lerobot_wmrl.world_models.frame_cache import frames_to_tensor
-from lerobot_wmrl.world_models.frame_tokenizer import Decoded, FrameTokenizer, feature_distance
+from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer, feature_distance
 from lerobot_wmrl.world_models.goal import imagine_goal
 from lerobot_wmrl.world_models.modeling_world_model import TextWorldModelRewardModel
 
@@ -21,22 +21,30 @@ MOST_GOALS = 64
 MOST_FINALS = 200
 
 
+class Finals(NamedTuple):
+    """True final frames: F successful episodes (F,), where success begins in them and how they began, both
+    decoded (F, N, 3, H, W), and the features of the former."""
+
+    episodes: np.ndarray
+    images: Tensor
+    starts: Tensor
+    features: list[Tensor]
+
+
 @dataclass(frozen=True)
 class Goals:
-    """G goal frames and F true final frames, decoded.
+    """G goal frames beside true final frames; pictures are decoded, (G, N, 3, H, W) in [0, 1].
 
-    episodes (G,) of the starts; start, goal: decoded frames; reached (G,), whether θ was reached;
-    finals: of successful episodes, final_starts: their first frames; final_episodes (F,); nearest (G,): the final of the same instruction with the least feature
-    distance to the goal, −1 without one; distance, start_distance (G,): to the goal, to the start frame.
+    episodes (G,), whose starts they are; start, goal; reached (G,), whether θ was reached; finals, None
+    without a success; nearest (G,): of the finals with the same instruction the one with the least feature
+    distance to the goal, −1 without one; distance, start_distance (G,): least ones to the goal, to the start.
     """
 
     episodes: np.ndarray
     start: Tensor
     goal: Tensor
     reached: np.ndarray
-    final_episodes: np.ndarray
-    finals: Tensor
-    final_starts: Tensor
+    finals: Finals | None
     nearest: np.ndarray
     distance: np.ndarray
     start_distance: np.ndarray
@@ -50,41 +58,58 @@ def imagine_goals(model: TextWorldModelRewardModel, source: Source, episodes: np
     tokens = tokenizer.encode(source.first_images(starts, device))
     instructions = [table.instructions[episode] for episode in starts]
     goal = imagine_goal(model, tokens, source.first_state(starts, device), instructions)
-    finals, rows = final_rows(source)
-    final = decoded_frames(tokenizer, source.frames[rows], device)
-    same = np.array([[table.instructions[f] == text for f in finals] for text in instructions])
-    same = same.reshape(len(starts), len(finals))
-    start = tokenizer.decode_with_features(tokens)
-    distance = feature_distances(goal.features, final.features, tokenizer.num_cameras)
-    start_distance = feature_distances(start.features, final.features, tokenizer.num_cameras)
-    closest, nearest = least(distance, same)
+    start, finals = tokenizer.decode_with_features(tokens), true_finals(tokenizer, source, device)
+    nearest, distance = np.full(len(starts), -1), np.full(len(starts), np.nan)
+    start_distance = distance
+    if finals is not None:
+        same = np.array([[table.instructions[f] == text for f in finals.episodes] for text in instructions])
+        pairs = feature_distances(goal.features, finals.features, tokenizer.num_cameras)
+        distance, nearest = least(pairs, same)
+        pairs = feature_distances(start.features, finals.features, tokenizer.num_cameras)
+        start_distance = least(pairs, same)[0]
     return Goals(
-        starts, start.images, tokenizer.decode(goal.tokens), goal.reached.cpu().numpy(),
-        finals, final.images, decoded_frames(tokenizer, source.frames[table.start[finals]], device).images,
-        nearest, closest, least(start_distance, same)[0],
+        starts, start.images, tokenizer.decode(goal.tokens), goal.reached.cpu().numpy(), finals,
+        nearest, distance, start_distance,
     )  # fmt: skip
 
 
 def goal_quality(goals: Goals, probe: TrainedProbe | None) -> dict[str, Any]:
     """Distances to the nearest true final frame, those of the start frame, and the probe's verdict."""
-    known = goals.nearest >= 0
     result = {
         "goals": len(goals.episodes),
         "goal_reached": Proportion(int(goals.reached.sum()), len(goals.reached)).as_json(),
         "nearest_final_tokenizer_lpips": Estimate.mean(goals.distance).as_json(),
         "start_to_final_tokenizer_lpips": Estimate.mean(goals.start_distance).as_json(),
-        "nearest_final_psnr": Estimate.mean(
-            psnr(goals.goal[known], goals.finals[goals.nearest[known]]).cpu().numpy()
-        ).as_json(),
+        "nearest_final_psnr": Estimate.mean(nearest_psnr(goals)).as_json(),
     }
-    if probe is not None:
-        unseen = is_held_out(goals.final_episodes)
+    if probe is not None and goals.finals is not None:
+        unseen = is_held_out(goals.finals.episodes)
         result["success_holds"] = probe.success(goals.start, goals.goal).as_json()
         result["success_holds_in_finals"] = probe.success(
-            goals.final_starts[unseen], goals.finals[unseen]
+            goals.finals.starts[unseen], goals.finals.images[unseen]
         ).as_json()
         result["probe"] = probe.as_json()
     return result
+
+
+def nearest_psnr(goals: Goals) -> np.ndarray:
+    """dB between each goal and the final nearest to it, of those that have one."""
+    if goals.finals is None:
+        return np.empty(0)
+    known = goals.nearest >= 0
+    return psnr(goals.goal[known], goals.finals.images[goals.nearest[known]]).cpu().numpy()
+
+
+def true_finals(tokenizer: FrameTokenizer, source: Source, device: torch.device) -> Finals | None:
+    """None if no episode succeeds."""
+    episodes, rows = final_rows(source)
+    if not len(episodes):
+        return None
+    decoded, starts = (
+        tokenizer.decode_with_features(tokenizer.encode(frames_to_tensor(source.frames[index]).to(device)))
+        for index in (rows, source.table.start[episodes])
+    )
+    return Finals(episodes, decoded.images, starts.images, decoded.features)
 
 
 def final_rows(source: Source) -> tuple[np.ndarray, np.ndarray]:
@@ -97,11 +122,6 @@ def final_rows(source: Source) -> tuple[np.ndarray, np.ndarray]:
         for start, n in zip(table.start[episodes], table.length[episodes], strict=True)
     ]
     return episodes, np.array(rows, int)
-
-
-def decoded_frames(tokenizer: FrameTokenizer, frames: np.ndarray, device: torch.device) -> Decoded:
-    """uint8 (F, N, H, W, 3) as the tokenizer draws them, with their features."""
-    return tokenizer.decode_with_features(tokenizer.encode(frames_to_tensor(frames).to(device)))
 
 
 def feature_distances(goals: Sequence[Tensor], finals: Sequence[Tensor], num_cameras: int) -> np.ndarray:
@@ -117,8 +137,6 @@ def feature_distances(goals: Sequence[Tensor], finals: Sequence[Tensor], num_cam
 
 def least(distance: np.ndarray, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Of the allowed columns the least value of each row and its index; NaN and −1 where none is. (G, F)"""
-    if not distance.shape[1]:
-        return np.full(len(distance), np.nan), np.full(len(distance), -1)
     masked = np.where(allowed, distance, np.inf)
     index, some = masked.argmin(1), allowed.any(1)
     return np.where(some, masked.min(1), np.nan), np.where(some, index, -1)

@@ -53,19 +53,19 @@ def save_strip(frames: np.ndarray, path: Path) -> None:
 def save_goals(goals: Goals, path: Path) -> None:
     """A contact sheet: start, imagined goal, and the nearest real frame of a success, for some episodes."""
     shown = evenly_spaced(len(goals.episodes), SHOWN_GOALS)
-    rows = {
-        "start": goals.start[shown],
-        "goal": goals.goal[shown],
-        "nearest real end": goals.finals[goals.nearest[shown]] if (goals.nearest >= 0).all() else None,
-    }
-    pictures = {title: to_uint8(images) for title, images in rows.items() if images is not None}
-    size = 1.5 * len(shown), 1.6 * len(pictures)
+    rows = {"start": goals.start[shown], "goal": goals.goal[shown]}
+    if goals.finals is not None and (goals.nearest >= 0).all():
+        rows["nearest end"] = goals.finals.images[goals.nearest[shown]]
+    pictures = {title: to_uint8(images) for title, images in rows.items()}
+    size = 1.5 * len(shown), 1.7 * len(pictures)
     figure, axes = plt.subplots(len(pictures), len(shown), figsize=size, squeeze=False)
     for line, (title, images) in zip(axes, pictures.items(), strict=True):
-        for axis, cameras, episode in zip(line, images, goals.episodes[shown], strict=True):
+        for axis, cameras in zip(line, images, strict=True):
             axis.imshow(np.concatenate(list(cameras), 1))
-            axis.set_title(f"{title}, episode {episode}", fontsize=6)
+            axis.set_title(title, fontsize=7)
             axis.axis("off")
+    for axis, episode in zip(axes[0], goals.episodes[shown], strict=True):
+        axis.set_title(f"episode {episode}\nstart", fontsize=7)
     _save(figure, path)
 
 
@@ -123,7 +123,7 @@ def save_sweep(gates: Sequence[Gate], path: Path) -> None:
     for axis, (name, title), limit in zip(axes, titles.items(), (5, 90), strict=True):
         for frames in SWEEP_FRAMES:
             shares = [100 * getattr(gate, name).share for gate in gates if gate.frames == frames]
-            axis.plot(SWEEP_THRESHOLDS, shares, label=f"{frames} frames")
+            axis.plot(SWEEP_THRESHOLDS, shares, label=f"k = {frames}")
         axis.axhline(limit, color="black", linewidth=0.8, linestyle=":")
         axis.set_title(title, fontsize=10)
         axis.set_xlabel("threshold")

@@ -26,7 +26,7 @@ MOST_FRAMES = 1500
 """Of each class in training, and of each in the held-out check."""
 
 SIZE = 64
-STEPS = 400
+EPOCHS = 10
 BATCH = 64
 LEARNING_RATE = 1e-3
 ENCODE_BATCH = 128
@@ -101,15 +101,15 @@ def is_held_out(episodes: np.ndarray) -> np.ndarray:
 
 
 def fit(network: SuccessProbe, data: LabelledFrames, rng: np.random.Generator) -> SuccessProbe:
-    """Binary cross-entropy, `STEPS` balanced batches."""
+    """Binary cross-entropy over `EPOCHS` passes."""
     optimizer = torch.optim.AdamW(network.parameters(), LEARNING_RATE, weight_decay=0.01)
-    for _ in trange(STEPS, desc="Training the success probe", unit="step"):
-        index = torch.from_numpy(rng.integers(0, len(data.success), BATCH)).to(data.success.device)
-        logit = network(data.first[index], data.images[index])
-        loss = F.binary_cross_entropy_with_logits(logit, data.success[index].float())
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
+    for _ in trange(EPOCHS, desc="Training the success probe", unit="epoch"):
+        for index in torch.from_numpy(rng.permutation(len(data.success))).split(BATCH):
+            logit = network(data.first[index], data.images[index])
+            loss = F.binary_cross_entropy_with_logits(logit, data.success[index].float())
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
     return network.eval()
 
 
