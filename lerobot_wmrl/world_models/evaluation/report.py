@@ -47,7 +47,7 @@ def report_action_model(
     extremes = robustness(model, source, outcomes.episodes, threshold, frames)
     numbers = {
         **success_agreement(outcomes, threshold, frames),
-        **{name: estimates[name].as_json()["value"] for name in TOP_LEVEL if name in estimates},
+        **{name: estimates[name].as_json()["value"] if name in estimates else None for name in TOP_LEVEL},
         "headline": {name: estimate.as_json() for name, estimate in estimates.items()},
         **steps,
         "play": {"episodes": len(play), **by_step(play, LONGEST)},
