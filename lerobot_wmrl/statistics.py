@@ -1,6 +1,7 @@
-"""Proportions with their uncertainty."""
+"""Proportions, means and other ratios with their uncertainty."""
 
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -8,6 +9,7 @@ import numpy as np
 from scipy.stats import binomtest, bootstrap
 
 Z_95 = 1.959963984540054
+RESAMPLES = 2000
 
 
 def wilson_interval(successes: int, n: int) -> tuple[float, float]:
@@ -49,6 +51,64 @@ class Proportion:
             "share": self.share if self.n else None,
             "wilson_95": list(self.interval),
         }
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A mean, or another ratio of two sums, over n episodes, with its bootstrap 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+    n: int
+
+    @classmethod
+    def mean(cls, values: np.ndarray) -> "Estimate":
+        """Of one number an episode (E,); NaN where an episode has none."""
+        known = np.isfinite(values)
+        return cls.ratio(np.where(known, values, 0), known)
+
+    @classmethod
+    def ratio(cls, numerator: np.ndarray, denominator: np.ndarray) -> "Estimate":
+        """Of the sums of both (E,) over the episodes: a precision, say. NaN if the denominator's is 0."""
+        value, low, high = map(float, bootstrap_ratio(numerator, denominator))
+        return cls(value, low, high, int((np.asarray(denominator) > 0).sum()))
+
+    def __str__(self) -> str:
+        if math.isnan(self.value):
+            return "not measured"
+        return f"{self.value:.3g} ({self.low:.3g} to {self.high:.3g})"
+
+    def as_json(self) -> dict[str, float | int | list[float] | None]:
+        """The value is None where there is no episode."""
+        known = not math.isnan(self.value)
+        return {
+            "value": self.value if known else None,
+            "bootstrap_95": [self.low, self.high] if known else None,
+            "episodes": self.n,
+        }
+
+
+def bootstrap_ratio(
+    numerator: np.ndarray, denominator: np.ndarray, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Σ numerator / Σ denominator over E episodes, and its percentile bootstrap 95 % interval (Efron 1979).
+
+    Whole episodes are drawn, since the frames of one depend on each other. (E, …), (E, …) → value, low, high,
+    each (…); NaN where the denominator is 0.
+    """
+    sums = [np.asarray(part, np.float64) for part in (numerator, denominator)]
+    episodes = len(sums[0])
+    if not episodes:
+        nothing = np.full(sums[0].shape[1:], np.nan)
+        return nothing, nothing, nothing
+    drawn = np.random.default_rng(seed).multinomial(episodes, np.full(episodes, 1 / episodes), RESAMPLES)
+    with np.errstate(invalid="ignore", divide="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # columns without any episode are NaN, as they should
+        value = sums[0].sum(0) / sums[1].sum(0)
+        resampled = np.tensordot(drawn, sums[0], 1) / np.tensordot(drawn, sums[1], 1)
+        low, high = np.nanpercentile(resampled, (2.5, 97.5), axis=0)
+    return value, low, high
 
 
 @dataclass(frozen=True)

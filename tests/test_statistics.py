@@ -3,7 +3,15 @@ import math
 import numpy as np
 import pytest
 
-from lerobot_wmrl.statistics import Z_95, MeanChange, PairedChange, Proportion, wilson_interval
+from lerobot_wmrl.statistics import (
+    Z_95,
+    Estimate,
+    MeanChange,
+    PairedChange,
+    Proportion,
+    bootstrap_ratio,
+    wilson_interval,
+)
 
 
 @pytest.mark.parametrize(("k", "n"), [(0, 20), (7, 20), (53, 100), (100, 100)])
@@ -62,3 +70,32 @@ def test_runs_on_different_starts_are_not_pooled() -> None:
 
 def test_runs_that_change_nothing_change_nothing() -> None:
     assert MeanChange.over_runs([[True, False]], [[True, False]]) == MeanChange(0.0, 0.0, 0.0, 1, 2)
+
+
+def test_the_bootstrap_of_a_mean_is_its_normal_interval() -> None:
+    values = np.random.default_rng(0).normal(3, 2, 400)
+    estimate = Estimate.mean(np.append(values, np.nan))
+    assert estimate.value == pytest.approx(values.mean())
+    assert estimate.n == 400
+    assert estimate.high - estimate.low == pytest.approx(2 * Z_95 * values.std() / math.sqrt(400), rel=0.1)
+
+
+def test_the_bootstrap_draws_whole_episodes() -> None:
+    """The frames of an episode are all right or all wrong: 2000 frames are only twenty draws."""
+    right = np.repeat([[0], [100]], 10, axis=0)[:, 0]
+    estimate = Estimate.ratio(right, np.full(20, 100))
+    assert estimate.value == 0.5
+    assert estimate.high - estimate.low == pytest.approx(2 * Z_95 * 0.5 / math.sqrt(20), rel=0.2)
+    assert estimate == Estimate.ratio(right, np.full(20, 100))
+
+
+def test_bootstraps_by_column_are_those_of_each_column() -> None:
+    values = np.random.default_rng(0).random((30, 3))
+    low = bootstrap_ratio(values, np.ones_like(values))[1]
+    assert low[1] == pytest.approx(Estimate.mean(values[:, 1]).low)
+
+
+def test_a_mean_of_nothing_is_no_number() -> None:
+    for nothing in (np.array([]), np.array([np.nan, np.nan])):
+        assert Estimate.mean(nothing).as_json() == {"value": None, "bootstrap_95": None, "episodes": 0}
+        assert str(Estimate.mean(nothing)) == "not measured"

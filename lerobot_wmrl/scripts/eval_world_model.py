@@ -3,15 +3,16 @@
     lerobot-wmrl-eval-world-model --model.path=outputs/action_world_model --dataset.root=D \\
         --output_dir=outputs/check
 
-Each episode is imagined from its first frame with its own actions. `metrics.json` gets the accuracy by
-step and the false-success rate: of the episodes that failed in reality, how many the model believes in.
+Each episode is imagined from its first frame with its own actions. `metrics.json` and `metrics.md` get the
+accuracy by step and the gate: of the episodes that failed in reality, how many the model believes in.
 Add `--text_model.path=…` for goal frames and the reward along a successful and a failed episode.
+docs/world_models.md explains every number.
 """
 
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import draccus
 
@@ -21,7 +22,9 @@ from lerobot_wmrl.presets import expand_preset
 from lerobot_wmrl.rewards.configuration_general import GeneralConfig
 
 if TYPE_CHECKING:
-    from lerobot_wmrl.world_models.evaluation import Replay
+    from lerobot_wmrl.world_models.evaluation.evaluate import Evaluation
+    from lerobot_wmrl.world_models.evaluation.replay import Source
+    from lerobot_wmrl.world_models.evaluation.report import Report
     from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 
 
@@ -42,12 +45,13 @@ class EvalWorldModelConfig(RunConfig):
         model: `--model.path=…`, an action world model.
         text_model: `--text_model.path=…`, for goal frames and reward curves.
         dataset: real episodes.
-        split: `all`, or `train` / `validation` of the dataset the model was trained on.
+        split: `all`; `train` or `validation` of the dataset the model was trained on; `ind` or `ood`, scenes
+            that training may see and those held out. Joined by a comma, `validation,ind`: what is in both.
         max_episodes: at most so many, evenly spread.
         done_threshold, done_frames: when an imagined episode counts as a success; as in the environment.
         reward: the general reward of the curves (--reward.alpha …); as in the environment.
         device: where the models run; the best there is by default.
-        output_dir: where metrics.json and the pictures go.
+        output_dir: where metrics.json, metrics.md and the pictures go.
     """
 
     model: Checkpoint = field(default_factory=Checkpoint)
@@ -72,12 +76,15 @@ def check_config(cfg: EvalWorldModelConfig) -> None:
 
 
 def eval_world_model(cfg: EvalWorldModelConfig) -> None:
-    """Replay, measure, draw."""
-    from lerobot_wmrl.files import write_json
+    """Replay, measure, write."""
+    from lerobot_wmrl.files import write_json, write_text
+    from lerobot_wmrl.maniskill.scenes import scenes_of
     from lerobot_wmrl.world_models.checkpoint import load_model
     from lerobot_wmrl.world_models.compatibility import check_dataset
     from lerobot_wmrl.world_models.episode_table import choose_episodes, open_dataset, read_episodes
-    from lerobot_wmrl.world_models.evaluation import accuracy_by_step, replay, success_agreement
+    from lerobot_wmrl.world_models.evaluation.evaluate import evaluate
+    from lerobot_wmrl.world_models.evaluation.replay import Source
+    from lerobot_wmrl.world_models.evaluation.report import report_action_model
     from lerobot_wmrl.world_models.frame_cache import cached_frames
     from lerobot_wmrl.world_models.reconstruction import reconstruction_metrics
 
@@ -85,59 +92,45 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     model = load_model(cfg.model.path, "action_world_model", cfg.device)
     table = read_episodes(open_dataset(cfg.dataset.root, cfg.dataset.repo_id))
     check_dataset(model.config, table.dataset.features)
-    episodes = choose_episodes(table, cfg.split, cfg.max_episodes)
+    unseen = {scene.index for scene in scenes_of("ood")}
+    episodes = choose_episodes(table, cfg.split, cfg.max_episodes, unseen)
     claim_output_dir(cfg.output_dir, draccus.encode(cfg))
-    frames = cached_frames(table.dataset, model.config.camera_keys)
-    run = replay(model, table, frames, episodes)
-    agreement = success_agreement(run, cfg.done_threshold, cfg.done_frames)
-    accuracy = accuracy_by_step(model, run)
-    draw(cfg, model, run, accuracy)
-    tokenizer = reconstruction_metrics(model, table, frames, episodes)
-    write_json(
-        cfg.output_dir / "metrics.json",
-        {**agreement, **accuracy, "tokenizer": tokenizer, "dataset": cfg.dataset.root},
+    source = Source(table, cached_frames(table.dataset, model.config.camera_keys))
+    evaluation = evaluate(model, source, episodes)
+    numbers, page = report_action_model(
+        model, source, evaluation, cfg.done_threshold, cfg.done_frames, cfg.output_dir
     )
-    print(
-        f"{len(episodes)} real episodes replayed: {agreement['false_successes']} of "
-        f"{agreement['real_failures']} failures were called successes, "
-        f"{agreement['recognised_successes']} of {agreement['real_successes']} successes were recognised. "
-        f"Written to {cfg.output_dir}"
-    )
-
-
-def draw(
-    cfg: EvalWorldModelConfig, model: "ActionWorldModelRewardModel", run: "Replay", accuracy: dict[str, Any]
-) -> None:
-    """Side-by-side animations and strips, accuracy, and with a text model goals and reward curves."""
-    from lerobot_wmrl.world_models import pictures
-
-    pictures.save_accuracy(accuracy, cfg.output_dir / "accuracy.png")
-    shown = run.one_of_each()
-    for name, index in shown.items():
-        frames = pictures.side_by_side(model, run, index)
-        pictures.save_animation(frames, cfg.output_dir / f"comparison_{name}.gif")
-        pictures.save_strip(frames, cfg.output_dir / f"comparison_{name}_strip.png")
     if cfg.text_model.path:
-        curves = reward_curves(cfg, model, run, shown)
-        pictures.save_goals(curves, cfg.output_dir / "goal_frames.png")
-        pictures.save_reward_curves(curves, cfg.output_dir / "reward_along_episodes.png")
+        goals, goal_page = report_text_model(cfg, model, source, evaluation)
+        numbers, page = numbers | goals, f"{page}\n\n{goal_page}"
+    numbers["tokenizer"] = reconstruction_metrics(model, table, source.frames, episodes)
+    write_json(cfg.output_dir / "metrics.json", {**numbers, "dataset": cfg.dataset.root, "split": cfg.split})
+    write_text(cfg.output_dir / "metrics.md", f"{page}\n")
+    print(f"{page}\n\n{len(episodes)} real episodes replayed. Written to {cfg.output_dir}")
 
 
-def reward_curves(
-    cfg: EvalWorldModelConfig, model: "ActionWorldModelRewardModel", run: "Replay", shown: dict[str, int]
-) -> dict[str, dict[str, Any]]:
-    """Per shown episode: done probability, similarity and the return so far."""
+def report_text_model(
+    cfg: EvalWorldModelConfig,
+    model: "ActionWorldModelRewardModel",
+    source: "Source",
+    evaluation: "Evaluation",
+) -> "Report":
+    """Goal frames, and the reward along the shown episodes."""
     from lerobot_wmrl.rewards.curves import reward_along_episode
     from lerobot_wmrl.world_models.checkpoint import load_model
+    from lerobot_wmrl.world_models.evaluation.pictures import save_reward_curves
+    from lerobot_wmrl.world_models.evaluation.report import report_goals
 
     text_model = load_model(cfg.text_model.path, "text_world_model", cfg.device)
-    return {
+    curves = {
         name: reward_along_episode(
-            model, text_model, cfg.reward, run.table, run.frames, int(run.episodes[index]),
+            model, text_model, cfg.reward, source.table, source.frames, run.episode,
             threshold=cfg.done_threshold, frames=cfg.done_frames,
         )
-        for name, index in shown.items()
+        for name, run in evaluation.shown.items()
     }  # fmt: skip
+    save_reward_curves(curves, cfg.output_dir / "reward_along_episodes.png")
+    return report_goals(text_model, source, evaluation, cfg.output_dir)
 
 
 def main() -> None:

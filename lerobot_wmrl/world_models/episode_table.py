@@ -1,5 +1,6 @@
 """A LeRobotDataset's numbers, without its pictures: what training and evaluation index episodes by."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,7 +22,8 @@ VALIDATION_EVERY = 20
 class EpisodeTable:
     """Per frame (N rows): state (N, P), action (N, A), done (N,). Per episode (E): start, length, ….
 
-    `kind` holds indices into `constants.KINDS`, −1 where the dataset does not say.
+    `kind` holds indices into `constants.KINDS`, `scene` those of the recorded scenes, −1 where the dataset
+    does not say.
     """
 
     dataset: LeRobotDataset
@@ -31,6 +33,7 @@ class EpisodeTable:
     start: np.ndarray
     length: np.ndarray
     kind: np.ndarray
+    scene: np.ndarray
     instructions: list[str]
 
     @property
@@ -83,12 +86,14 @@ def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
             f"{', '.join(dataset.features)}); world models need what was done beside what was seen"
         )
     columns = [ACTION, "episode_index"]
-    columns += [name for name in (OBS_STATE, "next.done", "start.kind") if name in dataset.features]
+    optional = (OBS_STATE, "next.done", "start.kind", "start.scene")
+    columns += [name for name in optional if name in dataset.features]
     rows = dataset.hf_dataset.with_format("numpy", columns=columns)[:]
     frames = len(rows["episode_index"])
     _, start, length = np.unique(rows["episode_index"], return_index=True, return_counts=True)
-    kind = (
-        np.asarray(rows["start.kind"]).reshape(-1)[start] if "start.kind" in rows else np.full(len(start), -1)
+    kind, scene = (
+        np.asarray(rows[name]).reshape(-1)[start] if name in rows else np.full(len(start), -1)
+        for name in ("start.kind", "start.scene")
     )
     done = np.asarray(rows["next.done"]).reshape(-1) if "next.done" in rows else np.zeros(frames, bool)
     state = (
@@ -96,7 +101,7 @@ def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
     )
     instructions = [episode["tasks"][0] for episode in dataset.meta.episodes]
     action = np.asarray(rows[ACTION], np.float32)
-    return EpisodeTable(dataset, state, action, done.astype(bool), start, length, kind, instructions)
+    return EpisodeTable(dataset, state, action, done.astype(bool), start, length, kind, scene, instructions)
 
 
 def golden_episodes(table: EpisodeTable) -> np.ndarray:
@@ -105,12 +110,28 @@ def golden_episodes(table: EpisodeTable) -> np.ndarray:
     return table.success & optimal
 
 
-def choose_episodes(table: EpisodeTable, split: str, at_most: int) -> np.ndarray:
-    """Indices of at most `at_most` episodes of the split `train`, `validation` or `all`, evenly spread."""
+def choose_episodes(
+    table: EpisodeTable, split: str, at_most: int, unseen: Collection[int] | None = None
+) -> np.ndarray:
+    """Indices of at most `at_most` episodes, evenly spread, that belong to every split named in `split`.
+
+    Splits, joined by commas: `train`, `validation` (as in the training of world models), `all`, and if the
+    scenes `unseen` in training are given, `ind` (all others) and `ood` (those). ValueError if there is none.
+    """
     masks = {"train": ~table.validation, "validation": table.validation, "all": table.length > 0}
-    if split not in masks:
-        raise ValueError(f"split={split!r}: choose one of {', '.join(masks)}")
-    episodes = masks[split].nonzero()[0]
+    if unseen is not None:
+        known, out = table.scene >= 0, np.isin(table.scene, list(unseen))
+        masks |= {"ind": known & ~out, "ood": known & out}
+    names = split.split(",")
+    for name in names:
+        if name not in masks:
+            raise ValueError(f"split={name!r}: choose one of {', '.join(masks)}, or several joined by commas")
+        if name in ("ind", "ood") and (table.scene < 0).all():
+            raise ValueError(
+                f"split={name!r}: dataset {table.dataset.root} does not say which scenes its episodes are in "
+                "(no column start.scene); use --split=all, train or validation"
+            )
+    episodes = np.logical_and.reduce([masks[name] for name in names]).nonzero()[0]
     if not len(episodes):
         raise ValueError(f"dataset {table.dataset.root}: no episode in its {split} split")
     return episodes[np.linspace(0, len(episodes) - 1, min(len(episodes), at_most)).astype(int)]

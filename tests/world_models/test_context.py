@@ -13,7 +13,8 @@ from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
 from lerobot_wmrl.world_models.context import NO_CONTEXT
 from lerobot_wmrl.world_models.episode_table import read_episodes
-from lerobot_wmrl.world_models.evaluation import decode, replay
+from lerobot_wmrl.world_models.evaluation.pictures import side_by_side, to_uint8
+from lerobot_wmrl.world_models.evaluation.replay import Source, replay_episodes
 from lerobot_wmrl.world_models.frame_cache import cached_frames, cached_tokens, frames_to_tensor
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
 from tests.trained import action_config, run_training, text_config
@@ -142,11 +143,11 @@ def test_environments_decode_beside_their_own_start_also_after_a_restart(models,
 
 def test_evaluation_decodes_beside_the_start_and_runs_whole(models, small_dataset, table, frames, tmp_path):
     model = load_model(models["action_world_model"], "action_world_model")
-    run = replay(model, table, frames, np.array([3, 1]))
-    first = frames_to_tensor(frames[table.start[[3, 1]]])
-    expected = model.tokenizer.decode(run.imagined.tokens[:, 0], model.tokenizer.context(first))
-    decoded = decode(model, run.imagined.tokens[:, 0], run.context)
-    assert np.array_equal(decoded, expected.detach().permute(0, 1, 3, 4, 2).numpy())
+    source = Source(table, frames)
+    for run in replay_episodes(model, source, np.array([3, 1])):
+        context = model.tokenizer.context(frames_to_tensor(frames[table.start[[run.episode]]]))
+        expected = to_uint8(model.tokenizer.decode(run.tokens[:1], context).detach())[0, 0]
+        assert np.array_equal(side_by_side(model, source, run)[1, -len(expected) :], expected)
     eval_world_model(
         EvalWorldModelConfig(
             model=Checkpoint(str(models["action_world_model"])),

@@ -1,0 +1,36 @@
+"""How well the done signal is predicted: frame by frame, episode by episode, and how late."""
+
+import numpy as np
+
+from lerobot_wmrl.statistics import Estimate
+from lerobot_wmrl.world_models.evaluation.gate import Outcomes
+
+
+def precision_recall_f1(called: np.ndarray, real: np.ndarray) -> dict[str, Estimate]:
+    """Of (E, …) bool, pooled over everything, with episodes as what is drawn for the intervals."""
+    axes = tuple(range(1, called.ndim))
+    hit, called_count, real_count = (mask.sum(axes) for mask in (called & real, called, real))
+    return {
+        "precision": Estimate.ratio(hit, called_count),
+        "recall": Estimate.ratio(hit, real_count),
+        "f1": Estimate.ratio(2 * hit, called_count + real_count),
+    }
+
+
+def done_delay(outcomes: Outcomes, threshold: float, frames: int) -> np.ndarray:
+    """Frames from the real to the imagined first success of each episode, NaN unless it has both. (E,)"""
+    begin = outcomes.called(threshold, frames)
+    return np.where((begin >= 0) & outcomes.success, begin - outcomes.done.argmax(1), np.nan)
+
+
+def done_quality(outcomes: Outcomes, threshold: float, frames: int) -> dict[str, Estimate]:
+    """`done_*` over frames at `threshold`, `episode_*` as the environment ends episodes, and the delay."""
+    fired = outcomes.probability >= threshold
+    called = outcomes.called(threshold, frames) >= 0
+    per_frame = precision_recall_f1(fired, outcomes.done)
+    per_episode = precision_recall_f1(called, outcomes.success)
+    return {
+        **{f"done_{name}": estimate for name, estimate in per_frame.items()},
+        **{f"episode_{name}": estimate for name, estimate in per_episode.items()},
+        "done_delay_frames": Estimate.mean(done_delay(outcomes, threshold, frames)),
+    }

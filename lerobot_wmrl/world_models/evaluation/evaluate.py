@@ -1,0 +1,39 @@
+"""One pass over real episodes: replay each, measure it, keep the numbers and let the frames go."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lerobot_wmrl.world_models.evaluation.accuracy import EpisodeAccuracy, measure
+from lerobot_wmrl.world_models.evaluation.alexnet_lpips import cached_lpips
+from lerobot_wmrl.world_models.evaluation.gate import Outcomes
+from lerobot_wmrl.world_models.evaluation.replay import EpisodeReplay, Source, replay_episodes
+from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """accuracy of every episode, in order; outcomes of those that attempt the task; shown: the replays of the
+    shortest success and the shortest failure, by name."""
+
+    accuracy: list[EpisodeAccuracy]
+    outcomes: Outcomes
+    shown: dict[str, EpisodeReplay]
+
+
+def evaluate(model: ActionWorldModelRewardModel, source: Source, episodes: np.ndarray) -> Evaluation:
+    """Replay and measure. ValueError if there is nothing to predict, or a number is not finite."""
+    if source.table.length[episodes].max() < 2:
+        raise ValueError(
+            f"dataset.root={source.table.dataset.root}: every chosen episode has a single frame; there is "
+            "nothing to predict. Use a dataset with longer episodes"
+        )
+    lpips = cached_lpips(model.state_mean.device)
+    accuracy, runs = [], []
+    shown: dict[str, EpisodeReplay] = {}
+    for run in replay_episodes(model, source, episodes):
+        accuracy.append(measure(model, source, run, lpips))
+        runs.append(replace(run, tokens=run.tokens[:0]))
+        shown.setdefault("success" if run.done.any() else "failure", run)
+    accuracy.sort(key=lambda episode: episode.episode)
+    return Evaluation(accuracy, Outcomes.of(runs).attempts(source.table), shown)

@@ -1,0 +1,157 @@
+"""The gate: of episodes that failed in reality, how many does the model, replayed open loop, believe in?
+
+It decides whether a policy may be trained inside the model, and is meant for real rollouts of policies that
+the model was not trained on.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lerobot_wmrl.constants import KINDS, PLAY
+from lerobot_wmrl.statistics import Proportion
+from lerobot_wmrl.world_models.compatibility import check_dataset
+from lerobot_wmrl.world_models.episode_table import EpisodeTable, open_dataset, read_episodes
+from lerobot_wmrl.world_models.evaluation.replay import EpisodeReplay, Source, replay_episodes
+from lerobot_wmrl.world_models.frame_cache import cached_frames
+from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
+
+MOST_FALSE = 0.05
+"""Share of the failures that may be called successes."""
+
+FEWEST_RECOGNISED = 0.9
+"""Share of the successes that must be found."""
+
+SWEEP_THRESHOLDS = tuple(round(0.3 + 0.05 * step, 2) for step in range(14))
+SWEEP_FRAMES = tuple(range(1, 7))
+
+
+@dataclass(frozen=True)
+class Outcomes:
+    """E real episodes as a model sees them.
+
+    episodes (E,); probability (E, T) of success after each action, NaN after the end; done (E, T), real.
+    """
+
+    episodes: np.ndarray
+    probability: np.ndarray
+    done: np.ndarray
+
+    @classmethod
+    def of(cls, runs: Sequence[EpisodeReplay]) -> "Outcomes":
+        """From replays, by episode."""
+        runs = sorted(runs, key=lambda run: run.episode)
+        shape = len(runs), max(len(run.done) for run in runs)
+        probability, done = np.full(shape, np.nan), np.zeros(shape, bool)
+        for row, run in enumerate(runs):
+            probability[row, : len(run.done)] = run.done_probability.cpu().numpy()
+            done[row, : len(run.done)] = run.done
+        return cls(np.array([run.episode for run in runs]), probability, done)
+
+    def attempts(self, table: EpisodeTable) -> "Outcomes":
+        """Without play, which attempts nothing; all of them, if there is nothing else."""
+        kept = table.kind[self.episodes] != KINDS.index(PLAY)
+        if not kept.any():
+            return self
+        return Outcomes(self.episodes[kept], self.probability[kept], self.done[kept])
+
+    @property
+    def success(self) -> np.ndarray:
+        """Really. (E,)"""
+        return np.any(self.done, axis=1)
+
+    def called(self, threshold: float, frames: int) -> np.ndarray:
+        """Where the model first sees success, as the environment would end an episode: the first of `frames`
+        consecutive frames at `threshold`, −1 if there is none. (E,)"""
+        return first_run(self.probability >= threshold, frames)
+
+
+@dataclass(frozen=True)
+class Gate:
+    """False successes among the failures, and successes that were recognised, at one operating point."""
+
+    threshold: float
+    frames: int
+    false_success: Proportion
+    recognised: Proportion
+
+    @property
+    def passed(self) -> bool:
+        """At most 5 % of the failures called success, at least 90 % of the successes found."""
+        return self.false_success.share <= MOST_FALSE and self.recognised.share >= FEWEST_RECOGNISED
+
+    def as_json(self) -> dict[str, Any]:
+        return {
+            "done_threshold": self.threshold,
+            "done_frames": self.frames,
+            "false_success_rate": self.false_success.as_json(),
+            "recognised_rate": self.recognised.as_json(),
+            "passed": self.passed,
+        }
+
+
+def success_gate(
+    model: ActionWorldModelRewardModel, dataset_root: str | Path, threshold: float = 0.5, frames: int = 3
+) -> Gate:
+    """Replay every episode of a dataset of real rollouts and count. ValueError if the model cannot."""
+    table = read_episodes(open_dataset(dataset_root))
+    check_dataset(model.config, table.dataset.features)
+    source = Source(table, cached_frames(table.dataset, model.config.camera_keys))
+    runs = list(replay_episodes(model, source, np.arange(len(table.start)), shuffled=False))
+    return gate_at(Outcomes.of(runs).attempts(table), threshold, frames)
+
+
+def gate_at(outcomes: Outcomes, threshold: float, frames: int) -> Gate:
+    """Count at one operating point."""
+    called, real = outcomes.called(threshold, frames) >= 0, outcomes.success
+    return Gate(
+        threshold,
+        frames,
+        Proportion(int((called & ~real).sum()), int((~real).sum())),
+        Proportion(int((called & real).sum()), int(real.sum())),
+    )
+
+
+def sweep(outcomes: Outcomes) -> list[Gate]:
+    """The gate at every operating point, from the same replay."""
+    return [gate_at(outcomes, at, frames) for frames in SWEEP_FRAMES for at in SWEEP_THRESHOLDS]
+
+
+def best_operating_point(gates: Sequence[Gate]) -> Gate | None:
+    """Of those with at most 5 % false successes the one that recognises most; None if there is none.
+
+    Among equals the fewest false successes, then the strictest.
+    """
+
+    def merit(gate: Gate) -> tuple[float, ...]:
+        return gate.recognised.k, -gate.false_success.k, gate.threshold, gate.frames
+
+    tolerable = [gate for gate in gates if gate.false_success.share <= MOST_FALSE and gate.recognised.n]
+    return max(tolerable, key=merit, default=None)
+
+
+def success_agreement(outcomes: Outcomes, threshold: float, frames: int) -> dict[str, Any]:
+    """The gate at one operating point, in detail: counts, rates, and every episode's verdict."""
+    gate = gate_at(outcomes, threshold, frames)
+    return {
+        "real_failures": gate.false_success.n,
+        "false_successes": gate.false_success.k,
+        "real_successes": gate.recognised.n,
+        "recognised_successes": gate.recognised.k,
+        **gate.as_json(),
+        "episodes": outcomes.episodes.tolist(),
+        "called_success": (outcomes.called(threshold, frames) >= 0).tolist(),
+        "real_success": outcomes.success.tolist(),
+    }
+
+
+def first_run(fired: np.ndarray, frames: int) -> np.ndarray:
+    """Where the first run of `frames` consecutive True begins, −1 if there is none. (E, T) → (E,)"""
+    count, begin = np.zeros(fired.shape[0], int), np.full(fired.shape[0], -1)
+    for step, column in enumerate(fired.T):
+        count = np.where(column, count + 1, 0)
+        begin = np.where((begin < 0) & (count >= frames), step - frames + 1, begin)
+    return begin

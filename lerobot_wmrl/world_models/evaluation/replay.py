@@ -1,0 +1,155 @@
+"""Real episodes imagined open loop: from their first frame, with their own actions."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from lerobot_wmrl.world_models.context import Context
+from lerobot_wmrl.world_models.episode_table import EpisodeTable
+from lerobot_wmrl.world_models.frame_cache import frames_to_tensor
+from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
+from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
+
+DELTA_PSNR_STEP = 15
+"""Imagined frames after which delta-PSNR is measured, as RoboScape does."""
+
+LONGEST = 300
+"""Actions of an episode that are replayed at most."""
+
+BATCH = 64
+
+
+class OpenLoop(NamedTuple):
+    """Imagined frames after each action of B episodes: row t belongs to real frame t + 1.
+
+    tokens (B, T, S); done_probability (B, T); proprioception (B, T, P).
+    """
+
+    tokens: Tensor
+    done_probability: Tensor
+    proprioception: Tensor
+
+
+@dataclass(frozen=True)
+class Source:
+    """Real episodes: their numbers, and their frames uint8 (rows, N, H, W, 3)."""
+
+    table: EpisodeTable
+    frames: np.ndarray
+
+    def rows(self, episode: int) -> slice:
+        """The rows that are replayed: at most `LONGEST`."""
+        start = int(self.table.start[episode])
+        return slice(start, start + min(int(self.table.length[episode]), LONGEST))
+
+    def images(self, episode: int, device: torch.device) -> Tensor:
+        """Those rows' frames, (T, N, 3, H, W) in [0, 1]."""
+        return frames_to_tensor(self.frames[self.rows(episode)]).to(device)
+
+    @torch.no_grad()
+    def starts(self, episodes: np.ndarray, tokenizer: FrameTokenizer) -> tuple[Tensor, Context]:
+        """The episodes' first frames: tokens (E, S), and their context if the tokenizer asks for one."""
+        device = next(tokenizer.parameters()).device
+        images = frames_to_tensor(self.frames[self.table.start[episodes]]).to(device)
+        context = tokenizer.context(images)
+        return tokenizer.encode(images, context), context
+
+    def first_state(self, episodes: np.ndarray, device: torch.device) -> Tensor:
+        """(E, P)"""
+        return torch.from_numpy(self.table.state[self.table.start[episodes]]).to(device)
+
+    def actions(self, episodes: np.ndarray, steps: int, device: torch.device) -> Tensor:
+        """The first `steps` actions of each episode, its last one repeated when it is over. (E, steps, A)"""
+        offset = np.minimum(np.arange(steps), self.table.length[episodes][:, None] - 1)
+        return torch.from_numpy(self.table.action[self.table.start[episodes][:, None] + offset]).to(device)
+
+
+@dataclass(frozen=True)
+class EpisodeReplay:
+    """What the model made of one episode of T actions; row t of it belongs to real frame t + 1.
+
+    context: of its first frame, one row; tokens (T, S); done_probability (T,); proprioception (T, P);
+    shuffled (S,), the frame at `DELTA_PSNR_STEP` with the actions of another episode, None where there is
+    none; done (T,), real success after each action; depth, metres (T − 1, N, H, W) of the real and of the
+    imagined frames, None unless the model predicts it.
+    """
+
+    episode: int
+    context: Context
+    tokens: Tensor
+    done_probability: Tensor
+    proprioception: Tensor
+    shuffled: Tensor | None
+    done: np.ndarray
+    depth: tuple[Tensor, Tensor] | None = None
+
+
+@torch.no_grad()
+def open_loop(model: ActionWorldModelRewardModel, tokens: Tensor, state: Tensor, actions: Tensor) -> OpenLoop:
+    """Imagine from tokens (B, S), state (B, P) with actions (B, T, A). The same noise at every call."""
+    imagination = model.start(tokens, state)
+    generator = torch.Generator(tokens.device).manual_seed(0)
+    steps = [model.step(imagination, action, generator) for action in actions.unbind(1)]
+    return OpenLoop(
+        torch.stack([step.tokens for step in steps], 1),
+        torch.stack([step.done_logit.sigmoid() for step in steps], 1),
+        torch.stack([step.proprioception for step in steps], 1),
+    )
+
+
+def replay_episodes(
+    model: ActionWorldModelRewardModel, source: Source, episodes: np.ndarray, shuffled: bool = True
+) -> Iterator[EpisodeReplay]:
+    """Replay the episodes, short ones first, one batch of imagined tokens in memory at a time.
+
+    `shuffled`: each is also imagined with the actions of the one before it in `episodes`, for delta-PSNR.
+    ValueError if an action or state is not finite.
+    """
+    check_finite(source.table, episodes)
+    by_length = np.argsort(source.table.length[episodes], kind="stable")
+    others = np.roll(episodes, 1) if shuffled else episodes
+    with tqdm(total=len(episodes), desc="Replaying episodes", unit="episode") as bar:
+        for begin in range(0, len(episodes), BATCH):
+            part = by_length[begin : begin + BATCH]
+            for run in _replay_batch(model, source, episodes[part], others[part]):
+                yield run
+                bar.update()
+
+
+def _replay_batch(
+    model: ActionWorldModelRewardModel, source: Source, episodes: np.ndarray, others: np.ndarray
+) -> Iterator[EpisodeReplay]:
+    device, table = model.state_mean.device, source.table
+    longest = min(int(table.length[episodes].max()), LONGEST)
+    tokens, context = source.starts(episodes, model.tokenizer)
+    state = source.first_state(episodes, device)
+    own = open_loop(model, tokens, state, source.actions(episodes, longest, device))
+    comparable = (table.length[episodes] > DELTA_PSNR_STEP) & (episodes != others)
+    if comparable.any():
+        actions = source.actions(others, DELTA_PSNR_STEP, device)
+        shuffled = open_loop(model, tokens, state, actions).tokens[:, -1]
+    for row, episode in enumerate(episodes.tolist()):
+        rows = source.rows(episode)
+        steps = slice(0, rows.stop - rows.start)
+        yield EpisodeReplay(
+            episode, context[[row]], own.tokens[row, steps], own.done_probability[row, steps],
+            own.proprioception[row, steps], shuffled[row] if comparable[row] else None, table.done[rows],
+        )  # fmt: skip
+
+
+def check_finite(table: EpisodeTable, episodes: np.ndarray) -> None:
+    """ValueError names the first episode with an action or state that is NaN or infinite."""
+    for episode in episodes:
+        rows = slice(table.start[episode], table.start[episode] + table.length[episode])
+        for name, column in (("action", table.action), ("observation.state", table.state)):
+            broken = ~np.isfinite(column[rows]).all(-1)
+            if broken.any():
+                raise ValueError(
+                    f"dataset.root={table.dataset.root}: episode {episode}, frame {broken.argmax()}: {name} "
+                    "is not a finite number; delete that episode (lerobot-edit-dataset) or record it again"
+                )

@@ -1,0 +1,86 @@
+"""The gate's arithmetic on made-up verdicts: no model, no pictures."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from lerobot_wmrl.world_models.evaluation.done import done_delay, done_quality
+from lerobot_wmrl.world_models.evaluation.gate import (
+    Outcomes,
+    best_operating_point,
+    first_run,
+    gate_at,
+    success_agreement,
+    sweep,
+)
+
+
+@pytest.fixture
+def outcomes() -> Outcomes:
+    """A success seen at once, one seen two frames late, one missed; a failure believed in, one not."""
+    nan = np.nan
+    probability = [
+        [0.1, 0.9, 0.9, 0.9, 0.9, 0.9],
+        [0.1, 0.1, 0.1, 0.8, 0.8, 0.8],
+        [0.1, 0.1, 0.1, 0.1, nan, nan],
+        [0.1, 0.7, 0.7, 0.7, 0.1, 0.1],
+        [0.1, 0.6, 0.1, 0.1, nan, nan],
+    ]
+    done = np.zeros((5, 6), bool)
+    done[0, 1:] = done[1, 1:] = done[2, 2:4] = True
+    return Outcomes(np.arange(5), np.array(probability), done)
+
+
+def test_the_first_run_is_of_consecutive_frames():
+    fired = np.array([[0, 1, 1, 0, 1], [1, 0, 1, 1, 1], [0, 0, 0, 0, 0]], bool)
+    assert first_run(fired, 2).tolist() == [1, 2, -1]
+    assert first_run(fired, 1).tolist() == [1, 0, -1]
+    assert first_run(fired, 6).tolist() == [-1, -1, -1]
+
+
+@pytest.mark.parametrize(("threshold", "frames", "false", "recognised"), [
+    (0.5, 3, 1, 2), (0.5, 1, 2, 2), (0.75, 3, 0, 2), (0.85, 3, 0, 1), (0.75, 4, 0, 1), (0.95, 1, 0, 0),
+])  # fmt: skip
+def test_the_gate_counts_as_the_environment_ends_episodes(outcomes, threshold, frames, false, recognised):
+    gate = gate_at(outcomes, threshold, frames)
+    assert (gate.false_success.k, gate.false_success.n) == (false, 2)
+    assert (gate.recognised.k, gate.recognised.n) == (recognised, 3)
+    assert not gate.passed
+
+
+def test_the_best_operating_point_is_tolerable_and_recognises_most(outcomes):
+    best = best_operating_point(sweep(outcomes))
+    assert (best.threshold, best.frames) == (0.8, 3)
+    assert (best.false_success.k, best.recognised.k) == (0, 2)
+    believed = Outcomes(outcomes.episodes, np.ones((5, 6)), outcomes.done)
+    assert best_operating_point(sweep(believed)) is None
+    knowing = Outcomes(outcomes.episodes, outcomes.done.astype(float), outcomes.done)
+    assert gate_at(knowing, 0.5, 2).passed
+
+
+def test_verdicts_of_every_episode_are_reported_as_json(outcomes):
+    agreement = json.loads(json.dumps(success_agreement(outcomes, 0.5, 3)))
+    assert agreement["called_success"] == [True, True, False, True, False]
+    assert agreement["real_success"] == [True, True, True, False, False]
+    assert (agreement["real_failures"], agreement["recognised_successes"]) == (2, 2)
+
+
+def test_done_by_frame_by_episode_and_how_late(outcomes):
+    """By frame: 5 + 3 of 5 + 5 + 2 true ones called, and 3 + 1 false ones."""
+    quality = {name: estimate.value for name, estimate in done_quality(outcomes, 0.5, 3).items()}
+    assert quality["done_precision"] == pytest.approx(8 / 12)
+    assert quality["done_recall"] == pytest.approx(8 / 12)
+    assert quality["done_f1"] == pytest.approx(8 / 12)
+    assert quality["episode_precision"] == pytest.approx(2 / 3)
+    assert quality["episode_recall"] == pytest.approx(2 / 3)
+    assert quality["done_delay_frames"] == pytest.approx((0 + 2) / 2)
+    assert np.isnan(done_delay(outcomes, 0.5, 3)[2:]).all()
+
+
+def test_without_any_success_rates_are_no_numbers():
+    never = Outcomes(np.arange(3), np.zeros((3, 4)), np.zeros((3, 4), bool))
+    assert math.isnan(done_quality(never, 0.5, 3)["done_f1"].value)
+    assert success_agreement(never, 0.5, 3)["recognised_rate"]["share"] is None
+    assert not gate_at(never, 0.5, 3).passed
