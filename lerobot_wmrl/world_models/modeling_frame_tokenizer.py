@@ -68,7 +68,7 @@ class FrameTokenizerRewardModel(PreTrainedRewardModel):
     def _perceptual_loss(self, device: torch.device) -> ImageLoss | None:
         """Not a module of this model: a checkpoint neither contains nor needs LPIPS's network."""
         weight = self.config.perceptual_weight
-        return PerceptualLoss(lpips_network(device), weight) if weight else None
+        return PerceptualLoss(lpips_network("vgg", device), weight) if weight else None
 
     @torch.no_grad()
     def compute_reward(self, batch: dict[str, Tensor]) -> Tensor:

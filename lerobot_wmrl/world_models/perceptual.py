@@ -1,16 +1,20 @@
-"""LPIPS (Zhang et al. 2018, eq. 1) as a training loss, by the package `lpips`, which is imported on use only.
+"""LPIPS (Zhang et al. 2018, eq. 1) by the package `lpips`.
 
-The package ships its linear heads; their backbone is torchvision's VGG-16, which is expected in torch's cache
-and never downloaded here.
+The package ships its linear heads; their backbones are torchvision's, which are expected in torch's cache and
+never downloaded here. Training takes VGG-16's, evaluation AlexNet's, as `lpips` advises.
 """
 
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, Final
 
 import torch
+from lpips import LPIPS
 from torch import Tensor
+from torchvision.models import AlexNet_Weights, VGG16_Weights
+
+BACKBONES: Final = {"vgg": VGG16_Weights.IMAGENET1K_V1, "alex": AlexNet_Weights.IMAGENET1K_V1}
 
 
 @dataclass(frozen=True)
@@ -25,16 +29,14 @@ class PerceptualLoss:
         return self.weight * self.network(reconstruction, images).mean()
 
 
-def backbone_path() -> Path:
-    """Where torchvision keeps VGG-16: in `$TORCH_HOME/hub/checkpoints`, by default under `~/.cache/torch`."""
-    from torchvision.models import VGG16_Weights
-
-    return Path(torch.hub.get_dir()) / "checkpoints" / PurePosixPath(VGG16_Weights.IMAGENET1K_V1.url).name
+def backbone_path(net: str) -> Path:
+    """Where torchvision keeps it: in `$TORCH_HOME/hub/checkpoints`, by default under `~/.cache/torch`."""
+    return Path(torch.hub.get_dir()) / "checkpoints" / PurePosixPath(BACKBONES[net].url).name
 
 
 def require_backbone() -> None:
-    """ValueError says where the backbone's file belongs and how to get it there, unless it is there."""
-    path = backbone_path()
+    """ValueError says where the loss's backbone belongs and how to get it there, unless it is there."""
+    path = backbone_path("vgg")
     if not path.is_file():
         raise ValueError(
             f"--model.perceptual_weight: LPIPS needs the VGG-16 of torchvision, and {path} is missing. On a "
@@ -45,14 +47,6 @@ def require_backbone() -> None:
 
 
 @cache
-def lpips_network(device: torch.device) -> torch.nn.Module:
-    """LPIPS on VGG-16, fixed: the form that trains best, where AlexNet's measures best (`lpips`'s advice)."""
-    require_backbone()
-    try:
-        import lpips
-    except ImportError as error:
-        raise ValueError(
-            "--model.perceptual_weight: the package lpips is not installed; pip install lpips, or train with "
-            "--model.perceptual_weight=0"
-        ) from error
-    return lpips.LPIPS(net="vgg", verbose=False).requires_grad_(False).to(device)
+def lpips_network(net: str, device: torch.device) -> torch.nn.Module:
+    """LPIPS on `vgg` or `alex`, fixed. Its backbone must be cached."""
+    return LPIPS(net=net, verbose=False).requires_grad_(False).to(device)

@@ -4,29 +4,31 @@ from pathlib import Path
 
 import pytest
 import torch
+from lpips import LPIPS
 
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
+from lerobot_wmrl.world_models.evaluation.alexnet_lpips import image_distance
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
 from lerobot_wmrl.world_models.perceptual import PerceptualLoss
 from tests.trained import run_training
 
 
-class GradientDistance(torch.nn.Module):
-    """How far horizontal differences of colours are apart: another image distance than L1 or L2."""
-
-    def forward(self, reconstruction: torch.Tensor, images: torch.Tensor) -> torch.Tensor:
-        return (reconstruction - images).diff(dim=-1).abs().mean((1, 2, 3))
-
-
-def test_the_term_adds_its_weight_times_the_distance_and_teaches_both_halves():
+@pytest.fixture(scope="module")
+def network() -> LPIPS:
+    """The real one, but for the weights of its backbone, which need a download."""
     torch.manual_seed(0)
-    tokenizer, images = FrameTokenizer(32, (8, 8), (5, 5)), torch.rand(2, 1, 3, 32, 32)
+    return LPIPS(net="alex", pnet_rand=True, verbose=False).requires_grad_(False)
+
+
+def test_the_term_adds_its_weight_times_the_distance_and_teaches_both_halves(network):
+    torch.manual_seed(0)
+    tokenizer, images = FrameTokenizer(64, (8, 8), (5, 5)), torch.rand(2, 1, 3, 64, 64)
     plain, metrics = tokenizer(images)
     assert "perceptual_loss" not in metrics
-    loss, metrics = tokenizer(images, perceptual=PerceptualLoss(GradientDistance(), 3.0))
+    loss, metrics = tokenizer(images, perceptual=PerceptualLoss(network, 3.0))
     term = loss - plain
     assert metrics["perceptual_loss"] == pytest.approx(term.item(), rel=1e-4)
-    single = tokenizer(images, perceptual=PerceptualLoss(GradientDistance(), 1.0))[1]["perceptual_loss"]
+    single = tokenizer(images, perceptual=PerceptualLoss(network, 1.0))[1]["perceptual_loss"]
     assert metrics["perceptual_loss"] == pytest.approx(3 * single, rel=1e-5)
     term.backward()
     for half in (tokenizer.encoder, tokenizer.decoder):
@@ -47,3 +49,13 @@ def test_a_missing_backbone_is_named_before_anything_is_written(small_dataset, t
 def test_negative_weights_are_named(name):
     with pytest.raises(ValueError, match=rf"--model\.{name}=-1\.0: must not be negative"):
         FrameTokenizerConfig(**{name: -1.0}, device="cpu")
+
+
+def test_as_a_measure_it_is_a_mean_over_cameras_and_zero_between_equals(network):
+    images, distance = torch.rand(3, 2, 3, 64, 64), image_distance(network)
+    assert torch.equal(distance(images, images), torch.zeros(3))
+    other = images.clone()
+    other[0, 1] = 0
+    assert distance(other, images)[0] > 0
+    alone = network(other[0, 1:], images[0, 1:], normalize=True).squeeze()
+    assert distance(other, images)[0] == pytest.approx(alone.item() / 2, rel=1e-4)

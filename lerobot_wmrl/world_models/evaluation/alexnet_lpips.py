@@ -1,27 +1,23 @@
 """LPIPS itself, where its backbone is at hand; elsewhere its formula on tokenizer features stands in."""
 
 from collections.abc import Callable
-from importlib.util import find_spec
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
-BACKBONE = "alexnet-owt-7be5be79.pth"
-"""torchvision's AlexNet, which the package `lpips` fetches and `TORCH_HOME` caches."""
+from lerobot_wmrl.world_models.perceptual import backbone_path, lpips_network
 
 PerceptualDistance = Callable[[Tensor, Tensor], Tensor]
 """Two (T, N, 3, H, W) in [0, 1] → (T,)."""
 
 
 def cached_lpips(device: torch.device) -> PerceptualDistance | None:
-    """LPIPS with AlexNet (Zhang et al. 2018), or None unless package and backbone are there: no download."""
-    cached = Path(torch.hub.get_dir()) / "checkpoints" / BACKBONE
-    if find_spec("lpips") is None or not cached.is_file():
-        return None
-    from lpips import LPIPS
+    """LPIPS with AlexNet (Zhang et al. 2018), or None unless its backbone is there: no download."""
+    return image_distance(lpips_network("alex", device)) if backbone_path("alex").is_file() else None
 
-    network = LPIPS(net="alex", verbose=False).to(device).eval()
+
+def image_distance(network: torch.nn.Module) -> PerceptualDistance:
+    """The mean of `network`'s distances over cameras."""
 
     @torch.no_grad()
     def distance(images: Tensor, real: Tensor) -> Tensor:
