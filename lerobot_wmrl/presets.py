@@ -27,6 +27,43 @@ TINY_WORLD_MODEL: Final[Flags] = {
     "log_freq": 5,
 }
 
+CPU_WORLD_MODEL: Final[Flags] = {
+    "model.layers": 6,
+    "model.width": 192,
+    "model.patch": 4,
+    "model.window": 48,
+    "model.clip_length": 40,
+    "steps": 4000,
+    "batch_size": 5,
+    "save_freq": 200,
+}
+"""What an hour on two cores trains."""
+
+GPU_WORLD_MODEL: Final[Flags] = {
+    "model.layers": 12,
+    "model.width": 512,
+    "model.heads": 8,
+    "model.window": 16,
+    "model.clip_length": 28,
+    "steps": 50_000,
+    "batch_size": 16,
+    "save_freq": 1000,
+}
+"""64 transformer tokens a frame of 128 pixels a side, beside the register."""
+
+PAPER_WORLD_MODEL: Final[Flags] = {
+    "model.layers": 32,
+    "model.width": 256,
+    "model.heads": 8,
+    "model.patch": 1,
+    "model.window": 48,
+    "model.clip_length": 28,
+    "steps": 100_000,
+    "batch_size": 16,
+    "save_freq": 1000,
+}
+"""RoboScape's transformer and the paper's clips and window."""
+
 PRESETS: Final[dict[str, dict[str, Flags]]] = {
     "tiny": {
         "train-world-model:frame_tokenizer": {
@@ -116,6 +153,24 @@ PRESETS: Final[dict[str, dict[str, Flags]]] = {
         },
         "eval": {"eval.batch_size": 2, "eval.use_async_envs": True},
         "eval-imagined": {"eval.batch_size": 50},
+    },
+    "cpu": {
+        "train-world-model:frame_tokenizer": {
+            "model.image_size": DEMO_IMAGE_SIZE,
+            "steps": 1600,
+            "batch_size": 48,
+            "save_freq": 200,
+        },
+        "train-world-model:action_world_model": CPU_WORLD_MODEL,
+        "train-world-model:text_world_model": CPU_WORLD_MODEL,
+    },
+    "gpu": {
+        "train-world-model:action_world_model": GPU_WORLD_MODEL,
+        "train-world-model:text_world_model": GPU_WORLD_MODEL,
+    },
+    "paper": {
+        "train-world-model:action_world_model": PAPER_WORLD_MODEL,
+        "train-world-model:text_world_model": PAPER_WORLD_MODEL,
     },
 }
 """Size → command → flags. `train-world-model:frame_tokenizer` adds to `train-world-model` for that type."""

@@ -84,7 +84,7 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         clipped = actions.to(self.device).clamp(self.action_low, self.action_high)
         imagined = self.model.step(self._imagination, clipped, self.generator)
         terminated, truncated = self._advance(imagined)
-        decoded = self.model.tokenizer.decode_with_features(imagined.tokens, self._context)
+        decoded = self.model.decode(imagined.tokens, self._context)
         closeness = self._similarity_to_goal(decoded.features)
         parts = {
             "success": terminated.float(),

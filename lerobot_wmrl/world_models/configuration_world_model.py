@@ -22,6 +22,10 @@ class WorldModelConfig(RewardModelConfig):
             give it the number of frames that episodes are imagined for.
         patch: side of the square of tokens that forms one transformer token.
         code_width: channels of the convolutions on the token grid.
+        conditioning: how blocks take in the condition: cross_attention (the paper's), adaln or additive.
+        decoding: how a frame's tokens come about: shifted (all drawn in one pass) or maskgit (in
+            `maskgit_steps` passes, the most confident first). maskgit takes a second pass in training too.
+        maskgit_steps: passes a frame of maskgit; 1 is as fast as shifted, and decodes the same way.
         motion_weight: how much more a token counts in the loss when it moves. A high weight makes the model
             believe in motion: it then pushes objects that the hand misses.
         done_weight, done_positive_weight, state_weight: of the other losses, beside the tokens' one.
@@ -46,6 +50,9 @@ class WorldModelConfig(RewardModelConfig):
     clip_length: int = 28
     patch: int = 2
     code_width: int = 48
+    conditioning: str = "cross_attention"
+    decoding: str = "shifted"
+    maskgit_steps: int = 4
 
     motion_weight: float = 1.0
     done_weight: float = 1.0
@@ -58,7 +65,7 @@ class WorldModelConfig(RewardModelConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("layers", "width", "heads", "window", "patch", "code_width"):
+        for name in ("layers", "width", "heads", "window", "patch", "code_width", "maskgit_steps"):
             if getattr(self, name) < 1:
                 raise ValueError(f"--model.{name}={getattr(self, name)}: must be at least 1")
         if self.clip_length < 2:

@@ -58,17 +58,25 @@ def force_predictions(
     return torch.cat([digits[:, :1], frames], 1), torch.cat([state[:, :1], states], 1)
 
 
-def next_frame_loss(
-    prediction: Prediction, codebook: CodeBook, digits: Tensor, state: Tensor, clip: Clip, config: Any
-) -> tuple[Tensor, dict[str, float]]:
-    """Cross-entropy of the next tokens (eq. 2), done (eqs. 3, 4 with BCE) and the next state.
+def token_weights(
+    codebook: CodeBook, digits: Tensor, clip: Clip, motion_weight: float
+) -> tuple[Tensor, Tensor]:
+    """What each token of frames 1 … T − 1 counts, and which move. digits (B, T, S, C) → two (B, T − 1, S).
 
     Tokens that move count `motion_weight` times more: most of a frame is still, and what moves decides.
     """
+    moved = codebook.distance(digits[:, 1:], digits[:, :-1]) >= MOTION_LEVELS
+    known = (clip.valid[:, 1:] & clip.valid[:, :-1])[..., None]
+    return (1 + motion_weight * moved) * known.float(), moved
+
+
+def next_frame_loss(
+    prediction: Prediction, codebook: CodeBook, digits: Tensor, state: Tensor, clip: Clip, config: Any
+) -> tuple[Tensor, dict[str, float]]:
+    """Cross-entropy of the next tokens (eq. 2), done (eqs. 3, 4 with BCE) and the next state."""
     target, known = digits[:, 1:], (clip.valid[:, 1:] & clip.valid[:, :-1])[..., None]
     valid = known.float()
-    moved = codebook.distance(target, digits[:, :-1]) >= MOTION_LEVELS
-    weight = (1 + config.motion_weight * moved) * valid
+    weight, moved = token_weights(codebook, digits, clip, config.motion_weight)
     logits = prediction.logits[:, :-1]
     token_loss = (codebook.cross_entropy(logits, target) * weight).sum() / weight.sum().clamp_min(1)
     state_error = (prediction.proprioception[:, :-1] - state[:, 1:]) / STATE_STEP

@@ -15,6 +15,7 @@ from lerobot.rewards.pretrained import PreTrainedRewardModel
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 
+from lerobot_wmrl.precision import compute_in, imagination_dtype
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.compatibility import check_cameras
 from lerobot_wmrl.world_models.configuration_world_model import (
@@ -22,8 +23,9 @@ from lerobot_wmrl.world_models.configuration_world_model import (
     TextWorldModelConfig,
     WorldModelConfig,
 )
-from lerobot_wmrl.world_models.context import Context
-from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
+from lerobot_wmrl.world_models.context import NO_CONTEXT, Context
+from lerobot_wmrl.world_models.decoding import Condition, FramesSeen, make_decoding
+from lerobot_wmrl.world_models.frame_tokenizer import Decoded, FrameTokenizer
 from lerobot_wmrl.world_models.frozen_t5 import CHECKPOINT_FOLDER, FrozenT5
 from lerobot_wmrl.world_models.goal import imagine_goal, similarity_to_goal
 from lerobot_wmrl.world_models.instructions import check_one_each
@@ -33,14 +35,15 @@ from lerobot_wmrl.world_models.losses import (
     force_predictions,
     forced_share,
     next_frame_loss,
+    token_weights,
 )
 from lerobot_wmrl.world_models.modeling_frame_tokenizer import stack_cameras
 from lerobot_wmrl.world_models.next_frame import NextFrameNetwork, Prediction
-from lerobot_wmrl.world_models.st_transformer import TemporalCache
+from lerobot_wmrl.world_models.temporal_memory import TemporalCache
 from lerobot_wmrl.world_models.text_encoder import make_text_encoder
 
-Condition = tuple[Tensor, Tensor | None]
-"""Condition tokens (B, T or 1, M, D) and their mask."""
+SMALL_BATCH = 16
+"""In so few imaginations at once on the CPU, casts cost more than bfloat16 saves."""
 
 MIN_SPREAD = 1e-3
 """Components that vary less than this are constants, and left alone by normalisation."""
@@ -66,7 +69,10 @@ class Imagined(NamedTuple):
 
 @dataclass
 class ImaginationState:
-    """Where B imaginations stand: digits (B, 1, S, C), normalised state (B, 1, P), ring of past frames."""
+    """Where B imaginations stand: digits (B, 1, S, C), normalised state (B, 1, P), ring of past frames.
+
+    Its tensors are allocated once and advanced in place. The network computes in the ring's dtype.
+    """
 
     digits: Tensor
     proprioception: Tensor
@@ -106,7 +112,9 @@ class WorldModelRewardModel(PreTrainedRewardModel):
             state_size=config.state_size, patch=config.patch, layers=config.layers, width=config.width,
             heads=config.heads, window=config.window, code_width=config.code_width,
             quantizer=config.quantizer,
+            conditioning=config.conditioning,
         )  # fmt: skip
+        self.decoding = make_decoding(config, self.network.embedding.local.in_channels)
         self._register_statistics("state", OBS_STATE, config.state_size, dataset_stats)
 
     def train(self, mode: bool = True) -> "WorldModelRewardModel":
@@ -165,8 +173,13 @@ class WorldModelRewardModel(PreTrainedRewardModel):
             with torch.no_grad():
                 guess = self.network(seen, seen_state, *condition)
             seen, seen_state = force_predictions(guess, self.network.codebook, seen, seen_state, share)
-        prediction = self.network(seen, seen_state, *condition)
-        return next_frame_loss(prediction, self.network.codebook, digits, state, clip, self.config)
+        memory = self.network.transformer.clip_memory(digits.shape[1], digits.device)
+        prediction = self.network(seen, seen_state, *condition, memory)
+        loss, metrics = next_frame_loss(prediction, self.network.codebook, digits, state, clip, self.config)
+        weight, _ = token_weights(self.network.codebook, digits, clip, self.config.motion_weight)
+        frames = FramesSeen(seen, condition, prediction, memory)
+        decoding_loss, decoding_metrics = self.decoding.loss(self.network, frames, digits[:, 1:], weight)
+        return loss + decoding_loss, metrics | decoding_metrics
 
     def forward(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, float]]:
         """LeRobot's batch: images (B, T, 3, H, W), action (B, T, A), state (B, T, P), next.done (B,)."""
@@ -202,13 +215,20 @@ class WorldModelRewardModel(PreTrainedRewardModel):
         return self.network(digits, self.normalize_state(clip.state), *self.condition(clip))
 
     def start(
-        self, tokens: Tensor, proprioception: Tensor, instructions: Sequence[str] | None = None
+        self,
+        tokens: Tensor,
+        proprioception: Tensor,
+        instructions: Sequence[str] | None = None,
+        dtype: torch.dtype | None = None,
     ) -> ImaginationState:
-        """Imagination from one frame: tokens (B, S), proprioception (B, P) in dataset units."""
-        batch = tokens.shape[0]
-        cache = self.network.transformer.make_cache(
-            batch, self.network.transformer_tokens, tokens.device, torch.float32
-        )
+        """Imagination from one frame: tokens (B, S), proprioception (B, P) in dataset units.
+
+        The network computes in `dtype`, by default the fastest; samples, done, state and entropy are float32.
+        """
+        batch, device = tokens.shape[0], tokens.device
+        small = batch < SMALL_BATCH and device.type == "cpu"
+        dtype = dtype or (torch.float32 if small else imagination_dtype(device))
+        cache = self.network.transformer.make_cache(batch, self.network.transformer_tokens, device, dtype)
         condition = self.encode_instructions(instructions, batch) if instructions is not None else None
         digits = self.network.codebook.digits(tokens)[:, None]
         return ImaginationState(digits, self.normalize_state(proprioception)[:, None], cache, condition)
@@ -217,9 +237,9 @@ class WorldModelRewardModel(PreTrainedRewardModel):
         """Put the environments in `mask` (B,) back to a first frame; their past is masked, not moved."""
         digits = self.network.codebook.digits(tokens)[:, None]
         first = self.normalize_state(proprioception)[:, None]
-        state.digits = torch.where(mask[:, None, None, None], digits, state.digits)
-        state.proprioception = torch.where(mask[:, None, None], first, state.proprioception)
-        state.cache.started = torch.where(mask, state.cache.position, state.cache.started)
+        state.digits.copy_(torch.where(mask[:, None, None, None], digits, state.digits))
+        state.proprioception.copy_(torch.where(mask[:, None, None], first, state.proprioception))
+        state.cache.restart(mask)
 
     @torch.no_grad()
     def step(
@@ -229,10 +249,13 @@ class WorldModelRewardModel(PreTrainedRewardModel):
         condition = state.condition if action is None else self.encode_actions(action[:, None])
         if condition is None:
             raise ValueError("this imagination needs an action each step, or an instruction at the start")
-        prediction = self.network.step(state.digits, state.proprioception, *condition, state.cache)
         codebook = self.network.codebook
-        state.digits = codebook.sample(prediction.logits, self.config.temperature, generator)
-        state.proprioception = prediction.proprioception
+        with compute_in(state.cache.keys.dtype, state.digits.device):
+            prediction = self.network.step(state.digits, state.proprioception, *condition, state.cache)
+            seen = FramesSeen(state.digits, condition, prediction, state.cache)
+            digits = self.decoding.decode(self.network, seen, self.config.temperature, generator)
+        state.digits.copy_(digits)
+        state.proprioception.copy_(prediction.proprioception)
         return Imagined(
             codebook.tokens(state.digits[:, 0]),
             prediction.done_logit[:, 0],
@@ -240,6 +263,13 @@ class WorldModelRewardModel(PreTrainedRewardModel):
             prediction.hidden[:, 0],
             codebook.entropy(prediction.logits[:, 0]),
         )
+
+    @torch.no_grad()
+    def decode(self, tokens: Tensor, context: Context = NO_CONTEXT) -> Decoded:
+        """Tokens (B, S) → images and features of the frames, computed as fast as imagination, as float32."""
+        with compute_in(imagination_dtype(tokens.device), tokens.device):
+            images, features = self.tokenizer.decode_with_features(tokens, context)
+        return Decoded(images.float(), [feature.float() for feature in features])
 
     def encode_actions(self, actions: Tensor) -> Condition:
         """Actions (B, T, A) in dataset units → condition tokens."""

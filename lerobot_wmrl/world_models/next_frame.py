@@ -1,7 +1,7 @@
 """The network both world models share: tokens of frame t and a condition give frame t + 1 (eq. 1).
 
 One pass predicts every token of the next frame (shifted prediction), the next proprioceptive state and
-whether success holds there.
+whether success holds there. What is read from the transformer is read in float32.
 """
 
 from collections.abc import Sequence
@@ -11,8 +11,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from lerobot_wmrl.precision import compute_in
 from lerobot_wmrl.world_models.codebook import make_codebook
-from lerobot_wmrl.world_models.st_transformer import SpatialTemporalTransformer, TemporalCache
+from lerobot_wmrl.world_models.conditioning import pooled
+from lerobot_wmrl.world_models.st_transformer import SpatialTemporalTransformer
+from lerobot_wmrl.world_models.temporal_memory import TemporalCache, TemporalMemory
 
 STATE_STEP = 0.1
 """The state head predicts changes in units of a tenth of the state's spread."""
@@ -39,9 +42,13 @@ class FrameEmbedding(nn.Module):
         self.patches = nn.Conv2d(code_width, width, patch, stride=patch)
         self.position = nn.Parameter(torch.randn((grid // patch) ** 2, width) * 0.02)
 
-    def forward(self, values: Tensor) -> tuple[Tensor, Tensor]:
-        """values (F, K, g, g) → tokens (F, (g/patch)², D) and the local features (F, code_width, g, g)."""
-        local = F.silu(self.local(values))
+    def forward(self, values: Tensor, mark: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """values (F, K, g, g) → tokens (F, (g/patch)², D) and the local features (F, code_width, g, g).
+
+        `mark` (F, code_width, g, g) says what else is known about the values.
+        """
+        local = self.local(values)
+        local = F.silu(local if mark is None else local + mark)
         return self.patches(local).flatten(2).transpose(1, 2) + self.position, local
 
 
@@ -65,14 +72,6 @@ class FrameHead(nn.Module):
         return logits, F.softplus(gate)
 
 
-def pooled(condition: Tensor, mask: Tensor | None) -> Tensor:
-    """Mean of the condition tokens (B, T or 1, M, D) that mask (B, 1, 1, 1, M) keeps. → (B, T or 1, D)"""
-    if mask is None:
-        return condition.mean(2)
-    kept = mask[:, :, 0, 0, :, None].to(condition.dtype)
-    return (condition * kept).sum(2) / kept.sum(2).clamp_min(1)
-
-
 class NextFrameNetwork(nn.Module):
     """Embeds frames, runs the transformer, reads the three predictions.
 
@@ -83,12 +82,13 @@ class NextFrameNetwork(nn.Module):
         levels: codes of each factor. quantizer: what they stand for, `fsq` or `lfq`.
         grid: side of a camera's token grid. num_cameras: grids a frame.
         state_size: P, 0 without proprioception. patch: side of the token patches that form one
-        transformer token.
+        transformer token. conditioning: how blocks take in the condition.
     """
 
     def __init__(
         self, *, levels: Sequence[int], grid: int, num_cameras: int, state_size: int, patch: int,
-        layers: int, width: int, heads: int, window: int, code_width: int, quantizer: str = "fsq",
+        layers: int, width: int, heads: int, window: int, code_width: int,
+        conditioning: str = "cross_attention", quantizer: str = "fsq",
     ) -> None:  # fmt: skip
         super().__init__()
         self.codebook = make_codebook(quantizer, levels)
@@ -97,7 +97,7 @@ class NextFrameNetwork(nn.Module):
         self.camera = nn.Parameter(torch.randn(num_cameras, 1, width) * 0.02)
         self.register = nn.Parameter(torch.randn(width) * 0.02)
         self.state_in = nn.Linear(state_size, width)
-        self.transformer = SpatialTemporalTransformer(layers, width, heads, window)
+        self.transformer = SpatialTemporalTransformer(layers, width, heads, window, conditioning)
         self.head = FrameHead(len(levels), sum(levels), patch, code_width, width)
         self.done = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, 1))
         self.state_out = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, state_size))
@@ -108,38 +108,51 @@ class NextFrameNetwork(nn.Module):
         return self.num_cameras * (self.grid // self.patch) ** 2 + 1
 
     def forward(
-        self, digits: Tensor, state: Tensor, condition: Tensor, mask: Tensor | None = None
+        self,
+        digits: Tensor,
+        state: Tensor,
+        condition: Tensor,
+        mask: Tensor | None = None,
+        memory: TemporalMemory | None = None,
     ) -> Prediction:
         """Teacher-forced pass. digits (B, T, S, C), state (B, T, P), condition (B, T or 1, M, D)."""
-        x, local = self._embed(digits, state, pooled(condition, mask))
-        return self._read(self.transformer(x, condition, mask), local, digits, state)
+        x, local = self.embed(digits, state, pooled(condition, mask))
+        return self._read(self.transformer(x, condition, mask, memory), local, digits, state)
 
     def step(
         self, digits: Tensor, state: Tensor, condition: Tensor, mask: Tensor | None, cache: TemporalCache
     ) -> Prediction:
         """The same for one new frame (T = 1) against the cache."""
-        x, local = self._embed(digits, state, pooled(condition, mask))
+        x, local = self.embed(digits, state, pooled(condition, mask))
         return self._read(self.transformer.step(x, condition, mask, cache), local, digits, state)
 
-    def _grids(self, per_token: Tensor) -> Tensor:
+    def grids(self, per_token: Tensor) -> Tensor:
         """(B, T, S, K) → (B·T·N, K, g, g)."""
         grids = per_token.unflatten(2, (self.num_cameras, self.grid, self.grid))
         return grids.flatten(0, 2).permute(0, 3, 1, 2)
 
-    def _embed(self, digits: Tensor, state: Tensor, condition: Tensor) -> tuple[Tensor, Tensor]:
+    def embed(
+        self, digits: Tensor, state: Tensor, condition: Tensor, mark: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Digits, state and the condition's mean (B, T or 1, D) → transformer tokens (B, T, 1 + S', D) and
+        local features. `mark` as in `FrameEmbedding`."""
         batch, time = digits.shape[:2]
-        tokens, local = self.embedding(self._grids(self.codebook.values(digits)))
+        tokens, local = self.embedding(self.grids(self.codebook.values(digits)), mark)
         tokens = tokens.unflatten(0, (batch, time, self.num_cameras)) + self.camera
         register = (self.register + self.state_in(state) + condition)[:, :, None]
         return torch.cat([register, tokens.flatten(2, 3)], 2), local
 
+    def token_logits(self, x: Tensor, local: Tensor, digits: Tensor) -> Tensor:
+        """The transformer's output (B, T, 1 + S', D) → logits (B, T, S, V), biased towards `digits`."""
+        frames = x[:, :, 1:].unflatten(2, (self.num_cameras, -1)).flatten(0, 2)
+        logits, gate = (self._per_token(grids.float(), digits) for grids in self.head(frames, local))
+        return logits + gate[..., self.codebook.factor_of_logit] * self.codebook.one_hot(digits)
+
     def _read(self, x: Tensor, local: Tensor, digits: Tensor, state: Tensor) -> Prediction:
-        hidden, tokens = x[:, :, 0], x[:, :, 1:]
-        frames = tokens.unflatten(2, (self.num_cameras, -1)).flatten(0, 2)
-        logits, gate = (self._per_token(grids, digits) for grids in self.head(frames, local))
-        logits = logits + gate[..., self.codebook.factor_of_logit] * self.codebook.one_hot(digits)
-        next_state = state + STATE_STEP * self.state_out(hidden)
-        return Prediction(logits, self.done(hidden).squeeze(-1), next_state, hidden)
+        logits, hidden = self.token_logits(x, local, digits), x[:, :, 0].float()
+        with compute_in(torch.float32, x.device):
+            next_state = state + STATE_STEP * self.state_out(hidden)
+            return Prediction(logits, self.done(hidden).squeeze(-1), next_state, hidden)
 
     def _per_token(self, grids: Tensor, digits: Tensor) -> Tensor:
         """(B·T·N, K, g, g) → (B, T, S, K)."""

@@ -1,0 +1,169 @@
+"""How fast a world model learns and imagines, against what the machine allows and against ManiSkill.
+
+    python benchmarks/world_model.py --world_model=outputs/demo/action_world_model
+    python benchmarks/world_model.py --sizes=gpu --no_maniskill
+
+All in one run. `--sizes` takes a preset's sizes with random weights. At each batch size, measured in turns:
+imagining (with the ring of past frames full), imagining and decoding to pictures, imagining in float32,
+imagining without the ring (the window computed anew for each frame), and training on clips, the optimiser
+included. The floor of a frame is the larger of two times: its arithmetic at the measured rate of matrix
+products, and its bytes (weights and ring) at the measured rate of memory. ManiSkill, one process, steps and
+renders the same picture, with this package's light robot meshes and with its own. On CUDA a step is captured
+in a CUDA graph. Writes docs/results/world_model_speed.json.
+"""
+
+import argparse
+import json
+import platform
+from pathlib import Path
+from typing import Any
+
+import torch
+from lerobot.utils.import_utils import register_third_party_plugins
+from torch.utils.flop_counter import FlopCounterMode
+
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.files import write_json
+from lerobot_wmrl.precision import imagination_dtype
+from lerobot_wmrl.presets import PRESETS
+from lerobot_wmrl.world_models.checkpoint import load_model
+from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig
+from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
+from machine import matmul_rate, rates, stream_rate
+from workloads import STEPS, Imagination, Work, random_clip, repeated, training_step
+
+RESULTS = Path(__file__).parents[1] / "docs" / "results"
+BATCHES = (1, 16, 64, 256)
+MOST_TRAINING_FRAMES = 4096
+"""In one training batch: the activations of more do not fit into the memory of a small machine."""
+
+
+def flop(work: Work) -> float:
+    """Multiply-adds of one call, counted as 2, by torch's own counter."""
+    with FlopCounterMode(display=False) as counter:
+        work()
+    return float(counter.get_total_flops())
+
+
+def measure_batch(
+    model: ActionWorldModelRewardModel, batch: int, matmul: float, stream: float
+) -> dict[str, Any]:
+    """All rates (frames a second) at one batch size, and their shares of the floor."""
+    device = model.state_mean.device
+    dtype = imagination_dtype(device)
+    fast, plain = (Imagination(model, batch, kind, device) for kind in (dtype, torch.float32))
+    frames = batch * model.config.clip_length
+    works: dict[str, tuple[float, Work]] = {
+        "imagined": (batch * STEPS, repeated(fast.step, device)),
+        "imagined_and_decoded": (batch * STEPS, repeated(fast.step_and_decode, device)),
+        "imagined_in_float32": (batch * STEPS, repeated(plain.step, device)),
+        "imagined_without_ring": (batch, fast.step_without_ring),
+    }
+    if frames <= MOST_TRAINING_FRAMES:
+        clip = random_clip(model, batch, device)
+        works["trained"] = (frames, training_step(model, clip, dtype))
+    found = rates(works, device)
+    arithmetic = {
+        "imagined": flop(fast.step) / batch,
+        "imagined_and_decoded": flop(fast.step_and_decode) / batch,
+    }
+    if "trained" in works:
+        arithmetic["trained"] = flop(works["trained"][1]) / frames
+    byte_seconds = {name: fast.bytes_a_frame() / stream for name in arithmetic if name != "trained"}
+    floor = {name: max(count / matmul, byte_seconds.get(name, 0.0)) for name, count in arithmetic.items()}
+    return {
+        "batch": batch,
+        "frames_per_s": {name: round(rate, 1) for name, rate in found.items()},
+        "mflop_per_frame": {name: round(count / 1e6, 1) for name, count in arithmetic.items()},
+        "mbyte_per_frame": round(fast.bytes_a_frame() / 1e6, 3),
+        "floor_frames_per_s": {name: round(1 / seconds, 1) for name, seconds in floor.items()},
+        "share_of_floor": {name: round(found[name] * seconds, 3) for name, seconds in floor.items()},
+        "times_faster_than_without_ring": round(found["imagined"] / found["imagined_without_ring"], 2),
+        "times_faster_than_float32": round(found["imagined"] / found["imagined_in_float32"], 2),
+    }
+
+
+def maniskill_rates(image_size: int) -> dict[str, float]:
+    """Rendered steps a second of one ManiSkill process, with light and with ManiSkill's robot meshes."""
+    works, open_envs = {}, []
+    for name, detail in (("light meshes", WmrlManiSkillEnv().robot_mesh_detail), ("stock meshes", 1.0)):
+        config = WmrlManiSkillEnv(image_size=image_size, robot_mesh_detail=detail)
+        env = config.create_envs(1)[config.type][0]
+        env.reset(seed=[1_000_000])
+        simulation, still = env.unwrapped.envs[0].unwrapped, env.single_action_space.sample() * 0
+        open_envs.append(env)
+        works[name] = (STEPS, lambda simulation=simulation, still=still: [
+            simulation.step(still) for _ in range(STEPS)
+        ])  # fmt: skip
+    found = rates(works, torch.device("cpu"))
+    for env in open_envs:
+        env.close()
+    return {name: round(rate, 1) for name, rate in found.items()}
+
+
+def make_model(given: argparse.Namespace) -> ActionWorldModelRewardModel:
+    """The checkpoint, or random weights of a preset's sizes."""
+    device = given.device or ("cuda" if torch.cuda.is_available() else "cpu")
+    if given.world_model:
+        model: ActionWorldModelRewardModel = load_model(given.world_model, "action_world_model", device)
+        return model
+    tokenizer, sizes = (
+        PRESETS[given.sizes].get(f"train-world-model:{kind}", {})
+        for kind in ("frame_tokenizer", "action_world_model")
+    )
+    settings: dict[str, Any] = {
+        name.removeprefix("model."): value for name, value in sizes.items() if name.startswith("model.")
+    }
+    settings["image_size"] = tokenizer.get("model.image_size", ActionWorldModelConfig.image_size)
+    return ActionWorldModelRewardModel(ActionWorldModelConfig(device=device, **settings)).to(device).eval()
+
+
+def main() -> None:
+    """Measure everything, print it, write it."""
+    register_third_party_plugins()
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    source = parser.add_mutually_exclusive_group(required=True)
+    source.add_argument("--world_model", help="output folder of an action world model's training")
+    sizes = [name for name, commands in PRESETS.items() if "train-world-model:action_world_model" in commands]
+    source.add_argument("--sizes", choices=sizes, help="random weights of this preset's sizes")
+    parser.add_argument("--batches", type=int, nargs="+", default=BATCHES, help="batch sizes")
+    parser.add_argument("--device", help="cpu or cuda; by default CUDA if there is any")
+    parser.add_argument("--no_maniskill", action="store_true", help="leave the simulator out")
+    parser.add_argument("--output", type=Path, default=RESULTS / "world_model_speed.json", help="JSON file")
+    given = parser.parse_args()
+    model = make_model(given)
+    device = model.state_mean.device
+    dtype = imagination_dtype(device)
+    matmul, stream = matmul_rate(dtype, device), stream_rate(device)
+    config = model.config
+    figures: dict[str, Any] = {
+        "machine": torch.cuda.get_device_name() if device.type == "cuda" else platform.machine(),
+        "threads": torch.get_num_threads(),
+        "dtype": str(dtype).removeprefix("torch."),
+        "image_size": config.image_size,
+        "network": {
+            name: getattr(config, name)
+            for name in ("layers", "width", "heads", "patch", "window", "conditioning", "decoding")
+        },
+        "transformer_tokens": model.network.transformer_tokens,
+        "matmul_gflop_per_s": round(matmul / 1e9, 1),
+        "stream_gbyte_per_s": round(stream / 1e9, 1),
+        "by_batch": [measure_batch(model, batch, matmul, stream) for batch in given.batches],
+    }
+    if not given.no_maniskill:
+        figures["maniskill_frames_per_s"] = maniskill_rates(config.image_size)
+        figures["times_faster_than_maniskill"] = {
+            str(row["batch"]): round(
+                row["frames_per_s"]["imagined_and_decoded"]
+                / figures["maniskill_frames_per_s"]["light meshes"], 2,
+            )
+            for row in figures["by_batch"]
+        }  # fmt: skip
+    print(json.dumps(figures, indent=2))
+    write_json(given.output, figures)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,38 @@
+"""The number format networks compute in: bfloat16 where the hardware multiplies in it, else float32.
+
+Weights, losses and optimiser states stay in float32; autocast chooses by operation (mixed precision,
+Micikevicius et al. 2018; bfloat16 needs no scaling of the loss).
+"""
+
+from typing import Final
+
+import torch
+
+PRECISIONS: Final = ("auto", "float32", "bfloat16")
+
+
+def multiplies_bfloat16(device: torch.device | str) -> bool:
+    """Whether `device` has instructions for it: CUDA from Ampere on; AVX512-BF16 or AMX."""
+    kind = torch.device(device).type
+    if kind == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    return kind == "cpu" and (torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported())
+
+
+def imagination_dtype(device: torch.device | str) -> torch.dtype:
+    """The fastest format on `device` that is exact enough to imagine in."""
+    return torch.bfloat16 if multiplies_bfloat16(device) else torch.float32
+
+
+def training_dtype(precision: str, device: torch.device | str) -> torch.dtype:
+    """What `--precision` means on `device`. ValueError if it is none of `PRECISIONS`."""
+    if precision not in PRECISIONS:
+        raise ValueError(f"--precision={precision}: choose one of {', '.join(PRECISIONS)}")
+    if precision == "auto":
+        return torch.bfloat16 if multiplies_bfloat16(device) else torch.float32
+    return torch.float32 if precision == "float32" else torch.bfloat16
+
+
+def compute_in(dtype: torch.dtype, device: torch.device | str) -> torch.autocast:
+    """A context in which matrix products and convolutions run in `dtype`; float32 changes nothing."""
+    return torch.autocast(torch.device(device).type, dtype=dtype, enabled=dtype != torch.float32)
