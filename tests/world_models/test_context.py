@@ -124,7 +124,7 @@ def test_environments_decode_beside_their_own_start_also_after_a_restart(models,
         dataset=StartFrames(str(small_dataset.root), split="all"), episode_length=3,
     )  # fmt: skip
     env = config.create_tensor_env(4)
-    tokenizer, starts = env.model.tokenizer, env.starts
+    starts = env.starts
     assert len(starts.context) == len(starts.tokens)
     env.reset(seed=0)
     before = env._start_index.clone()
@@ -136,7 +136,7 @@ def test_environments_decode_beside_their_own_start_also_after_a_restart(models,
         tokens = env.model.network.codebook.tokens(env._imagination.digits[:, 0])
         start = before if step < 3 else env._start_index
         if step != 2:
-            expected = tokenizer.decode(tokens, starts.context[start])[:, 0]
+            expected = env.model.decode(tokens, starts.context[start]).images[:, 0]
             torch.testing.assert_close(observation[CAMERA], expected)
     assert not torch.equal(before, env._start_index)
 

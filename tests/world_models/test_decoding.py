@@ -11,7 +11,7 @@ from lerobot_wmrl.world_models.decoding import FramesSeen, MaskGitDecoding, Shif
 from lerobot_wmrl.world_models.decoding.maskgit import fixed_counts, largest
 from lerobot_wmrl.world_models.next_frame import NextFrameNetwork
 
-LEVELS, TOKENS, WIDTH, FRAMES = (5, 2), 4, 32, 4
+LEVELS, TOKENS, WIDTH, FRAMES = (5, 3), 4, 32, 4
 
 
 def network() -> NextFrameNetwork:
@@ -66,7 +66,7 @@ def trained() -> tuple[NextFrameNetwork, MaskGitDecoding]:
     parameters = [*model.parameters(), *decoding.parameters()]
     optimizer = torch.optim.Adam(parameters, 1e-2)
     weight = torch.ones(16, FRAMES - 1, TOKENS)
-    for _ in range(120):
+    for _ in range(200):
         digits = frames(16)
         seen, target = look(model, digits), digits[:, 1:]
         one_pass = model.codebook.cross_entropy(seen.prediction.logits[:, :-1], target).mean()
