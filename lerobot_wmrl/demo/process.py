@@ -21,6 +21,7 @@ from typing import BinaryIO
 
 import psutil
 
+from lerobot_wmrl.malloc import keep_freed_memory
 from lerobot_wmrl.progress import own_progress_lock
 
 SAMPLE_SECONDS = 1.0
@@ -32,12 +33,6 @@ PRELOADED = (
     "lerobot_env_wmrl",
     "lerobot_wmrl.maniskill.simulation",
 )
-
-MALLOC = {"MALLOC_MMAP_MAX_": 0, "MALLOC_TRIM_THRESHOLD_": (2 << 30) - 1, "MALLOC_TOP_PAD_": 256 << 20}
-"""glibc keeps freed tensors instead of giving them back to the kernel: 1.1-1.5 times faster on a CPU."""
-
-MALLOPT = {"MALLOC_MMAP_MAX_": -4, "MALLOC_TRIM_THRESHOLD_": -1, "MALLOC_TOP_PAD_": -2}
-"""The same settings for a process that runs already, by their numbers in <malloc.h>."""
 
 Report = Callable[[float, int], None]
 """Called about once a second with the seconds since the start and the peak memory so far in bytes."""
@@ -60,13 +55,6 @@ def entry_point(program: str) -> Callable[[], int | None]:
     if not found:
         raise ValueError(f"the command {program} is not installed: run `make setup`")
     return next(iter(found)).load()
-
-
-def environment() -> dict[str, str]:
-    """What a command of the demo gets: the width of the screen, fast malloc for its children."""
-    columns = str(shutil.get_terminal_size().columns)
-    malloc = {name: str(value) for name, value in MALLOC.items()}
-    return {"COLUMNS": columns, **malloc, **os.environ}
 
 
 def run_measured(command: Sequence[str], log: Path, report: Report) -> int:
@@ -99,10 +87,8 @@ def _run_command(command: list[str], output: int, parent: int) -> None:
     for stream in (1, 2):
         os.dup2(output, stream)
     sys.stdout, sys.stderr = (os.fdopen(stream, "w", buffering=1, closefd=False) for stream in (1, 2))
-    os.environ.update(environment())
-    libc = ctypes.CDLL(None)
-    for name, number in MALLOPT.items():
-        libc.mallopt(number, MALLOC[name])
+    os.environ.setdefault("COLUMNS", str(shutil.get_terminal_size().columns))
+    keep_freed_memory()
     sys.argv = command
     sys.exit(entry_point(command[0])())
 

@@ -20,6 +20,7 @@ from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 
 from lerobot_wmrl.command import RunConfig, claim_output_dir, run_command
 from lerobot_wmrl.constants import EVALUATION_SEED
+from lerobot_wmrl.malloc import keep_freed_memory
 from lerobot_wmrl.presets import expand_preset
 from lerobot_wmrl.rl.configuration_ppo import PPOConfig
 
@@ -146,6 +147,7 @@ def train_in(
 
 def main() -> None:
     """Entry point of the console command."""
+    keep_freed_memory()
     run_command(train_policy, TrainConfig, partial(expand_preset, command="train"))
 
 

@@ -17,6 +17,7 @@ from lerobot.configs.rewards import RewardModelConfig
 
 from lerobot_wmrl.command import RunConfig, claim_output_dir, require_free, run_command
 from lerobot_wmrl.dataset_source import DatasetSource
+from lerobot_wmrl.malloc import keep_freed_memory
 from lerobot_wmrl.presets import expand_preset
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
 from lerobot_wmrl.world_models.configuration_world_model import WorldModelConfig
@@ -98,6 +99,7 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
 
 def main() -> None:
     """Entry point of the console command."""
+    keep_freed_memory()
     run_command(train_world_model, TrainWorldModelConfig, partial(expand_preset, command="train-world-model"))
 
 
