@@ -8,19 +8,21 @@
 Running the same command again continues from the last checkpoint. `--preset=demo` sets the sizes.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import draccus
+from accelerate import PartialState
 from lerobot.configs.rewards import RewardModelConfig
 
 from lerobot_wmrl.command import RunConfig, claim_output_dir, require_free, run_command
 from lerobot_wmrl.dataset_source import DatasetSource
 from lerobot_wmrl.malloc import keep_freed_memory
+from lerobot_wmrl.precision import PRECISIONS, training_dtype
 from lerobot_wmrl.presets import expand_preset
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
-from lerobot_wmrl.world_models.configuration_world_model import WorldModelConfig
 
 TRAINED = ("frame_tokenizer", "action_world_model", "text_world_model")
 
@@ -36,8 +38,11 @@ class TrainWorldModelConfig(RunConfig):
         dataset: the LeRobotDataset to learn from.
         output_dir: where checkpoints and metrics go; continues if it holds this run already.
         steps, batch_size: optimiser steps, and frames (tokenizer) or clips (world models) a step.
+            Under `torchrun --nproc_per_node=N` every process has `batch_size` of them.
         save_freq, log_freq: steps between checkpoints and between lines of metrics.jsonl.
         seed: of initial weights and batches.
+        precision: `float32`, `bfloat16` (mixed: weights and losses stay in float32), or `auto`: bfloat16 if
+            the device multiplies in it. The checkpoints' train_config.json tells which it was.
     """
 
     model: RewardModelConfig = field(default_factory=FrameTokenizerConfig)
@@ -48,6 +53,7 @@ class TrainWorldModelConfig(RunConfig):
     save_freq: int = 500
     log_freq: int = 20
     seed: int = 0
+    precision: str = "auto"
 
 
 def check_config(cfg: TrainWorldModelConfig) -> None:
@@ -57,15 +63,17 @@ def check_config(cfg: TrainWorldModelConfig) -> None:
     for name in ("steps", "batch_size", "save_freq", "log_freq"):
         if getattr(cfg, name) < 1:
             raise ValueError(f"--{name}={getattr(cfg, name)}: must be at least 1")
+    if cfg.precision not in PRECISIONS:
+        raise ValueError(f"--precision={cfg.precision}: choose one of {', '.join(PRECISIONS)}")
+    if cfg.model.push_to_hub and not cfg.model.repo_id:
+        raise ValueError("--model.push_to_hub=true: give its name on the hub, --model.repo_id=user/name")
 
 
-def check_tokenizer_path(model: RewardModelConfig) -> None:
-    """ValueError if a world model would learn the codes of an untrained tokenizer."""
-    if isinstance(model, WorldModelConfig) and not model.tokenizer_path:
-        raise ValueError(
-            "--model.tokenizer_path is missing: give the output folder of a training with "
-            "--model.type=frame_tokenizer"
-        )
+def publish(model: Any, cfg: TrainWorldModelConfig) -> None:
+    """Upload the trained model if `--model.push_to_hub=true`."""
+    if cfg.model.push_to_hub and PartialState().is_main_process:
+        model.push_model_to_hub(cfg)
+        print(f"{cfg.output_dir}: published as {cfg.model.repo_id}")
 
 
 def train_world_model(cfg: TrainWorldModelConfig) -> None:
@@ -78,29 +86,34 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
     from lerobot_wmrl.world_models.training import build_model, make_sampler, train
 
     check_config(cfg)
+    processes = PartialState(cpu=cfg.model.device == "cpu")
     table = read_episodes(open_dataset(cfg.dataset.root, cfg.dataset.repo_id))
     given = draccus.encode(cfg)
     checkpoint = latest_checkpoint(cfg.output_dir)
-    if checkpoint is not None and int(checkpoint.name) >= cfg.steps:
-        claim_output_dir(cfg.output_dir, given)
-        print(f"{cfg.output_dir}: already trained for {cfg.steps} steps")
-        return
-    if checkpoint is None:
-        check_tokenizer_path(cfg.model)
     set_seed(cfg.seed)
     model = build_model(cfg.model, table, cfg.output_dir)
     require_free(cfg.output_dir, given)
-    sampler = make_sampler(model, table, cfg.batch_size, cfg.seed)
-    claim_output_dir(cfg.output_dir, given)
-    train(model, sampler, cfg, cfg.save_pretrained)
-    if isinstance(cfg.model, FrameTokenizerConfig):
-        write_reconstruction(model, table, cfg.output_dir)
+    if checkpoint is not None and int(checkpoint.name) >= cfg.steps:
+        claim_output_dir(cfg.output_dir, given)
+        print(f"{cfg.output_dir}: already trained for {cfg.steps} steps")
+    else:
+        with processes.main_process_first():
+            sampler = make_sampler(model, table, cfg.batch_size, cfg.seed)
+            if processes.is_main_process:
+                claim_output_dir(cfg.output_dir, given)
+        dtype = training_dtype(cfg.precision, cfg.model.device)
+        used = replace(cfg, precision=str(dtype).removeprefix("torch."))
+        train(model, sampler, used, used.save_pretrained)
+        if isinstance(cfg.model, FrameTokenizerConfig) and processes.is_main_process:
+            write_reconstruction(model, table, cfg.output_dir)
+    publish(model, cfg)
 
 
 def main() -> None:
     """Entry point of the console command."""
     keep_freed_memory()
     run_command(train_world_model, TrainWorldModelConfig, partial(expand_preset, command="train-world-model"))
+    PartialState().destroy_process_group()
 
 
 if __name__ == "__main__":

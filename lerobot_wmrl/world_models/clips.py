@@ -1,4 +1,7 @@
-"""Training batches as pure functions of (seed, step): a resumed training repeats and skips no sample."""
+"""Training batches as pure functions of (seed, step): a resumed training repeats and skips no sample.
+
+`batch_size` is a process's share: each draws the whole batch and keeps its own rows of it.
+"""
 
 from dataclasses import dataclass
 
@@ -6,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lerobot_wmrl.world_models.distributed import own_rows, rank_and_size
 from lerobot_wmrl.world_models.episode_table import EpisodeTable
 from lerobot_wmrl.world_models.frame_cache import frames_to_tensor
 from lerobot_wmrl.world_models.losses import Clip
@@ -31,12 +35,13 @@ class ClipSampler:
     device: str
 
     def __call__(self, step: int) -> Clip:
-        """The batch of one training step."""
-        rng = np.random.default_rng([self.seed, step])
-        episodes = rng.choice(self.episodes, self.batch_size)
+        """This process's share of the batch of one training step."""
+        rng, size = np.random.default_rng([self.seed, step]), self.batch_size * rank_and_size()[1]
+        episodes = rng.choice(self.episodes, size)
         room = np.maximum(self.table.length[episodes] - 2, 1)
-        offsets = np.where(rng.random(self.batch_size) < FROM_START, 0, rng.integers(0, room))
-        return self.clips(episodes, offsets)
+        offsets = np.where(rng.random(size) < FROM_START, 0, rng.integers(0, room))
+        rows = own_rows(self.batch_size)
+        return self.clips(episodes[rows], offsets[rows])
 
     def clips(self, episodes: np.ndarray, offsets: np.ndarray) -> Clip:
         """Rows `offset … offset + clip_length − 1` of each episode, padded with its last row."""
@@ -73,11 +78,12 @@ class FrameSampler:
     device: str
 
     def __call__(self, step: int) -> dict[str, Tensor]:
-        """The batch of one training step: `observation.images.*` and `reference.*`, (B, 3, H, W)."""
+        """This process's share of one step's batch: `observation.images.*`, `reference.*`, (B, 3, H, W)."""
         rng = np.random.default_rng([self.seed, step])
-        episodes = rng.choice(self.episodes, self.batch_size)
+        episodes = rng.choice(self.episodes, self.batch_size * rank_and_size()[1])
         start = self.table.start[episodes]
         rows = start + rng.integers(0, self.table.length[episodes])
+        start, rows = start[own_rows(self.batch_size)], rows[own_rows(self.batch_size)]
         images, reference = (frames_to_tensor(self.frames[index]).to(self.device) for index in (rows, start))
         batch = {}
         for index, camera in enumerate(self.cameras):

@@ -7,11 +7,14 @@ embedding, since networks see the code's values and not its index.
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import ClassVar, Final
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+
+from lerobot_wmrl.world_models.distributed import draw_own_rows
 
 LARGEST_TOKEN: Final = 2**31
 """Tokens are cached as int32."""
@@ -73,7 +76,7 @@ class CodeBook(nn.Module):
 
     def neighbors(self, digits: Tensor) -> Tensor:
         """Each digit (…, C) one step further, at random: one level up or down, if there is one."""
-        shift = torch.randint_like(digits, 0, 2) * 2 - 1
+        shift = draw_own_rows(partial(torch.randint, 0, 2), digits.shape, digits.device) * 2 - 1
         return (digits + shift).clamp_min(0).minimum(self.levels - 1)
 
     def one_hot(self, digits: Tensor) -> Tensor:
@@ -130,7 +133,9 @@ class BinaryCodeBook(CodeBook):
 
     def neighbors(self, digits: Tensor) -> Tensor:
         """Each digit (…, C) with one of its signs, at random, flipped."""
-        return digits ^ (1 << torch.randint_like(digits, 0, self.bits))
+        return digits ^ (
+            1 << draw_own_rows(partial(torch.randint, 0, self.bits), digits.shape, digits.device)
+        )
 
 
 CODEBOOKS: Final[dict[str, type[CodeBook]]] = {"fsq": CodeBook, "lfq": BinaryCodeBook}

@@ -6,6 +6,13 @@ from typing import Any
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
 
+def frame_size(feature: Mapping[str, Any]) -> tuple[int, int]:
+    """(H, W) of a camera's feature, whose shape is (H, W, 3) or, by its names, (3, H, W)."""
+    names = feature.get("names") or ("height", "width", "channels")
+    height, width = feature["shape"][:2] if names[2].startswith("channel") else feature["shape"][1:]
+    return height, width
+
+
 def check_cameras(config: Any, features: Mapping[str, Any]) -> None:
     """ValueError unless the dataset has the config's cameras at its image size."""
     for key in config.camera_keys:
@@ -15,7 +22,7 @@ def check_cameras(config: Any, features: Mapping[str, Any]) -> None:
                 f"cameras={config.cameras}: the dataset has no {key} (its cameras: {cameras}); set "
                 "--model.cameras to match, or use a dataset with this camera"
             )
-        height, width = features[key]["shape"][:2]
+        height, width = frame_size(features[key])
         if (height, width) != (config.image_size, config.image_size):
             raise ValueError(
                 f"image_size={config.image_size}: the dataset's {key} is {height}x{width}; "
@@ -24,9 +31,9 @@ def check_cameras(config: Any, features: Mapping[str, Any]) -> None:
 
 
 def check_dataset(config: Any, features: Mapping[str, Any]) -> None:
-    """ValueError unless a trained world model can start in, or replay, the dataset's episodes."""
+    """ValueError unless a trained model can learn from, start in or replay the dataset's episodes."""
     check_cameras(config, features)
-    sizes = {OBS_STATE: config.state_size, ACTION: getattr(config, "action_size", 0)}
+    sizes = {OBS_STATE: getattr(config, "state_size", 0), ACTION: getattr(config, "action_size", 0)}
     for name, wanted in sizes.items():
         found = features[name]["shape"][0] if name in features else 0
         if wanted and found != wanted:
@@ -34,3 +41,26 @@ def check_dataset(config: Any, features: Mapping[str, Any]) -> None:
                 f"{name}: the world model was trained with {wanted} components, the dataset has "
                 f"{found or 'none'}; use a dataset like the one it was trained on"
             )
+
+
+def check_tokenizer_source(config: Any) -> None:
+    """ValueError unless a world model that is to be trained gets its codes from exactly one place."""
+    if config.tokenizer_path and config.pretrained_path:
+        raise ValueError(
+            f"--model.tokenizer_path={config.tokenizer_path}: the world model at {config.pretrained_path} "
+            "carries the tokenizer whose codes it has learnt; leave one of the two out"
+        )
+    if not config.tokenizer_path and not config.pretrained_path:
+        raise ValueError(
+            "--model.tokenizer_path is missing (--reward_model.tokenizer_path in lerobot-train): give the "
+            "output folder of a training with type=frame_tokenizer"
+        )
+
+
+def check_episode_lengths(meta: Any) -> None:
+    """ValueError if no episode has a second frame to predict."""
+    if meta.total_frames <= meta.total_episodes:
+        raise ValueError(
+            f"dataset.root={meta.root}: {meta.total_episodes} episodes of {meta.total_frames} frames in all; "
+            "a world model learns from episodes of two frames or more: record longer ones"
+        )

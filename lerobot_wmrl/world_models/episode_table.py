@@ -79,7 +79,7 @@ def missing_files(meta: LeRobotDatasetMetadata) -> list[Path]:
 
 
 def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
-    """Read the columns that models train on. ValueError names a missing column."""
+    """Read the columns that models train on. ValueError names a missing one, or one with NaN or infinity."""
     if ACTION not in dataset.features:
         raise ValueError(
             f"dataset.root={dataset.root}: the feature {ACTION!r} is missing (it has "
@@ -89,6 +89,9 @@ def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
     optional = (OBS_STATE, "next.done", "start.kind", "start.scene")
     columns += [name for name in optional if name in dataset.features]
     rows = dataset.hf_dataset.with_format("numpy", columns=columns)[:]
+    for column in (ACTION, OBS_STATE, "next.done"):
+        if column in rows:
+            check_finite(dataset, column, np.asarray(rows[column]), rows["episode_index"])
     frames = len(rows["episode_index"])
     _, start, length = np.unique(rows["episode_index"], return_index=True, return_counts=True)
     kind, scene = (
@@ -102,6 +105,19 @@ def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
     instructions = [episode["tasks"][0] for episode in dataset.meta.episodes]
     action = np.asarray(rows[ACTION], np.float32)
     return EpisodeTable(dataset, state, action, done.astype(bool), start, length, kind, scene, instructions)
+
+
+def check_finite(dataset: LeRobotDataset, column: str, values: np.ndarray, episode: np.ndarray) -> None:
+    """ValueError names the first episode and frame at which values (N, …) hold NaN or infinity."""
+    finite = np.isfinite(values.astype(np.float64).reshape(len(values), -1)).all(1)
+    if not finite.all():
+        row = int(np.argmin(finite))
+        frame = row - int(np.argmax(episode == episode[row]))
+        raise ValueError(
+            f"dataset.root={dataset.root}: {column} of episode {episode[row]}, frame {frame}, is "
+            f"{values[row].tolist()}; remove the episode with lerobot-edit-dataset "
+            f"--operation.type=delete_episodes --operation.episode_indices=[{episode[row]}]"
+        )
 
 
 def golden_episodes(table: EpisodeTable) -> np.ndarray:

@@ -17,6 +17,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.video_utils import decode_video_frames
 from tqdm import tqdm
 
+from lerobot_wmrl.world_models.compatibility import frame_size
 from lerobot_wmrl.world_models.episode_table import VIDEO_BACKEND
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
 
@@ -31,8 +32,7 @@ def cache_dir(dataset: LeRobotDataset) -> Path:
 
 def cached_frames(dataset: LeRobotDataset, camera_keys: Sequence[str]) -> np.ndarray:
     """All frames as a read-only memory map, uint8 (rows, N, H, W, 3); decoded on the first call."""
-    height, width = dataset.features[camera_keys[0]]["shape"][:2]
-    shape = (dataset.num_frames, len(camera_keys), height, width, 3)
+    shape = (dataset.num_frames, len(camera_keys), *frame_size(dataset.features[camera_keys[0]]), 3)
     key = _digest([dataset.num_episodes, dataset.num_frames, *camera_keys, *_file_stamps(dataset)])
 
     def fill(target: np.ndarray) -> None:

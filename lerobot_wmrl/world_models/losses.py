@@ -7,6 +7,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from lerobot_wmrl.world_models.codebook import CodeBook
+from lerobot_wmrl.world_models.distributed import draw_own_rows, masked_mean
 from lerobot_wmrl.world_models.next_frame import STATE_STEP, Prediction
 
 MOTION_LEVELS = 3
@@ -38,7 +39,8 @@ def corrupt_digits(digits: Tensor, codebook: CodeBook, share: float) -> Tensor:
     if share <= 0:
         return digits
     neighbors = codebook.neighbors(digits)
-    return torch.where(torch.rand(digits.shape, device=digits.device) < share, neighbors, digits)
+    hit = draw_own_rows(torch.rand, digits.shape, digits.device) < share
+    return torch.where(hit, neighbors, digits)
 
 
 def forced_share(target: float, progress: float) -> float:
@@ -52,9 +54,9 @@ def force_predictions(
 ) -> tuple[Tensor, Tensor]:
     """Scheduled sampling in parallel: replace a share of the input frames by one-pass predictions of them."""
     predicted = codebook.sample(guess.logits[:, :-1], 0.0, None)
-    swap = torch.rand(digits.shape[:2], device=digits.device)[:, 1:] < share
+    swap = draw_own_rows(torch.rand, digits.shape[:2], digits.device)[:, 1:] < share
     frames = torch.where(swap[..., None, None], predicted, digits[:, 1:])
-    states = torch.where(swap[..., None], guess.proprioception[:, :-1], state[:, 1:])
+    states = torch.where(swap[..., None], guess.proprioception[:, :-1].to(state.dtype), state[:, 1:])
     return torch.cat([digits[:, :1], frames], 1), torch.cat([state[:, :1], states], 1)
 
 
@@ -73,37 +75,38 @@ def token_weights(
 def next_frame_loss(
     prediction: Prediction, codebook: CodeBook, digits: Tensor, state: Tensor, clip: Clip, config: Any
 ) -> tuple[Tensor, dict[str, float]]:
-    """Cross-entropy of the next tokens (eq. 2), done (eqs. 3, 4 with BCE) and the next state."""
+    """Cross-entropy of the next tokens (eq. 2), done (eqs. 3, 4 with BCE) and the next state.
+
+    Computed in float32, whatever the network computes in.
+    """
+    prediction = Prediction(*(output.float() for output in prediction))
     target, known = digits[:, 1:], (clip.valid[:, 1:] & clip.valid[:, :-1])[..., None]
-    valid = known.float()
     weight, moved = token_weights(codebook, digits, clip, config.motion_weight)
     logits = prediction.logits[:, :-1]
-    token_loss = (codebook.cross_entropy(logits, target) * weight).sum() / weight.sum().clamp_min(1)
+    token_loss = masked_mean(codebook.cross_entropy(logits, target), weight)
     state_error = (prediction.proprioception[:, :-1] - state[:, 1:]) / STATE_STEP
-    state_loss = (
-        F.smooth_l1_loss(state_error, torch.zeros_like(state_error), reduction="none", beta=STATE_PRECISION)
-        * valid
-    ).sum()
-    state_loss = state_loss / (valid.sum() * max(1, state.shape[-1])).clamp_min(1)
+    state_losses = F.smooth_l1_loss(
+        state_error, torch.zeros_like(state_error), reduction="none", beta=STATE_PRECISION
+    )
+    state_loss = masked_mean(state_losses, known.expand_as(state_losses))
     done_loss = masked_done_loss(prediction.done_logit, clip, config.done_positive_weight)
     loss = token_loss + config.done_weight * done_loss + config.state_weight * state_loss
-    right = (codebook.sample(logits.detach(), 0.0, None) == target).all(-1) & known
+    right = (codebook.sample(logits.detach(), 0.0, None) == target).all(-1)
     return loss, {
         "token_loss": token_loss.item(),
         "done_loss": done_loss.item(),
         "state_loss": state_loss.item(),
-        "token_accuracy": (right.sum() / valid.expand_as(right).sum().clamp_min(1)).item(),
-        "moving_token_accuracy": (right & moved).sum().item() / max(1.0, (moved * valid).sum().item()),
+        "token_accuracy": masked_mean(right, known.expand_as(right)).item(),
+        "moving_token_accuracy": masked_mean(right, moved & known).item(),
     }
 
 
 def masked_done_loss(done_logit: Tensor, clip: Clip, positive_weight: float) -> Tensor:
     """BCE over the rows whose outcome is known; the rare class counts `positive_weight` times."""
-    known = (clip.done_known & clip.valid).float()
     losses = F.binary_cross_entropy_with_logits(
         done_logit,
         clip.done,
         reduction="none",
         pos_weight=torch.tensor(positive_weight, device=done_logit.device),
     )
-    return (losses * known).sum() / known.sum().clamp_min(1)
+    return masked_mean(losses, clip.done_known & clip.valid)

@@ -12,25 +12,36 @@ from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokeniz
 from lerobot_wmrl.world_models.context import NO_CONTEXT
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer, ImageLoss, motion_weight
 from lerobot_wmrl.world_models.goal import similarity_to_goal
+from lerobot_wmrl.world_models.hub_card import HubCard
 from lerobot_wmrl.world_models.perceptual import PerceptualLoss, lpips_network, require_backbone
 
 
-def stack_cameras(batch: dict[str, Tensor], keys: Sequence[str]) -> Tensor:
-    """Camera images (…, 3, H, W) of a batch → (…, N, 3, H, W). ValueError names a missing camera."""
+def stack_cameras(batch: dict[str, Tensor], keys: Sequence[str], size: int) -> Tensor:
+    """Camera images (…, 3, H, W) of a batch → (…, N, 3, H, W). ValueError if one is missing or no `size`."""
     missing = [key for key in keys if key not in batch]
     if missing:
         present = [key for key in batch if "images" in key]
         raise ValueError(
             f"the batch lacks the cameras {missing}; it has {present}. Train on a dataset with them."
         )
+    for key in keys:
+        if tuple(batch[key].shape[-3:]) != (3, size, size):
+            raise ValueError(
+                f"{key}: frames of shape {tuple(batch[key].shape[-3:])}, but the tokenizer's are (3, {size}, "
+                f"{size}); resize them, or train a tokenizer at their size"
+            )
     return torch.stack([batch[key] for key in keys], dim=-4)
 
 
-class FrameTokenizerRewardModel(PreTrainedRewardModel):
+class FrameTokenizerRewardModel(HubCard, PreTrainedRewardModel):
     """Frames to tokens and back; its reward is 1 − distance to a goal frame in feature space (eq. 5)."""
 
     config_class = FrameTokenizerConfig
     name = "frame_tokenizer"
+    summary = (
+        "A frame tokenizer: camera frames to grids of discrete tokens and back, for the world models of "
+        "`lerobot_env_wmrl`. Its reward is the similarity of a frame to a goal frame."
+    )
 
     def __init__(self, config: FrameTokenizerConfig, dataset_meta: Any = None, **kwargs: Any) -> None:
         super().__init__(config)
@@ -46,21 +57,24 @@ class FrameTokenizerRewardModel(PreTrainedRewardModel):
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
         """Reconstruction loss of images (B, 3, H, W); `reference.*`: the episodes' first frames, if known."""
-        images, reference = stack_cameras(batch, self.config.camera_keys), self._reference(batch)
+        images, reference = self._stack(batch, "observation.images"), self._reference(batch)
         weight, context = None, NO_CONTEXT
         if reference is not None:
             weight = motion_weight(images, reference, self.config.motion_weight)
             context = self.tokenizer.context(reference)
         return self.tokenizer(images, weight, self._perceptual_loss(images.device), context)
 
+    def _stack(self, batch: dict[str, Tensor], prefix: str) -> Tensor:
+        keys = [f"{prefix}.{camera}" for camera in self.config.cameras]
+        return stack_cameras(batch, keys, self.config.image_size)
+
     def _reference(self, batch: dict[str, Tensor]) -> Tensor | None:
         """The first frames of the episodes, if the batch has them. ValueError if they are needed."""
-        keys = [f"reference.{camera}" for camera in self.config.cameras]
-        if keys[0] in batch:
-            return stack_cameras(batch, keys)
+        if f"reference.{self.config.cameras[0]}" in batch:
+            return self._stack(batch, "reference")
         if self.config.context:
             raise ValueError(
-                f"--model.context=true: the batch lacks {keys}, the first frames of the episodes; train with "
+                "--model.context=true: the batch lacks `reference.*`, the first frames of the episodes; train with "
                 "lerobot-wmrl-train-world-model, which adds them"
             )
         return None
@@ -76,8 +90,8 @@ class FrameTokenizerRewardModel(PreTrainedRewardModel):
 
         A context-conditioned tokenizer also needs `reference.*`, the first frames of the episodes.
         """
-        images, reference = stack_cameras(batch, self.config.camera_keys), self._reference(batch)
-        goal = stack_cameras(batch, [f"goal.{camera}" for camera in self.config.cameras])
+        images, reference = self._stack(batch, "observation.images"), self._reference(batch)
+        goal = self._stack(batch, "goal")
         context = NO_CONTEXT if reference is None else self.tokenizer.context(reference)
         goal_tokens = self.tokenizer.encode(goal, context)
         goal_features = self.tokenizer.decode_with_features(goal_tokens, context).features

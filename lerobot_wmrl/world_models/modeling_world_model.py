@@ -4,6 +4,7 @@ Trained from token clips (`loss`) or from a LeRobotDataset's batches (`forward`)
 `restart` and `step`, which advance a preallocated state in place.
 """
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +18,12 @@ from torch import Tensor, nn
 
 from lerobot_wmrl.precision import compute_in, imagination_dtype
 from lerobot_wmrl.world_models.checkpoint import load_model
-from lerobot_wmrl.world_models.compatibility import check_cameras
+from lerobot_wmrl.world_models.compatibility import (
+    check_cameras,
+    check_dataset,
+    check_episode_lengths,
+    check_tokenizer_source,
+)
 from lerobot_wmrl.world_models.configuration_world_model import (
     ActionWorldModelConfig,
     TextWorldModelConfig,
@@ -28,6 +34,7 @@ from lerobot_wmrl.world_models.decoding import Condition, FramesSeen, make_decod
 from lerobot_wmrl.world_models.frame_tokenizer import Decoded, FrameTokenizer
 from lerobot_wmrl.world_models.frozen_t5 import CHECKPOINT_FOLDER, FrozenT5
 from lerobot_wmrl.world_models.goal import imagine_goal, similarity_to_goal
+from lerobot_wmrl.world_models.hub_card import HubCard
 from lerobot_wmrl.world_models.instructions import check_one_each
 from lerobot_wmrl.world_models.losses import (
     Clip,
@@ -41,6 +48,7 @@ from lerobot_wmrl.world_models.modeling_frame_tokenizer import stack_cameras
 from lerobot_wmrl.world_models.next_frame import NextFrameNetwork, Prediction
 from lerobot_wmrl.world_models.temporal_memory import TemporalCache
 from lerobot_wmrl.world_models.text_encoder import make_text_encoder
+from lerobot_wmrl.world_models.windows import clip_from_windows
 
 SMALL_BATCH = 16
 """In so few imaginations at once on the CPU, casts cost more than bfloat16 saves."""
@@ -80,7 +88,7 @@ class ImaginationState:
     condition: Condition | None = None
 
 
-class WorldModelRewardModel(PreTrainedRewardModel):
+class WorldModelRewardModel(HubCard, PreTrainedRewardModel):
     """Base of both: tokenizer, next-frame network and statistics in one checkpoint."""
 
     config_class = WorldModelConfig
@@ -94,6 +102,9 @@ class WorldModelRewardModel(PreTrainedRewardModel):
         super().__init__(config)
         self.config: Any = config
         self.training_progress = 1.0
+        if dataset_meta is not None:
+            check_tokenizer_source(config)
+            check_episode_lengths(dataset_meta)
         source = self._adopt_tokenizer() if config.tokenizer_path else None
         if dataset_meta is not None:
             self._adopt_features(dataset_meta.features)
@@ -133,11 +144,14 @@ class WorldModelRewardModel(PreTrainedRewardModel):
         return source
 
     def _adopt_features(self, features: dict[str, Any]) -> None:
+        """Take the widths from the dataset; a trained model must find its own there."""
+        if self.config.pretrained_path:
+            check_dataset(self.config, features)
         check_cameras(self.config, features)
         if self.config.state_size and OBS_STATE not in features:
-            raise ValueError("the dataset has no observation.state; set --model.state_size=0 to do without")
+            logging.info("the dataset has no observation.state: the world model does without proprioception")
         if self.config.state_size:
-            self.config.state_size = features[OBS_STATE]["shape"][0]
+            self.config.state_size = features[OBS_STATE]["shape"][0] if OBS_STATE in features else 0
 
     def _register_statistics(self, name: str, key: str, size: int, stats: Any) -> None:
         mean, std = torch.zeros(size), torch.ones(size)
@@ -181,32 +195,23 @@ class WorldModelRewardModel(PreTrainedRewardModel):
         decoding_loss, decoding_metrics = self.decoding.loss(self.network, frames, digits[:, 1:], weight)
         return loss + decoding_loss, metrics | decoding_metrics
 
-    def forward(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, float]]:
-        """LeRobot's batch: images (B, T, 3, H, W), action (B, T, A), state (B, T, P), next.done (B,)."""
-        return self.loss(self.clip_from_batch(batch))
+    def forward(self, batch: Clip | dict[str, Any]) -> tuple[Tensor, dict[str, float]]:
+        """The loss on a clip, or on LeRobot's batch, of which `clip_from_windows` has the shapes."""
+        return self.loss(batch if isinstance(batch, Clip) else self.clip_from_batch(batch))
 
     @torch.no_grad()
     def clip_from_batch(self, batch: dict[str, Any]) -> Clip:
-        """Tokenise a batch of windows. Only the last frame has a done label, if any."""
-        images = stack_cameras(batch, self.config.camera_keys)
+        """Tokenise a batch of LeRobot's windows."""
+        images = stack_cameras(batch, self.config.camera_keys, self.config.image_size)
         shape = images.shape[:2]
         context = self._context(batch)[torch.arange(shape[0]).repeat_interleave(shape[1])]
         tokens = self.tokenizer.encode(images.flatten(0, 1), context).unflatten(0, shape)
-        padded = batch.get(f"{self.config.camera_keys[0]}_is_pad", torch.zeros(shape, dtype=torch.bool))
-        done, known = torch.zeros(shape, device=tokens.device), torch.zeros(shape, dtype=torch.bool)
-        if "next.done" in batch:
-            done[:, -1], known[:, -1] = batch["next.done"].reshape(-1).float(), True
-        state = (
-            batch[OBS_STATE] if self.config.state_size else tokens.new_zeros((*shape, 0), dtype=torch.float32)
-        )
-        return Clip(
-            tokens, state, batch[ACTION], done, ~padded.to(tokens.device), known.to(tokens.device),
-            list(batch.get("task", [""] * shape[0])),
-        )  # fmt: skip
+        return clip_from_windows(tokens, batch, self.config.camera_keys[0], self.config.state_size)
 
     def _context(self, batch: dict[str, Any]) -> Context:
         """Of the windows' first frames, since a window does not hold its episode's. B rows, or none."""
-        return self.tokenizer.context(stack_cameras(batch, self.config.camera_keys)[:, 0])
+        images = stack_cameras(batch, self.config.camera_keys, self.config.image_size)
+        return self.tokenizer.context(images[:, 0])
 
     @torch.no_grad()
     def predict(self, clip: Clip) -> Prediction:
@@ -285,6 +290,10 @@ class ActionWorldModelRewardModel(WorldModelRewardModel):
 
     config_class = ActionWorldModelConfig
     name = "action_world_model"
+    summary = (
+        "An action-conditioned world model: from a frame, the robot's state and an action it imagines the "
+        "next frame and state. Its reward is the probability that the task is then done."
+    )
     action_mean: Tensor
     action_std: Tensor
 
@@ -310,7 +319,9 @@ class ActionWorldModelRewardModel(WorldModelRewardModel):
     @torch.no_grad()
     def compute_reward(self, batch: dict[str, Any]) -> Tensor:
         """Probability that success holds after the window's last action. → (B,)"""
-        return self.predict(self.clip_from_batch(batch)).done_logit[:, -1].sigmoid()
+        clip = self.clip_from_batch(batch)
+        last = clip.valid.sum(1, keepdim=True) - 1
+        return self.predict(clip).done_logit.gather(1, last).squeeze(1).sigmoid()
 
 
 class TextWorldModelRewardModel(WorldModelRewardModel):
@@ -318,6 +329,10 @@ class TextWorldModelRewardModel(WorldModelRewardModel):
 
     config_class = TextWorldModelConfig
     name = "text_world_model"
+    summary = (
+        "A text-conditioned world model: from a frame and an instruction it imagines how the task is done. "
+        "Its reward is the similarity of a frame to the end of what it imagined."
+    )
 
     def __init__(
         self, config: TextWorldModelConfig, *, dataset_meta: Any = None, t5: FrozenT5 | None = None,

@@ -1,13 +1,20 @@
-"""The one training loop of tokenizer and world models: seeded, resumable, logged."""
+"""The one training loop of tokenizer and world models: seeded, resumable, logged, on one or more devices.
+
+Under `torchrun` every process has `batch_size` rows of the batch, DistributedDataParallel averages their
+gradients, and the first process alone writes.
+"""
 
 import logging
+import math
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
+from accelerate import PartialState
 from lerobot.common.train_utils import (
+    load_training_num_processes,
     load_training_state,
     save_training_state,
     should_save_checkpoint,
@@ -18,26 +25,31 @@ from lerobot.rewards.pretrained import PreTrainedRewardModel
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from lerobot.utils.random_utils import set_seed
 from torch import Tensor
+from torch.nn.parallel import DistributedDataParallel
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LRScheduler
 from tqdm import tqdm
 
 from lerobot_wmrl.checkpoints import latest_checkpoint, write_checkpoint
+from lerobot_wmrl.precision import compute_in, training_dtype
 from lerobot_wmrl.tracking import append_metrics
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.clips import ClipSampler, FrameSampler
+from lerobot_wmrl.world_models.compatibility import check_dataset
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import cosine_schedule
 from lerobot_wmrl.world_models.configuration_world_model import TextWorldModelConfig
+from lerobot_wmrl.world_models.distributed import mean_over_processes
 from lerobot_wmrl.world_models.episode_table import EpisodeTable, golden_episodes
 from lerobot_wmrl.world_models.frame_cache import cached_frames, cached_tokens
-
-LossFunction = Callable[[Any], tuple[Tensor, dict[str, float]]]
 
 
 def build_model(config: RewardModelConfig, table: EpisodeTable, output_dir: Path) -> PreTrainedRewardModel:
     """A fresh model with the dataset's statistics, or the latest checkpoint of this run."""
-    checkpoint = latest_checkpoint(output_dir)
+    checkpoint, meta = latest_checkpoint(output_dir), table.dataset.meta
     if checkpoint is not None:
-        return load_model(checkpoint, config.type, config.device or "cpu")
-    meta = table.dataset.meta
+        model = load_model(checkpoint, config.type, config.device or "cpu")
+        check_dataset(model.config, meta.features)
+        return model
     return make_reward_model(config, dataset_stats=meta.stats, dataset_meta=meta)
 
 
@@ -47,6 +59,8 @@ def make_sampler(
     """Batches for this kind of model from the episodes that are not held out."""
     config: Any = model.config
     episodes = ~table.validation
+    if not episodes.any():
+        raise ValueError(f"dataset.root={table.dataset.root}: has no episode to train on; record some first")
     if model.name == "frame_tokenizer":
         frames = cached_frames(table.dataset, config.camera_keys)
         return FrameSampler(
@@ -70,6 +84,23 @@ def make_sampler(
     )
 
 
+def load_progress(output_dir: Path, optimizer: Optimizer, scheduler: LRScheduler, state: PartialState) -> int:
+    """Restore optimiser, schedule and random numbers from the last checkpoint. → its step, 0 without one.
+
+    ValueError if another number of processes wrote it: the batches that follow would be of another size.
+    """
+    checkpoint = latest_checkpoint(output_dir)
+    if checkpoint is None:
+        return 0
+    began_with = load_training_num_processes(checkpoint) or 1
+    if began_with != state.num_processes:
+        raise ValueError(
+            f"--output_dir={output_dir}: this run began with {began_with} processes, here are "
+            f"{state.num_processes}; continue it with torchrun --nproc_per_node={began_with}"
+        )
+    return load_training_state(checkpoint, optimizer, scheduler)[0]
+
+
 def train(
     model: PreTrainedRewardModel,
     sampler: ClipSampler | FrameSampler,
@@ -78,47 +109,56 @@ def train(
 ) -> None:
     """Optimise from the last checkpoint to `cfg.steps`. ValueError (and no new checkpoint) on a NaN loss."""
     set_seed(cfg.seed)
+    processes = PartialState()
     preset: Any = model.config.get_optimizer_preset()
     optimizer = preset.build([p for p in model.parameters() if p.requires_grad])
     scheduler = cosine_schedule(preset.lr, cfg.steps).build(optimizer, cfg.steps)
-    checkpoint = latest_checkpoint(cfg.output_dir)
-    step = load_training_state(checkpoint, optimizer, scheduler)[0] if checkpoint else 0
-    loss_function: LossFunction = model.loss if isinstance(sampler, ClipSampler) else model
+    first = load_progress(cfg.output_dir, optimizer, scheduler, processes)
+    network = DistributedDataParallel(model) if processes.num_processes > 1 else model
+    device: str = model.config.device
+    dtype = training_dtype(cfg.precision, device)
 
     def save(folder: Path) -> None:
         model.save_pretrained(folder / PRETRAINED_MODEL_DIR)
         save_config(folder / PRETRAINED_MODEL_DIR)
-        save_training_state(folder, step, optimizer, scheduler, batch_size=cfg.batch_size)
+        save_training_state(folder, step, optimizer, scheduler, processes.num_processes, cfg.batch_size)
 
     model.train()
-    began, first = time.monotonic(), step
-    progress = tqdm(
-        range(step, cfg.steps), initial=step, total=cfg.steps, desc=f"Training {model.name}", unit="step"
-    )
-    for _ in progress:
-        model.training_progress = step / cfg.steps
-        loss, metrics = loss_function(sampler(step))
+    began = time.monotonic()
+    progress = tqdm(total=cfg.steps, initial=first, desc=f"Training {model.name}", unit="step",
+                    disable=not processes.is_main_process)  # fmt: skip
+    for step in range(first + 1, cfg.steps + 1):
+        model.training_progress = (step - 1) / cfg.steps
+        with compute_in(dtype, device):
+            loss, metrics = network(sampler(step - 1))
         metrics |= descend(model, loss, optimizer, preset.grad_clip_norm)
         scheduler.step()
-        step += 1
         if step % cfg.log_freq == 0 or step == cfg.steps:
+            metrics = mean_over_processes(metrics, device)
             metrics["steps_per_s"] = (step - first) / (time.monotonic() - began)
-            append_metrics(cfg.output_dir, step, metrics)
-            progress.set_postfix(loss=f"{metrics['loss']:.3f}")
-        if should_save_checkpoint(step, cfg.save_freq, cfg.steps):
+            log(cfg.output_dir, step, metrics, progress)
+        if processes.is_main_process and should_save_checkpoint(step, cfg.save_freq, cfg.steps):
             write_checkpoint(cfg.output_dir, cfg.steps, step, save)
+        progress.update()
+    progress.close()
+
+
+def log(output_dir: Path, step: int, metrics: dict[str, float], progress: tqdm) -> None:
+    """Show the loss, and let the first process write a line of metrics."""
+    progress.set_postfix(loss=f"{metrics['loss']:.3f}")
+    if PartialState().is_main_process:
+        append_metrics(output_dir, step, metrics)
 
 
 def descend(
-    model: torch.nn.Module, loss: Tensor, optimizer: torch.optim.Optimizer, grad_clip_norm: float
+    model: torch.nn.Module, loss: Tensor, optimizer: Optimizer, grad_clip_norm: float
 ) -> dict[str, float]:
     """One optimiser step. → the loss and the norm of its gradient. ValueError, and no step, on a NaN."""
-    if not torch.isfinite(loss):
-        raise ValueError(
-            f"the loss is {loss.item()}; the last checkpoint is kept: lower --model.learning_rate"
-        )
+    value = mean_over_processes({"loss": loss.item()}, loss.device)["loss"]
+    if not math.isfinite(value):
+        raise ValueError(f"the loss is {value}; the last checkpoint is kept: lower --model.learning_rate")
     optimizer.zero_grad()
     loss.backward()
     grad_norm = torch.nn.utils.clip_grad_norm_(model.parameters(), grad_clip_norm)
     optimizer.step()
-    return {"loss": loss.item(), "grad_norm": grad_norm.item()}
+    return {"loss": value, "grad_norm": grad_norm.item()}

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from lerobot_wmrl.world_models.conditioning import pooled
 from lerobot_wmrl.world_models.decoding.shifted import FramesSeen, ShiftedDecoding
+from lerobot_wmrl.world_models.distributed import draw_own_rows, masked_mean
 from lerobot_wmrl.world_models.next_frame import NextFrameNetwork
 from lerobot_wmrl.world_models.temporal_memory import DraftMemory
 
@@ -77,12 +78,12 @@ class MaskGitDecoding(ShiftedDecoding):
         The last frame's next one is unknown: its draft is made up, nobody sees it and it does not count.
         """
         following = torch.cat([target, seen.digits[:, -1:]], 1)
-        chance = torch.rand(following.shape[:2], device=target.device)[..., None]
-        masked = torch.rand(following.shape[:3], device=target.device) < (chance * math.pi / 2).cos()
+        chance = draw_own_rows(torch.rand, following.shape[:2], target.device)[..., None]
+        drawn = draw_own_rows(torch.rand, following.shape[:3], target.device)
+        masked = drawn < (chance * math.pi / 2).cos()
         logits = self.draft_logits(network, seen, seen.memory.drafts(), following, ~masked)[:, :-1]
-        weight = weight * masked[:, :-1]
-        losses = network.codebook.cross_entropy(logits, target)
-        loss = (losses * weight).sum() / weight.sum().clamp_min(1)
+        losses = network.codebook.cross_entropy(logits.float(), target)
+        loss = masked_mean(losses, weight * masked[:, :-1])
         return loss, {"draft_loss": loss.item()}
 
     def draft_logits(

@@ -1,0 +1,49 @@
+"""Windows as lerobot-train gives them, to clips as world models learn from them."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from lerobot.utils.constants import ACTION, DONE, OBS_STATE
+from torch import Tensor
+
+from lerobot_wmrl.world_models.losses import Clip
+
+
+def clip_from_windows(tokens: Tensor, batch: Mapping[str, Any], camera_key: str, state_size: int) -> Clip:
+    """A window ends at its row of the dataset; a clip begins at a frame that has no past.
+
+    LeRobot fills a window that would begin before its episode with copies of the first row. They are moved
+    behind the window's end, where they count for nothing: else the model would learn that actions at the
+    start of an episode do nothing. Only the last row's `next.done` is in the batch, and like the token path
+    (`clips.FROM_START`) only windows that hold their episode's start have it as a label.
+
+    Args:
+        tokens: (B, T, S), of the window's frames.
+        batch: action (B, T, A), observation.state (B, T, P), next.done (B,) or (B, 1), task, `*_is_pad`
+            (B, T); all but the action may be missing.
+
+    Raises:
+        ValueError: the action is missing, or has another length than the frames.
+    """
+    (rows, length), device = tokens.shape[:2], tokens.device
+    action = batch.get(ACTION)
+    if action is None or action.ndim != 3 or action.shape[1] != length:
+        found = "none" if action is None else f"shape {tuple(action.shape)}"
+        raise ValueError(f"action: {found}, but the batch has windows of {length} frames; give one a frame")
+    padded = batch.get(f"{camera_key}_is_pad", torch.zeros(rows, length, dtype=torch.bool)).to(device)
+    before = padded.sum(1, keepdim=True)
+    index = (torch.arange(length, device=device) + before).clamp(max=length - 1)
+    valid = torch.arange(length, device=device) < length - before
+    last = torch.arange(length, device=device) == length - 1 - before
+    done, known = torch.zeros(rows, length, device=device), torch.zeros_like(last)
+    if isinstance(batch.get(DONE), Tensor):  # LeRobot's processors put False where the dataset has none
+        done, known = last * batch[DONE].reshape(rows, 1).float(), last & (before > 0)
+    state = batch[OBS_STATE] if state_size else action.new_zeros(rows, length, 0)
+    tokens, state, action = (take_rows(values, index) for values in (tokens, state, action))
+    return Clip(tokens, state, action, done, valid, known, list(batch.get("task", [""] * rows)))
+
+
+def take_rows(values: Tensor, index: Tensor) -> Tensor:
+    """Rows `index` (B, T) of every window: values (B, T, …) → same shape."""
+    return values[torch.arange(len(values), device=values.device)[:, None], index]
