@@ -20,7 +20,7 @@ TINY: dict[str, Any] = {
 
 def run_training(config: Any, root: Path, output_dir: Path, steps: int = 3, **settings: Any) -> Path:
     """Train `config`'s model on the dataset at `root`; returns the output folder."""
-    options = {"batch_size": 2, "save_freq": 1, "log_freq": 1, **settings}
+    options = {"batch_size": 2, "save_freq": 1, "log_freq": 1, "precision": "float32", **settings}
     train_world_model(
         TrainWorldModelConfig(
             model=config, dataset=DatasetSource(str(root)), output_dir=output_dir, steps=steps, **options
@@ -29,10 +29,14 @@ def run_training(config: Any, root: Path, output_dir: Path, steps: int = 3, **se
     return output_dir
 
 
-def train_tokenizer(root: Path, output_dir: Path, **settings: Any) -> Path:
+def tokenizer_config() -> FrameTokenizerConfig:
     """A small frame tokenizer for 32x32 images."""
-    config = FrameTokenizerConfig(image_size=32, widths=[8, 16], levels=[5, 4], device="cpu")
-    return run_training(config, root, output_dir, **settings)
+    return FrameTokenizerConfig(image_size=32, widths=[8, 16], levels=[5, 4], device="cpu")
+
+
+def train_tokenizer(root: Path, output_dir: Path, **settings: Any) -> Path:
+    """The tokenizer above, trained."""
+    return run_training(tokenizer_config(), root, output_dir, **settings)
 
 
 def action_config(tokenizer: Path, **settings: Any) -> ActionWorldModelConfig:

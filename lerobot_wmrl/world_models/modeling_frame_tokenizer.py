@@ -74,8 +74,8 @@ class FrameTokenizerRewardModel(HubCard, PreTrainedRewardModel):
             return self._stack(batch, "reference")
         if self.config.context:
             raise ValueError(
-                "--model.context=true: the batch lacks `reference.*`, the first frames of the episodes; train with "
-                "lerobot-wmrl-train-world-model, which adds them"
+                "--model.context=true: the batch lacks `reference.*`, the first frames of the episodes; train "
+                "with lerobot-wmrl-train-world-model, which adds them"
             )
         return None
 

@@ -310,6 +310,11 @@ class ActionWorldModelRewardModel(WorldModelRewardModel):
         self.config.action_size = features[ACTION]["shape"][0]
 
     def encode_actions(self, actions: Tensor) -> Condition:
+        if actions.shape[-1] != self.config.action_size:
+            raise ValueError(
+                f"action: {actions.shape[-1]} components, but the world model was trained with "
+                f"{self.config.action_size}; use a dataset or policy with the same actions"
+            )
         normalised = (actions - self.action_mean) / self.action_std
         return self.embed_action(normalised).unflatten(-1, (self.config.condition_tokens, -1)), None
 

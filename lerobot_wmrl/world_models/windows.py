@@ -24,13 +24,17 @@ def clip_from_windows(tokens: Tensor, batch: Mapping[str, Any], camera_key: str,
             (B, T); all but the action may be missing.
 
     Raises:
-        ValueError: the action is missing, or has another length than the frames.
+        ValueError: the action is missing or has another length than the frames; NaN or infinity in a number.
     """
     (rows, length), device = tokens.shape[:2], tokens.device
     action = batch.get(ACTION)
     if action is None or action.ndim != 3 or action.shape[1] != length:
         found = "none" if action is None else f"shape {tuple(action.shape)}"
         raise ValueError(f"action: {found}, but the batch has windows of {length} frames; give one a frame")
+    state = batch[OBS_STATE] if state_size else action.new_zeros(rows, length, 0)
+    for name, values in ((ACTION, action), (OBS_STATE, state)):
+        if not torch.isfinite(values).all():
+            raise ValueError(f"{name}: holds NaN or infinity; remove the episodes that do from the dataset")
     padded = batch.get(f"{camera_key}_is_pad", torch.zeros(rows, length, dtype=torch.bool)).to(device)
     before = padded.sum(1, keepdim=True)
     index = (torch.arange(length, device=device) + before).clamp(max=length - 1)
@@ -39,7 +43,6 @@ def clip_from_windows(tokens: Tensor, batch: Mapping[str, Any], camera_key: str,
     done, known = torch.zeros(rows, length, device=device), torch.zeros_like(last)
     if isinstance(batch.get(DONE), Tensor):  # LeRobot's processors put False where the dataset has none
         done, known = last * batch[DONE].reshape(rows, 1).float(), last & (before > 0)
-    state = batch[OBS_STATE] if state_size else action.new_zeros(rows, length, 0)
     tokens, state, action = (take_rows(values, index) for values in (tokens, state, action))
     return Clip(tokens, state, action, done, valid, known, list(batch.get("task", [""] * rows)))
 

@@ -4,14 +4,19 @@ import os
 import shutil
 from pathlib import Path
 
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
+import torch
 
 from lerobot_wmrl.dataset_source import DatasetSource
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.rewards.configuration_general import GeneralConfig
 from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
 from lerobot_wmrl.world_models.checkpoint import load_model
-from tests.trained import action_config, run_training, train_tokenizer
+from lerobot_wmrl.world_models.episode_table import choose_episodes, read_episodes
+from tests.trained import action_config, run_training, text_config, tokenizer_config, train_tokenizer
 
 
 def test_wrong_input_is_named(small_dataset, trained_models, tmp_path):
@@ -129,3 +134,93 @@ def test_truncated_numbers_are_named(small_dataset, tmp_path):
     with pytest.raises(ValueError, match=r"dataset\.root=.*cannot be opened .*record it again"):
         train_tokenizer(root, tmp_path / "run", steps=1)
     assert not (tmp_path / "run").exists()
+
+
+def with_value(source: Path, root: Path, column: str, row: int, value: float) -> Path:
+    """A copy of a dataset with another number in the first place of a row's column."""
+    shutil.copytree(source, root)
+    path = next((root / "data").rglob("*.parquet"))
+    table = pq.read_table(path)
+    rows = [np.asarray(cell, np.float32) for cell in table[column].to_pylist()]
+    rows[row][0] = value
+    kind = table.schema.field(column).type
+    cells = pa.array([cell.tolist() for cell in rows], kind)
+    pq.write_table(table.set_column(table.column_names.index(column), column, cells), path)
+    return root
+
+
+@pytest.mark.parametrize(("column", "value"), [("action", np.nan), ("observation.state", -np.inf)])
+def test_numbers_that_are_none_are_named_with_their_episode(column, value, small_dataset, tmp_path):
+    row = int(read_episodes(small_dataset).start[2]) + 4
+    root = with_value(Path(small_dataset.root), tmp_path / "dataset", column, row, value)
+    with pytest.raises(
+        ValueError, match=rf"{column} of episode 2, frame 4, is \[.*{value}.*episode_indices=\[2\]"
+    ):
+        train_tokenizer(root, tmp_path / "run", steps=1)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("build", [action_config, text_config])
+def test_episodes_of_one_frame_are_named(build, make_synthetic_dataset, trained_models, tmp_path):
+    root = Path(make_synthetic_dataset(tmp_path / "dataset", episodes=3, length=1).root)
+    with pytest.raises(
+        ValueError, match="3 episodes of 3 frames in all; a world model learns from episodes of two"
+    ):
+        run_training(build(trained_models["frame_tokenizer"]), root, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_split_without_episodes_is_named(small_dataset):
+    with pytest.raises(ValueError, match="no episode in its validation split"):
+        choose_episodes(read_episodes(small_dataset), "validation", 5)
+
+
+def test_a_second_tokenizer_is_refused(small_dataset, trained_models, tmp_path):
+    """A run goes on with the codes it began with, and a trained model keeps those it has learnt."""
+    root, tokenizer = Path(small_dataset.root), trained_models["frame_tokenizer"]
+    other = train_tokenizer(root, tmp_path / "other", steps=1, seed=1)
+    run = run_training(action_config(tokenizer), root, tmp_path / "run", steps=2)
+    with pytest.raises(ValueError, match=r"holds a run with other settings \(model"):
+        run_training(action_config(other), root, run, steps=3)
+    trained = str(run / "checkpoints" / "last" / "pretrained_model")
+    with pytest.raises(
+        ValueError, match=r"--model\.tokenizer_path=.*other: the world model at .* carries the tok"
+    ):
+        run_training(action_config(other, pretrained_path=trained), root, tmp_path / "again")
+    assert not (tmp_path / "again").exists()
+
+
+def test_a_trained_model_does_not_go_on_with_actions_of_another_width(
+    small_dataset, trained_models, tmp_path
+):
+    root = Path(small_dataset.root)
+    trained = str(trained_models["action_world_model"] / "checkpoints" / "last" / "pretrained_model")
+    config = action_config(trained_models["frame_tokenizer"], pretrained_path=trained, action_size=5)
+    config.tokenizer_path = None
+    with pytest.raises(
+        ValueError, match="action: the world model was trained with 5 components, the dataset has 7"
+    ):
+        run_training(config, root, tmp_path / "run")
+
+
+def test_batches_that_do_not_fit_are_named(trained_models):
+    tokenizer = load_model(trained_models["frame_tokenizer"], "frame_tokenizer")
+    key, state, action = "observation.images.third_view", torch.zeros(1, 3, 8), torch.zeros(1, 3, 7)
+    with pytest.raises(ValueError, match=r"third_view: frames of shape \(3, 48, 48\), .* are \(3, 32, 32\)"):
+        tokenizer({key: torch.zeros(2, 3, 48, 48)})
+    model, images = (
+        load_model(trained_models["action_world_model"], "action_world_model"),
+        torch.zeros(1, 3, 3, 32, 32),
+    )
+    batch = {key: images, "observation.state": state, "action": action}
+    with pytest.raises(ValueError, match=r"action: shape \(1, 7\), but the batch has windows of 3 frames"):
+        model({**batch, "action": action[:, 0]})
+    with pytest.raises(ValueError, match="action: 5 components, but the world model was trained with 7"):
+        model({**batch, "action": action[..., :5]})
+    with pytest.raises(ValueError, match=r"observation\.state: holds NaN or infinity"):
+        model({**batch, "observation.state": state / 0})
+
+
+def test_another_precision_is_named(small_dataset, tmp_path):
+    with pytest.raises(ValueError, match="--precision=half: choose one of auto, float32, bfloat16"):
+        run_training(tokenizer_config(), Path(small_dataset.root), tmp_path / "run", precision="half")

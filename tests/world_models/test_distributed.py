@@ -36,8 +36,8 @@ def flags(model: str, root: Path, tokenizer: Path, output_dir: Path, processes: 
     source = [] if model == "frame_tokenizer" else [f"--model.tokenizer_path={tokenizer}"]
     return [
         f"--model.type={model}", "--model.device=cpu", *source, *SIZES[model], f"--dataset.root={root}",
-        f"--output_dir={output_dir}", f"--batch_size={BATCH // processes}", f"--steps={STEPS}", "--log_freq=1",
-        "--save_freq=3", "--precision=float32",
+        f"--output_dir={output_dir}", f"--batch_size={BATCH // processes}", f"--steps={STEPS}",
+        "--log_freq=1", "--save_freq=3", "--precision=float32",
     ]  # fmt: skip
 
 

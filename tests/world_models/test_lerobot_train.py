@@ -22,7 +22,7 @@ SMALL = ["--reward_model.layers=1", "--reward_model.width=32", "--reward_model.h
 
 @pytest.fixture(scope="module")
 def foreign_dataset(tmp_path_factory) -> Path:
-    """Two cameras with names of their own, stored as images, one of them channels first; no state, no labels."""
+    """Two cameras with names of their own, stored as images, one channels first; no state, no labels."""
     first = {"dtype": "image", "shape": (3, SIZE, SIZE), "names": ["channels", "height", "width"]}
     last = {"dtype": "image", "shape": (SIZE, SIZE, 3), "names": ["height", "width", "channels"]}
     action = {"dtype": "float32", "shape": (ACTIONS,), "names": None}
@@ -35,7 +35,8 @@ def foreign_dataset(tmp_path_factory) -> Path:
         for _ in range(length):
             picture = rng.integers(0, 255, (SIZE, SIZE, 3), dtype=np.uint8)
             dataset.add_frame({
-                "observation.images.top": picture, "observation.images.left.fisheye": picture.transpose(2, 0, 1),
+                "observation.images.top": picture,
+                "observation.images.left.fisheye": picture.transpose(2, 0, 1),
                 "action": rng.normal(size=ACTIONS).astype(np.float32), "task": "stir",
             })  # fmt: skip
         dataset.save_episode()

@@ -1,0 +1,72 @@
+"""A short training on made-up arrays: no video, no file and no trained tokenizer stands between machines.
+
+A change of a model, a loss, the sampler or the optimiser shows here first; if it is meant, write the new
+numbers down.
+"""
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from lerobot.rewards.factory import make_reward_model
+from lerobot.utils.random_utils import set_seed
+
+from lerobot_wmrl.tracking import read_metrics
+from lerobot_wmrl.world_models.clips import ClipSampler, FrameSampler
+from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig, TextWorldModelConfig
+from lerobot_wmrl.world_models.episode_table import EpisodeTable
+from lerobot_wmrl.world_models.training import train
+from tests.trained import TINY, tokenizer_config
+
+EPISODES, ROWS, TOKENS, CODES = 4, 14, 16, 20
+GOLDEN = {
+    "frame_tokenizer": [],
+    "action_world_model": [],
+    "text_world_model": [],
+}
+WORLD_MODEL: dict[str, Any] = {
+    "device": "cpu", "image_size": 32, "tokenizer_widths": [8, 16], "levels": [5, 4], "token_noise": 0.1,
+    **TINY,
+}  # fmt: skip
+
+
+def made_up_episodes() -> EpisodeTable:
+    """Drifting numbers; every second episode ends in success."""
+    rng, rows = np.random.default_rng(0), EPISODES * ROWS
+    state = rng.normal(size=(rows, 8)).cumsum(0).astype(np.float32)
+    action = rng.normal(size=(rows, 7)).astype(np.float32)
+    done = np.tile(np.arange(2 * ROWS) >= 2 * ROWS - 3, EPISODES // 2)
+    start, length = np.arange(EPISODES) * ROWS, np.full(EPISODES, ROWS)
+    instructions = ["push the can", "pull the box"] * (EPISODES // 2)
+    dataset: Any = SimpleNamespace(root="made up")
+    return EpisodeTable(dataset, state, action, done, start, length, np.zeros(EPISODES, int), instructions)
+
+
+def made_up_sampler(model: str) -> ClipSampler | FrameSampler:
+    """Pictures that brighten, or tokens of which a few change from row to row."""
+    table, rng, episodes = made_up_episodes(), np.random.default_rng(1), np.arange(EPISODES)
+    if model == "frame_tokenizer":
+        ramp = np.linspace(0, 255, 32) * np.linspace(0.2, 1, EPISODES * ROWS)[:, None]
+        frames = np.broadcast_to(ramp[:, None, None, :, None], (EPISODES * ROWS, 1, 32, 32, 3)).astype(
+            np.uint8
+        )
+        return FrameSampler(table, frames, episodes, ["third_view"], batch_size=4, seed=0, device="cpu")
+    tokens = rng.integers(0, CODES, TOKENS) + (rng.random((EPISODES * ROWS, TOKENS)) < 0.1).cumsum(0)
+    return ClipSampler(
+        table, tokens % CODES, episodes, TINY["clip_length"], batch_size=4, seed=0, device="cpu"
+    )
+
+
+@pytest.mark.parametrize("model", GOLDEN)
+def test_the_loss_of_a_short_training_is_the_golden_one(model, tmp_path: Path):
+    configs = {"action_world_model": ActionWorldModelConfig, "text_world_model": TextWorldModelConfig}
+    set_seed(0)
+    config = configs[model](**WORLD_MODEL) if model in configs else tokenizer_config()
+    settings = SimpleNamespace(
+        output_dir=tmp_path, steps=8, batch_size=4, save_freq=8, log_freq=1, seed=0, precision="float32"
+    )
+    (tmp_path / "checkpoints").mkdir()
+    train(make_reward_model(config), made_up_sampler(model), settings, lambda folder: None)
+    assert [row["loss"] for row in read_metrics(tmp_path)] == pytest.approx(GOLDEN[model], rel=1e-3)

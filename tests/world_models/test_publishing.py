@@ -1,0 +1,91 @@
+"""Trained models on a hub on the loopback: published by the commands, file by file, and used from there."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+import torch
+from huggingface_hub import constants, set_client_factory
+from huggingface_hub.utils._http import default_client_factory
+from lerobot.rewards.factory import get_reward_model_class
+
+from lerobot_wmrl.world_models.checkpoint import load_model
+from tests.hub_server import WRITE_TOKEN, Hub, running_hub
+from tests.trained import action_config, run_training, text_config, tokenizer_config
+
+
+class ToLoopback(httpx.HTTPTransport):
+    """Brings what is for the hub that the client knows to the one on the loopback."""
+
+    def __init__(self, url: str) -> None:
+        super().__init__()
+        self.target = httpx.URL(url)
+
+    def handle_request(self, request: httpx.Request) -> httpx.Response:
+        path = request.url.raw_path
+        request.url = self.target.copy_with(raw_path=path)
+        return super().handle_request(request)
+
+
+@pytest.fixture
+def hub(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Hub]:
+    """LeRobot publishes at one address only; large files go as LFS, which the hub here speaks."""
+    with running_hub() as hub:
+        mounts, hub.url = {constants.ENDPOINT: ToLoopback(hub.url)}, constants.ENDPOINT
+        set_client_factory(lambda: httpx.Client(mounts=mounts, follow_redirects=True))
+        monkeypatch.setattr(constants, "HF_HUB_DISABLE_XET", True)
+        monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
+        monkeypatch.setenv("HF_TOKEN", WRITE_TOKEN)
+        yield hub
+        set_client_factory(default_client_factory)
+
+
+@pytest.mark.parametrize("name", ["frame_tokenizer", "action_world_model", "text_world_model"])
+def test_a_published_model_is_the_trained_one(name, hub, small_dataset, trained_models, tmp_path):
+    make = {"action_world_model": action_config, "text_world_model": text_config}.get(name)
+    config = make(trained_models["frame_tokenizer"]) if make else tokenizer_config()
+    config.push_to_hub, config.repo_id = True, f"somebody/{name}"
+    folder = run_training(config, Path(small_dataset.root), tmp_path / "run", steps=1)
+    published = hub.repos["models", f"somebody/{name}"].head
+    local = {
+        path.name: path.read_bytes() for path in (folder / "checkpoints/last/pretrained_model").iterdir()
+    }
+    assert set(published) == {*local, "README.md", ".gitattributes"}
+    assert published["model.safetensors"] == local["model.safetensors"]
+    assert json.loads(published["config.json"]) == json.loads(local["config.json"])
+
+    card = published["README.md"].decode()
+    model_class = get_reward_model_class(name)
+    assert model_class.summary in card
+    assert "not recognized" not in card
+    torch.manual_seed(0)
+    batch = {
+        **{f"{part}.third_view": torch.rand(2, 3, 32, 32) for part in ("observation.images", "goal")},
+        "observation.state": torch.randn(2, 4, 8), "action": torch.randn(2, 4, 7), "task": ["push", "pull"],
+    }  # fmt: skip
+    if name != "frame_tokenizer":
+        batch["observation.images.third_view"] = torch.rand(2, 4, 3, 32, 32)
+    expected = load_model(folder, name).compute_reward(batch)
+    for model in (model_class.from_pretrained(f"somebody/{name}"), load_model(f"somebody/{name}", name)):
+        assert torch.equal(model.compute_reward(batch), expected)
+
+
+def test_what_was_trained_but_not_published_is_published_by_the_same_command(hub, small_dataset, tmp_path):
+    config = tokenizer_config()
+    config.push_to_hub, config.repo_id = True, "somebody/later"
+    root = Path(small_dataset.root)
+    folder = run_training(config, root, tmp_path / "run", steps=1)
+    before = hub.repos.pop(("models", "somebody/later"))
+    run_training(config, root, folder, steps=1)
+    after = hub.repos["models", "somebody/later"]
+    assert before.head["model.safetensors"] == after.head["model.safetensors"]
+
+
+def test_a_model_without_a_name_is_not_trained_in_order_to_be_published(small_dataset, tmp_path):
+    config = tokenizer_config()
+    config.push_to_hub = True
+    with pytest.raises(ValueError, match=r"--model\.push_to_hub=true: .*--model\.repo_id=user/name"):
+        run_training(config, Path(small_dataset.root), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
