@@ -70,11 +70,14 @@ class FrameTokenizerRewardModel(HubCard, PreTrainedRewardModel):
 
     def _reference(self, batch: dict[str, Tensor]) -> Tensor | None:
         """The first frames of the episodes, if the batch has them. ValueError if they are needed."""
-        if f"reference.{self.config.cameras[0]}" in batch:
+        missing = [
+            key for key in (f"reference.{camera}" for camera in self.config.cameras) if key not in batch
+        ]
+        if not missing:
             return self._stack(batch, "reference")
         if self.config.context:
             raise ValueError(
-                "--model.context=true: the batch lacks `reference.*`, the first frames of the episodes; train "
+                f"--model.context=true: the batch lacks {missing}, the first frames of the episodes; train "
                 "with lerobot-wmrl-train-world-model, which adds them"
             )
         return None

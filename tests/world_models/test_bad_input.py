@@ -194,9 +194,9 @@ def test_a_trained_model_does_not_go_on_with_actions_of_another_width(
     small_dataset, trained_models, tmp_path
 ):
     root = Path(small_dataset.root)
-    trained = str(trained_models["action_world_model"] / "checkpoints" / "last" / "pretrained_model")
-    config = action_config(trained_models["frame_tokenizer"], pretrained_path=trained, action_size=5)
-    config.tokenizer_path = None
+    trained = trained_models["action_world_model"] / "checkpoints" / "last" / "pretrained_model"
+    config = load_model(trained, "action_world_model").config
+    config.pretrained_path, config.action_size = str(trained), 5
     with pytest.raises(
         ValueError, match="action: the world model was trained with 5 components, the dataset has 7"
     ):
