@@ -17,7 +17,8 @@ from lerobot_wmrl.envs.start_frames import Starts, load_starts
 from lerobot_wmrl.rewards.general import consecutive_count, sparse_reward
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.goal import similarity
-from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel, Imagined
+from lerobot_wmrl.world_models.imagination import Imagined
+from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 
 Observation = dict[str, Any]
 

@@ -8,9 +8,9 @@ from torch import Tensor
 
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig, TextWorldModelConfig
 from lerobot_wmrl.world_models.decoding import DECODINGS
+from lerobot_wmrl.world_models.imagination import ImaginationState
 from lerobot_wmrl.world_models.modeling_world_model import (
     ActionWorldModelRewardModel,
-    ImaginationState,
     TextWorldModelRewardModel,
 )
 

@@ -1,0 +1,126 @@
+"""Unrolling a world model frame by frame: `start`, `restart` and `step` advance a preallocated state."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from lerobot_wmrl.precision import compute_in, imagination_dtype
+from lerobot_wmrl.world_models.context import NO_CONTEXT, Context
+from lerobot_wmrl.world_models.decoding import Condition, FramesSeen, ShiftedDecoding
+from lerobot_wmrl.world_models.frame_tokenizer import Decoded, FrameTokenizer
+from lerobot_wmrl.world_models.next_frame import NextFrameNetwork
+from lerobot_wmrl.world_models.temporal_memory import TemporalCache
+
+SMALL_BATCH = 16
+"""In so few imaginations at once on the CPU, casts cost more than bfloat16 saves."""
+
+
+class Imagined(NamedTuple):
+    """One imagined frame of every environment.
+
+    tokens (B, S); done_logit (B,); proprioception (B, P) in the dataset's units; hidden (B, D);
+    entropy (B,), the mean over code factors of the predictive entropy in nats.
+    """
+
+    tokens: Tensor
+    done_logit: Tensor
+    proprioception: Tensor
+    hidden: Tensor
+    entropy: Tensor
+
+
+@dataclass
+class ImaginationState:
+    """Where B imaginations stand: digits (B, 1, S, C), normalised state (B, 1, P), ring of past frames.
+
+    Its tensors are allocated once and advanced in place. The network computes in the ring's dtype.
+    """
+
+    digits: Tensor
+    proprioception: Tensor
+    cache: TemporalCache
+    condition: Condition | None = None
+
+
+class Imagination:
+    """What a world model does with its parts once they are trained."""
+
+    name: str
+    config: Any
+    tokenizer: FrameTokenizer
+    network: NextFrameNetwork
+    decoding: ShiftedDecoding
+    state_mean: Tensor
+    state_std: Tensor
+
+    def normalize_state(self, state: Tensor) -> Tensor:
+        """Dataset units to the network's. (…, P) → (…, P)"""
+        raise NotImplementedError
+
+    def start(
+        self,
+        tokens: Tensor,
+        proprioception: Tensor,
+        instructions: Sequence[str] | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> ImaginationState:
+        """Imagination from one frame: tokens (B, S), proprioception (B, P) in dataset units.
+
+        The network computes in `dtype`, by default the fastest; samples, done, state and entropy are float32.
+        """
+        batch, device = tokens.shape[0], tokens.device
+        small = batch < SMALL_BATCH and device.type == "cpu"
+        dtype = dtype or (torch.float32 if small else imagination_dtype(device))
+        cache = self.network.transformer.make_cache(batch, self.network.transformer_tokens, device, dtype)
+        condition = self.encode_instructions(instructions, batch) if instructions is not None else None
+        digits = self.network.codebook.digits(tokens)[:, None]
+        return ImaginationState(digits, self.normalize_state(proprioception)[:, None], cache, condition)
+
+    def restart(self, state: ImaginationState, mask: Tensor, tokens: Tensor, proprioception: Tensor) -> None:
+        """Put the environments in `mask` (B,) back to a first frame; their past is masked, not moved."""
+        digits = self.network.codebook.digits(tokens)[:, None]
+        first = self.normalize_state(proprioception)[:, None]
+        state.digits.copy_(torch.where(mask[:, None, None, None], digits, state.digits))
+        state.proprioception.copy_(torch.where(mask[:, None, None], first, state.proprioception))
+        state.cache.restart(mask)
+
+    @torch.no_grad()
+    def step(
+        self, state: ImaginationState, action: Tensor | None = None, generator: torch.Generator | None = None
+    ) -> Imagined:
+        """Imagine the next frame of every environment: action (B, A) in the dataset's units."""
+        condition = state.condition if action is None else self.encode_actions(action[:, None])
+        if condition is None:
+            raise ValueError("this imagination needs an action each step, or an instruction at the start")
+        codebook = self.network.codebook
+        with compute_in(state.cache.keys.dtype, state.digits.device):
+            prediction = self.network.step(state.digits, state.proprioception, *condition, state.cache)
+            seen = FramesSeen(state.digits, condition, prediction, state.cache)
+            digits = self.decoding.decode(self.network, seen, self.config.temperature, generator)
+        state.digits.copy_(digits)
+        state.proprioception.copy_(prediction.proprioception)
+        return Imagined(
+            codebook.tokens(state.digits[:, 0]),
+            prediction.done_logit[:, 0],
+            prediction.proprioception[:, 0] * self.state_std + self.state_mean,
+            prediction.hidden[:, 0],
+            codebook.entropy(prediction.logits[:, 0]),
+        )
+
+    @torch.no_grad()
+    def decode(self, tokens: Tensor, context: Context = NO_CONTEXT) -> Decoded:
+        """Tokens (B, S) → images and features of the frames, computed as fast as imagination, as float32."""
+        with compute_in(imagination_dtype(tokens.device), tokens.device):
+            images, features = self.tokenizer.decode_with_features(tokens, context)
+        return Decoded(images.float(), [feature.float() for feature in features])
+
+    def encode_actions(self, actions: Tensor) -> Condition:
+        """Actions (B, T, A) in dataset units → condition tokens."""
+        raise NotImplementedError(f"{self.name} is not conditioned on actions")
+
+    def encode_instructions(self, instructions: Sequence[str], batch: int) -> Condition:
+        """One instruction for each of `batch` episodes → condition tokens."""
+        raise NotImplementedError(f"{self.name} is not conditioned on text")
