@@ -1,0 +1,157 @@
+"""Can a world model be trusted with a policy it has not seen? The whole experiment, from recording on.
+
+    python benchmarks/gate.py --output_dir=outputs/gate
+
+One task (push) in nine training scenes. Planners and three cloned policies, as they are and disturbed, give
+the data; a fourth policy, too, is rolled out in ManiSkill and replayed in the world model. Every stage is one
+of the package's commands; the same call again continues. About two hours on two cores; the result is
+outputs/gate/check/metrics.json. Flags of the action world model's training may follow.
+"""
+
+import argparse
+from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from lerobot.utils.import_utils import register_third_party_plugins
+
+from lerobot_wmrl.demo.pipeline import run_stages
+from lerobot_wmrl.demo.stages import Stage, checkpoint
+from lerobot_wmrl.presets import Flags, format_flags, preset_flags
+
+SCENES = "[0,1,2,19,25,42,55,61,79]"
+"""Nine objects on both tables, with both containers."""
+
+CAMERAS = "[side_view,wrist]"
+ALL_CAMERAS = "[third_view,side_view,wrist]"
+KINDS = "{optimal: 0.22, waypoint: 0.06, interpolated: 0.08, disturbed: 0.16, near_miss: 0.48}"
+IMAGE_SIZE = 64
+
+CLONES = {"A": (range(0, 20), 400), "B": (range(20, 40), 600), "C": (range(40, 60), 250)}
+"""Policies whose attempts are learnt from: demonstrations, training steps."""
+
+UNSEEN = (range(60, 96), 500)
+"""The policy that is asked about."""
+
+FIRST_SEEDS = {"learnt": 50_000, "asked": 1_200_000}
+SEEDS_EACH = 10_000
+
+MANNERS = {"calm": 0.0, "disturbed": 0.4}
+"""How a policy acts: exploration. One that is only ever seen disturbed is believed when it fails calmly."""
+
+
+class Experiment:
+    """The commands of the experiment, all paths below `out`.
+
+    Args:
+        episodes: planned ones; an eighth as many of each policy and manner.
+        model_flags: further flags of the action world model's training.
+    """
+
+    def __init__(self, out: Path, episodes: int, model_flags: Sequence[str]) -> None:
+        self.out, self.episodes, self.model_flags = out, episodes, model_flags
+
+    def stages(self) -> list[Stage]:
+        """In order."""
+        policies = {**CLONES, "unseen": UNSEEN}
+        stages = [
+            self._stage("planned", self.record, "planned", KINDS, self.episodes, 0, ALL_CAMERAS),
+            self._stage("good", self.record, "good", "{optimal: 1}", 96, 10_000, "[side_view]"),
+        ]
+        for name, (demonstrations, steps) in policies.items():
+            stages.append(self._stage(f"clone_{name}", self.clone, name, demonstrations, steps))
+        attempts: dict[str, list[str]] = {"learnt": [], "asked": []}
+        for policy, (manner, exploration) in product(policies, MANNERS.items()):
+            role, name = "asked" if policy == "unseen" else "learnt", f"{manner}_{policy}"
+            first = FIRST_SEEDS[role] + SEEDS_EACH * len(attempts[role])
+            attempts[role].append(name)
+            stages.append(self._stage(name, self.roll_out, name, policy, exploration, first))
+        return [
+            *stages,
+            self._stage("dataset", self.merge, "dataset", ["planned", *attempts["learnt"]]),
+            self._stage("rollouts", self.merge, "rollouts", attempts["asked"]),
+            self._stage("frame_tokenizer", self.train_tokenizer),
+            self._stage("action_world_model", self.train_model),
+            self._stage("check", self.check),
+        ]
+
+    def _stage(self, name: str, make: Callable[..., list[str]], *arguments: Any) -> Stage:
+        return Stage(name, name.replace("_", " "), partial(make, *arguments))
+
+    def path(self, name: str) -> str:
+        return str(self.out / name)
+
+    def simulator(self, cameras: str) -> Flags:
+        return {
+            "env.type": "wmrl_maniskill", "env.task": "push", "env.scenes": SCENES,
+            "env.image_size": IMAGE_SIZE, "env.cameras": cameras,
+        }  # fmt: skip
+
+    def record(self, name: str, kinds: str, episodes: int, seed: int, cameras: str) -> list[str]:
+        flags: Flags = {"kinds": kinds, "num_episodes": episodes, "seed": seed, "output_dir": self.path(name)}
+        return ["lerobot-wmrl-record", *format_flags({**self.simulator(cameras), **flags})]
+
+    def clone(self, name: str, demonstrations: range, steps: int) -> list[str]:
+        flags: Flags = {
+            "policy.type": "cnn", "policy.push_to_hub": False, "dataset.repo_id": "local/good",
+            "dataset.root": self.path("good"), "dataset.episodes": str(list(demonstrations)).replace(" ", ""),
+            "steps": steps, "save_freq": steps, "seed": steps, "output_dir": self.path(f"policy_{name}"),
+        }  # fmt: skip
+        return ["lerobot-train", *preset_flags("demo", "sft"), *format_flags(flags)]
+
+    def roll_out(self, name: str, policy: str, exploration: float, seed: int) -> list[str]:
+        flags: Flags = {
+            "policy.path": str(checkpoint(self.out / f"policy_{policy}")), "exploration": exploration,
+            "num_episodes": max(2, self.episodes // 8), "seed": seed, "output_dir": self.path(name),
+        }  # fmt: skip
+        return ["lerobot-wmrl-record", *format_flags({**self.simulator(ALL_CAMERAS), **flags})]
+
+    def merge(self, name: str, parts: list[str]) -> list[str]:
+        flags: Flags = {
+            "new_repo_id": f"local/{name}", "new_root": self.path(name), "operation.type": "merge",
+            "operation.repo_ids": str([f"local/{part}" for part in parts]),
+            "operation.roots": str([self.path(part) for part in parts]),
+            "operation.concatenate_videos": False, "operation.concatenate_data": False,
+        }  # fmt: skip
+        return ["lerobot-edit-dataset", *format_flags(flags)]
+
+    def train_tokenizer(self) -> list[str]:
+        flags: Flags = {
+            "model.type": "frame_tokenizer", "model.cameras": CAMERAS, "model.context": True, "steps": 2500,
+            "dataset.root": self.path("planned"), "output_dir": self.path("frame_tokenizer"),
+        }  # fmt: skip
+        return ["lerobot-wmrl-train-world-model", "--preset=cpu", *format_flags(flags)]
+
+    def train_model(self) -> list[str]:
+        flags: Flags = {
+            "model.type": "action_world_model", "model.tokenizer_path": self.path("frame_tokenizer"),
+            "dataset.root": self.path("dataset"), "output_dir": self.path("action_world_model"),
+        }  # fmt: skip
+        return [
+            "lerobot-wmrl-train-world-model", "--preset=cpu", *format_flags(flags), *self.model_flags
+        ]  # fmt: skip
+
+    def check(self) -> list[str]:
+        flags: Flags = {
+            "model.path": self.path("action_world_model"), "dataset.root": self.path("rollouts"),
+            "max_episodes": 1000, "output_dir": self.path("check"),
+        }  # fmt: skip
+        return ["lerobot-wmrl-eval-world-model", *format_flags(flags)]
+
+
+def main() -> None:
+    """Entry point."""
+    register_third_party_plugins()
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--output_dir", type=Path, default=Path("outputs/gate"))
+    parser.add_argument("--episodes", type=int, default=1500, help="planned episodes")
+    given, model_flags = parser.parse_known_args()
+    run_stages(Experiment(given.output_dir, given.episodes, model_flags).stages(), given.output_dir)
+
+
+if __name__ == "__main__":
+    main()
