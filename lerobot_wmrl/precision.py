@@ -36,3 +36,9 @@ def training_dtype(precision: str, device: torch.device | str) -> torch.dtype:
 def compute_in(dtype: torch.dtype, device: torch.device | str) -> torch.autocast:
     """A context in which matrix products and convolutions run in `dtype`; float32 changes nothing."""
     return torch.autocast(torch.device(device).type, dtype=dtype, enabled=dtype != torch.float32)
+
+
+def computing_dtype(device: torch.device | str) -> torch.dtype:
+    """What the surrounding `compute_in` computes in on `device`; float32 outside of one."""
+    kind = torch.device(device).type
+    return torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else torch.float32

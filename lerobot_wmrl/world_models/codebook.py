@@ -70,6 +70,16 @@ class CodeBook(nn.Module):
         """Digits (…, C) → values in [−1, 1] (…, K)."""
         return digits * 2.0 / (self.levels - 1) - 1.0
 
+    def expected_values(self, logits: Tensor) -> Tensor:
+        """Means of the values under the predicted probabilities: logits (…, V) → (…, K)."""
+        means = []
+        for factor, part in enumerate(logits.split(self.level_counts, -1)):
+            codes = part.new_zeros(part.shape[-1], len(self.level_counts), dtype=torch.long)
+            codes[:, factor] = torch.arange(len(codes), device=codes.device)
+            values = self.values(codes).unflatten(-1, (len(self.level_counts), -1))[:, factor]
+            means.append(part.softmax(-1) @ values)
+        return torch.cat(means, -1)
+
     def distance(self, digits: Tensor, other: Tensor) -> Tensor:
         """Steps between two codes, levels summed over factors: digits (…, C) twice → (…)."""
         return (digits - other).abs().sum(-1)

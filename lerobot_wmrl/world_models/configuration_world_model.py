@@ -30,6 +30,10 @@ class WorldModelConfig(RewardModelConfig):
             believe in motion: it then pushes objects that the hand misses.
         done_weight, done_positive_weight, state_weight: of the other losses, beside the tokens' one.
         self_forcing: share of input frames replaced by the model's own predictions in training.
+        self_rollout: share of clips that in the last quarter of training show what the model itself makes of
+            their first frame and actions, instead of the real frames; what it has to predict stays real.
+        keypoint_weight: of RoboScape's keypoint consistency: the tokens that move most should look, wherever
+            they get to, as at the clip's start. 0: off.
         token_noise: share of input code factors moved by one step in training: a level of FSQ, a sign of LFQ.
         temperature: of sampling in imagination; 0 takes the most likely code.
     """
@@ -59,6 +63,8 @@ class WorldModelConfig(RewardModelConfig):
     done_positive_weight: float = 1.0
     state_weight: float = 4.0
     self_forcing: float = 0.5
+    self_rollout: float = 0.0
+    keypoint_weight: float = 0.0
     token_noise: float = 0.02
     temperature: float = 0.0
     learning_rate: float = 1e-3
@@ -68,6 +74,14 @@ class WorldModelConfig(RewardModelConfig):
         for name in ("layers", "width", "heads", "window", "patch", "code_width", "maskgit_steps"):
             if getattr(self, name) < 1:
                 raise ValueError(f"--model.{name}={getattr(self, name)}: must be at least 1")
+        if not 0 <= self.self_rollout <= 1:
+            raise ValueError(
+                f"--model.self_rollout={self.self_rollout}: must be a share of the clips, between 0 and 1"
+            )
+        if self.keypoint_weight < 0:
+            raise ValueError(
+                f"--model.keypoint_weight={self.keypoint_weight}: must be 0 (off) or a positive weight"
+            )
         if self.clip_length < 2:
             raise ValueError(
                 f"--model.clip_length={self.clip_length}: must be at least 2, a frame and its next"

@@ -11,7 +11,7 @@ from lerobot_wmrl.precision import compute_in, imagination_dtype
 from lerobot_wmrl.world_models.context import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.decoding import Condition, FramesSeen, ShiftedDecoding
 from lerobot_wmrl.world_models.frame_tokenizer import Decoded, FrameTokenizer
-from lerobot_wmrl.world_models.next_frame import NextFrameNetwork
+from lerobot_wmrl.world_models.next_frame import NextFrameNetwork, Prediction
 from lerobot_wmrl.world_models.temporal_memory import TemporalCache
 
 SMALL_BATCH = 16
@@ -96,12 +96,7 @@ class Imagination:
         if condition is None:
             raise ValueError("this imagination needs an action each step, or an instruction at the start")
         codebook = self.network.codebook
-        with compute_in(state.cache.keys.dtype, state.digits.device):
-            prediction = self.network.step(state.digits, state.proprioception, *condition, state.cache)
-            seen = FramesSeen(state.digits, condition, prediction, state.cache)
-            digits = self.decoding.decode(self.network, seen, self.config.temperature, generator)
-        state.digits.copy_(digits)
-        state.proprioception.copy_(prediction.proprioception)
+        prediction = self._advance(state, condition, self.config.temperature, generator)
         return Imagined(
             codebook.tokens(state.digits[:, 0]),
             prediction.done_logit[:, 0],
@@ -109,6 +104,42 @@ class Imagination:
             prediction.hidden[:, 0],
             codebook.entropy(prediction.logits[:, 0]),
         )
+
+    @torch.no_grad()
+    def roll_out(
+        self, tokens: Tensor, proprioception: Tensor, condition: Condition, steps: int, dtype: torch.dtype
+    ) -> tuple[Tensor, Tensor]:
+        """Frames 0 … `steps` of imaginations with the most likely codes, as the network sees them.
+
+        tokens (B, S) and proprioception (B, P) of frame 0; condition tokens (B, steps or more, or 1, M, D).
+        → digits (B, 1 + steps, S, C), normalised state (B, 1 + steps, P). Draws no global random number.
+        """
+        state = self.start(tokens, proprioception, dtype=dtype)
+        unused = torch.Generator(tokens.device)
+        given, mask = condition
+        digits, states = [state.digits.clone()], [state.proprioception.clone()]
+        for step in range(steps):
+            now = given[:, step : step + 1] if given.shape[1] > 1 else given
+            self._advance(state, (now, mask), 0.0, unused)
+            digits.append(state.digits.clone())
+            states.append(state.proprioception.clone())
+        return torch.cat(digits, 1), torch.cat(states, 1)
+
+    def _advance(
+        self,
+        state: ImaginationState,
+        condition: Condition,
+        temperature: float,
+        generator: torch.Generator | None,
+    ) -> Prediction:
+        """Put `state` one frame further. → what was predicted"""
+        with compute_in(state.cache.keys.dtype, state.digits.device):
+            prediction = self.network.step(state.digits, state.proprioception, *condition, state.cache)
+            seen = FramesSeen(state.digits, condition, prediction, state.cache)
+            digits = self.decoding.decode(self.network, seen, temperature, generator)
+        state.digits.copy_(digits)
+        state.proprioception.copy_(prediction.proprioception)
+        return prediction
 
     @torch.no_grad()
     def decode(self, tokens: Tensor, context: Context = NO_CONTEXT) -> Decoded:

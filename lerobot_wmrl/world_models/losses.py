@@ -17,6 +17,9 @@ codes' own flicker."""
 STATE_PRECISION = 0.1
 """Where the state loss turns from squared to absolute, in `STATE_STEP`s: about a millimetre of the TCP."""
 
+SELF_ROLLOUT_FROM = 0.75
+"""Progress of the training after which clips are replaced by rollouts: earlier ones soon leave the data."""
+
 
 class Clip(NamedTuple):
     """Rows t = 0 … T − 1 of an episode: what is seen, what is done, and what that leads to.
@@ -47,6 +50,13 @@ def forced_share(target: float, progress: float) -> float:
     """Share of input frames to replace after `progress` (0 to 1) of the training: none in the first
     quarter, when predictions are noise, then rising to `target` at half time."""
     return target * min(1.0, max(0.0, 4 * progress - 1))
+
+
+def self_rollout_rows(share: float, progress: float, batch: int, device: torch.device) -> Tensor:
+    """Indices of the clips that show rollouts instead of real frames, after `progress` (0 to 1)."""
+    if share <= 0 or progress < SELF_ROLLOUT_FROM:
+        return torch.empty(0, dtype=torch.long, device=device)
+    return (draw_own_rows(torch.rand, (batch,), device) < share).nonzero().squeeze(1)
 
 
 def force_predictions(

@@ -11,6 +11,7 @@ from lerobot.rewards.pretrained import PreTrainedRewardModel
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
+from lerobot_wmrl.precision import computing_dtype
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.compatibility import (
     check_cameras,
@@ -24,12 +25,14 @@ from lerobot_wmrl.world_models.decoding import Condition, FramesSeen, make_decod
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
 from lerobot_wmrl.world_models.hub_card import HubCard
 from lerobot_wmrl.world_models.imagination import Imagination
+from lerobot_wmrl.world_models.keypoints import keypoint_loss, surroundings
 from lerobot_wmrl.world_models.losses import (
     Clip,
     corrupt_digits,
     force_predictions,
     forced_share,
     next_frame_loss,
+    self_rollout_rows,
     token_weights,
 )
 from lerobot_wmrl.world_models.modeling_frame_tokenizer import stack_cameras
@@ -133,20 +136,48 @@ class WorldModelRewardModel(HubCard, Imagination, PreTrainedRewardModel):
         """Eqs. 2-4 on a clip of tokens, with part of the inputs replaced by the model's own predictions."""
         condition = self.condition(clip)
         digits, state = self.network.codebook.digits(clip.tokens), self.normalize_state(clip.state)
-        seen = corrupt_digits(digits, self.network.codebook, self.config.token_noise)
-        seen_state = state
-        share = forced_share(self.config.self_forcing, self.training_progress)
-        if share > 0:
-            with torch.no_grad():
-                guess = self.network(seen, seen_state, *condition)
-            seen, seen_state = force_predictions(guess, self.network.codebook, seen, seen_state, share)
+        seen, seen_state = self.inputs(clip, condition, digits, state)
         memory = self.network.transformer.clip_memory(digits.shape[1], digits.device)
         prediction = self.network(seen, seen_state, *condition, memory)
         loss, metrics = next_frame_loss(prediction, self.network.codebook, digits, state, clip, self.config)
         weight, _ = token_weights(self.network.codebook, digits, clip, self.config.motion_weight)
         frames = FramesSeen(seen, condition, prediction, memory)
         decoding_loss, decoding_metrics = self.decoding.loss(self.network, frames, digits[:, 1:], weight)
-        return loss + decoding_loss, metrics | decoding_metrics
+        loss, metrics = loss + decoding_loss, metrics | decoding_metrics
+        if self.config.keypoint_weight > 0:
+            around = surroundings(self.network.grid, self.network.num_cameras, digits.device)
+            logits = prediction.logits[:, :-1].float()
+            consistency = keypoint_loss(logits, self.network.codebook, digits, clip.valid, around)
+            loss = loss + self.config.keypoint_weight * consistency
+            metrics["keypoint_loss"] = consistency.item()
+        return loss, metrics
+
+    @torch.no_grad()
+    def inputs(
+        self, clip: Clip, condition: Condition, digits: Tensor, state: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """What the network sees instead of a clip's digits (B, T, S, C) and normalised state (B, T, P).
+
+        Against drift: noise, one-pass predictions of single frames, and whole rollouts from first frames.
+        """
+        codebook, progress = self.network.codebook, self.training_progress
+        seen, seen_state = corrupt_digits(digits, codebook, self.config.token_noise), state
+        share = forced_share(self.config.self_forcing, progress)
+        if share > 0:
+            guess = self.network(seen, seen_state, *condition)
+            seen, seen_state = force_predictions(guess, codebook, seen, seen_state, share)
+        rows = self_rollout_rows(self.config.self_rollout, progress, len(digits), digits.device)
+        if len(rows):
+            rolled, rolled_state = self._roll_out_rows(rows, clip, condition)
+            seen, seen_state = seen.index_copy(0, rows, rolled), seen_state.index_copy(0, rows, rolled_state)
+        return seen, seen_state
+
+    def _roll_out_rows(self, rows: Tensor, clip: Clip, condition: Condition) -> tuple[Tensor, Tensor]:
+        """Clips `rows` imagined from their first frames, as precisely as they are learnt from."""
+        tokens, mask = condition
+        own = tokens[rows], None if mask is None else mask[rows]
+        steps, dtype = clip.tokens.shape[1] - 1, computing_dtype(clip.tokens.device)
+        return self.roll_out(clip.tokens[rows, 0], clip.state[rows, 0], own, steps, dtype)
 
     def forward(self, batch: Clip | dict[str, Any]) -> tuple[Tensor, dict[str, float]]:
         """The loss on a clip, or on LeRobot's batch, of which `clip_from_windows` has the shapes."""

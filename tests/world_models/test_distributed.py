@@ -22,7 +22,8 @@ SIZES = {
     "frame_tokenizer": ["--model.image_size=32", "--model.widths=[8,16]", "--model.levels=[5,4]"],
     "action_world_model": [
         "--model.layers=1", "--model.width=32", "--model.heads=2", "--model.clip_length=14",
-        "--model.code_width=8", "--model.token_noise=0.1",
+        "--model.code_width=8", "--model.token_noise=0.1", "--model.self_rollout=0.5",
+        "--model.keypoint_weight=1",
     ],
     "text_world_model": [
         "--model.layers=1", "--model.width=32", "--model.heads=2", "--model.clip_length=14",

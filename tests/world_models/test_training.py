@@ -1,4 +1,5 @@
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -45,6 +46,15 @@ def test_clips_hold_the_rows_of_one_episode_in_order(sampler):
     assert sampler.clips(np.array([1]), np.array([0])).done_known.sum() == min(12, sampler.table.length[1])
 
 
+def test_training_meets_every_length_of_history(sampler, trained_models):
+    """From one frame on, at the start of episodes and amid them: windows of random length add nothing."""
+    model = load_model(trained_models["action_world_model"], "action_world_model")
+    memory = model.network.transformer.clip_memory(sampler.clip_length, torch.device("cpu"))
+    assert memory.mask.sum(1).tolist() == list(range(1, sampler.clip_length + 1))
+    amid = torch.cat([~sampler(step).done_known[:, 0] for step in range(50)])
+    assert 0.15 < amid.float().mean() < 0.35
+
+
 def test_cached_frames_are_those_of_the_dataset(small_dataset):
     frames = cached_frames(small_dataset, ["observation.images.third_view"])
     for index in (0, 7, len(frames) - 1):
@@ -60,6 +70,7 @@ def test_only_successful_optimal_episodes_are_golden(small_dataset):
 @pytest.mark.parametrize(("build", "precision"), [
     (action_config, "float32"), (action_config, "bfloat16"), (text_config, "float32"),
     (lambda _: tokenizer_config(), "bfloat16"),
+    (partial(action_config, self_rollout=1.0, keypoint_weight=1.0), "bfloat16"),
 ])  # fmt: skip
 def test_training_goes_on_bit_for_bit_after_a_stop(build, precision, small_dataset, trained_models, tmp_path):
     """With its samples, optimiser and random numbers; and the checkpoint tells the precision."""

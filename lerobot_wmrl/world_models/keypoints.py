@@ -1,0 +1,82 @@
+"""Keypoint consistency (RoboScape, section 2.3): what moves looks, wherever it gets to, as at the start.
+
+RoboScape tracks dense points with SpatialTracker, keeps the K most active ones, and draws the visual tokens
+predicted along their tracks to those of the first frame. Here tokens are the points and block matching of
+their codes is the tracker: nothing is looked at but the pictures.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lerobot_wmrl.world_models.codebook import CodeBook
+from lerobot_wmrl.world_models.distributed import masked_mean
+from lerobot_wmrl.world_models.losses import MOTION_LEVELS
+
+KEYPOINTS = 16
+"""K, the most active tracks of a clip. A gripper and an object cover about as many tokens."""
+
+REACH = 1
+"""Tokens by which a track moves at most from one frame to the next, along each axis."""
+
+
+class Tracks(NamedTuple):
+    """places (B, T, K), the token of each keypoint in each frame; moving (B, T, K), whether it is known there
+    and moves at all in the clip."""
+
+    places: Tensor
+    moving: Tensor
+
+
+def surroundings(grid: int, num_cameras: int, device: torch.device) -> Tensor:
+    """Tokens within `REACH` of each one in its camera's grid, itself first. → (S, (2 REACH + 1)²)"""
+    offset = torch.arange(-REACH, REACH + 1, device=device)
+    shifts = torch.cartesian_prod(offset, offset)
+    shifts = shifts[shifts.abs().sum(1).argsort(stable=True)]
+    cell = torch.arange(grid, device=device)
+    row, column = ((torch.cartesian_prod(cell, cell)[:, None] + shifts).clamp(0, grid - 1)).unbind(-1)
+    camera = torch.arange(num_cameras, device=device)[:, None, None] * grid**2
+    return (camera + row * grid + column).flatten(0, 1)
+
+
+def track_tokens(digits: Tensor, codebook: CodeBook, around: Tensor) -> Tensor:
+    """Where each token of the first frame is later: digits (B, T, S, C), `around` (S, N) → (B, T, S).
+
+    Block matching: frame by frame to the code nearest to the first one among those around, if it is nearer
+    by `MOTION_LEVELS`.
+    """
+    clip = torch.arange(len(digits), device=digits.device)[:, None, None]
+    own = digits[:, 0, :, None]
+    places = [torch.arange(digits.shape[2], device=digits.device).expand(len(digits), -1)]
+    for frame in digits[:, 1:].unbind(1):
+        reachable = around[places[-1]]
+        distance = codebook.distance(frame[clip, reachable], own)
+        distance[..., 0] -= MOTION_LEVELS - 1
+        places.append(reachable.gather(-1, distance.argmin(-1, keepdim=True)).squeeze(-1))
+    return torch.stack(places, 1)
+
+
+def most_active(places: Tensor, valid: Tensor, count: int) -> Tracks:
+    """Of tracks (B, T, S) the `count` that change place most often. valid (B, T): frames of the episode."""
+    moves = (places[:, 1:] != places[:, :-1]) & (valid[:, 1:] & valid[:, :-1])[..., None]
+    activity, chosen = moves.sum(1).sort(dim=-1, descending=True, stable=True)
+    chosen = chosen[:, None, :count].expand(-1, places.shape[1], -1)
+    return Tracks(places.gather(2, chosen), (activity[:, None, :count] > 0) & valid[..., None])
+
+
+def keypoint_loss(
+    logits: Tensor, codebook: CodeBook, digits: Tensor, valid: Tensor, around: Tensor
+) -> Tensor:
+    """RoboScape's eq. 5: squared distance of the values expected along the tracks from those at their starts.
+
+    logits (B, T − 1, S, V) of frames 1 … T − 1; digits (B, T, S, C) of all frames; valid (B, T) → scalar.
+    """
+    tracks = most_active(track_tokens(digits, codebook, around), valid, KEYPOINTS)
+    places = tracks.places[:, 1:, :, None]
+    along = logits.gather(2, places.expand(-1, -1, -1, logits.shape[-1]))
+    own = codebook.values(digits[:, 0]).gather(
+        1, tracks.places[:, 0, :, None].expand(-1, -1, codebook.channels)
+    )
+    apart = (codebook.expected_values(along) - own[:, None]).square().mean(-1)
+    return masked_mean(apart, tracks.moving[:, 1:].float())
