@@ -107,12 +107,18 @@ class Imagination:
 
     @torch.no_grad()
     def roll_out(
-        self, tokens: Tensor, proprioception: Tensor, condition: Condition, steps: int, dtype: torch.dtype
+        self,
+        tokens: Tensor,
+        proprioception: Tensor,
+        condition: Condition,
+        steps: int,
+        dtype: torch.dtype | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Frames 0 … `steps` of imaginations with the most likely codes, as the network sees them.
 
-        tokens (B, S) and proprioception (B, P) of frame 0; condition tokens (B, steps or more, or 1, M, D).
-        → digits (B, 1 + steps, S, C), normalised state (B, 1 + steps, P). Draws no global random number.
+        tokens (B, S), proprioception (B, P) of frame 0 and `dtype` as in `start`; condition tokens float32,
+        (B, `steps` or more, M, D) or (B, 1, M, D). → digits (B, 1 + steps, S, C), normalised state
+        (B, 1 + steps, P). Draws no global random number.
         """
         state = self.start(tokens, proprioception, dtype=dtype)
         unused = torch.Generator(tokens.device)

@@ -173,10 +173,13 @@ class WorldModelRewardModel(HubCard, Imagination, PreTrainedRewardModel):
         return seen, seen_state
 
     def _roll_out_rows(self, rows: Tensor, clip: Clip, condition: Condition) -> tuple[Tensor, Tensor]:
-        """Clips `rows` imagined from their first frames, as precisely as they are learnt from."""
+        """Clips `rows` imagined from their first frames: in float32 if they are learnt from in it, so that
+        the format does not depend on how many rows a process has; else as imagination chooses."""
         tokens, mask = condition
-        own = tokens[rows], None if mask is None else mask[rows]
-        steps, dtype = clip.tokens.shape[1] - 1, computing_dtype(clip.tokens.device)
+        own = tokens[rows].float(), None if mask is None else mask[rows]
+        exact = computing_dtype(clip.tokens.device) == torch.float32
+        dtype = torch.float32 if exact else None
+        steps = clip.tokens.shape[1] - 1
         return self.roll_out(clip.tokens[rows, 0], clip.state[rows, 0], own, steps, dtype)
 
     def forward(self, batch: Clip | dict[str, Any]) -> tuple[Tensor, dict[str, float]]:

@@ -1,0 +1,185 @@
+"""What each option of the action world model is worth: variants trained alike, measured on the same episodes.
+
+    python benchmarks/world_model_ablation.py --dataset.root=outputs/push --rollouts=outputs/rollouts \\
+        --variants none keypoints self_rollout --preset=demo --output_dir=outputs/ablation
+
+All variants have the same tokenizer, data, steps and seed, and differ by the flags in `VARIANTS`. They are
+replayed open loop on the episodes held out from training, and on `--rollouts`, real episodes of policies, for
+the gate. A variant that is trained, or trained and measured, is not trained or measured again. Prints a table
+and writes docs/results/world_model_ablation.json.
+"""
+
+import argparse
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import draccus
+import numpy as np
+from lerobot.utils.import_utils import register_third_party_plugins
+
+from lerobot_wmrl.command import CONFIG_FILE
+from lerobot_wmrl.files import write_json
+from lerobot_wmrl.malloc import keep_freed_memory
+from lerobot_wmrl.presets import Flags, format_flags, preset_flags
+from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig, train_world_model
+from lerobot_wmrl.statistics import Estimate
+from lerobot_wmrl.world_models.checkpoint import load_model
+from lerobot_wmrl.world_models.episode_table import choose_episodes, open_dataset, read_episodes
+from lerobot_wmrl.world_models.evaluation.accuracy import EpisodeAccuracy, headline
+from lerobot_wmrl.world_models.evaluation.done import done_quality
+from lerobot_wmrl.world_models.evaluation.evaluate import evaluate
+from lerobot_wmrl.world_models.evaluation.gate import success_gate
+from lerobot_wmrl.world_models.evaluation.replay import Source
+from lerobot_wmrl.world_models.evaluation.tables import NAMES, markdown_table
+from lerobot_wmrl.world_models.frame_cache import cached_frames
+
+RESULTS: Final = Path(__file__).parents[1] / "docs" / "results" / "world_model_ablation.json"
+
+VARIANTS: Final[dict[str, Flags]] = {
+    "none": {},
+    "keypoints": {"model.keypoint_weight": 1.0},
+    "self_rollout": {"model.self_rollout": 0.4},
+    "no_self_forcing": {"model.self_forcing": 0.0},
+    "adaln": {"model.conditioning": "adaln"},
+    "additive": {"model.conditioning": "additive"},
+    "no_state": {"model.state_size": 0},
+    "maskgit": {"model.decoding": "maskgit"},
+}
+"""Name → what differs from the preset."""
+
+PSNR_STEPS: Final = (1, 10, 30)
+MEASURES: Final = {
+    **{f"psnr_{step}": f"PSNR at step {step} (dB)" for step in PSNR_STEPS},
+    **{name: NAMES[name] for name in ("delta_psnr_15", "moving_psnr", "abs_rel", "done_f1")},
+}
+"""Columns of the table, those of the gate beside them; one that nothing has is left out."""
+
+
+def train_variant(given: argparse.Namespace, name: str, model: str, flags: Mapping[str, Any]) -> Path:
+    """Train `model` as the preset says, with `flags` over it, unless that is done. → its folder"""
+    folder: Path = given.output_dir / name
+    common = {
+        "model.type": model, "model.device": given.device, "dataset.root": given.dataset_root,
+        "output_dir": folder, "seed": given.seed,
+    }  # fmt: skip
+    args = [*preset_flags(given.preset, "train-world-model", [model]), *format_flags({**common, **flags})]
+    train_world_model(draccus.parse(TrainWorldModelConfig, args=args))
+    return folder
+
+
+def trained_tokenizer(given: argparse.Namespace) -> str:
+    """The given tokenizer, or one that is trained first."""
+    if given.tokenizer:
+        return str(given.tokenizer)
+    return str(train_variant(given, "frame_tokenizer", "frame_tokenizer", {}))
+
+
+def psnr_at(accuracy: Sequence[EpisodeAccuracy], step: int) -> Estimate:
+    """PSNR of the `step`-th imagined frame, over the episodes that last so long."""
+    curves = [episode.steps.get("psnr", np.empty(0)) for episode in accuracy]
+    return Estimate.mean(np.array([curve[step - 1] if len(curve) >= step else np.nan for curve in curves]))
+
+
+def measure(given: argparse.Namespace, folder: Path) -> dict[str, Any]:
+    """One variant's row: estimates of held-out episodes, and the gate's counts."""
+    model = load_model(folder, "action_world_model", given.device)
+    table = read_episodes(open_dataset(given.dataset_root))
+    source = Source(table, cached_frames(table.dataset, model.config.camera_keys))
+    evaluation = evaluate(model, source, choose_episodes(table, given.split, given.max_episodes))
+    estimates = headline(evaluation.accuracy) | done_quality(evaluation.outcomes, threshold=0.5, frames=3)
+    estimates |= {f"psnr_{step}": psnr_at(evaluation.accuracy, step) for step in PSNR_STEPS}
+    row: dict[str, Any] = {
+        "steps": json.loads((folder / CONFIG_FILE).read_text())["steps"],
+        "parameters": sum(p.numel() for p in model.parameters() if p.requires_grad),
+        **{name: estimates[name].as_json() for name in MEASURES if name in estimates},
+    }
+    if given.rollouts:
+        row["gate"] = success_gate(model, given.rollouts).as_json()
+    return row
+
+
+def measured_once(given: argparse.Namespace, folder: Path) -> dict[str, Any]:
+    """`measure`, or what it found before on the same episodes."""
+    path = folder / "ablation.json"
+    on = {"split": given.split, "max_episodes": given.max_episodes, "rollouts": given.rollouts}
+    stored = json.loads(path.read_text()) if path.is_file() else {}
+    if stored.get("measured_on") != on:
+        stored = {"measured_on": on, **measure(given, folder)}
+        write_json(path, stored)
+    return {key: value for key, value in stored.items() if key != "measured_on"}
+
+
+def estimate_cell(number: Mapping[str, Any] | None) -> str:
+    """Value and bootstrap interval."""
+    if number is None or number["value"] is None:
+        return "–"
+    low, high = number["bootstrap_95"]
+    return f"{number['value']:.2f} ({low:.2f} to {high:.2f})"
+
+
+def share_cell(number: Mapping[str, Any]) -> str:
+    """Percentage and Wilson's interval."""
+    if not number["n"]:
+        return "–"
+    low, high = number["wilson_95"]
+    return f"{100 * number['share']:.0f} % ({100 * low:.0f} to {100 * high:.0f}; n = {number['n']})"
+
+
+def results_table(rows: Mapping[str, Mapping[str, Any]]) -> str:
+    """A line a variant, with 95 % intervals."""
+    columns = [name for name in MEASURES if any(name in row for row in rows.values())]
+    head, gated = (
+        ["variant", *(MEASURES[name] for name in columns)],
+        any("gate" in row for row in rows.values()),
+    )
+    if gated:
+        head += ["failures called successes", "successes recognised"]
+    lines = []
+    for variant, row in rows.items():
+        line = [variant, *(estimate_cell(row.get(name)) for name in columns)]
+        if gated:
+            line += [share_cell(row["gate"][name]) for name in ("false_success_rate", "recognised_rate")]
+        lines.append(line)
+    return markdown_table(head, lines)
+
+
+def parse_arguments() -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--dataset.root", dest="dataset_root", required=True, help="what to learn from")
+    parser.add_argument("--rollouts", help="dataset of real rollouts for the gate; none: no gate")
+    parser.add_argument("--tokenizer", help="trained frame tokenizer; by default the preset's is trained")
+    parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=list(VARIANTS))
+    parser.add_argument("--preset", default="cpu", help="sizes of tokenizer and network (default: cpu)")
+    parser.add_argument("--steps", type=int, help="of every variant; by default the preset's")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--split", default="validation", help="episodes that are replayed")
+    parser.add_argument("--max_episodes", type=int, default=200, help="of them, evenly spread")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--output_dir", type=Path, default=Path("outputs/ablation"))
+    parser.add_argument("--output", type=Path, default=RESULTS, help="JSON file")
+    return parser.parse_args()
+
+
+def main() -> None:
+    """Entry point."""
+    given = parse_arguments()
+    keep_freed_memory()
+    register_third_party_plugins()
+    settings = {"steps": given.steps} if given.steps else {}
+    settings["model.tokenizer_path"] = trained_tokenizer(given)
+    rows = {}
+    for name in given.variants:
+        folder = train_variant(given, name, "action_world_model", {**settings, **VARIANTS[name]})
+        rows[name] = measured_once(given, folder)
+        shared = {key: getattr(given, key) for key in ("preset", "seed", "split", "max_episodes")}
+        write_json(given.output, {**shared, "variants": rows})
+    print(results_table(rows))
+
+
+if __name__ == "__main__":
+    main()
