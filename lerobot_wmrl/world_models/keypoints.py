@@ -5,6 +5,7 @@ predicted along their tracks to those of the first frame. Here tokens are the po
 their codes is the tracker: nothing is looked at but the pictures.
 """
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -15,7 +16,7 @@ from lerobot_wmrl.world_models.distributed import masked_mean
 from lerobot_wmrl.world_models.losses import MOTION_LEVELS
 
 KEYPOINTS = 16
-"""K, the most active tracks of a clip. A gripper and an object cover about as many tokens."""
+"""K, the most active tracks a camera and clip. A gripper and an object cover about as many tokens."""
 
 REACH = 1
 """Tokens by which a track moves at most from one frame to the next, along each axis."""
@@ -57,26 +58,33 @@ def track_tokens(digits: Tensor, codebook: CodeBook, around: Tensor) -> Tensor:
     return torch.stack(places, 1)
 
 
-def most_active(places: Tensor, valid: Tensor, count: int) -> Tracks:
-    """Of tracks (B, T, S) the `count` that change place most often. valid (B, T): frames of the episode."""
+def most_active(places: Tensor, valid: Tensor, num_cameras: int) -> Tracks:
+    """Of tracks (B, T, S) the `KEYPOINTS` of each camera that change place most often.
+
+    By camera, since in one on the wrist everything moves. valid (B, T): frames of the episode.
+    """
     moves = (places[:, 1:] != places[:, :-1]) & (valid[:, 1:] & valid[:, :-1])[..., None]
-    activity, chosen = moves.sum(1).sort(dim=-1, descending=True, stable=True)
-    chosen = chosen[:, None, :count].expand(-1, places.shape[1], -1)
-    return Tracks(places.gather(2, chosen), (activity[:, None, :count] > 0) & valid[..., None])
+    activity = moves.sum(1).unflatten(-1, (num_cameras, -1))
+    order = activity.argsort(dim=-1, descending=True, stable=True)[..., :KEYPOINTS]
+    first = torch.arange(num_cameras, device=places.device)[:, None] * activity.shape[-1]
+    chosen = (order + first).flatten(1)[:, None].expand(-1, places.shape[1], -1)
+    active = activity.gather(-1, order).flatten(1)[:, None] > 0
+    return Tracks(places.gather(2, chosen), active & valid[..., None])
 
 
 def keypoint_loss(
-    logits: Tensor, codebook: CodeBook, digits: Tensor, valid: Tensor, around: Tensor
+    logits: Tensor, codebook: CodeBook, digits: Tensor, valid: Tensor, num_cameras: int
 ) -> Tensor:
     """RoboScape's eq. 5: squared distance of the values expected along the tracks from those at their starts.
 
     logits (B, T − 1, S, V) of frames 1 … T − 1; digits (B, T, S, C) of all frames; valid (B, T) → scalar.
     """
-    tracks = most_active(track_tokens(digits, codebook, around), valid, KEYPOINTS)
+    grid = math.isqrt(digits.shape[2] // num_cameras)
+    around = surroundings(grid, num_cameras, digits.device)
+    tracks = most_active(track_tokens(digits, codebook, around), valid, num_cameras)
     places = tracks.places[:, 1:, :, None]
     along = logits.gather(2, places.expand(-1, -1, -1, logits.shape[-1]))
-    own = codebook.values(digits[:, 0]).gather(
-        1, tracks.places[:, 0, :, None].expand(-1, -1, codebook.channels)
-    )
+    start = tracks.places[:, 0, :, None].expand(-1, -1, codebook.channels)
+    own = codebook.values(digits[:, 0]).gather(1, start)
     apart = (codebook.expected_values(along) - own[:, None]).square().mean(-1)
     return masked_mean(apart, tracks.moving[:, 1:].float())

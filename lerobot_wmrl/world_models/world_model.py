@@ -25,7 +25,7 @@ from lerobot_wmrl.world_models.decoding import Condition, FramesSeen, make_decod
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
 from lerobot_wmrl.world_models.hub_card import HubCard
 from lerobot_wmrl.world_models.imagination import Imagination
-from lerobot_wmrl.world_models.keypoints import keypoint_loss, surroundings
+from lerobot_wmrl.world_models.keypoints import keypoint_loss
 from lerobot_wmrl.world_models.losses import (
     Clip,
     corrupt_digits,
@@ -145,9 +145,10 @@ class WorldModelRewardModel(HubCard, Imagination, PreTrainedRewardModel):
         decoding_loss, decoding_metrics = self.decoding.loss(self.network, frames, digits[:, 1:], weight)
         loss, metrics = loss + decoding_loss, metrics | decoding_metrics
         if self.config.keypoint_weight > 0:
-            around = surroundings(self.network.grid, self.network.num_cameras, digits.device)
-            logits = prediction.logits[:, :-1].float()
-            consistency = keypoint_loss(logits, self.network.codebook, digits, clip.valid, around)
+            consistency = keypoint_loss(
+                prediction.logits[:, :-1].float(), self.network.codebook, digits, clip.valid,
+                self.network.num_cameras,
+            )  # fmt: skip
             loss = loss + self.config.keypoint_weight * consistency
             metrics["keypoint_loss"] = consistency.item()
         return loss, metrics

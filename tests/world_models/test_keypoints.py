@@ -4,6 +4,7 @@ from torch import Tensor
 
 from lerobot_wmrl.world_models.codebook import CodeBook, make_codebook
 from lerobot_wmrl.world_models.keypoints import (
+    KEYPOINTS,
     Tracks,
     keypoint_loss,
     most_active,
@@ -54,7 +55,7 @@ def test_flicker_of_codes_is_no_motion():
 
 def test_the_fastest_is_a_keypoint_while_it_is_known():
     places = track_tokens(crossing(), CODEBOOK, AROUND)
-    tracks = most_active(places, VALID, 3)
+    tracks = most_active(places, VALID, 1)
     assert tracks.places[0, :, 0].tolist() == [START + time for time in range(TIME)]
     assert tracks.moving[0, :, 0].all()
     padded = VALID.clone()
@@ -63,27 +64,38 @@ def test_the_fastest_is_a_keypoint_while_it_is_known():
     assert cut.moving[0, :, 0].tolist() == [True, True, False, False]
 
 
+def test_every_camera_has_keypoints_of_its_own():
+    """However much more moves in the other."""
+    start = torch.arange(2 * GRID**2)
+    busy = start + torch.arange(TIME)[:, None] % 2 * (start < GRID**2)
+    busy[1:, GRID**2 + 7] = GRID**2 + 8
+    tracks = most_active(busy[None], VALID, 2)
+    assert tracks.places.shape == (1, TIME, 2 * KEYPOINTS)
+    assert tracks.places[0, :, KEYPOINTS].tolist() == [GRID**2 + 7, *[GRID**2 + 8] * (TIME - 1)]
+    assert tracks.moving[0, 0].sum() == KEYPOINTS + 1
+
+
 def test_keypoints_that_look_as_at_the_start_cost_nothing_wherever_they_are():
     digits = crossing()
     consistent = sure(digits[:, 1:])
-    assert keypoint_loss(consistent, CODEBOOK, digits, VALID, AROUND) < 1e-6
+    assert keypoint_loss(consistent, CODEBOOK, digits, VALID, 1) < 1e-6
     faded = digits.clone()
     faded[0, 2, START + 2] = 1
-    assert keypoint_loss(sure(faded[:, 1:]), CODEBOOK, digits, VALID, AROUND) > 0.1
+    assert keypoint_loss(sure(faded[:, 1:]), CODEBOOK, digits, VALID, 1) > 0.1
     elsewhere = consistent.clone()
     elsewhere[:, :, 0] += torch.randn(15)
-    assert keypoint_loss(elsewhere, CODEBOOK, digits, VALID, AROUND) < 1e-6
+    assert keypoint_loss(elsewhere, CODEBOOK, digits, VALID, 1) < 1e-6
 
 
 def test_without_motion_there_is_no_keypoint():
     digits = crossing()[:, :1].expand(-1, TIME, -1, -1)
     logits = torch.randn(1, TIME - 1, GRID**2, 15)
-    assert keypoint_loss(logits, CODEBOOK, digits, VALID, AROUND) == 0
+    assert keypoint_loss(logits, CODEBOOK, digits, VALID, 1) == 0
 
 
 def test_the_loss_pulls_along_the_track_only():
     logits = torch.zeros(1, TIME - 1, GRID**2, 15, requires_grad=True)
-    keypoint_loss(logits, CODEBOOK, crossing(), VALID, AROUND).backward()
+    keypoint_loss(logits, CODEBOOK, crossing(), VALID, 1).backward()
     pulled = logits.grad.abs().sum(-1)[0].nonzero().tolist()
     followed = track_tokens(crossing(), CODEBOOK, AROUND)[0]
     moving = (followed != followed[:1]).any(0)
