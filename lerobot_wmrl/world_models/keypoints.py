@@ -11,6 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from lerobot_wmrl.precision import compute_in
 from lerobot_wmrl.world_models.codebook import CodeBook
 from lerobot_wmrl.world_models.distributed import masked_mean
 from lerobot_wmrl.world_models.losses import MOTION_LEVELS
@@ -78,6 +79,7 @@ def keypoint_loss(
     """RoboScape's eq. 5: squared distance of the values expected along the tracks from those at their starts.
 
     logits (B, T − 1, S, V) of frames 1 … T − 1; digits (B, T, S, C) of all frames; valid (B, T) → scalar.
+    Computed in float32, whatever the network computes in.
     """
     grid = math.isqrt(digits.shape[2] // num_cameras)
     around = surroundings(grid, num_cameras, digits.device)
@@ -86,5 +88,6 @@ def keypoint_loss(
     along = logits.gather(2, places.expand(-1, -1, -1, logits.shape[-1]))
     start = tracks.places[:, 0, :, None].expand(-1, -1, codebook.channels)
     own = codebook.values(digits[:, 0]).gather(1, start)
-    apart = (codebook.expected_values(along) - own[:, None]).square().mean(-1)
+    with compute_in(torch.float32, logits.device):
+        apart = (codebook.expected_values(along.float()) - own[:, None]).square().mean(-1)
     return masked_mean(apart, tracks.moving[:, 1:].float())

@@ -146,7 +146,7 @@ class WorldModelRewardModel(HubCard, Imagination, PreTrainedRewardModel):
         loss, metrics = loss + decoding_loss, metrics | decoding_metrics
         if self.config.keypoint_weight > 0:
             consistency = keypoint_loss(
-                prediction.logits[:, :-1].float(), self.network.codebook, digits, clip.valid,
+                prediction.logits[:, :-1], self.network.codebook, digits, clip.valid,
                 self.network.num_cameras,
             )  # fmt: skip
             loss = loss + self.config.keypoint_weight * consistency

@@ -2,6 +2,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from lerobot_wmrl.precision import compute_in
 from lerobot_wmrl.world_models.codebook import CodeBook, make_codebook
 from lerobot_wmrl.world_models.keypoints import (
     KEYPOINTS,
@@ -85,6 +86,15 @@ def test_keypoints_that_look_as_at_the_start_cost_nothing_wherever_they_are():
     elsewhere = consistent.clone()
     elsewhere[:, :, 0] += torch.randn(15)
     assert keypoint_loss(elsewhere, CODEBOOK, digits, VALID, 1) < 1e-6
+
+
+def test_it_is_as_exact_in_a_training_in_bfloat16():
+    torch.manual_seed(0)
+    logits = torch.randn(1, TIME - 1, GRID**2, 15)
+    exact = keypoint_loss(logits, CODEBOOK, crossing(), VALID, 1)
+    with compute_in(torch.bfloat16, "cpu"):
+        mixed = keypoint_loss(logits, CODEBOOK, crossing(), VALID, 1)
+    assert torch.equal(mixed, exact)
 
 
 def test_without_motion_there_is_no_keypoint():
