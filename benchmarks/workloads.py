@@ -35,7 +35,10 @@ class Imagination:
         tokens = torch.zeros(
             self.batch, self.model.tokenizer.tokens_per_frame, dtype=torch.long, device=self.device
         )
-        state = self.model.start(tokens, self.model.state_mean.expand(self.batch, -1), dtype=self.dtype)
+        state = self.model.start(
+            tokens, self.model.state_mean.expand(self.batch, -1), dtype=self.dtype,
+            depth=torch.ones(tokens.shape, device=self.device),
+        )  # fmt: skip
         state.cache.visible = state.cache.window
         state.cache.position.fill_(state.cache.window)
         return state
@@ -55,7 +58,10 @@ class Imagination:
         condition = model.encode_actions(self.action[:, None].expand(-1, window, -1))
         digits = self.state.digits.expand(-1, window, -1, -1)
         with compute_in(self.dtype, self.device):
-            prediction = model.network(digits, self.state.proprioception.expand(-1, window, -1), *condition)
+            prediction = model.network(
+                digits, self.state.proprioception.expand(-1, window, -1), *condition,
+                depth=self.state.depth.expand(-1, window, -1),
+            )  # fmt: skip
         return model.network.codebook.sample(prediction.logits[:, -1], 0.0, None)
 
     def bytes_a_frame(self) -> float:
@@ -95,7 +101,8 @@ def random_clip(model: ActionWorldModelRewardModel, batch: int, device: torch.de
         torch.randn(*shape, size, device=device) for size in (config.state_size, config.action_size)
     )
     yes = torch.ones(shape, dtype=torch.bool, device=device)
-    return Clip(tokens, state, action, torch.zeros(shape, device=device), yes, yes, [""] * batch)
+    done, depth = torch.zeros(shape, device=device), torch.ones(tokens.shape, device=device)
+    return Clip(tokens, state, action, done, yes, yes, [""] * batch, depth)
 
 
 def training_step(model: ActionWorldModelRewardModel, clip: Clip, dtype: torch.dtype) -> Work:

@@ -8,6 +8,7 @@ from torch import Tensor
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.world_models.compatibility import check_dataset
 from lerobot_wmrl.world_models.context import Context
+from lerobot_wmrl.world_models.depth_maps import depth_at
 from lerobot_wmrl.world_models.episode_table import choose_episodes, open_dataset, read_episodes
 from lerobot_wmrl.world_models.frame_cache import cached_frames, frames_to_tensor
 from lerobot_wmrl.world_models.goal import imagine_goal, similarity
@@ -21,13 +22,15 @@ GOAL_BATCH = 64
 
 class Starts(NamedTuple):
     """K starts: tokens (K, S), the images they decode to (K, N, 3, H, W), the tokenizer's context of K first
-    frames, proprioception (K, P), instructions, goal features [(K·N, C, h, w)], the start's similarity to its
-    goal (K,), and goal_reached (K,), False where the text model never reached θ."""
+    frames, proprioception (K, P), depth (K, S) in metres if the model looks at it, instructions, goal
+    features [(K·N, C, h, w)], the start's similarity to its goal (K,), and goal_reached (K,), False where the
+    text model never reached θ."""
 
     tokens: Tensor
     images: Tensor
     context: Context
     proprioception: Tensor
+    depth: Tensor | None
     instructions: list[str]
     goal_features: list[Tensor]
     similarity: Tensor
@@ -48,7 +51,7 @@ def load_starts(
     device = model.state_mean.device
     images = frames_to_tensor(cached_frames(table.dataset, model.config.camera_keys)[rows]).to(device)
     state = torch.from_numpy(table.state[rows][:, : model.config.state_size]).to(device)
-    context = model.tokenizer.context(images)
+    context, depth = model.tokenizer.context(images), depth_at(model, table.dataset, rows)
     tokens = model.tokenizer.encode(images, context)
     goals = [
         imagine_goal(
@@ -57,6 +60,7 @@ def load_starts(
             state[i : i + GOAL_BATCH],
             instructions[i : i + GOAL_BATCH],
             context[i : i + GOAL_BATCH],
+            depth_at(text_model, table.dataset, rows[i : i + GOAL_BATCH]),
         )
         for i in range(0, len(rows), GOAL_BATCH)
     ]
@@ -64,4 +68,6 @@ def load_starts(
     decoded = model.tokenizer.decode_with_features(tokens, context)
     closeness = similarity(decoded.features, goal_features, len(tokens))
     reached = torch.cat([goal.reached for goal in goals])
-    return Starts(tokens, decoded.images, context, state, instructions, goal_features, closeness, reached)
+    return Starts(
+        tokens, decoded.images, context, state, depth, instructions, goal_features, closeness, reached
+    )

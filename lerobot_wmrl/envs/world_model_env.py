@@ -73,7 +73,7 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
             drawn = torch.tensor(seed, device=self.device) % len(self.starts.tokens)
         self._start_index, self._context = drawn, self.starts.context[drawn]
         tokens, state = self.starts.tokens[drawn], self.starts.proprioception[drawn]
-        self._imagination = self.model.start(tokens, state)
+        self._imagination = self.model.start(tokens, state, depth=self._start_depth())
         self._elapsed = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
         self._done_streak = torch.zeros_like(self._elapsed)
         self._similarity = self.starts.similarity[drawn]
@@ -123,7 +123,7 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         self._start_index = torch.where(mask, self._draw_starts(), self._start_index)
         self._context = self.starts.context[self._start_index]
         tokens, state = self.starts.tokens[self._start_index], self.starts.proprioception[self._start_index]
-        self.model.restart(self._imagination, mask, tokens, state)
+        self.model.restart(self._imagination, mask, tokens, state, self._start_depth())
         self._elapsed = self._elapsed.masked_fill(mask, 0)
         self._done_streak = self._done_streak.masked_fill(mask, 0)
         self._similarity = torch.where(mask, self.starts.similarity[self._start_index], self._similarity)
@@ -136,6 +136,11 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
     def _draw_starts(self) -> Tensor:
         count = len(self.starts.tokens)
         return torch.randint(count, (self.num_envs,), generator=self.generator, device=self.device)
+
+    def _start_depth(self) -> Tensor | None:
+        """Of each environment's start, (B, S) metres, if the model looks at depth."""
+        depth = self.starts.depth
+        return depth if depth is None else depth[self._start_index]
 
     def _similarity_to_goal(self, features: list[Tensor]) -> Tensor:
         cameras = self.model.tokenizer.num_cameras

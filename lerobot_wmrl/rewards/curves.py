@@ -7,6 +7,7 @@ import torch
 
 from lerobot_wmrl.rewards.configuration_general import GeneralConfig
 from lerobot_wmrl.rewards.general import consecutive_count, general_reward, sparse_reward
+from lerobot_wmrl.world_models.depth_maps import depth_at
 from lerobot_wmrl.world_models.episode_table import EpisodeTable
 from lerobot_wmrl.world_models.frame_cache import frames_to_tensor
 from lerobot_wmrl.world_models.goal import imagine_goal, similarity_to_goal
@@ -36,9 +37,11 @@ def reward_along_episode(
     state, action = (torch.from_numpy(column[rows]).to(device) for column in (table.state, table.action))
     known = torch.ones(1, len(tokens), dtype=torch.bool, device=device)
     instruction = [table.instructions[episode]]
-    clip = Clip(tokens[None], state[None], action[None], known.float(), known, known, instruction)
+    depth = depth_at(model, table.dataset, np.arange(rows.start, rows.stop)[None])
+    clip = Clip(tokens[None], state[None], action[None], known.float(), known, known, instruction, depth)
     done_logit = model.predict(clip).done_logit[0, :-1]
-    goal = imagine_goal(text_model, tokens[:1], state[:1], instruction, start)
+    first_depth = depth_at(text_model, table.dataset, slice(rows.start, rows.start + 1))
+    goal = imagine_goal(text_model, tokens[:1], state[:1], instruction, start, first_depth)
     features = [layer.repeat(len(tokens), 1, 1, 1) for layer in goal.features]
     closeness = similarity_to_goal(model.tokenizer, tokens, features, context)
     paid = success_once(done_logit, threshold, frames)

@@ -23,7 +23,8 @@ FROM_START = 0.75
 class ClipSampler:
     """Clips of tokens for the world models.
 
-    tokens (rows, S) is the memory map; `episodes` the indices of the episodes to draw from.
+    tokens (rows, S) is the memory map; `episodes` the indices of the episodes to draw from; depth (rows, S),
+    metres of each token, for models that look at it.
     """
 
     table: EpisodeTable
@@ -33,6 +34,7 @@ class ClipSampler:
     batch_size: int
     seed: int
     device: str
+    depth: np.ndarray | None = None
 
     def __call__(self, step: int) -> Clip:
         """This process's share of the batch of one training step."""
@@ -59,6 +61,7 @@ class ClipSampler:
             self._tensor(valid),
             self._tensor(known),
             [self.table.instructions[episode] for episode in episodes],
+            None if self.depth is None else self._tensor(self.depth[rows]),
         )
 
     def _tensor(self, array: np.ndarray) -> Tensor:

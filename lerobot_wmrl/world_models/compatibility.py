@@ -28,6 +28,26 @@ def check_cameras(config: Any, features: Mapping[str, Any]) -> None:
                 f"image_size={config.image_size}: the dataset's {key} is {height}x{width}; "
                 f"train a tokenizer with --model.image_size={height} or record at {config.image_size}"
             )
+    if getattr(config, "depth", False):
+        check_depth(config, features)
+
+
+def depth_key(camera_key: str) -> str:
+    """Where the dataset has a camera's depth."""
+    return f"{camera_key}_depth"
+
+
+def check_depth(config: Any, features: Mapping[str, Any]) -> None:
+    """ValueError unless the dataset has the depth of the config's cameras, at their image size."""
+    for key in map(depth_key, config.camera_keys):
+        found = frame_size(features[key]) if key in features else None
+        if found != (config.image_size, config.image_size):
+            size = "none" if found is None else f"one of {found[0]}x{found[1]}"
+            raise ValueError(
+                f"--model.depth=true: the world model looks at {key} of {config.image_size} x "
+                f"{config.image_size} pixels, the dataset has {size}; record it with "
+                "lerobot-wmrl-record --depth=true"
+            )
 
 
 def check_dataset(config: Any, features: Mapping[str, Any]) -> None:

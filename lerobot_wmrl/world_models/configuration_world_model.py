@@ -26,9 +26,11 @@ class WorldModelConfig(RewardModelConfig):
         decoding: how a frame's tokens come about: shifted (all drawn in one pass) or maskgit (in
             `maskgit_steps` passes, the most confident first). maskgit takes a second pass in training too.
         maskgit_steps: passes a frame of maskgit; 1 is as fast as shifted, and decodes the same way.
+        depth: see and predict each camera's depth beside its tokens (RoboScape's depth branch). The dataset
+            must have `observation.images.<camera>_depth`, which `lerobot-wmrl-record --depth=true` writes.
         motion_weight: how much more a token counts in the loss when it moves. A high weight makes the model
             believe in motion: it then pushes objects that the hand misses.
-        done_weight, done_positive_weight, state_weight: of the other losses, beside the tokens' one.
+        done_weight, done_positive_weight, state_weight, depth_weight: of the losses beside the tokens' one.
         self_forcing: share of input frames replaced by the model's own predictions in training.
         self_rollout: share of clips that in the last quarter of training show what the model itself makes of
             their first frame and actions, instead of the real frames; what it has to predict stays real.
@@ -57,11 +59,13 @@ class WorldModelConfig(RewardModelConfig):
     conditioning: str = "cross_attention"
     decoding: str = "shifted"
     maskgit_steps: int = 4
+    depth: bool = False
 
     motion_weight: float = 1.0
     done_weight: float = 1.0
     done_positive_weight: float = 1.0
     state_weight: float = 4.0
+    depth_weight: float = 1.0
     self_forcing: float = 0.5
     self_rollout: float = 0.0
     keypoint_weight: float = 0.0

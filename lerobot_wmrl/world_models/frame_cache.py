@@ -33,7 +33,7 @@ def cache_dir(dataset: LeRobotDataset) -> Path:
 def cached_frames(dataset: LeRobotDataset, camera_keys: Sequence[str]) -> np.ndarray:
     """All frames as a read-only memory map, uint8 (rows, N, H, W, 3); decoded on the first call."""
     shape = (dataset.num_frames, len(camera_keys), *frame_size(dataset.features[camera_keys[0]]), 3)
-    key = _digest([dataset.num_episodes, dataset.num_frames, *camera_keys, *_file_stamps(dataset)])
+    key = digest([dataset.num_episodes, dataset.num_frames, *camera_keys, *file_stamps(dataset)])
 
     def fill(target: np.ndarray) -> None:
         for episode in tqdm(range(dataset.num_episodes), desc="Decoding frames", unit="episode"):
@@ -42,7 +42,7 @@ def cached_frames(dataset: LeRobotDataset, camera_keys: Sequence[str]) -> np.nda
             for camera, name in enumerate(camera_keys):
                 target[begin:end, camera] = _decode_episode(dataset, episode, name)
 
-    return _memory_map(cache_dir(dataset) / f"frames-{key}.npy", shape, np.uint8, fill)
+    return memory_map(cache_dir(dataset) / f"frames-{key}.npy", shape, np.uint8, fill)
 
 
 def cached_tokens(
@@ -54,7 +54,7 @@ def cached_tokens(
     """
     frames = cached_frames(dataset, camera_keys)
     weights = hashlib.sha256(b"".join(p.detach().cpu().numpy().tobytes() for p in tokenizer.parameters()))
-    key = _digest([weights.hexdigest(), *_file_stamps(dataset)])
+    key = digest([weights.hexdigest(), *file_stamps(dataset)])
     device = next(tokenizer.parameters()).device
     episodes = dataset.meta.episodes
     starts = np.repeat(np.asarray(episodes["dataset_from_index"]), np.asarray(episodes["length"]))
@@ -69,7 +69,7 @@ def cached_tokens(
                 target[part] = tokenizer.encode(images, context).cpu().numpy()
 
     shape = (len(frames), tokenizer.tokens_per_frame)
-    return _memory_map(cache_dir(dataset) / f"tokens-{key}.npy", shape, np.int32, fill)
+    return memory_map(cache_dir(dataset) / f"tokens-{key}.npy", shape, np.int32, fill)
 
 
 def frames_to_tensor(frames: np.ndarray) -> torch.Tensor:
@@ -85,20 +85,31 @@ def _decode_episode(dataset: LeRobotDataset, episode: int, key: str) -> np.ndarr
         return np.stack(
             [np.asarray(image.convert("RGB")) for image in dataset.hf_dataset.with_format(None)[indices][key]]
         )
-    first = rows[f"videos/{key}/from_timestamp"]
-    times = [first + index / dataset.fps for index in range(len(indices))]
+    return decode_video(dataset, episode, key).permute(0, 2, 3, 1).numpy()
+
+
+def decode_video(dataset: LeRobotDataset, episode: int, key: str) -> torch.Tensor:
+    """Frames of one episode and camera: uint8 (T, 3, H, W), or codes of depth (T, 1, H, W).
+
+    ValueError if the video is corrupted.
+    """
+    rows = dataset.meta.episodes[episode]
+    first, length = rows[f"videos/{key}/from_timestamp"], rows["length"]
+    times = [first + index / dataset.fps for index in range(length)]
     path = Path(dataset.root) / dataset.meta.get_video_file_path(episode, key)
     try:
-        frames = decode_video_frames(path, times, dataset.tolerance_s, VIDEO_BACKEND, return_uint8=True)
+        return decode_video_frames(
+            path, times, dataset.tolerance_s, VIDEO_BACKEND, return_uint8=True,
+            is_depth=key in dataset.meta.depth_keys,
+        )  # fmt: skip
     except Exception as error:
         raise ValueError(
             f"dataset {dataset.root}: episode {episode}: {key}: {path.name} cannot be decoded ({error}); "
             "delete the dataset and record it again with the same command"
         ) from error
-    return frames.permute(0, 2, 3, 1).numpy()
 
 
-def _memory_map(
+def memory_map(
     path: Path, shape: tuple[int, ...], dtype: type, fill: Callable[[np.ndarray], None]
 ) -> np.ndarray:
     """The array at `path`, or a new one that `fill` writes; it appears only once it is whole."""
@@ -118,11 +129,11 @@ def _memory_map(
     return np.load(path, mmap_mode="r")
 
 
-def _file_stamps(dataset: LeRobotDataset) -> list[object]:
+def file_stamps(dataset: LeRobotDataset) -> list[object]:
     """Size and time of the dataset's files: another recording in the same folder is another cache."""
     files = sorted(path for pattern in ("*.mp4", "*.parquet") for path in Path(dataset.root).rglob(pattern))
     return [item for path in files for item in (path.name, path.stat().st_size, path.stat().st_mtime_ns)]
 
 
-def _digest(parts: Sequence[object]) -> str:
+def digest(parts: Sequence[object]) -> str:
     return hashlib.sha256(json.dumps([str(part) for part in parts]).encode()).hexdigest()[:12]

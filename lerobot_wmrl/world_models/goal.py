@@ -28,13 +28,14 @@ def imagine_goal(
     proprioception: Tensor,
     instructions: Sequence[str],
     context: Context = NO_CONTEXT,
+    depth: Tensor | None = None,
 ) -> Goal:
     """Eq. 6: the first imagined frame whose done probability reaches θ, else the one of the largest.
 
-    tokens (B, S) of the start frames, proprioception (B, P), one instruction each, and the start frames'
-    context if the tokenizer is conditioned on it.
+    tokens (B, S) of the start frames, proprioception (B, P), one instruction each, the start frames' context
+    if the tokenizer is conditioned on it, and their depth (B, S) in metres if the model looks at it.
     """
-    state = model.start(tokens, proprioception, instructions)
+    state = model.start(tokens, proprioception, instructions, depth=depth)
     goal, best = tokens, torch.full((tokens.shape[0],), -1.0, device=tokens.device)
     reached = torch.zeros_like(best, dtype=torch.bool)
     for _ in range(model.config.goal_horizon):

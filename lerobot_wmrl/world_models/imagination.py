@@ -22,7 +22,8 @@ class Imagined(NamedTuple):
     """One imagined frame of every environment.
 
     tokens (B, S); done_logit (B,); proprioception (B, P) in the dataset's units; hidden (B, D);
-    entropy (B,), the mean over code factors of the predictive entropy in nats.
+    entropy (B,), the mean over code factors of the predictive entropy in nats; depth (B, S), metres of each
+    token, (B, 0) if the model does not predict it.
     """
 
     tokens: Tensor
@@ -30,17 +31,20 @@ class Imagined(NamedTuple):
     proprioception: Tensor
     hidden: Tensor
     entropy: Tensor
+    depth: Tensor
 
 
 @dataclass
 class ImaginationState:
-    """Where B imaginations stand: digits (B, 1, S, C), normalised state (B, 1, P), ring of past frames.
+    """Where B imaginations stand: digits (B, 1, S, C), normalised state (B, 1, P), depth (B, 1, S) as the
+    network has it or (B, 1, 0), ring of past frames.
 
     Its tensors are allocated once and advanced in place. The network computes in the ring's dtype.
     """
 
     digits: Tensor
     proprioception: Tensor
+    depth: Tensor
     cache: TemporalCache
     condition: Condition | None = None
 
@@ -66,25 +70,33 @@ class Imagination:
         proprioception: Tensor,
         instructions: Sequence[str] | None = None,
         dtype: torch.dtype | None = None,
+        depth: Tensor | None = None,
     ) -> ImaginationState:
-        """Imagination from one frame: tokens (B, S), proprioception (B, P) in dataset units.
+        """Imagination from one frame: tokens (B, S), proprioception (B, P) in dataset units, and if the model
+        looks at it the depth (B, S), metres of each token; ValueError without.
 
         The network computes in `dtype`, by default the fastest; samples, done, state and entropy are float32.
         """
         batch, device = tokens.shape[0], tokens.device
         small = batch < SMALL_BATCH and device.type == "cpu"
         dtype = dtype or (torch.float32 if small else imagination_dtype(device))
-        cache = self.network.transformer.make_cache(batch, self.network.transformer_tokens, device, dtype)
+        cache = self.network.make_cache(batch, device, dtype)
         condition = self.encode_instructions(instructions, batch) if instructions is not None else None
         digits = self.network.codebook.digits(tokens)[:, None]
-        return ImaginationState(digits, self.normalize_state(proprioception)[:, None], cache, condition)
+        first, depth = self.normalize_state(proprioception), self.network.depth.normalize(depth, tokens)
+        return ImaginationState(digits, first[:, None], depth[:, None], cache, condition)
 
-    def restart(self, state: ImaginationState, mask: Tensor, tokens: Tensor, proprioception: Tensor) -> None:
+    def restart(
+        self, state: ImaginationState, mask: Tensor, tokens: Tensor, proprioception: Tensor,
+        depth: Tensor | None = None,
+    ) -> None:  # fmt: skip
         """Put the environments in `mask` (B,) back to a first frame; their past is masked, not moved."""
         digits = self.network.codebook.digits(tokens)[:, None]
         first = self.normalize_state(proprioception)[:, None]
         state.digits.copy_(torch.where(mask[:, None, None, None], digits, state.digits))
         state.proprioception.copy_(torch.where(mask[:, None, None], first, state.proprioception))
+        depth = self.network.depth.normalize(depth, tokens)[:, None]
+        state.depth.copy_(torch.where(mask[:, None, None], depth, state.depth))
         state.cache.restart(mask)
 
     @torch.no_grad()
@@ -103,6 +115,7 @@ class Imagination:
             prediction.proprioception[:, 0] * self.state_std + self.state_mean,
             prediction.hidden[:, 0],
             codebook.entropy(prediction.logits[:, 0]),
+            self.network.depth.metres(prediction.depth[:, 0]),
         )
 
     @torch.no_grad()
@@ -113,23 +126,25 @@ class Imagination:
         condition: Condition,
         steps: int,
         dtype: torch.dtype | None = None,
-    ) -> tuple[Tensor, Tensor]:
+        depth: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Frames 0 … `steps` of imaginations with the most likely codes, as the network sees them.
 
-        tokens (B, S), proprioception (B, P) of frame 0 and `dtype` as in `start`; condition tokens float32,
-        (B, `steps` or more, M, D) or (B, 1, M, D). → digits (B, 1 + steps, S, C), normalised state
-        (B, 1 + steps, P). Draws no global random number.
+        tokens (B, S), proprioception (B, P) and depth of frame 0 and `dtype` as in `start`; condition tokens
+        float32, (B, `steps` or more, M, D) or (B, 1, M, D). → digits (B, 1 + steps, S, C), normalised state
+        (B, 1 + steps, P), normalised depth (B, 1 + steps, S or 0). Draws no global random number.
         """
-        state = self.start(tokens, proprioception, dtype=dtype)
+        state = self.start(tokens, proprioception, dtype=dtype, depth=depth)
         unused = torch.Generator(tokens.device)
         given, mask = condition
-        digits, states = [state.digits.clone()], [state.proprioception.clone()]
+        digits, states, depths = [state.digits.clone()], [state.proprioception.clone()], [state.depth.clone()]
         for step in range(steps):
             now = given[:, step : step + 1] if given.shape[1] > 1 else given
             self._advance(state, (now, mask), 0.0, unused)
             digits.append(state.digits.clone())
             states.append(state.proprioception.clone())
-        return torch.cat(digits, 1), torch.cat(states, 1)
+            depths.append(state.depth.clone())
+        return torch.cat(digits, 1), torch.cat(states, 1), torch.cat(depths, 1)
 
     def _advance(
         self,
@@ -140,11 +155,14 @@ class Imagination:
     ) -> Prediction:
         """Put `state` one frame further. → what was predicted"""
         with compute_in(state.cache.keys.dtype, state.digits.device):
-            prediction = self.network.step(state.digits, state.proprioception, *condition, state.cache)
+            prediction = self.network.step(
+                state.digits, state.proprioception, *condition, state.cache, state.depth
+            )
             seen = FramesSeen(state.digits, condition, prediction, state.cache)
             digits = self.decoding.decode(self.network, seen, temperature, generator)
         state.digits.copy_(digits)
         state.proprioception.copy_(prediction.proprioception)
+        state.depth.copy_(prediction.depth)
         return prediction
 
     @torch.no_grad()

@@ -25,7 +25,8 @@ class Clip(NamedTuple):
     """Rows t = 0 … T − 1 of an episode: what is seen, what is done, and what that leads to.
 
     tokens (B, T, S); state (B, T, P) in dataset units; action (B, T, A); done (B, T), success at frame
-    t + 1; valid (B, T), False where the episode is padded; done_known (B, T); one instruction an episode.
+    t + 1; valid (B, T), False where the episode is padded; done_known (B, T); one instruction an episode;
+    depth (B, T, S), metres of each token, for models that look at it.
     """
 
     tokens: Tensor
@@ -35,6 +36,7 @@ class Clip(NamedTuple):
     valid: Tensor
     done_known: Tensor
     instructions: list[str]
+    depth: Tensor | None = None
 
 
 def corrupt_digits(digits: Tensor, codebook: CodeBook, share: float) -> Tensor:
@@ -60,14 +62,21 @@ def self_rollout_rows(share: float, progress: float, batch: int, device: torch.d
 
 
 def force_predictions(
-    guess: Prediction, codebook: CodeBook, digits: Tensor, state: Tensor, share: float
-) -> tuple[Tensor, Tensor]:
+    guess: Prediction, codebook: CodeBook, digits: Tensor, state: Tensor, depth: Tensor, share: float
+) -> tuple[Tensor, Tensor, Tensor]:
     """Scheduled sampling in parallel: replace a share of the input frames by one-pass predictions of them."""
     predicted = codebook.sample(guess.logits[:, :-1], 0.0, None)
     swap = draw_own_rows(torch.rand, digits.shape[:2], digits.device)[:, 1:] < share
     frames = torch.where(swap[..., None, None], predicted, digits[:, 1:])
-    states = torch.where(swap[..., None], guess.proprioception[:, :-1].to(state.dtype), state[:, 1:])
-    return torch.cat([digits[:, :1], frames], 1), torch.cat([state[:, :1], states], 1)
+    states, depths = (
+        torch.where(swap[..., None], own[:, :-1].to(real.dtype), real[:, 1:])
+        for own, real in ((guess.proprioception, state), (guess.depth, depth))
+    )
+    return (
+        torch.cat([digits[:, :1], frames], 1),
+        torch.cat([state[:, :1], states], 1),
+        torch.cat([depth[:, :1], depths], 1),
+    )
 
 
 def token_weights(

@@ -115,5 +115,6 @@ class TextWorldModelRewardModel(WorldModelRewardModel):
     def compute_reward(self, batch: dict[str, Any]) -> Tensor:
         """Similarity of the window's last frame to the goal imagined from its first one. → (B,)"""
         clip, context = self.clip_from_batch(batch), self._context(batch)
-        goal = imagine_goal(self, clip.tokens[:, 0], clip.state[:, 0], clip.instructions, context)
+        depth = clip.depth if clip.depth is None else clip.depth[:, 0]
+        goal = imagine_goal(self, clip.tokens[:, 0], clip.state[:, 0], clip.instructions, context, depth)
         return similarity_to_goal(self.tokenizer, clip.tokens[:, -1], goal.features, context)

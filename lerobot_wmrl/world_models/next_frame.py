@@ -1,7 +1,7 @@
 """The network both world models share: tokens of frame t and a condition give frame t + 1 (eq. 1).
 
-One pass predicts every token of the next frame (shifted prediction), the next proprioceptive state and
-whether success holds there. What is read from the transformer is read in float32.
+One pass predicts every token of the next frame (shifted prediction), the next proprioceptive state, whether
+success holds there and, on request, the next depth. What is read from the transformer is read in float32.
 """
 
 from collections.abc import Sequence
@@ -9,11 +9,12 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from lerobot_wmrl.precision import compute_in
 from lerobot_wmrl.world_models.codebook import make_codebook
 from lerobot_wmrl.world_models.conditioning import pooled
+from lerobot_wmrl.world_models.depth_branch import DepthBranch, NoDepth
+from lerobot_wmrl.world_models.frame_grids import FrameEmbedding, FrameHead
 from lerobot_wmrl.world_models.st_transformer import SpatialTemporalTransformer
 from lerobot_wmrl.world_models.temporal_memory import TemporalCache, TemporalMemory
 
@@ -24,52 +25,15 @@ STATE_STEP = 0.1
 class Prediction(NamedTuple):
     """About frame t + 1, given frames up to t. V is the sum of the levels of all factors.
 
-    logits (B, T, S, V); done_logit (B, T); proprioception (B, T, P) in normalised units; hidden (B, T, D).
+    logits (B, T, S, V); done_logit (B, T); proprioception (B, T, P) in normalised units; hidden (B, T, D);
+    depth (B, T, S) as the depth branch scales it, (B, T, 0) without one.
     """
 
     logits: Tensor
     done_logit: Tensor
     proprioception: Tensor
     hidden: Tensor
-
-
-class FrameEmbedding(nn.Module):
-    """Code grids to transformer tokens: a 3x3 convolution, then non-overlapping patches of the grid."""
-
-    def __init__(self, channels: int, grid: int, patch: int, code_width: int, width: int) -> None:
-        super().__init__()
-        self.local = nn.Conv2d(channels, code_width, 3, padding=1)
-        self.patches = nn.Conv2d(code_width, width, patch, stride=patch)
-        self.position = nn.Parameter(torch.randn((grid // patch) ** 2, width) * 0.02)
-
-    def forward(self, values: Tensor, mark: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """values (F, K, g, g) → tokens (F, (g/patch)², D) and the local features (F, code_width, g, g).
-
-        `mark` (F, code_width, g, g) says what else is known about the values.
-        """
-        local = self.local(values)
-        local = F.silu(local if mark is None else local + mark)
-        return self.patches(local).flatten(2).transpose(1, 2) + self.position, local
-
-
-class FrameHead(nn.Module):
-    """Transformer tokens back to the code grid: logits of each factor, biased towards staying the same."""
-
-    def __init__(self, factors: int, logits: int, patch: int, code_width: int, width: int) -> None:
-        super().__init__()
-        self.patch = patch
-        self.split = (logits, factors)
-        self.up = nn.Linear(width, patch**2 * code_width)
-        self.mix = nn.Conv2d(2 * code_width, code_width, 3, padding=1)
-        self.out = nn.Conv2d(code_width, logits + factors, 1)
-
-    def forward(self, hidden: Tensor, local: Tensor) -> tuple[Tensor, Tensor]:
-        """hidden (F, (g/patch)², D), local (F, code_width, g, g) → logits (F, V, g, g), gate (F, C, g, g)."""
-        size = local.shape[-1] // self.patch
-        up = F.pixel_shuffle(self.up(hidden).transpose(1, 2).unflatten(2, (size, size)), self.patch)
-        mixed = F.silu(self.mix(torch.cat([up, local], 1)))
-        logits, gate = self.out(mixed).split(self.split, 1)
-        return logits, F.softplus(gate)
+    depth: Tensor
 
 
 class NextFrameNetwork(nn.Module):
@@ -82,13 +46,14 @@ class NextFrameNetwork(nn.Module):
         levels: codes of each factor. quantizer: what they stand for, `fsq` or `lfq`.
         grid: side of a camera's token grid. num_cameras: grids a frame.
         state_size: P, 0 without proprioception. patch: side of the token patches that form one
-        transformer token. conditioning: how blocks take in the condition.
+        transformer token. conditioning: how blocks take in the condition. depth: whether depth is seen and
+        predicted beside the tokens.
     """
 
     def __init__(
         self, *, levels: Sequence[int], grid: int, num_cameras: int, state_size: int, patch: int,
         layers: int, width: int, heads: int, window: int, code_width: int,
-        conditioning: str = "cross_attention", quantizer: str = "fsq",
+        conditioning: str = "cross_attention", quantizer: str = "fsq", depth: bool = False,
     ) -> None:  # fmt: skip
         super().__init__()
         self.codebook = make_codebook(quantizer, levels)
@@ -101,6 +66,12 @@ class NextFrameNetwork(nn.Module):
         self.head = FrameHead(len(levels), sum(levels), patch, code_width, width)
         self.done = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, 1))
         self.state_out = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, state_size))
+        self.depth: NoDepth = NoDepth()
+        if depth:
+            self.depth = DepthBranch(
+                grid=grid, num_cameras=num_cameras, patch=patch, layers=layers, width=width, heads=heads,
+                window=window, code_width=code_width, conditioning=conditioning,
+            )  # fmt: skip
 
     @property
     def transformer_tokens(self) -> int:
@@ -114,17 +85,31 @@ class NextFrameNetwork(nn.Module):
         condition: Tensor,
         mask: Tensor | None = None,
         memory: TemporalMemory | None = None,
+        depth: Tensor | None = None,
     ) -> Prediction:
-        """Teacher-forced pass. digits (B, T, S, C), state (B, T, P), condition (B, T or 1, M, D)."""
+        """Teacher-forced pass. digits (B, T, S, C), state (B, T, P), condition (B, T or 1, M, D), depth
+        (B, T, S) where the network looks at it."""
+        memory = memory or self.transformer.clip_memory(digits.shape[1], digits.device)
         x, local = self.embed(digits, state, pooled(condition, mask))
-        return self._read(self.transformer(x, condition, mask, memory), local, digits, state)
+        fuse, next_depth = self.depth(depth, x[:, :, :1], condition, mask, memory)
+        x = self.transformer(x, condition, mask, memory, fuse)
+        return self._read(x, local, digits, state, next_depth)
 
     def step(
-        self, digits: Tensor, state: Tensor, condition: Tensor, mask: Tensor | None, cache: TemporalCache
-    ) -> Prediction:
+        self, digits: Tensor, state: Tensor, condition: Tensor, mask: Tensor | None, cache: TemporalCache,
+        depth: Tensor | None = None,
+    ) -> Prediction:  # fmt: skip
         """The same for one new frame (T = 1) against the cache."""
-        x, local = self.embed(digits, state, pooled(condition, mask))
-        return self._read(self.transformer.step(x, condition, mask, cache), local, digits, state)
+        prediction: Prediction = self(digits, state, condition, mask, cache.advance(), depth)
+        return prediction
+
+    def make_cache(
+        self, batch: int, device: torch.device, dtype: torch.dtype, grows: bool | None = None
+    ) -> TemporalCache:
+        """An empty ring for `batch` environments, as `SpatialTemporalTransformer.make_cache` has it."""
+        return self.transformer.make_cache(
+            batch, self.transformer_tokens, device, dtype, grows, self.depth.layers
+        )
 
     def grids(self, per_token: Tensor) -> Tensor:
         """(B, T, S, K) → (B·T·N, K, g, g)."""
@@ -148,11 +133,11 @@ class NextFrameNetwork(nn.Module):
         logits, gate = (self._per_token(grids.float(), digits) for grids in self.head(frames, local))
         return logits + gate[..., self.codebook.factor_of_logit] * self.codebook.one_hot(digits)
 
-    def _read(self, x: Tensor, local: Tensor, digits: Tensor, state: Tensor) -> Prediction:
+    def _read(self, x: Tensor, local: Tensor, digits: Tensor, state: Tensor, depth: Tensor) -> Prediction:
         logits, hidden = self.token_logits(x, local, digits), x[:, :, 0].float()
         with compute_in(torch.float32, x.device):
             next_state = state + STATE_STEP * self.state_out(hidden)
-            return Prediction(logits, self.done(hidden).squeeze(-1), next_state, hidden)
+            return Prediction(logits, self.done(hidden).squeeze(-1), next_state, hidden, depth)
 
     def _per_token(self, grids: Tensor, digits: Tensor) -> Tensor:
         """(B·T·N, K, g, g) → (B, T, S, K)."""

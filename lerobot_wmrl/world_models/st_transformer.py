@@ -15,6 +15,14 @@ from lerobot_wmrl.world_models.attention import SelfAttention, attention
 from lerobot_wmrl.world_models.conditioning import ConditionTokens, make_conditioning, pooled
 from lerobot_wmrl.world_models.temporal_memory import ClipMemory, TemporalCache, TemporalMemory
 
+LayerHook = Callable[[int, Tensor], Tensor]
+"""Takes a layer's index and output (B, T, S, D), and returns what the next layer is given."""
+
+
+def unchanged(layer: int, x: Tensor) -> Tensor:
+    """Hands every layer's output on as it is."""
+    return x
+
 
 class SpatialTemporalBlock(nn.Module):
     """Space, time, condition, MLP; each with pre-norm and a skip."""
@@ -43,13 +51,17 @@ class SpatialTemporalBlock(nn.Module):
 
 
 class SpatialTemporalTransformer(nn.Module):
-    """L blocks and a final norm over frames of S tokens of width D, remembering `window` frames."""
+    """L blocks and a final norm over frames of S tokens of width D, remembering `window` frames.
+
+    Its layers are those from `first_layer` on in a memory that it shares with another transformer.
+    """
 
     def __init__(
-        self, layers: int, width: int, heads: int, window: int, conditioning: str = "cross_attention"
-    ) -> None:
+        self, layers: int, width: int, heads: int, window: int, conditioning: str = "cross_attention",
+        first_layer: int = 0,
+    ) -> None:  # fmt: skip
         super().__init__()
-        self.window = window
+        self.window, self.first_layer = window, first_layer
         self.heads = heads
         self.head_width = width // heads
         self.blocks = nn.ModuleList(SpatialTemporalBlock(width, heads, conditioning) for _ in range(layers))
@@ -61,6 +73,7 @@ class SpatialTemporalTransformer(nn.Module):
         condition: Tensor,
         condition_mask: Tensor | None = None,
         memory: TemporalMemory | None = None,
+        after_layer: LayerHook = unchanged,
     ) -> Tensor:
         """x (B, T, S, D) → (B, T, S, D).
 
@@ -69,7 +82,8 @@ class SpatialTemporalTransformer(nn.Module):
         memory = memory or self.clip_memory(x.shape[1], x.device)
         given = ConditionTokens(condition, condition_mask, pooled(condition, condition_mask))
         for layer, block in enumerate(self.blocks):
-            x = block(x, given, partial(memory.attend, layer))
+            attend_time = partial(memory.attend, self.first_layer + layer)
+            x = after_layer(layer, block(x, given, attend_time))
         return self.norm(x)
 
     def step(
@@ -83,12 +97,13 @@ class SpatialTemporalTransformer(nn.Module):
         return ClipMemory(length, self.window, self.head_width, device)
 
     def make_cache(
-        self, batch: int, tokens: int, device: torch.device, dtype: torch.dtype, grows: bool | None = None
-    ) -> TemporalCache:
+        self, batch: int, tokens: int, device: torch.device, dtype: torch.dtype, grows: bool | None = None,
+        layers_beside: int = 0,
+    ) -> TemporalCache:  # fmt: skip
         """An empty ring for `batch` environments of `tokens` tokens a frame.
 
         If it grows, attention skips slots that are still empty; if not, all steps are alike, which a CUDA
-        graph needs. By default it grows on the CPU.
+        graph needs. By default it grows on the CPU. `layers_beside`: those of a transformer that shares it.
         """
-        shape = (len(self.blocks), batch, tokens, self.heads, self.window, self.head_width)
+        shape = (len(self.blocks) + layers_beside, batch, tokens, self.heads, self.window, self.head_width)
         return TemporalCache.empty(shape, device, dtype, device.type == "cpu" if grows is None else grows)

@@ -31,10 +31,10 @@ def banded_causal_mask(length: int, window: int, device: torch.device) -> Tensor
 class DraftMemory:
     """Frames that others do not see: a draft sees what the frame before it saw, and itself.
 
-    past: keys and values (B, S, h, K, d) of each layer; mask broadcastable to (B, S, h, T, K).
+    past: keys and values (B, S, h, K, d) by layer; mask broadcastable to (B, S, h, T, K).
     """
 
-    past: list[tuple[Tensor, Tensor]]
+    past: dict[int, tuple[Tensor, Tensor]]
     mask: Tensor
     rotation: Rotation
 
@@ -50,11 +50,11 @@ class ClipMemory:
         self.positions, self.head_width = torch.arange(length, device=device), head_width
         self.rotation = Rotation.at(self.positions, head_width)
         self.mask = banded_causal_mask(length, window, device)
-        self.past: list[tuple[Tensor, Tensor]] = []
+        self.past: dict[int, tuple[Tensor, Tensor]] = {}
 
     def attend(self, layer: int, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
         query, key = self.rotation(query), self.rotation(key)
-        self.past.append((key, value))
+        self.past[layer] = key, value
         return attention(query, key, value, self.mask)
 
     def drafts(self) -> DraftMemory:
@@ -110,7 +110,7 @@ class TemporalCache:
 
     def drafts(self) -> DraftMemory:
         """For drafts of the frame after the newest one."""
-        past = [self.past(layer) for layer in range(len(self.keys))]
+        past = {layer: self.past(layer) for layer in range(len(self.keys))}
         return DraftMemory(past, self._mask(), Rotation.at(self.position, self.keys.shape[-1]))
 
     def _mask(self) -> Tensor:

@@ -38,6 +38,7 @@ from lerobot_wmrl.world_models.clips import ClipSampler, FrameSampler
 from lerobot_wmrl.world_models.compatibility import check_dataset
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import cosine_schedule
 from lerobot_wmrl.world_models.configuration_world_model import TextWorldModelConfig
+from lerobot_wmrl.world_models.depth_maps import cached_depth
 from lerobot_wmrl.world_models.distributed import mean_over_processes
 from lerobot_wmrl.world_models.episode_table import EpisodeTable, golden_episodes
 from lerobot_wmrl.world_models.frame_cache import cached_frames, cached_tokens
@@ -79,8 +80,9 @@ def make_sampler(
         )
     tokenizer: Any = model.tokenizer
     tokens = cached_tokens(table.dataset, config.camera_keys, tokenizer)
+    depth = cached_depth(table.dataset, config.camera_keys, tokenizer.grid) if config.depth else None
     return ClipSampler(
-        table, tokens, episodes.nonzero()[0], config.clip_length, batch_size, seed, config.device
+        table, tokens, episodes.nonzero()[0], config.clip_length, batch_size, seed, config.device, depth
     )
 
 

@@ -10,7 +10,9 @@ from torch import Tensor
 from lerobot_wmrl.world_models.losses import Clip
 
 
-def clip_from_windows(tokens: Tensor, batch: Mapping[str, Any], camera_key: str, state_size: int) -> Clip:
+def clip_from_windows(
+    tokens: Tensor, batch: Mapping[str, Any], camera_key: str, state_size: int, depth: Tensor | None = None
+) -> Clip:
     """A window ends at its row of the dataset; a clip begins at a frame that has no past.
 
     LeRobot fills a window that would begin before its episode with copies of the first row. They are moved
@@ -22,6 +24,7 @@ def clip_from_windows(tokens: Tensor, batch: Mapping[str, Any], camera_key: str,
         tokens: (B, T, S), of the window's frames.
         batch: action (B, T, A), observation.state (B, T, P), next.done (B,) or (B, 1), task, `*_is_pad`
             (B, T); all but the action may be missing.
+        depth: (B, T, S) metres, of the window's frames.
 
     Raises:
         ValueError: the action is missing or has another length than the frames; NaN or infinity in a number.
@@ -44,7 +47,8 @@ def clip_from_windows(tokens: Tensor, batch: Mapping[str, Any], camera_key: str,
     if isinstance(batch.get(DONE), Tensor):  # LeRobot's processors put False where the dataset has none
         done, known = last * batch[DONE].reshape(rows, 1).float(), last & (before > 0)
     tokens, state, action = (take_rows(values, index) for values in (tokens, state, action))
-    return Clip(tokens, state, action, done, valid, known, list(batch.get("task", [""] * rows)))
+    depth = depth if depth is None else take_rows(depth, index)
+    return Clip(tokens, state, action, done, valid, known, list(batch.get("task", [""] * rows)), depth)
 
 
 def take_rows(values: Tensor, index: Tensor) -> Tensor:

@@ -22,6 +22,7 @@ from lerobot_wmrl.world_models.compatibility import (
 from lerobot_wmrl.world_models.configuration_world_model import WorldModelConfig
 from lerobot_wmrl.world_models.context import Context
 from lerobot_wmrl.world_models.decoding import Condition, FramesSeen, make_decoding
+from lerobot_wmrl.world_models.depth_maps import depth_of_windows
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
 from lerobot_wmrl.world_models.hub_card import HubCard
 from lerobot_wmrl.world_models.imagination import Imagination
@@ -81,7 +82,7 @@ class WorldModelRewardModel(HubCard, Imagination, PreTrainedRewardModel):
             state_size=config.state_size, patch=config.patch, layers=config.layers, width=config.width,
             heads=config.heads, window=config.window, code_width=config.code_width,
             quantizer=config.quantizer,
-            conditioning=config.conditioning,
+            conditioning=config.conditioning, depth=config.depth,
         )  # fmt: skip
         self.decoding = make_decoding(config, self.network.embedding.local.in_channels)
         self._register_statistics("state", OBS_STATE, config.state_size, dataset_stats)
@@ -136,14 +137,17 @@ class WorldModelRewardModel(HubCard, Imagination, PreTrainedRewardModel):
         """Eqs. 2-4 on a clip of tokens, with part of the inputs replaced by the model's own predictions."""
         condition = self.condition(clip)
         digits, state = self.network.codebook.digits(clip.tokens), self.normalize_state(clip.state)
-        seen, seen_state = self.inputs(clip, condition, digits, state)
+        depth = self.network.depth.normalize(clip.depth, clip.tokens)
+        seen, seen_state, seen_depth = self.inputs(clip, condition, digits, state, depth)
         memory = self.network.transformer.clip_memory(digits.shape[1], digits.device)
-        prediction = self.network(seen, seen_state, *condition, memory)
+        prediction = self.network(seen, seen_state, *condition, memory, seen_depth)
         loss, metrics = next_frame_loss(prediction, self.network.codebook, digits, state, clip, self.config)
         weight, _ = token_weights(self.network.codebook, digits, clip, self.config.motion_weight)
         frames = FramesSeen(seen, condition, prediction, memory)
         decoding_loss, decoding_metrics = self.decoding.loss(self.network, frames, digits[:, 1:], weight)
-        loss, metrics = loss + decoding_loss, metrics | decoding_metrics
+        depth_loss, depth_metrics = self.network.depth.loss(prediction.depth, depth, clip.valid)
+        loss = loss + decoding_loss + self.config.depth_weight * depth_loss
+        metrics = metrics | decoding_metrics | depth_metrics
         if self.config.keypoint_weight > 0:
             consistency = keypoint_loss(
                 prediction.logits[:, :-1], self.network.codebook, digits, clip.valid,
@@ -155,9 +159,10 @@ class WorldModelRewardModel(HubCard, Imagination, PreTrainedRewardModel):
 
     @torch.no_grad()
     def inputs(
-        self, clip: Clip, condition: Condition, digits: Tensor, state: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """What the network sees instead of a clip's digits (B, T, S, C) and normalised state (B, T, P).
+        self, clip: Clip, condition: Condition, digits: Tensor, state: Tensor, depth: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """What the network sees instead of a clip's digits (B, T, S, C), normalised state (B, T, P) and
+        normalised depth (B, T, S or 0).
 
         Against drift: noise, one-pass predictions of single frames, and whole rollouts from first frames.
         """
@@ -165,15 +170,16 @@ class WorldModelRewardModel(HubCard, Imagination, PreTrainedRewardModel):
         seen, seen_state = corrupt_digits(digits, codebook, self.config.token_noise), state
         share = forced_share(self.config.self_forcing, progress)
         if share > 0:
-            guess = self.network(seen, seen_state, *condition)
-            seen, seen_state = force_predictions(guess, codebook, seen, seen_state, share)
+            guess = self.network(seen, seen_state, *condition, depth=depth)
+            seen, seen_state, depth = force_predictions(guess, codebook, seen, seen_state, depth, share)
         rows = self_rollout_rows(self.config.self_rollout, progress, len(digits), digits.device)
         if len(rows):
-            rolled, rolled_state = self._roll_out_rows(rows, clip, condition)
+            rolled, rolled_state, rolled_depth = self._roll_out_rows(rows, clip, condition)
             seen, seen_state = seen.index_copy(0, rows, rolled), seen_state.index_copy(0, rows, rolled_state)
-        return seen, seen_state
+            depth = depth.index_copy(0, rows, rolled_depth)
+        return seen, seen_state, depth
 
-    def _roll_out_rows(self, rows: Tensor, clip: Clip, condition: Condition) -> tuple[Tensor, Tensor]:
+    def _roll_out_rows(self, rows: Tensor, clip: Clip, condition: Condition) -> tuple[Tensor, Tensor, Tensor]:
         """Clips `rows` imagined from their first frames: in float32 if they are learnt from in it, so that
         the format does not depend on how many rows a process has; else as imagination chooses."""
         tokens, mask = condition
@@ -181,7 +187,8 @@ class WorldModelRewardModel(HubCard, Imagination, PreTrainedRewardModel):
         exact = computing_dtype(clip.tokens.device) == torch.float32
         dtype = torch.float32 if exact else None
         steps = clip.tokens.shape[1] - 1
-        return self.roll_out(clip.tokens[rows, 0], clip.state[rows, 0], own, steps, dtype)
+        depth = None if clip.depth is None else clip.depth[rows, 0]
+        return self.roll_out(clip.tokens[rows, 0], clip.state[rows, 0], own, steps, dtype, depth)
 
     def forward(self, batch: Clip | dict[str, Any]) -> tuple[Tensor, dict[str, float]]:
         """The loss on a clip, or on LeRobot's batch, of which `clip_from_windows` has the shapes."""
@@ -194,7 +201,14 @@ class WorldModelRewardModel(HubCard, Imagination, PreTrainedRewardModel):
         shape = images.shape[:2]
         context = self._context(batch)[torch.arange(shape[0]).repeat_interleave(shape[1])]
         tokens = self.tokenizer.encode(images.flatten(0, 1), context).unflatten(0, shape)
-        return clip_from_windows(tokens, batch, self.config.camera_keys[0], self.config.state_size)
+        depth = self._depth(batch)
+        return clip_from_windows(tokens, batch, self.config.camera_keys[0], self.config.state_size, depth)
+
+    def _depth(self, batch: dict[str, Any]) -> Tensor | None:
+        """Of the windows' frames, (B, T, S) metres, if the model looks at depth."""
+        if not self.config.depth:
+            return None
+        return depth_of_windows(batch, self.config.camera_keys, self.tokenizer.grid)
 
     def _context(self, batch: dict[str, Any]) -> Context:
         """Of the windows' first frames, since a window does not hold its episode's. B rows, or none."""
@@ -205,4 +219,5 @@ class WorldModelRewardModel(HubCard, Imagination, PreTrainedRewardModel):
     def predict(self, clip: Clip) -> Prediction:
         """Teacher-forced predictions on a clip."""
         digits = self.network.codebook.digits(clip.tokens)
-        return self.network(digits, self.normalize_state(clip.state), *self.condition(clip))
+        depth = self.network.depth.normalize(clip.depth, clip.tokens)
+        return self.network(digits, self.normalize_state(clip.state), *self.condition(clip), depth=depth)

@@ -16,7 +16,11 @@ def clip_and_prediction(valid: torch.Tensor) -> tuple[Clip, Prediction, torch.Te
     flags = torch.ones(2, 5, dtype=torch.bool)
     clip = Clip(tokens, torch.randn(2, 5, 3), torch.zeros(2, 5, 7), torch.zeros(2, 5), valid, flags, ["", ""])
     prediction = Prediction(
-        torch.randn(2, 5, 6, 7), torch.randn(2, 5), torch.randn(2, 5, 3), torch.zeros(2, 5, 8)
+        torch.randn(2, 5, 6, 7),
+        torch.randn(2, 5),
+        torch.randn(2, 5, 3),
+        torch.zeros(2, 5, 8),
+        torch.randn(2, 5, 6),
     )
     return clip, prediction, CODEBOOK.digits(tokens)
 
@@ -49,7 +53,7 @@ def test_perfect_predictions_cost_nothing_and_are_for_the_next_frame():
     clip, prediction, digits = clip_and_prediction(torch.ones(2, 5, dtype=torch.bool))
     logits = torch.roll(CODEBOOK.one_hot(digits), -1, 1) * 100
     state = torch.roll(clip.state, -1, 1)
-    perfect = Prediction(logits, torch.full((2, 5), -50.0), state, prediction.hidden)
+    perfect = Prediction(logits, torch.full((2, 5), -50.0), state, prediction.hidden, prediction.depth)
     loss, metrics = next_frame_loss(perfect, CODEBOOK, digits, clip.state, clip, CONFIG)
     assert loss.item() < 1e-6
     assert metrics["token_accuracy"] == 1
@@ -65,11 +69,13 @@ def test_unknown_outcomes_do_not_train_done():
 
 def test_forcing_replaces_later_frames_only_and_only_by_predictions():
     clip, prediction, digits = clip_and_prediction(torch.ones(2, 5, dtype=torch.bool))
-    seen, state = force_predictions(prediction, CODEBOOK, digits, clip.state, share=1.0)
+    depth = torch.randn(2, 5, 6)
+    seen, state, seen_depth = force_predictions(prediction, CODEBOOK, digits, clip.state, depth, share=1.0)
     assert torch.equal(seen[:, 0], digits[:, 0])
     assert torch.equal(state[:, 0], clip.state[:, 0])
     assert torch.equal(seen[:, 1:], CODEBOOK.sample(prediction.logits[:, :-1], 0.0, None))
     assert torch.equal(state[:, 1:], prediction.proprioception[:, :-1])
+    assert torch.equal(seen_depth, torch.cat([depth[:, :1], prediction.depth[:, :-1]], 1))
 
 
 def test_corruption_moves_a_share_of_the_factors_by_one_level():

@@ -30,7 +30,8 @@ def model_and_clip(name: str, trained_models, dataset, **settings) -> tuple[Worl
 
 def seen_by(model: WorldModelRewardModel, clip: Clip) -> tuple[torch.Tensor, torch.Tensor]:
     digits, state = model.network.codebook.digits(clip.tokens), model.normalize_state(clip.state)
-    return model.inputs(clip, model.condition(clip), digits, state)
+    depth = model.network.depth.normalize(clip.depth, clip.tokens)
+    return model.inputs(clip, model.condition(clip), digits, state, depth)[:2]
 
 
 @pytest.mark.parametrize("name", MODELS)

@@ -96,5 +96,6 @@ class MaskGitDecoding(ShiftedDecoding):
         mark = self.mark(network.grids(torch.cat([known, known * values], -1)))
         state = seen.prediction.proprioception.detach()
         x, local = network.embed(draft, state, pooled(*seen.condition), mark)
-        hidden = network.transformer(x + self.role, *seen.condition, memory)
+        fuse, _ = network.depth(seen.prediction.depth.detach(), x[:, :, :1], *seen.condition, memory)
+        hidden = network.transformer(x + self.role, *seen.condition, memory, fuse)
         return network.token_logits(hidden, local, draft)

@@ -41,10 +41,11 @@ def robustness(
     episodes, device = episodes[:BATCH], model.state_mean.device
     tokens, context = source.starts(episodes, model.tokenizer)
     state, own = source.first_state(episodes, device), source.actions(episodes, HORIZON, device)
+    depth = source.first_depth(model, episodes)
     low, high = source.table.action.min(0), source.table.action.max(0)
     result: dict[str, Any] = {"episodes": len(episodes), "frames": HORIZON}
     for name, actions in extreme_actions(own, low, high).items():
-        imagined = open_loop(model, tokens, state, actions)
+        imagined = open_loop(model, tokens, state, actions, depth)
         called = first_run((imagined.done_probability >= threshold).cpu().numpy(), frames) >= 0
         first, last = (model.tokenizer.decode(t, context) for t in (tokens, imagined.tokens[:, -1]))
         result[name] = {

@@ -57,7 +57,8 @@ def imagine_goals(model: TextWorldModelRewardModel, source: Source, episodes: np
     starts = episodes[:MOST_GOALS]
     tokens, context = source.starts(starts, tokenizer)
     instructions = [table.instructions[episode] for episode in starts]
-    goal = imagine_goal(model, tokens, source.first_state(starts, device), instructions, context)
+    state, depth = source.first_state(starts, device), source.first_depth(model, starts)
+    goal = imagine_goal(model, tokens, state, instructions, context, depth)
     start, finals = tokenizer.decode_with_features(tokens, context), true_finals(tokenizer, source, device)
     nearest, distance = np.full(len(starts), -1), np.full(len(starts), np.nan)
     start_distance = distance

@@ -10,10 +10,12 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lerobot_wmrl.world_models.context import Context
+from lerobot_wmrl.world_models.depth_maps import depth_at
 from lerobot_wmrl.world_models.episode_table import EpisodeTable
 from lerobot_wmrl.world_models.frame_cache import frames_to_tensor
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
+from lerobot_wmrl.world_models.world_model import WorldModelRewardModel
 
 DELTA_PSNR_STEP = 15
 """Imagined frames after which delta-PSNR is measured, as RoboScape does."""
@@ -27,12 +29,14 @@ BATCH = 64
 class OpenLoop(NamedTuple):
     """Imagined frames after each action of B episodes: row t belongs to real frame t + 1.
 
-    tokens (B, T, S); done_probability (B, T); proprioception (B, T, P).
+    tokens (B, T, S); done_probability (B, T); proprioception (B, T, P); depth (B, T, S), metres of each
+    token, (B, T, 0) if the model does not predict it.
     """
 
     tokens: Tensor
     done_probability: Tensor
     proprioception: Tensor
+    depth: Tensor
 
 
 @dataclass(frozen=True)
@@ -63,6 +67,10 @@ class Source:
         """(E, P)"""
         return torch.from_numpy(self.table.state[self.table.start[episodes]]).to(device)
 
+    def first_depth(self, model: WorldModelRewardModel, episodes: np.ndarray) -> Tensor | None:
+        """(E, S) metres, if the model looks at depth."""
+        return depth_at(model, self.table.dataset, self.table.start[episodes])
+
     def actions(self, episodes: np.ndarray, steps: int, device: torch.device) -> Tensor:
         """The first `steps` actions of each episode, its last one repeated when it is over. (E, steps, A)"""
         offset = np.minimum(np.arange(steps), self.table.length[episodes][:, None] - 1)
@@ -75,8 +83,8 @@ class EpisodeReplay:
 
     context: of its first frame, one row; tokens (T, S); done_probability (T,); proprioception (T, P);
     shuffled (S,), the frame at `DELTA_PSNR_STEP` with the actions of another episode, None where there is
-    none; done (T,), real success after each action; depth, metres (T − 1, N, H, W) of the real and of the
-    imagined frames, None unless the model predicts it.
+    none; done (T,), real success after each action; depth, metres (T − 1, N, g, g) on the tokens' grids, of
+    the real and of the imagined frames, None unless the model predicts it.
     """
 
     episode: int
@@ -90,15 +98,20 @@ class EpisodeReplay:
 
 
 @torch.no_grad()
-def open_loop(model: ActionWorldModelRewardModel, tokens: Tensor, state: Tensor, actions: Tensor) -> OpenLoop:
-    """Imagine from tokens (B, S), state (B, P) with actions (B, T, A). The same noise at every call."""
-    imagination = model.start(tokens, state)
+def open_loop(
+    model: ActionWorldModelRewardModel, tokens: Tensor, state: Tensor, actions: Tensor,
+    depth: Tensor | None = None,
+) -> OpenLoop:  # fmt: skip
+    """Imagine from tokens (B, S), state (B, P) and, if the model looks at it, depth (B, S) with actions
+    (B, T, A). The same noise at every call."""
+    imagination = model.start(tokens, state, depth=depth)
     generator = torch.Generator(tokens.device).manual_seed(0)
     steps = [model.step(imagination, action, generator) for action in actions.unbind(1)]
     return OpenLoop(
         torch.stack([step.tokens for step in steps], 1),
         torch.stack([step.done_logit.sigmoid() for step in steps], 1),
         torch.stack([step.proprioception for step in steps], 1),
+        torch.stack([step.depth for step in steps], 1),
     )
 
 
@@ -127,19 +140,32 @@ def _replay_batch(
     device, table = model.state_mean.device, source.table
     longest = min(int(table.length[episodes].max()), LONGEST)
     tokens, context = source.starts(episodes, model.tokenizer)
-    state = source.first_state(episodes, device)
-    own = open_loop(model, tokens, state, source.actions(episodes, longest, device))
+    state, depth = source.first_state(episodes, device), source.first_depth(model, episodes)
+    own = open_loop(model, tokens, state, source.actions(episodes, longest, device), depth)
     comparable = (table.length[episodes] > DELTA_PSNR_STEP) & (episodes != others)
     if comparable.any():
         actions = source.actions(others, DELTA_PSNR_STEP, device)
-        shuffled = open_loop(model, tokens, state, actions).tokens[:, -1]
+        shuffled = open_loop(model, tokens, state, actions, depth).tokens[:, -1]
     for row, episode in enumerate(episodes.tolist()):
         rows = source.rows(episode)
         steps = slice(0, rows.stop - rows.start)
         yield EpisodeReplay(
             episode, context[[row]], own.tokens[row, steps], own.done_probability[row, steps],
             own.proprioception[row, steps], shuffled[row] if comparable[row] else None, table.done[rows],
+            real_and_imagined_depth(model, source, rows, own.depth[row, steps]),
         )  # fmt: skip
+
+
+def real_and_imagined_depth(
+    model: ActionWorldModelRewardModel, source: Source, rows: slice, imagined: Tensor
+) -> tuple[Tensor, Tensor] | None:
+    """Depth of the frames after the first of these rows on the tokens' grids, from metres imagined after each
+    row's action (T, S). → two (T − 1, N, g, g)"""
+    real = depth_at(model, source.table.dataset, rows)
+    if real is None:
+        return None
+    grids = (model.tokenizer.num_cameras, model.tokenizer.grid, model.tokenizer.grid)
+    return real[1:].unflatten(1, grids), imagined[:-1].unflatten(1, grids)
 
 
 def check_finite(table: EpisodeTable, episodes: np.ndarray) -> None:
