@@ -163,3 +163,15 @@ def test_depth_that_is_missing_or_on_another_grid_is_named():
         model.start(clip.tokens[:, 0], clip.state[:, 0])
     with pytest.raises(ValueError, match=r"depth: shape \(3, 12, 8\), .*shape \(3, 12, 32\)"):
         model.loss(clip._replace(depth=clip.depth[..., :8]))
+
+
+@torch.no_grad()
+def test_rollouts_in_training_show_the_depth_that_was_imagined():
+    model, clip = random_model(self_rollout=1.0, self_forcing=0.0), random_clip()
+    depth = model.network.depth.normalize(clip.depth, clip.tokens)
+    digits, state = model.network.codebook.digits(clip.tokens), model.normalize_state(clip.state)
+    _, _, seen = model.inputs(clip, model.condition(clip), digits, state, depth)
+    imagination = model.start(clip.tokens[:, 0], clip.state[:, 0], depth=clip.depth[:, 0])
+    imagined = model.step(imagination, clip.action[:, 0]).depth
+    assert torch.equal(seen[:, 0], depth[:, 0])
+    torch.testing.assert_close(model.network.depth.metres(seen[:, 1]), imagined, atol=1e-4, rtol=0)
