@@ -9,6 +9,7 @@ outputs/gate/check/metrics.json. Flags of the action world model's training may 
 """
 
 import argparse
+import shutil
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import product
@@ -94,6 +95,8 @@ class Experiment:
         return ["lerobot-wmrl-record", *format_flags({**self.simulator(cameras), **flags})]
 
     def clone(self, name: str, demonstrations: range, steps: int) -> list[str]:
+        """From the beginning, since it takes a minute: LeRobot refuses what an interrupted call left."""
+        shutil.rmtree(self.out / f"policy_{name}", ignore_errors=True)
         flags: Flags = {
             "policy.type": "cnn", "policy.push_to_hub": False, "dataset.repo_id": "local/good",
             "dataset.root": self.path("good"), "dataset.episodes": str(list(demonstrations)).replace(" ", ""),
@@ -109,6 +112,7 @@ class Experiment:
         return ["lerobot-wmrl-record", *format_flags({**self.simulator(ALL_CAMERAS), **flags})]
 
     def merge(self, name: str, parts: list[str]) -> list[str]:
+        shutil.rmtree(self.out / name, ignore_errors=True)
         flags: Flags = {
             "new_repo_id": f"local/{name}", "new_root": self.path(name), "operation.type": "merge",
             "operation.repo_ids": str([f"local/{part}" for part in parts]),

@@ -30,6 +30,10 @@ class Imagination:
     def __post_init__(self) -> None:
         self.action = self.model.action_mean.expand(self.batch, -1).clone()
         self.state = self._full_ring()
+        tokenizer = self.model.tokenizer
+        size, cameras = tokenizer.image_size, tokenizer.num_cameras
+        first = torch.zeros(self.batch, cameras, 3, size, size, device=self.device)
+        self.context = tokenizer.context(first)
 
     def _full_ring(self) -> ImaginationState:
         tokens = torch.zeros(
@@ -49,7 +53,7 @@ class Imagination:
 
     def step_and_decode(self) -> Tensor:
         """Its pictures, (B, N, 3, H, W)."""
-        return self.model.decode(self.step()).images
+        return self.model.decode(self.step(), self.context).images
 
     @torch.no_grad()
     def step_without_ring(self) -> Tensor:

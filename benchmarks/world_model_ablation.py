@@ -22,6 +22,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot_wmrl.command import CONFIG_FILE
 from lerobot_wmrl.files import write_json
 from lerobot_wmrl.malloc import keep_freed_memory
+from lerobot_wmrl.maniskill.scenes import scenes_of
 from lerobot_wmrl.presets import Flags, format_flags, preset_flags
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig, train_world_model
 from lerobot_wmrl.statistics import Estimate
@@ -40,6 +41,8 @@ RESULTS: Final = Path(__file__).parents[1] / "docs" / "results" / "world_model_a
 VARIANTS: Final[dict[str, Flags]] = {
     "none": {},
     "keypoints": {"model.keypoint_weight": 1.0},
+    "depth": {"model.depth": True},
+    "both": {"model.depth": True, "model.keypoint_weight": 1.0},
     "self_rollout": {"model.self_rollout": 0.4},
     "no_self_forcing": {"model.self_forcing": 0.0},
     "adaln": {"model.conditioning": "adaln"},
@@ -47,7 +50,7 @@ VARIANTS: Final[dict[str, Flags]] = {
     "no_state": {"model.state_size": 0},
     "maskgit": {"model.decoding": "maskgit"},
 }
-"""Name → what differs from the preset."""
+"""Name → what differs from the preset. Depth needs a dataset recorded with it."""
 
 PSNR_STEPS: Final = (1, 10, 30)
 MEASURES: Final = {
@@ -87,7 +90,8 @@ def measure(given: argparse.Namespace, folder: Path) -> dict[str, Any]:
     model = load_model(folder, "action_world_model", given.device)
     table = read_episodes(open_dataset(given.dataset_root))
     source = Source(table, cached_frames(table.dataset, model.config.camera_keys))
-    evaluation = evaluate(model, source, choose_episodes(table, given.split, given.max_episodes))
+    unseen = {scene.index for scene in scenes_of("ood")}
+    evaluation = evaluate(model, source, choose_episodes(table, given.split, given.max_episodes, unseen))
     estimates = headline(evaluation.accuracy) | done_quality(evaluation.outcomes, threshold=0.5, frames=3)
     estimates |= {f"psnr_{step}": psnr_at(evaluation.accuracy, step) for step in PSNR_STEPS}
     row: dict[str, Any] = {
@@ -153,7 +157,7 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--dataset.root", dest="dataset_root", required=True, help="what to learn from")
     parser.add_argument("--rollouts", help="dataset of real rollouts for the gate; none: no gate")
     parser.add_argument("--tokenizer", help="trained frame tokenizer; by default the preset's is trained")
-    parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=list(VARIANTS))
+    parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=["none", "keypoints"])
     parser.add_argument("--preset", default="cpu", help="sizes of tokenizer and network (default: cpu)")
     parser.add_argument("--steps", type=int, help="of every variant; by default the preset's")
     parser.add_argument("--seed", type=int, default=0)

@@ -50,7 +50,7 @@ def load_starts(
     instructions = [table.instructions[episode] for episode in episodes]
     device = model.state_mean.device
     images = frames_to_tensor(cached_frames(table.dataset, model.config.camera_keys)[rows]).to(device)
-    state = torch.from_numpy(table.state[rows][:, : model.config.state_size]).to(device)
+    state = torch.from_numpy(table.state[rows]).to(device)
     context, depth = model.tokenizer.context(images), depth_at(model, table.dataset, rows)
     tokens = model.tokenizer.encode(images, context)
     goals = [
@@ -69,5 +69,13 @@ def load_starts(
     closeness = similarity(decoded.features, goal_features, len(tokens))
     reached = torch.cat([goal.reached for goal in goals])
     return Starts(
-        tokens, decoded.images, context, state, depth, instructions, goal_features, closeness, reached
+        tokens,
+        decoded.images,
+        context,
+        state[:, : model.config.state_size],
+        depth,
+        instructions,
+        goal_features,
+        closeness,
+        reached,
     )

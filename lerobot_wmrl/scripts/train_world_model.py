@@ -69,6 +69,12 @@ def check_config(cfg: TrainWorldModelConfig) -> None:
         raise ValueError("--model.push_to_hub=true: give its name on the hub, --model.repo_id=user/name")
 
 
+def check_processes(cfg: TrainWorldModelConfig, processes: int) -> None:
+    """ValueError for what cannot be shared: LFQ's entropy is of the whole batch, and the library's is not."""
+    if processes > 1 and isinstance(cfg.model, FrameTokenizerConfig) and cfg.model.quantizer == "lfq":
+        raise ValueError("--model.quantizer=lfq: trains in one process only; leave torchrun out, or take fsq")
+
+
 def publish(model: Any, cfg: TrainWorldModelConfig) -> None:
     """Upload the trained model if `--model.push_to_hub=true`."""
     if cfg.model.push_to_hub and PartialState().is_main_process:
@@ -87,6 +93,7 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
 
     check_config(cfg)
     processes = PartialState(cpu=cfg.model.device == "cpu")
+    check_processes(cfg, processes.num_processes)
     table = read_episodes(open_dataset(cfg.dataset.root, cfg.dataset.repo_id))
     given = draccus.encode(cfg)
     checkpoint = latest_checkpoint(cfg.output_dir)
@@ -104,8 +111,8 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
         dtype = training_dtype(cfg.precision, cfg.model.device)
         used = replace(cfg, precision=str(dtype).removeprefix("torch."))
         train(model, sampler, used, used.save_pretrained)
-        if isinstance(cfg.model, FrameTokenizerConfig) and processes.is_main_process:
-            write_reconstruction(model, table, cfg.output_dir)
+    if isinstance(cfg.model, FrameTokenizerConfig) and processes.is_main_process:
+        write_reconstruction(model, table, cfg.output_dir)
     publish(model, cfg)
 
 

@@ -7,9 +7,11 @@ FSQ (Mentzer et al. 2023, eq. 1) rounds every factor to its levels: no auxiliary
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
+import torch
 from torch import Tensor, nn
 from vector_quantize_pytorch import FSQ, LFQ
 
+from lerobot_wmrl.precision import compute_in
 from lerobot_wmrl.world_models.codebook import BinaryCodeBook, make_codebook
 
 ENTROPY_WEIGHT: Final = 0.1
@@ -59,7 +61,8 @@ class LookupFreeQuantizer(nn.Module):
 
     def forward(self, vectors: Tensor) -> Quantized:
         """Vectors (F, K, g, g) → their codes and tokens; in training also the loss (eqs. 4, 5) in nats."""
-        (codes, digits, loss), parts = self.lfq(vectors, return_loss_breakdown=True)
+        with compute_in(torch.float32, vectors.device):
+            (codes, digits, loss), parts = self.lfq(vectors.float(), return_loss_breakdown=True)
         metrics = {
             "quantizer_loss": loss.item(),
             "token_entropy": parts.per_sample_entropy.item(),

@@ -94,7 +94,9 @@ def psnr(error: Tensor) -> Tensor:
 
 
 def write_reconstruction(model: Any, table: EpisodeTable, output_dir: Path) -> None:
-    """Measure the held-out episodes (all of them, if none is held out) and write `reconstruction.json`."""
+    """Write `reconstruction.json` unless it is there: of held-out episodes, or of all if none is held out."""
+    if (output_dir / RECONSTRUCTION_FILE).is_file():
+        return
     split = "validation" if table.validation.any() else "all"
     episodes = choose_episodes(table, split, MAX_FRAMES)
     frames = cached_frames(table.dataset, model.config.camera_keys)

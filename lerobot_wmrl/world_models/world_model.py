@@ -84,6 +84,7 @@ class WorldModelRewardModel(HubCard, Imagination, PreTrainedRewardModel):
             quantizer=config.quantizer,
             conditioning=config.conditioning, depth=config.depth,
         )  # fmt: skip
+        self.tokenizer.eval()
         self.decoding = make_decoding(config, self.network.embedding.local.in_channels)
         self._register_statistics("state", OBS_STATE, config.state_size, dataset_stats)
 
@@ -139,6 +140,7 @@ class WorldModelRewardModel(HubCard, Imagination, PreTrainedRewardModel):
         digits, state = self.network.codebook.digits(clip.tokens), self.normalize_state(clip.state)
         depth = self.network.depth.normalize(clip.depth, clip.tokens)
         seen, seen_state, seen_depth = self.inputs(clip, condition, digits, state, depth)
+        torch.clear_autocast_cache()  # older torch keeps the casts made without gradients
         memory = self.network.transformer.clip_memory(digits.shape[1], digits.device)
         prediction = self.network(seen, seen_state, *condition, memory, seen_depth)
         loss, metrics = next_frame_loss(prediction, self.network.codebook, digits, state, clip, self.config)

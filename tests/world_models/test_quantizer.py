@@ -109,3 +109,12 @@ def test_a_world_model_takes_its_quantizer_from_the_tokenizer(small_dataset, tmp
     assert imagined.tokens.shape == tokens.shape
     assert imagined.tokens.max() < 16**3
     assert model.tokenizer.decode(imagined.tokens).shape == images.shape
+
+
+def test_lfq_is_measured_in_float32_whatever_the_network_computes_in():
+    torch.manual_seed(0)
+    quantizer, vectors = LookupFreeQuantizer([16, 16]), torch.randn(4, 8, 4, 4)
+    plain = quantizer(vectors)
+    with torch.autocast("cpu", torch.bfloat16):
+        mixed = quantizer(vectors)
+    assert mixed.metrics == plain.metrics

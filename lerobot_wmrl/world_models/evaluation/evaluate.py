@@ -4,6 +4,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lerobot_wmrl.constants import KINDS, PLAY
+from lerobot_wmrl.world_models.context import NO_CONTEXT
 from lerobot_wmrl.world_models.evaluation.accuracy import EpisodeAccuracy, measure
 from lerobot_wmrl.world_models.evaluation.alexnet_lpips import cached_lpips
 from lerobot_wmrl.world_models.evaluation.gate import Outcomes
@@ -33,7 +35,8 @@ def evaluate(model: ActionWorldModelRewardModel, source: Source, episodes: np.nd
     shown: dict[str, EpisodeReplay] = {}
     for run in replay_episodes(model, source, episodes):
         accuracy.append(measure(model, source, run, lpips))
-        runs.append(replace(run, tokens=run.tokens[:0]))
-        shown.setdefault("success" if run.done.any() else "failure", run)
+        runs.append(replace(run, tokens=run.tokens.new_empty(0), context=NO_CONTEXT))
+        if source.table.kind[run.episode] != KINDS.index(PLAY) and len(run.done) > 1:
+            shown.setdefault("success" if run.done.any() else "failure", run)
     accuracy.sort(key=lambda episode: episode.episode)
     return Evaluation(accuracy, Outcomes.of(runs).attempts(source.table), shown)
