@@ -16,6 +16,7 @@ from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.envs.start_frames import Starts, load_starts
 from lerobot_wmrl.rewards.general import consecutive_count, sparse_reward
 from lerobot_wmrl.world_models.checkpoint import load_model
+from lerobot_wmrl.world_models.compatibility import check_same_tokenizer
 from lerobot_wmrl.world_models.goal import similarity
 from lerobot_wmrl.world_models.imagination import Imagined
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
@@ -167,12 +168,6 @@ def make_world_model_env(config: WorldModelEnv, n_envs: int, device: str | None)
             f"action components; the action box has {len(ACTION_LOW)}, so record with lerobot-wmrl-record"
         )
     text_model = load_model(config.text_world_model_path, "text_world_model", device)
-    own, other = model.tokenizer.state_dict(), text_model.tokenizer.state_dict()
-    same = own.keys() == other.keys() and all(torch.equal(own[name], other[name]) for name in own)
-    if not same:
-        raise ValueError(
-            f"--env.text_world_model_path={config.text_world_model_path}: trained on another tokenizer than "
-            f"{config.world_model_path}; train both with the same --model.tokenizer_path"
-        )
+    check_same_tokenizer(model, text_model, f"--env.text_world_model_path={config.text_world_model_path}")
     starts = load_starts(config.dataset, model, text_model)
     return WorldModelVectorEnv(model, starts, make_reward_model(config.reward), config, n_envs)

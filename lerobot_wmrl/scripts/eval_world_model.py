@@ -118,10 +118,12 @@ def report_text_model(
     """Goal frames, and the reward along the shown episodes."""
     from lerobot_wmrl.rewards.curves import reward_along_episode
     from lerobot_wmrl.world_models.checkpoint import load_model
+    from lerobot_wmrl.world_models.compatibility import check_same_tokenizer
     from lerobot_wmrl.world_models.evaluation.pictures import save_reward_curves
     from lerobot_wmrl.world_models.evaluation.report import report_goals
 
     text_model = load_model(cfg.text_model.path, "text_world_model", cfg.device)
+    check_same_tokenizer(model, text_model, f"--text_model.path={cfg.text_model.path}")
     curves = {
         name: reward_along_episode(
             model, text_model, cfg.reward, source.table, source.frames, run.episode,

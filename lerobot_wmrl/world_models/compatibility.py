@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
+import torch
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
 
@@ -83,4 +84,14 @@ def check_episode_lengths(meta: Any) -> None:
         raise ValueError(
             f"dataset.root={meta.root}: {meta.total_episodes} episodes of {meta.total_frames} frames in all; "
             "a world model learns from episodes of two frames or more: record longer ones"
+        )
+
+
+def check_same_tokenizer(model: Any, text_model: Any, flag: str) -> None:
+    """ValueError unless both world models, the second given by `flag`, speak of frames in the same tokens."""
+    own, other = model.tokenizer.state_dict(), text_model.tokenizer.state_dict()
+    if own.keys() != other.keys() or not all(torch.equal(own[name], other[name]) for name in own):
+        raise ValueError(
+            f"{flag}: trained on another tokenizer than the action world model; train both with the same "
+            "--model.tokenizer_path"
         )
