@@ -23,6 +23,12 @@ LARGEST_BINARY_FACTOR: Final = 2**12
 """LFQ's entropy term holds a probability for every code of a factor at every token of the batch."""
 
 
+def gumbel(like: Tensor, generator: torch.Generator | None) -> Tensor:
+    """Standard Gumbel noise of that shape."""
+    uniform = torch.rand(like.shape, device=like.device, generator=generator).clamp_min(1e-9)
+    return -(-uniform.log()).log()
+
+
 class CodeBook(nn.Module):
     """Finite scalar quantisation: a factor is one value in [−1, 1], its digit the index of its level.
 
@@ -109,8 +115,7 @@ class CodeBook(nn.Module):
     def sample(self, logits: Tensor, temperature: float, generator: torch.Generator | None) -> Tensor:
         """Gumbel-argmax at a temperature on the logits (0: the most likely code). (…, V) → digits (…, C)."""
         if temperature > 0:
-            uniform = torch.rand(logits.shape, device=logits.device, generator=generator).clamp_min(1e-9)
-            logits = logits / temperature - (-uniform.log()).log()
+            logits = logits / temperature + gumbel(logits, generator)
         return torch.stack([part.argmax(-1) for part in logits.split(self.level_counts, -1)], -1)
 
 

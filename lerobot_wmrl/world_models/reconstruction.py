@@ -12,8 +12,8 @@ from tqdm import trange
 from lerobot_wmrl.files import write_json
 from lerobot_wmrl.world_models.codebook import CodeBook, make_codebook
 from lerobot_wmrl.world_models.episode_table import EpisodeTable, choose_episodes
+from lerobot_wmrl.world_models.evaluation.image_metrics import motion_mask, psnr_from_mse
 from lerobot_wmrl.world_models.frame_cache import cached_frames, frames_to_tensor
-from lerobot_wmrl.world_models.frame_tokenizer import MOTION_THRESHOLD
 
 RECONSTRUCTION_FILE = "reconstruction.json"
 MAX_FRAMES = 2000
@@ -49,7 +49,10 @@ def reconstruction_metrics(
     rows, starts = _rows(table, episodes, max_frames)
     measured = reconstruct(model, frames, rows, starts)
     colors = measured.moving_colors.sum(0)
-    whole, moving = psnr(measured.error).mean(0), psnr(measured.moving_error.sum(0) / colors)
+    whole, moving = (
+        psnr_from_mse(measured.error).mean(0),
+        psnr_from_mse(measured.moving_error.sum(0) / colors),
+    )
     cameras = list(enumerate(model.config.cameras))
     return {
         "frames": len(rows),
@@ -69,7 +72,7 @@ def reconstruct(model: Any, frames: np.ndarray, rows: np.ndarray, starts: np.nda
         context = model.tokenizer.context(start)
         tokens = model.tokenizer.encode(real, context)
         error = (model.tokenizer.decode(tokens, context) - real).square()
-        moved = ((real - start).abs().amax(2, keepdim=True) > MOTION_THRESHOLD).expand_as(error)
+        moved = motion_mask(real, start)[:, :, None].expand_as(error)
         sums = (error * moved).sum((2, 3, 4)), moved.sum((2, 3, 4))
         parts.append((tokens, error.mean((2, 3, 4)), *sums))
     return Reconstruction(*(torch.cat(column).cpu() for column in zip(*parts, strict=True)))
@@ -86,11 +89,6 @@ def code_use(codebook: CodeBook, tokens: Tensor) -> dict[str, Any]:
         "codes": _use(tokens.flatten(), int(np.prod(sizes))),
         "code_factors": [_use(digits, size) for digits, size in zip(factors, sizes, strict=True)],
     }
-
-
-def psnr(error: Tensor) -> Tensor:
-    """Mean squared error of colours in [0, 1] → dB, at most 100."""
-    return -10 * error.clamp_min(1e-10).log10()
 
 
 def write_reconstruction(model: Any, table: EpisodeTable, output_dir: Path) -> None:

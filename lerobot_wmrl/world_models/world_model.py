@@ -201,7 +201,7 @@ class WorldModelRewardModel(HubCard, Imagination, PreTrainedRewardModel):
         """Tokenise a batch of LeRobot's windows."""
         images = stack_cameras(batch, self.config.camera_keys, self.config.image_size)
         shape = images.shape[:2]
-        context = self._context(batch)[torch.arange(shape[0]).repeat_interleave(shape[1])]
+        context = self.tokenizer.context(images[:, 0])[torch.arange(shape[0]).repeat_interleave(shape[1])]
         tokens = self.tokenizer.encode(images.flatten(0, 1), context).unflatten(0, shape)
         depth = self._depth(batch)
         return clip_from_windows(tokens, batch, self.config.camera_keys[0], self.config.state_size, depth)

@@ -11,9 +11,10 @@ from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.codebook import BinaryCodeBook, CodeBook
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
 from lerobot_wmrl.world_models.episode_table import read_episodes
+from lerobot_wmrl.world_models.evaluation.image_metrics import psnr_from_mse
 from lerobot_wmrl.world_models.frame_cache import cached_frames, frames_to_tensor
 from lerobot_wmrl.world_models.frame_tokenizer import MOTION_THRESHOLD
-from lerobot_wmrl.world_models.reconstruction import code_use, psnr, reconstruction_metrics
+from lerobot_wmrl.world_models.reconstruction import code_use, reconstruction_metrics
 from tests.trained import run_training
 
 CAMERAS = ("third_view", "wrist")
@@ -43,10 +44,10 @@ def test_psnr_is_that_of_each_camera_and_of_its_moved_pixels(dataset, output_dir
     rows = slice(table.start[4], table.start[4] + table.length[4])
     real = frames_to_tensor(frames[rows])
     error = (model.tokenizer.decode(model.tokenizer.encode(real)) - real) ** 2
-    expected = psnr(error.mean((2, 3, 4))).mean(0).tolist()
+    expected = psnr_from_mse(error.mean((2, 3, 4))).mean(0).tolist()
     assert list(metrics["psnr"].values()) == pytest.approx(expected, abs=1e-2)
     moved = (real - real[:1])[:, 0].abs().amax(1) > MOTION_THRESHOLD
-    moving = psnr(error[:, 0].permute(0, 2, 3, 1)[moved].mean()).item()
+    moving = psnr_from_mse(error[:, 0].permute(0, 2, 3, 1)[moved].mean()).item()
     assert metrics["moving_psnr"] == {"third_view": pytest.approx(moving, abs=1e-2), "wrist": None}
     assert metrics["frames"] == table.length[4]
 

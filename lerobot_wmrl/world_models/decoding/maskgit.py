@@ -12,6 +12,7 @@ from typing import Any, Final
 import torch
 from torch import Tensor, nn
 
+from lerobot_wmrl.world_models.codebook import gumbel
 from lerobot_wmrl.world_models.conditioning import pooled
 from lerobot_wmrl.world_models.decoding.shifted import FramesSeen, ShiftedDecoding
 from lerobot_wmrl.world_models.distributed import draw_own_rows, masked_mean
@@ -28,12 +29,6 @@ def fixed_counts(tokens: int, passes: int) -> Sequence[int]:
     return [
         tokens - math.floor(tokens * math.cos(math.pi / 2 * done / passes)) for done in range(1, passes + 1)
     ]
-
-
-def gumbel(like: Tensor, generator: torch.Generator | None) -> Tensor:
-    """Standard Gumbel noise of that shape."""
-    uniform = torch.rand(like.shape, device=like.device, generator=generator).clamp_min(1e-9)
-    return -(-uniform.log()).log()
 
 
 def largest(confidence: Tensor, fixed: Tensor, count: int) -> Tensor:
