@@ -54,7 +54,7 @@ def cached_tokens(
     """
     frames = cached_frames(dataset, camera_keys)
     weights = hashlib.sha256(b"".join(p.detach().cpu().numpy().tobytes() for p in tokenizer.parameters()))
-    key = digest([weights.hexdigest(), *file_stamps(dataset)])
+    key = digest([weights.hexdigest(), *camera_keys, *file_stamps(dataset)])
     device = next(tokenizer.parameters()).device
     episodes = dataset.meta.episodes
     starts = np.repeat(np.asarray(episodes["dataset_from_index"]), np.asarray(episodes["length"]))

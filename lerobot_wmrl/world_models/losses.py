@@ -79,28 +79,34 @@ def force_predictions(
     )
 
 
-def token_weights(
-    codebook: CodeBook, digits: Tensor, clip: Clip, motion_weight: float
-) -> tuple[Tensor, Tensor]:
-    """What each token of frames 1 … T − 1 counts, and which move. digits (B, T, S, C) → two (B, T − 1, S).
+class TokenWeights(NamedTuple):
+    """Of the tokens of frames 1 … T − 1, (B, T − 1, S): what each counts, 0 for padding, and which move."""
+
+    weight: Tensor
+    moved: Tensor
+
+
+def token_weights(codebook: CodeBook, digits: Tensor, clip: Clip, motion_weight: float) -> TokenWeights:
+    """What the tokens with digits (B, T, S, C) count.
 
     Tokens that move count `motion_weight` times more: most of a frame is still, and what moves decides.
     """
     moved = codebook.distance(digits[:, 1:], digits[:, :-1]) >= MOTION_LEVELS
     known = (clip.valid[:, 1:] & clip.valid[:, :-1])[..., None]
-    return (1 + motion_weight * moved) * known.float(), moved
+    return TokenWeights((1 + motion_weight * moved) * known.float(), moved)
 
 
 def next_frame_loss(
-    prediction: Prediction, codebook: CodeBook, digits: Tensor, state: Tensor, clip: Clip, config: Any
-) -> tuple[Tensor, dict[str, float]]:
+    prediction: Prediction, codebook: CodeBook, digits: Tensor, state: Tensor, clip: Clip,
+    weights: TokenWeights, config: Any,
+) -> tuple[Tensor, dict[str, float]]:  # fmt: skip
     """Cross-entropy of the next tokens (eq. 2), done (eqs. 3, 4 with BCE) and the next state.
 
-    Computed in float32, whatever the network computes in.
+    Computed in float32, whatever the network computes in. `weights`: of the tokens, from `token_weights`.
     """
     prediction = Prediction(*(output.float() for output in prediction))
     target, known = digits[:, 1:], (clip.valid[:, 1:] & clip.valid[:, :-1])[..., None]
-    weight, moved = token_weights(codebook, digits, clip, config.motion_weight)
+    weight, moved = weights
     logits = prediction.logits[:, :-1]
     token_loss = masked_mean(codebook.cross_entropy(logits, target), weight)
     state_error = (prediction.proprioception[:, :-1] - state[:, 1:]) / STATE_STEP

@@ -143,10 +143,14 @@ class WorldModelRewardModel(HubCard, Imagination, PreTrainedRewardModel):
         torch.clear_autocast_cache()  # older torch keeps the casts made without gradients
         memory = self.network.transformer.clip_memory(digits.shape[1], digits.device)
         prediction = self.network(seen, seen_state, *condition, memory, seen_depth)
-        loss, metrics = next_frame_loss(prediction, self.network.codebook, digits, state, clip, self.config)
-        weight, _ = token_weights(self.network.codebook, digits, clip, self.config.motion_weight)
+        weights = token_weights(self.network.codebook, digits, clip, self.config.motion_weight)
+        loss, metrics = next_frame_loss(
+            prediction, self.network.codebook, digits, state, clip, weights, self.config
+        )
         frames = FramesSeen(seen, condition, prediction, memory)
-        decoding_loss, decoding_metrics = self.decoding.loss(self.network, frames, digits[:, 1:], weight)
+        decoding_loss, decoding_metrics = self.decoding.loss(
+            self.network, frames, digits[:, 1:], weights.weight
+        )
         depth_loss, depth_metrics = self.network.depth.loss(prediction.depth, depth, clip.valid)
         loss = loss + decoding_loss + self.config.depth_weight * depth_loss
         metrics = metrics | decoding_metrics | depth_metrics

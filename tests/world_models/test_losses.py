@@ -3,7 +3,13 @@ from types import SimpleNamespace
 import torch
 
 from lerobot_wmrl.world_models.codebook import CodeBook
-from lerobot_wmrl.world_models.losses import Clip, corrupt_digits, force_predictions, next_frame_loss
+from lerobot_wmrl.world_models.losses import (
+    Clip,
+    corrupt_digits,
+    force_predictions,
+    next_frame_loss,
+    token_weights,
+)
 from lerobot_wmrl.world_models.next_frame import Prediction
 
 CONFIG = SimpleNamespace(motion_weight=3.0, done_weight=1.0, done_positive_weight=2.0, state_weight=1.0)
@@ -25,16 +31,23 @@ def clip_and_prediction(valid: torch.Tensor) -> tuple[Clip, Prediction, torch.Te
     return clip, prediction, CODEBOOK.digits(tokens)
 
 
+def loss_of(
+    prediction: Prediction, digits: torch.Tensor, clip: Clip
+) -> tuple[torch.Tensor, dict[str, float]]:
+    weights = token_weights(CODEBOOK, digits, clip, CONFIG.motion_weight)
+    return next_frame_loss(prediction, CODEBOOK, digits, clip.state, clip, weights, CONFIG)
+
+
 def test_padding_does_not_count():
     valid = torch.tensor([[True] * 5, [True] * 3 + [False] * 2])
     clip, prediction, digits = clip_and_prediction(valid)
-    loss, _ = next_frame_loss(prediction, CODEBOOK, digits, clip.state, clip, CONFIG)
+    loss, _ = loss_of(prediction, digits, clip)
     for tensor in prediction[:3]:
         tensor[1, 3:] += 100
     prediction.logits[1, 2] += torch.randn(6, 7)
     prediction.proprioception[1, 2] += 5
     digits[1, 3:] = 0
-    again, _ = next_frame_loss(prediction, CODEBOOK, digits, clip.state, clip, CONFIG)
+    again, _ = loss_of(prediction, digits, clip)
     torch.testing.assert_close(loss, again)
 
 
@@ -42,10 +55,10 @@ def test_no_transition_is_learnt_out_of_padding_before_an_episode():
     """LeRobot pads a window that begins before its episode by repeating the first frame."""
     valid = torch.tensor([[False, False, True, True, True], [True] * 5])
     clip, prediction, digits = clip_and_prediction(valid)
-    loss, _ = next_frame_loss(prediction, CODEBOOK, digits, clip.state, clip, CONFIG)
+    loss, _ = loss_of(prediction, digits, clip)
     for tensor in (prediction.logits, prediction.proprioception):
         tensor[0, 1] += torch.randn_like(tensor[0, 1])
-    again, _ = next_frame_loss(prediction, CODEBOOK, digits, clip.state, clip, CONFIG)
+    again, _ = loss_of(prediction, digits, clip)
     torch.testing.assert_close(loss, again)
 
 
@@ -54,7 +67,7 @@ def test_perfect_predictions_cost_nothing_and_are_for_the_next_frame():
     logits = torch.roll(CODEBOOK.one_hot(digits), -1, 1) * 100
     state = torch.roll(clip.state, -1, 1)
     perfect = Prediction(logits, torch.full((2, 5), -50.0), state, prediction.hidden, prediction.depth)
-    loss, metrics = next_frame_loss(perfect, CODEBOOK, digits, clip.state, clip, CONFIG)
+    loss, metrics = loss_of(perfect, digits, clip)
     assert loss.item() < 1e-6
     assert metrics["token_accuracy"] == 1
     assert metrics["moving_token_accuracy"] == 1
@@ -63,7 +76,7 @@ def test_perfect_predictions_cost_nothing_and_are_for_the_next_frame():
 def test_unknown_outcomes_do_not_train_done():
     clip, prediction, digits = clip_and_prediction(torch.ones(2, 5, dtype=torch.bool))
     clip = clip._replace(done_known=torch.zeros(2, 5, dtype=torch.bool))
-    _, metrics = next_frame_loss(prediction, CODEBOOK, digits, clip.state, clip, CONFIG)
+    _, metrics = loss_of(prediction, digits, clip)
     assert metrics["done_loss"] == 0
 
 

@@ -10,7 +10,7 @@ from lerobot.rewards.factory import make_reward_model
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.clips import ClipSampler
 from lerobot_wmrl.world_models.episode_table import read_episodes
-from lerobot_wmrl.world_models.losses import SELF_ROLLOUT_FROM, Clip, next_frame_loss
+from lerobot_wmrl.world_models.losses import SELF_ROLLOUT_FROM, Clip, next_frame_loss, token_weights
 from lerobot_wmrl.world_models.world_model import WorldModelRewardModel
 from tests.trained import action_config
 
@@ -57,7 +57,9 @@ def test_the_real_frames_are_still_what_is_to_be_predicted(name, trained_models,
     loss, _ = model.loss(clip)
     real, state = model.network.codebook.digits(clip.tokens), model.normalize_state(clip.state)
     prediction = model.network(*seen_by(model, clip), *model.condition(clip))
-    expected, _ = next_frame_loss(prediction, model.network.codebook, real, state, clip, model.config)
+    codebook = model.network.codebook
+    weights = token_weights(codebook, real, clip, model.config.motion_weight)
+    expected, _ = next_frame_loss(prediction, codebook, real, state, clip, weights, model.config)
     torch.testing.assert_close(loss, expected)
 
 

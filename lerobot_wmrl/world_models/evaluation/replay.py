@@ -121,9 +121,7 @@ def replay_episodes(
     """Replay the episodes, short ones first, one batch of imagined tokens in memory at a time.
 
     `shuffled`: each is also imagined with the actions of the one before it in `episodes`, for delta-PSNR.
-    ValueError if an action or state is not finite.
     """
-    check_finite(source.table, episodes)
     by_length = np.argsort(source.table.length[episodes], kind="stable")
     others = np.roll(episodes, 1) if shuffled else episodes
     with tqdm(total=len(episodes), desc="Replaying episodes", unit="episode") as bar:
@@ -166,16 +164,3 @@ def real_and_imagined_depth(
         return None
     grids = (model.tokenizer.num_cameras, model.tokenizer.grid, model.tokenizer.grid)
     return real[1:].unflatten(1, grids), imagined[:-1].unflatten(1, grids)
-
-
-def check_finite(table: EpisodeTable, episodes: np.ndarray) -> None:
-    """ValueError names the first episode with an action or state that is NaN or infinite."""
-    for episode in episodes:
-        rows = slice(table.start[episode], table.start[episode] + table.length[episode])
-        for name, column in (("action", table.action), ("observation.state", table.state)):
-            broken = ~np.isfinite(column[rows]).all(-1)
-            if broken.any():
-                raise ValueError(
-                    f"dataset.root={table.dataset.root}: episode {episode}, frame {broken.argmax()}: {name} "
-                    "is not a finite number; delete that episode (lerobot-edit-dataset) or record it again"
-                )

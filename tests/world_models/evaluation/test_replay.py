@@ -136,14 +136,6 @@ def test_play_is_no_attempt(source, model):
     assert Outcomes.of(runs).attempts(replace(source.table, kind=kind)).episodes.tolist() == [2, 3, 4, 5]
 
 
-def test_numbers_that_are_none_are_named(source, model):
-    action = source.table.action.copy()
-    action[source.table.start[1] + 3, 2] = np.nan
-    broken = Source(replace(source.table, action=action), source.frames)
-    with pytest.raises(ValueError, match=r"episode 1, frame 3: action is not a finite number"):
-        evaluate(model, broken, np.arange(6))
-
-
 def test_episodes_of_one_frame_are_named(source, model):
     table = replace(source.table, length=np.ones(6, int))
     with pytest.raises(ValueError, match="every chosen episode has a single frame"):
