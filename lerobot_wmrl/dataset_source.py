@@ -9,3 +9,15 @@ class DatasetSource:
 
     root: str = ""
     repo_id: str | None = None
+
+
+@dataclass
+class TrainingData(DatasetSource):
+    """A dataset to learn from.
+
+    Args:
+        episodes: indices of those to learn from, as in lerobot-train; by default all. Those that are held
+            out stay held out.
+    """
+
+    episodes: list[int] | None = None

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from lerobot_wmrl.dataset_source import DatasetSource
+from lerobot_wmrl.dataset_source import TrainingData
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig, train_world_model
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig, TextWorldModelConfig
@@ -23,7 +23,7 @@ def run_training(config: Any, root: Path, output_dir: Path, steps: int = 3, **se
     options = {"batch_size": 2, "save_freq": 1, "log_freq": 1, "precision": "float32", **settings}
     train_world_model(
         TrainWorldModelConfig(
-            model=config, dataset=DatasetSource(str(root)), output_dir=output_dir, steps=steps, **options
+            model=config, dataset=TrainingData(str(root)), output_dir=output_dir, steps=steps, **options
         )
     )
     return output_dir

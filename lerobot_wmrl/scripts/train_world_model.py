@@ -18,7 +18,7 @@ from accelerate import PartialState
 from lerobot.configs.rewards import RewardModelConfig
 
 from lerobot_wmrl.command import RunConfig, claim_output_dir, require_free, run_command
-from lerobot_wmrl.dataset_source import DatasetSource
+from lerobot_wmrl.dataset_source import TrainingData
 from lerobot_wmrl.malloc import keep_freed_memory
 from lerobot_wmrl.precision import PRECISIONS, training_dtype
 from lerobot_wmrl.presets import expand_preset
@@ -35,7 +35,7 @@ class TrainWorldModelConfig(RunConfig):
 
     Args:
         model: `--model.type=frame_tokenizer|action_world_model|text_world_model` and its settings.
-        dataset: the LeRobotDataset to learn from.
+        dataset: the LeRobotDataset to learn from, or some of its episodes.
         output_dir: where checkpoints and metrics go; continues if it holds this run already.
         steps, batch_size: optimiser steps, and frames (tokenizer) or clips (world models) a step.
             Under `torchrun --nproc_per_node=N` every process has `batch_size` of them.
@@ -46,7 +46,7 @@ class TrainWorldModelConfig(RunConfig):
     """
 
     model: RewardModelConfig = field(default_factory=FrameTokenizerConfig)
-    dataset: DatasetSource = field(default_factory=DatasetSource)
+    dataset: TrainingData = field(default_factory=TrainingData)
     output_dir: Path = Path("outputs/world_model")
     steps: int = 20_000
     batch_size: int = 8
@@ -105,7 +105,7 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
         print(f"{cfg.output_dir}: already trained for {cfg.steps} steps")
     else:
         with processes.main_process_first():
-            sampler = make_sampler(model, table, cfg.batch_size, cfg.seed)
+            sampler = make_sampler(model, table, cfg.dataset.episodes, cfg.batch_size, cfg.seed)
             if processes.is_main_process:
                 claim_output_dir(cfg.output_dir, given)
         dtype = training_dtype(cfg.precision, cfg.model.device)

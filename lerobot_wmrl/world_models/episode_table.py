@@ -1,6 +1,6 @@
 """A LeRobotDataset's numbers, without its pictures: what training and evaluation index episodes by."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -45,6 +45,17 @@ class EpisodeTable:
     def validation(self) -> np.ndarray:
         """Held-out episodes. (E,)"""
         return np.arange(len(self.start)) % VALIDATION_EVERY == VALIDATION_EVERY - 1
+
+    def among(self, chosen: Sequence[int] | None) -> np.ndarray:
+        """Which episodes are `chosen`, all if None. ValueError names one that does not exist. (E,)"""
+        indices = np.arange(len(self.start))
+        for episode in chosen or ():
+            if not 0 <= episode < len(indices):
+                raise ValueError(
+                    f"--dataset.episodes: there is no episode {episode} in {self.dataset.root}; it has "
+                    f"episodes 0 to {len(indices) - 1}"
+                )
+        return indices >= 0 if chosen is None else np.isin(indices, chosen)
 
 
 def open_dataset(root: str | Path, repo_id: str | None = None) -> LeRobotDataset:

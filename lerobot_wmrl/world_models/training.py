@@ -7,7 +7,7 @@ gradients, and the first process alone writes.
 import logging
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -55,13 +55,20 @@ def build_model(config: RewardModelConfig, table: EpisodeTable, output_dir: Path
 
 
 def make_sampler(
-    model: PreTrainedRewardModel, table: EpisodeTable, batch_size: int, seed: int
+    model: PreTrainedRewardModel,
+    table: EpisodeTable,
+    chosen: Sequence[int] | None,
+    batch_size: int,
+    seed: int,
 ) -> ClipSampler | FrameSampler:
-    """Batches for this kind of model from the episodes that are not held out."""
+    """Batches for this kind of model from the episodes that are not held out, and `chosen` if some are."""
     config: Any = model.config
-    episodes = ~table.validation
+    episodes = ~table.validation & table.among(chosen)
     if not episodes.any():
-        raise ValueError(f"dataset.root={table.dataset.root}: has no episode to train on; record some first")
+        raise ValueError(
+            f"dataset.root={table.dataset.root}: has no episode to train on; record some first, or choose "
+            "others with --dataset.episodes: every twentieth is held out"
+        )
     if model.name == "frame_tokenizer":
         frames = cached_frames(table.dataset, config.camera_keys)
         return FrameSampler(

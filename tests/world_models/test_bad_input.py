@@ -175,6 +175,11 @@ def test_a_split_without_episodes_is_named(small_dataset):
         choose_episodes(read_episodes(small_dataset), "validation", 5)
 
 
+def test_episodes_that_are_not_there_are_named(small_dataset):
+    with pytest.raises(ValueError, match=r"--dataset.episodes: there is no episode 6 in .*episodes 0 to 5"):
+        read_episodes(small_dataset).among([0, 6])
+
+
 def test_a_second_tokenizer_is_refused(small_dataset, trained_models, tmp_path):
     """A run goes on with the codes it began with, and a trained model keeps those it has learnt."""
     root, tokenizer = Path(small_dataset.root), trained_models["frame_tokenizer"]

@@ -16,6 +16,7 @@ from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.clips import ClipSampler
 from lerobot_wmrl.world_models.episode_table import golden_episodes, read_episodes
 from lerobot_wmrl.world_models.frame_cache import cached_frames, cached_tokens
+from lerobot_wmrl.world_models.training import make_sampler
 from tests.trained import action_config, run_training, text_config, tokenizer_config, train_tokenizer
 
 WEIGHTS = "checkpoints/last/pretrained_model/model.safetensors"
@@ -53,6 +54,13 @@ def test_training_meets_every_length_of_history(sampler, trained_models):
     assert memory.mask.sum(1).tolist() == list(range(1, sampler.clip_length + 1))
     amid = torch.cat([~sampler(step).done_known[:, 0] for step in range(50)])
     assert 0.15 < amid.float().mean() < 0.35
+
+
+def test_only_chosen_episodes_are_learnt_from(small_dataset, trained_models):
+    table = read_episodes(small_dataset)
+    model = load_model(trained_models["action_world_model"], "action_world_model")
+    assert make_sampler(model, table, [1, 3], batch_size=2, seed=0).episodes.tolist() == [1, 3]
+    assert make_sampler(model, table, None, batch_size=2, seed=0).episodes.tolist() == list(range(6))
 
 
 def test_cached_frames_are_those_of_the_dataset(small_dataset):
