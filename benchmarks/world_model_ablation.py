@@ -26,6 +26,7 @@ from lerobot_wmrl.maniskill.scenes import scenes_of
 from lerobot_wmrl.presets import Flags, format_flags, preset_flags
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig, train_world_model
 from lerobot_wmrl.statistics import Estimate
+from lerobot_wmrl.tracking import read_metrics
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.episode_table import choose_episodes, open_dataset, read_episodes
 from lerobot_wmrl.world_models.evaluation.accuracy import EpisodeAccuracy, headline
@@ -94,8 +95,12 @@ def measure(given: argparse.Namespace, folder: Path) -> dict[str, Any]:
     evaluation = evaluate(model, source, choose_episodes(table, given.split, given.max_episodes, unseen))
     estimates = headline(evaluation.accuracy) | done_quality(evaluation.outcomes, threshold=0.5, frames=3)
     estimates |= {f"psnr_{step}": psnr_at(evaluation.accuracy, step) for step in PSNR_STEPS}
+    config, speed = json.loads((folder / CONFIG_FILE).read_text()), read_metrics(folder)[-1]["steps_per_s"]
+    chosen = config["dataset"]["episodes"]
     row: dict[str, Any] = {
-        "steps": json.loads((folder / CONFIG_FILE).read_text())["steps"],
+        "steps": config["steps"],
+        "minutes": round(config["steps"] / speed / 60, 1),
+        "episodes": table.dataset.num_episodes if chosen is None else len(chosen),
         "parameters": sum(p.numel() for p in model.parameters() if p.requires_grad),
         **{name: estimates[name].as_json() for name in MEASURES if name in estimates},
     }
@@ -139,50 +144,58 @@ def results_table(rows: Mapping[str, Mapping[str, Any]]) -> str:
         any("gate" in row for row in rows.values()),
     )
     if gated:
-        head += ["failures called successes", "successes recognised"]
+        head += ["failures called successes", "successes recognised", "AUC"]
     lines = []
     for variant, row in rows.items():
         line = [variant, *(estimate_cell(row.get(name)) for name in columns)]
         if gated:
-            line += [share_cell(row["gate"][name]) for name in ("false_success_rate", "recognised_rate")]
+            gate = row["gate"]
+            line += [share_cell(gate[name]) for name in ("false_success_rate", "recognised_rate")]
+            line.append(f"{gate['auc']:.2f}" if gate["auc"] is not None else "–")
         lines.append(line)
     return markdown_table(head, lines)
 
 
-def parse_arguments() -> argparse.Namespace:
-    """The command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def add_arguments(parser: argparse.ArgumentParser, output_dir: Path, results: Path) -> None:
+    """What all comparisons of trainings are given."""
     parser.add_argument("--dataset.root", dest="dataset_root", required=True, help="what to learn from")
     parser.add_argument("--rollouts", help="dataset of real rollouts for the gate; none: no gate")
     parser.add_argument("--tokenizer", help="trained frame tokenizer; by default the preset's is trained")
-    parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=["none", "keypoints"])
     parser.add_argument("--preset", default="cpu", help="sizes of tokenizer and network (default: cpu)")
     parser.add_argument("--steps", type=int, help="of every variant; by default the preset's")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--split", default="validation", help="episodes that are replayed")
     parser.add_argument("--max_episodes", type=int, default=200, help="of them, evenly spread")
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--output_dir", type=Path, default=Path("outputs/ablation"))
-    parser.add_argument("--output", type=Path, default=RESULTS, help="JSON file")
-    return parser.parse_args()
+    parser.add_argument("--output_dir", type=Path, default=output_dir)
+    parser.add_argument("--output", type=Path, default=results, help="JSON file")
+
+
+def compare(given: argparse.Namespace, variants: Mapping[str, Flags]) -> dict[str, Any]:
+    """Train and measure each of `variants`, name → what differs from the preset, and write the results
+    after each. → rows by name"""
+    keep_freed_memory()
+    register_third_party_plugins()
+    settings: dict[str, Any] = {"steps": given.steps} if given.steps else {}
+    settings["model.tokenizer_path"] = trained_tokenizer(given)
+    rows = {}
+    for name, flags in variants.items():
+        folder = train_variant(given, name, "action_world_model", {**settings, **flags})
+        rows[name] = measured_once(given, folder)
+        shared = {key: getattr(given, key) for key in ("preset", "seed", "split", "max_episodes")}
+        write_json(given.output, {**shared, "variants": rows})
+    return rows
 
 
 def main() -> None:
     """Entry point."""
-    given = parse_arguments()
-    keep_freed_memory()
-    register_third_party_plugins()
-    settings = {"steps": given.steps} if given.steps else {}
-    settings["model.tokenizer_path"] = trained_tokenizer(given)
-    rows = {}
-    for name in given.variants:
-        folder = train_variant(given, name, "action_world_model", {**settings, **VARIANTS[name]})
-        rows[name] = measured_once(given, folder)
-        shared = {key: getattr(given, key) for key in ("preset", "seed", "split", "max_episodes")}
-        write_json(given.output, {**shared, "variants": rows})
-    print(results_table(rows))
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=["none", "keypoints"])
+    add_arguments(parser, Path("outputs/ablation"), RESULTS)
+    given = parser.parse_args()
+    print(results_table(compare(given, {name: VARIANTS[name] for name in given.variants})))
 
 
 if __name__ == "__main__":

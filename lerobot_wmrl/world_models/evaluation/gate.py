@@ -4,12 +4,14 @@ It decides whether a policy may be trained inside the model, and is meant for re
 the model was not trained on.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import mannwhitneyu
 
 from lerobot_wmrl.constants import KINDS, PLAY
 from lerobot_wmrl.statistics import Proportion
@@ -68,15 +70,33 @@ class Outcomes:
         consecutive frames at `threshold`, −1 if there is none. (E,)"""
         return first_run(self.probability >= threshold, frames)
 
+    def scores(self, frames: int) -> np.ndarray:
+        """The highest threshold at which the model sees success for `frames` frames in a row. (E,)"""
+        probability = np.nan_to_num(self.probability)
+        if probability.shape[1] < frames:
+            return np.zeros(len(probability))
+        return np.lib.stride_tricks.sliding_window_view(probability, frames, axis=1).min(-1).max(1)
+
+    def auc(self, frames: int) -> float:
+        """Probability that a success scores higher than a failure, 0.5 by chance, whatever the threshold.
+        NaN without both."""
+        scores, success = self.scores(frames), self.success
+        if success.all() or not success.any():
+            return math.nan
+        above = mannwhitneyu(scores[success], scores[~success]).statistic
+        return float(above / (success.sum() * (~success).sum()))
+
 
 @dataclass(frozen=True)
 class Gate:
-    """False successes among the failures, and successes that were recognised, at one operating point."""
+    """False successes among the failures, and successes that were recognised, at one operating point; and
+    how well the two are told apart at any threshold, `Outcomes.auc`."""
 
     threshold: float
     frames: int
     false_success: Proportion
     recognised: Proportion
+    auc: float
 
     @property
     def passed(self) -> bool:
@@ -89,6 +109,7 @@ class Gate:
             "done_frames": self.frames,
             "false_success_rate": self.false_success.as_json(),
             "recognised_rate": self.recognised.as_json(),
+            "auc": None if math.isnan(self.auc) else self.auc,
             "passed": self.passed,
         }
 
@@ -112,6 +133,7 @@ def gate_at(outcomes: Outcomes, threshold: float, frames: int) -> Gate:
         frames,
         Proportion(int((called & ~real).sum()), int((~real).sum())),
         Proportion(int((called & real).sum()), int(real.sum())),
+        outcomes.auc(frames),
     )
 
 

@@ -56,6 +56,7 @@ def gate_lines(gate: Gate, best: Gate | None) -> str:
         f"Gate at --done_threshold={gate.threshold} --done_frames={gate.frames}: "
         f"{'passed' if gate.passed else 'not passed'}.",
         f"Failures called successes: {gate.false_success}. Successes recognised: {gate.recognised}.",
+        f"AUC of successes against failures, whatever the threshold: {gate.auc:.2f} (0.5 by chance).",
     ]
     if best is None:
         lines.append("No operating point keeps false successes at 5 % or less and recognises anything.")

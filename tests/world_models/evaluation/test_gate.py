@@ -50,6 +50,14 @@ def test_the_gate_counts_as_the_environment_ends_episodes(outcomes, threshold, f
     assert not gate.passed
 
 
+def test_auc_is_the_share_of_pairs_in_the_right_order(outcomes):
+    """Scores over three frames: successes 0.9, 0.8, 0.1; failures 0.7, 0.1. One pair ties."""
+    assert outcomes.scores(3).tolist() == [0.9, 0.8, 0.1, 0.7, 0.1]
+    assert outcomes.auc(3) == pytest.approx((2 + 2 + 0.5) / 6)
+    assert math.isnan(Outcomes(np.arange(2), np.ones((2, 4)), np.ones((2, 4), bool)).auc(3))
+    assert outcomes.auc(7) == 0.5
+
+
 def test_the_best_operating_point_is_tolerable_and_recognises_most(outcomes):
     best = best_operating_point(sweep(outcomes))
     assert (best.threshold, best.frames) == (0.8, 3)

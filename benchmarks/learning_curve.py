@@ -1,0 +1,84 @@
+"""What would make the world model better: more data, a larger network or more training?
+
+    python benchmarks/learning_curve.py --dataset.root=outputs/gate/dataset \\
+        --rollouts=outputs/gate/rollouts --tokenizer=outputs/gate/frame_tokenizer
+
+One training as the preset says; beside it some with a half and a quarter of the episodes, of the steps, and
+with smaller networks, all else alike and each with a whole learning-rate schedule. All are replayed open
+loop on held-out episodes and on the rollouts, for the gate. Interrupted, the same command continues; what is
+trained and measured is not done again. Writes docs/results/learning_curve.json and
+docs/images/learning_curve.png.
+"""
+
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from matplotlib.figure import Figure
+
+from lerobot_wmrl.presets import PRESETS, Flags
+from lerobot_wmrl.report.figures import COLOURS, tidy
+from lerobot_wmrl.world_models.episode_table import open_dataset
+from world_model_ablation import add_arguments, compare, results_table
+
+DOCS: Final = Path(__file__).parents[1] / "docs"
+FULL: Final = "full"
+PARTS: Final = (2, 4)
+"""A half, and a quarter."""
+
+SIZES: Final[dict[str, Flags]] = {
+    "width_128": {"model.layers": 4, "model.width": 128},
+    "width_96": {"model.layers": 3, "model.width": 96},
+}
+"""Networks below the preset's."""
+
+PANELS: Final = (("data", "episodes"), ("time", "minutes"), ("size", "parameters"))
+"""Which rows are drawn beside the full one, by how their names begin, over what."""
+
+
+def variants(preset: str, steps: int | None, episodes: int) -> dict[str, Flags]:
+    """Name → what differs from the full training on `episodes` of them."""
+    full = steps or int(PRESETS[preset]["train-world-model:action_world_model"]["steps"])
+    data = {f"data_1/{part}": {"dataset.episodes": str(list(range(0, episodes, part)))} for part in PARTS}
+    time = {f"time_1/{part}": {"steps": full // part} for part in PARTS}
+    return {FULL: {}, **data, **time, **{f"size_{name}": flags for name, flags in SIZES.items()}}
+
+
+def draw(rows: Mapping[str, Mapping[str, Any]], path: Path) -> None:
+    """A panel each for data, time and size: delta-PSNR and, if the gate was asked, its AUC."""
+    figure = Figure(figsize=(9, 3))
+    for axes, (prefix, amount) in zip(figure.subplots(1, len(PANELS)), PANELS, strict=True):
+        shown = [row for name, row in rows.items() if name == FULL or name.startswith(prefix)]
+        shown.sort(key=lambda row: row[amount])
+        amounts = [row[amount] for row in shown]
+        estimates = [row["delta_psnr_15"] for row in shown]
+        spread = [[abs(each["value"] - each["bootstrap_95"][side]) for each in estimates] for side in (0, 1)]
+        axes.errorbar(amounts, [each["value"] for each in estimates], spread, color=COLOURS[0],
+                      marker="o", capsize=3, label="delta-PSNR at 15 (dB)")  # fmt: skip
+        if all("gate" in row for row in shown):
+            right = axes.twinx()
+            right.plot(amounts, [row["gate"]["auc"] for row in shown], color=COLOURS[1], marker="s")
+            right.set_ylabel("AUC of the gate", color=COLOURS[1])
+            right.set_ylim(0.5, 1)
+        axes.set_xscale("log", base=2)
+        axes.set_xlabel(amount)
+        axes.set_ylabel("delta-PSNR at 15 (dB)", color=COLOURS[0])
+    tidy(figure).savefig(path, dpi=130, bbox_inches="tight")
+
+
+def main() -> None:
+    """Entry point."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add_arguments(parser, Path("outputs/learning_curve"), DOCS / "results" / "learning_curve.json")
+    given = parser.parse_args()
+    episodes = open_dataset(given.dataset_root).num_episodes
+    rows = compare(given, variants(given.preset, given.steps, episodes))
+    draw(rows, DOCS / "images" / "learning_curve.png")
+    print(results_table(rows))
+
+
+if __name__ == "__main__":
+    main()
