@@ -18,6 +18,7 @@ import platform
 from pathlib import Path
 from typing import Any
 
+import draccus
 import torch
 from lerobot.utils.import_utils import register_third_party_plugins
 from torch.utils.flop_counter import FlopCounterMode
@@ -25,9 +26,9 @@ from torch.utils.flop_counter import FlopCounterMode
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.files import write_json
 from lerobot_wmrl.precision import imagination_dtype
-from lerobot_wmrl.presets import PRESETS
+from lerobot_wmrl.presets import PRESETS, preset_flags
+from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig
 from lerobot_wmrl.world_models.checkpoint import load_model
-from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 from machine import matmul_rate, rates, stream_rate
 from workloads import STEPS, Imagination, Work, random_clip, repeated, training_step
@@ -107,15 +108,18 @@ def make_model(given: argparse.Namespace) -> ActionWorldModelRewardModel:
     if given.world_model:
         model: ActionWorldModelRewardModel = load_model(given.world_model, "action_world_model", device)
         return model
-    tokenizer, sizes = (
-        PRESETS[given.sizes].get(f"train-world-model:{kind}", {})
-        for kind in ("frame_tokenizer", "action_world_model")
+    tokenizer, config = (
+        preset_config(given.sizes, kind) for kind in ("frame_tokenizer", "action_world_model")
     )
-    settings: dict[str, Any] = {
-        name.removeprefix("model."): value for name, value in sizes.items() if name.startswith("model.")
-    }
-    settings["image_size"] = tokenizer.get("model.image_size", ActionWorldModelConfig.image_size)
-    return ActionWorldModelRewardModel(ActionWorldModelConfig(device=device, **settings)).to(device).eval()
+    config.device, config.image_size, config.tokenizer_widths = device, tokenizer.image_size, tokenizer.widths
+    config.levels, config.quantizer = tokenizer.levels, tokenizer.quantizer
+    return ActionWorldModelRewardModel(config).to(device).eval()
+
+
+def preset_config(preset: str, kind: str) -> Any:
+    """The model's configuration that the training command has with `--preset`."""
+    flags = [*preset_flags(preset, "train-world-model", [kind]), f"--model.type={kind}", "--model.device=cpu"]
+    return draccus.parse(TrainWorldModelConfig, args=flags).model
 
 
 def main() -> None:

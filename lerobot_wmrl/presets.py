@@ -51,6 +51,15 @@ GPU_WORLD_MODEL: Final[Flags] = {
 }
 """64 transformer tokens a frame of 128 pixels a side, beside the register."""
 
+LFQ_TOKENIZER: Final[Flags] = {
+    "model.quantizer": "lfq",
+    "model.levels": "[512,512]",
+    "steps": 50_000,
+    "batch_size": 64,
+    "save_freq": 1000,
+}
+"""MAGVIT-2's quantiser with 2^18 codes, in two factors of nine bits, at 128 pixels a side."""
+
 PAPER_WORLD_MODEL: Final[Flags] = {
     "model.layers": 32,
     "model.width": 256,
@@ -165,10 +174,12 @@ PRESETS: Final[dict[str, dict[str, Flags]]] = {
         "train-world-model:text_world_model": CPU_WORLD_MODEL,
     },
     "gpu": {
+        "train-world-model:frame_tokenizer": LFQ_TOKENIZER,
         "train-world-model:action_world_model": GPU_WORLD_MODEL,
         "train-world-model:text_world_model": GPU_WORLD_MODEL,
     },
     "paper": {
+        "train-world-model:frame_tokenizer": LFQ_TOKENIZER,
         "train-world-model:action_world_model": PAPER_WORLD_MODEL,
         "train-world-model:text_world_model": PAPER_WORLD_MODEL,
     },

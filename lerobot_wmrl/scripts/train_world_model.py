@@ -9,6 +9,7 @@ Running the same command again continues from the last checkpoint. `--preset=dem
 """
 
 from dataclasses import dataclass, field, replace
+from datetime import timedelta
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,9 @@ from lerobot_wmrl.malloc import keep_freed_memory
 from lerobot_wmrl.precision import PRECISIONS, training_dtype
 from lerobot_wmrl.presets import expand_preset
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
+
+LONGEST_WAIT = timedelta(hours=6)
+"""Of other processes for the first one, while it decodes and encodes every frame of a large dataset."""
 
 TRAINED = ("frame_tokenizer", "action_world_model", "text_world_model")
 
@@ -92,7 +96,7 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
     from lerobot_wmrl.world_models.training import build_model, make_sampler, train
 
     check_config(cfg)
-    processes = PartialState(cpu=cfg.model.device == "cpu")
+    processes = PartialState(cpu=cfg.model.device == "cpu", timeout=LONGEST_WAIT)
     check_processes(cfg, processes.num_processes)
     table = read_episodes(open_dataset(cfg.dataset.root, cfg.dataset.repo_id))
     given = draccus.encode(cfg)

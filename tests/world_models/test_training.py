@@ -5,12 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from draccus import parse
 from lerobot.configs.rewards import RewardModelConfig
+from lerobot.rewards.factory import make_reward_model
 from safetensors.torch import load_file
 
 from lerobot_wmrl.dataset_source import DatasetSource
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
+from lerobot_wmrl.presets import PRESETS, preset_flags
 from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
+from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig
 from lerobot_wmrl.tracking import read_metrics
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.clips import ClipSampler
@@ -54,6 +58,20 @@ def test_training_meets_every_length_of_history(sampler, trained_models):
     assert memory.mask.sum(1).tolist() == list(range(1, sampler.clip_length + 1))
     amid = torch.cat([~sampler(step).done_known[:, 0] for step in range(50)])
     assert 0.15 < amid.float().mean() < 0.35
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_the_flags_of_a_preset_fit_together(preset):
+    """Lookup-free codes from `gpu` on; and the network's patches divide the tokenizer's grid."""
+    tokenizer, *world_models = (
+        parse(TrainWorldModelConfig, args=[
+            *preset_flags(preset, "train-world-model", [kind]), f"--model.type={kind}", "--model.device=cpu",
+        ]).model
+        for kind in ("frame_tokenizer", "action_world_model", "text_world_model")
+    )  # fmt: skip
+    assert tokenizer.quantizer == ("lfq" if preset in ("gpu", "paper") else "fsq")
+    grid = make_reward_model(tokenizer).tokenizer.grid
+    assert all(grid % config.patch == 0 for config in world_models)
 
 
 def test_only_chosen_episodes_are_learnt_from(small_dataset, trained_models):
