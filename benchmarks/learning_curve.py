@@ -6,8 +6,7 @@
 One training as the preset says; beside it some with a half and a quarter of the episodes, of the steps, and
 with smaller networks, all else alike and each with a whole learning-rate schedule. All are replayed open
 loop on held-out episodes and on the rollouts, for the gate. Interrupted, the same command continues; what is
-trained and measured is not done again. Writes docs/results/learning_curve.json and
-docs/images/learning_curve.png.
+trained and measured is not done again. Writes docs/results/learning_curve.json and a picture beside it.
 """
 
 import argparse
@@ -22,10 +21,10 @@ from lerobot_wmrl.report.figures import COLOURS, tidy
 from lerobot_wmrl.world_models.episode_table import open_dataset
 from world_model_ablation import add_arguments, compare, results_table
 
-DOCS: Final = Path(__file__).parents[1] / "docs"
+RESULTS: Final = Path(__file__).parents[1] / "docs" / "results" / "learning_curve.json"
 FULL: Final = "full"
-PARTS: Final = (2, 4)
-"""A half, and a quarter."""
+PARTS: Final = {"half": 2, "quarter": 4}
+"""Of the episodes, and of the steps."""
 
 SIZES: Final[dict[str, Flags]] = {
     "width_128": {"model.layers": 4, "model.width": 128},
@@ -40,8 +39,11 @@ PANELS: Final = (("data", "episodes"), ("time", "minutes"), ("size", "parameters
 def variants(preset: str, steps: int | None, episodes: int) -> dict[str, Flags]:
     """Name → what differs from the full training on `episodes` of them."""
     full = steps or int(PRESETS[preset]["train-world-model:action_world_model"]["steps"])
-    data = {f"data_1/{part}": {"dataset.episodes": str(list(range(0, episodes, part)))} for part in PARTS}
-    time = {f"time_1/{part}": {"steps": full // part} for part in PARTS}
+    data = {
+        f"data_{name}": {"dataset.episodes": str(list(range(0, episodes, part)))}
+        for name, part in PARTS.items()
+    }
+    time = {f"time_{name}": {"steps": full // part} for name, part in PARTS.items()}
     return {FULL: {}, **data, **time, **{f"size_{name}": flags for name, flags in SIZES.items()}}
 
 
@@ -72,11 +74,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    add_arguments(parser, Path("outputs/learning_curve"), DOCS / "results" / "learning_curve.json")
+    add_arguments(parser, Path("outputs/learning_curve"), RESULTS)
     given = parser.parse_args()
     episodes = open_dataset(given.dataset_root).num_episodes
     rows = compare(given, variants(given.preset, given.steps, episodes))
-    draw(rows, DOCS / "images" / "learning_curve.png")
+    draw(rows, given.output.with_suffix(".png"))
     print(results_table(rows))
 
 

@@ -99,7 +99,7 @@ def measure(given: argparse.Namespace, folder: Path) -> dict[str, Any]:
     chosen = config["dataset"]["episodes"]
     row: dict[str, Any] = {
         "steps": config["steps"],
-        "minutes": round(config["steps"] / speed / 60, 1),
+        "minutes": round(config["steps"] / speed / 60, 2),
         "episodes": table.dataset.num_episodes if chosen is None else len(chosen),
         "parameters": sum(p.numel() for p in model.parameters() if p.requires_grad),
         **{name: estimates[name].as_json() for name in MEASURES if name in estimates},
