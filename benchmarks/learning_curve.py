@@ -48,25 +48,26 @@ def variants(preset: str, steps: int | None, episodes: int) -> dict[str, Flags]:
 
 
 def draw(rows: Mapping[str, Mapping[str, Any]], path: Path) -> None:
-    """A panel each for data, time and size: delta-PSNR and, if the gate was asked, its AUC."""
-    figure = Figure(figsize=(9, 3))
-    for axes, (prefix, amount) in zip(figure.subplots(1, len(PANELS)), PANELS, strict=True):
+    """A column each for data, time and size: delta-PSNR above and, if the gate was asked, its AUC below."""
+    gated = all("gate" in row for row in rows.values())
+    figure = Figure(figsize=(9, 5 if gated else 2.6), layout="constrained")
+    grid = figure.subplots(1 + gated, len(PANELS), squeeze=False, sharex="col", sharey="row")
+    for column, (prefix, amount) in zip(grid.T, PANELS, strict=True):
         shown = [row for name, row in rows.items() if name == FULL or name.startswith(prefix)]
         shown.sort(key=lambda row: row[amount])
         amounts = [row[amount] for row in shown]
         estimates = [row["delta_psnr_15"] for row in shown]
+        values = [each["value"] for each in estimates]
         spread = [[abs(each["value"] - each["bootstrap_95"][side]) for each in estimates] for side in (0, 1)]
-        axes.errorbar(amounts, [each["value"] for each in estimates], spread, color=COLOURS[0],
-                      marker="o", capsize=3, label="delta-PSNR at 15 (dB)")  # fmt: skip
-        if all("gate" in row for row in shown):
-            right = axes.twinx()
-            right.plot(amounts, [row["gate"]["auc"] for row in shown], color=COLOURS[1], marker="s")
-            right.set_ylabel("AUC of the gate", color=COLOURS[1])
-            right.set_ylim(0.5, 1)
-        axes.set_xscale("log", base=2)
-        axes.set_xlabel(amount)
-        axes.set_ylabel("delta-PSNR at 15 (dB)", color=COLOURS[0])
-    tidy(figure).savefig(path, dpi=130, bbox_inches="tight")
+        column[0].errorbar(amounts, values, spread, color=COLOURS[0], marker="o", capsize=3)
+        if gated:
+            column[1].plot(amounts, [row["gate"]["auc"] for row in shown], color=COLOURS[1], marker="o")
+        column[-1].set_xscale("log")
+        column[-1].set_xlabel(amount)
+    grid[0, 0].set_ylabel("delta-PSNR at step 15 (dB)")
+    if gated:
+        grid[1, 0].set_ylabel("AUC of the gate")
+    tidy(figure).savefig(path, dpi=130)
 
 
 def main() -> None:
