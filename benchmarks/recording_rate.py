@@ -2,7 +2,7 @@
 
     python benchmarks/recording_rate.py
 
-All tasks, two cameras of 128x128 pixels, video encoding and a dataset for every
+All tasks, three cameras of 128x128 pixels, video encoding and a dataset for every
 episode included; starting the processes is not. Writes
 docs/results/recording_rate.json.
 """
@@ -25,7 +25,7 @@ from lerobot_wmrl.constants import KINDS, PLAY, TASKS
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.files import write_json
 
-CAMERAS = ("third_view", "wrist")
+CAMERAS = ("third_view", "side_view", "wrist")
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
 SEED = 5_000
 WARM_UP = 2
