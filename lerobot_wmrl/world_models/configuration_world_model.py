@@ -1,10 +1,17 @@
 """Configurations of the action-conditioned and the text-conditioned world model."""
 
 from dataclasses import dataclass, field
+from typing import Final
 
 from lerobot.configs.rewards import RewardModelConfig
 from lerobot.optim.optimizers import AdamWConfig
 from lerobot.optim.schedulers import LRSchedulerConfig
+
+AUTOREGRESSIVE_ONLY: Final = {
+    "conditioning": "cross_attention", "decoding": "shifted", "depth": False, "self_rollout": 0.0,
+    "keypoint_weight": 0.0,
+}  # fmt: skip
+"""Options that anchored dynamics do not have, and their defaults."""
 
 
 @dataclass
@@ -49,6 +56,7 @@ class WorldModelConfig(RewardModelConfig):
     tokenizer_context: bool = False
     state_size: int = 8
 
+    dynamics: str = "autoregressive"
     layers: int = 4
     width: int = 128
     heads: int = 4
@@ -66,6 +74,7 @@ class WorldModelConfig(RewardModelConfig):
     done_positive_weight: float = 1.0
     state_weight: float = 4.0
     depth_weight: float = 1.0
+    drawn_frames: int = 4
     self_forcing: float = 0.5
     self_rollout: float = 0.0
     keypoint_weight: float = 0.0
@@ -75,7 +84,9 @@ class WorldModelConfig(RewardModelConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("layers", "width", "heads", "window", "patch", "code_width", "maskgit_steps"):
+        for name in (
+            "layers", "width", "heads", "window", "patch", "code_width", "maskgit_steps", "drawn_frames",
+        ):  # fmt: skip
             if getattr(self, name) < 1:
                 raise ValueError(f"--model.{name}={getattr(self, name)}: must be at least 1")
         if not 0 <= self.self_rollout <= 1:
@@ -94,10 +105,21 @@ class WorldModelConfig(RewardModelConfig):
             raise ValueError(
                 f"--model.width={self.width}: must be a multiple of 2 x --model.heads={self.heads}"
             )
+        if self.dynamics == "anchored":
+            self._check_anchored()
         if self.state_size < 0:
             raise ValueError(
                 f"--model.state_size={self.state_size}: must be 0 (none) or the width of the state"
             )
+
+    def _check_anchored(self) -> None:
+        """ValueError if something is asked for that only predictions from the frame before have."""
+        for name, off in AUTOREGRESSIVE_ONLY.items():
+            if (value := getattr(self, name)) != off:
+                raise ValueError(
+                    f"--model.{name}={value}: anchored dynamics do not have it; leave it out, or choose "
+                    "--model.dynamics=autoregressive"
+                )
 
     def get_optimizer_preset(self) -> AdamWConfig:
         return AdamWConfig(lr=self.learning_rate, weight_decay=1e-2, grad_clip_norm=1.0)

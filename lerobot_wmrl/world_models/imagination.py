@@ -10,9 +10,9 @@ from torch import Tensor
 from lerobot_wmrl.precision import compute_in, imagination_dtype
 from lerobot_wmrl.world_models.context import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.decoding import Condition, FramesSeen, ShiftedDecoding
+from lerobot_wmrl.world_models.frame_network import FrameNetwork, Prediction
 from lerobot_wmrl.world_models.frame_tokenizer import Decoded, FrameTokenizer
-from lerobot_wmrl.world_models.next_frame import NextFrameNetwork, Prediction
-from lerobot_wmrl.world_models.temporal_memory import TemporalCache
+from lerobot_wmrl.world_models.temporal_memory import FrameCache
 
 SMALL_BATCH = 16
 """In so few imaginations at once on the CPU, casts cost more than bfloat16 saves."""
@@ -37,15 +37,15 @@ class Imagined(NamedTuple):
 @dataclass
 class ImaginationState:
     """Where B imaginations stand: digits (B, 1, S, C), normalised state (B, 1, P), depth (B, 1, S) as the
-    network has it or (B, 1, 0), ring of past frames.
+    network has it or (B, 1, 0), what is remembered of the past.
 
-    Its tensors are allocated once and advanced in place. The network computes in the ring's dtype.
+    Its tensors are allocated once and advanced in place. The network computes in the cache's dtype.
     """
 
     digits: Tensor
     proprioception: Tensor
     depth: Tensor
-    cache: TemporalCache
+    cache: FrameCache
     condition: Condition | None = None
 
 
@@ -55,7 +55,7 @@ class Imagination:
     name: str
     config: Any
     tokenizer: FrameTokenizer
-    network: NextFrameNetwork
+    network: FrameNetwork
     decoding: ShiftedDecoding
     state_mean: Tensor
     state_std: Tensor
@@ -154,7 +154,7 @@ class Imagination:
         generator: torch.Generator | None,
     ) -> Prediction:
         """Put `state` one frame further. → what was predicted"""
-        with compute_in(state.cache.keys.dtype, state.digits.device):
+        with compute_in(state.cache.dtype, state.digits.device):
             prediction = self.network.step(
                 state.digits, state.proprioception, *condition, state.cache, state.depth
             )

@@ -8,7 +8,7 @@ from torch.nn import functional as F
 
 from lerobot_wmrl.world_models.codebook import CodeBook
 from lerobot_wmrl.world_models.distributed import draw_own_rows, masked_mean
-from lerobot_wmrl.world_models.next_frame import STATE_STEP, Prediction
+from lerobot_wmrl.world_models.frame_network import STATE_STEP, Prediction
 
 MOTION_LEVELS = 3
 """A token moves when its code changes by so many steps, FSQ's levels or LFQ's signs; less is mostly the
@@ -37,6 +37,11 @@ class Clip(NamedTuple):
     done_known: Tensor
     instructions: list[str]
     depth: Tensor | None = None
+
+
+def take_rows(values: Tensor, index: Tensor) -> Tensor:
+    """Rows `index` (B, K) of every clip: values (B, T, …) → (B, K, …)."""
+    return values[torch.arange(len(values), device=values.device)[:, None], index]
 
 
 def corrupt_digits(digits: Tensor, codebook: CodeBook, share: float) -> Tensor:
@@ -79,50 +84,70 @@ def force_predictions(
     )
 
 
-class TokenWeights(NamedTuple):
-    """Of the tokens of frames 1 … T − 1, (B, T − 1, S): what each counts, 0 for padding, and which move."""
+class NextFrames(NamedTuple):
+    """K frames a clip that are to be predicted: digits (B, K, S, C); of their tokens, (B, K, S), what each
+    counts, 0 for padding, and which are of valid frames that move."""
 
+    digits: Tensor
     weight: Tensor
     moved: Tensor
 
 
-def token_weights(codebook: CodeBook, digits: Tensor, clip: Clip, motion_weight: float) -> TokenWeights:
-    """What the tokens with digits (B, T, S, C) count.
+def next_frames(codebook: CodeBook, digits: Tensor, clip: Clip, motion_weight: float) -> NextFrames:
+    """Frames 1 … T − 1 of clips with digits (B, T, S, C).
 
     Tokens that move count `motion_weight` times more: most of a frame is still, and what moves decides.
     """
-    moved = codebook.distance(digits[:, 1:], digits[:, :-1]) >= MOTION_LEVELS
     known = (clip.valid[:, 1:] & clip.valid[:, :-1])[..., None]
-    return TokenWeights((1 + motion_weight * moved) * known.float(), moved)
+    moved = known & (codebook.distance(digits[:, 1:], digits[:, :-1]) >= MOTION_LEVELS)
+    return NextFrames(digits[:, 1:], (1 + motion_weight * moved) * known.float(), moved)
+
+
+def frames_since_start(
+    codebook: CodeBook, digits: Tensor, clip: Clip, motion_weight: float, rows: Tensor
+) -> NextFrames:
+    """The frames after rows (B, K) of clips with digits (B, T, S, C).
+
+    Tokens that are not as in the first frame count `motion_weight` times more.
+    """
+    known = take_rows(clip.valid[:, 1:] & clip.valid[:, :-1], rows)[..., None]
+    target = take_rows(digits[:, 1:], rows)
+    moved = known & (codebook.distance(target, digits[:, :1]) >= MOTION_LEVELS)
+    return NextFrames(target, (1 + motion_weight * moved) * known.float(), moved)
+
+
+def draw_rows(valid: Tensor, count: int) -> Tensor:
+    """`count` rows of each clip whose next one is valid too, at random: valid (B, T) → (B, count)."""
+    chance = draw_own_rows(torch.rand, (len(valid), count), valid.device)
+    transitions = (valid[:, 1:].sum(1, keepdim=True)).clamp_min(1)
+    return (chance * transitions).long().clamp_max(valid.shape[1] - 2)
 
 
 def next_frame_loss(
-    prediction: Prediction, codebook: CodeBook, digits: Tensor, state: Tensor, clip: Clip,
-    weights: TokenWeights, config: Any,
-) -> tuple[Tensor, dict[str, float]]:  # fmt: skip
+    prediction: Prediction, codebook: CodeBook, frames: NextFrames, state: Tensor, clip: Clip, config: Any
+) -> tuple[Tensor, dict[str, float]]:
     """Cross-entropy of the next tokens (eq. 2), done (eqs. 3, 4 with BCE) and the next state.
 
-    Computed in float32, whatever the network computes in. `weights`: of the tokens, from `token_weights`.
+    Computed in float32, whatever the network computes in. `frames`: those that the first logits are of.
     """
     prediction = Prediction(*(output.float() for output in prediction))
-    target, known = digits[:, 1:], (clip.valid[:, 1:] & clip.valid[:, :-1])[..., None]
-    weight, moved = weights
-    logits = prediction.logits[:, :-1]
-    token_loss = masked_mean(codebook.cross_entropy(logits, target), weight)
+    logits = prediction.logits[:, : frames.digits.shape[1]]
+    token_loss = masked_mean(codebook.cross_entropy(logits, frames.digits), frames.weight)
     state_error = (prediction.proprioception[:, :-1] - state[:, 1:]) / STATE_STEP
     state_losses = F.smooth_l1_loss(
         state_error, torch.zeros_like(state_error), reduction="none", beta=STATE_PRECISION
     )
+    known = (clip.valid[:, 1:] & clip.valid[:, :-1])[..., None]
     state_loss = masked_mean(state_losses, known.expand_as(state_losses))
     done_loss = masked_done_loss(prediction.done_logit, clip, config.done_positive_weight)
     loss = token_loss + config.done_weight * done_loss + config.state_weight * state_loss
-    right = (codebook.sample(logits.detach(), 0.0, None) == target).all(-1)
+    right = (codebook.sample(logits.detach(), 0.0, None) == frames.digits).all(-1)
     return loss, {
         "token_loss": token_loss.item(),
         "done_loss": done_loss.item(),
         "state_loss": state_loss.item(),
-        "token_accuracy": masked_mean(right, known.expand_as(right)).item(),
-        "moving_token_accuracy": masked_mean(right, moved & known).item(),
+        "token_accuracy": masked_mean(right, frames.weight > 0).item(),
+        "moving_token_accuracy": masked_mean(right, frames.moved).item(),
     }
 
 

@@ -12,7 +12,13 @@ import torch
 from torch import Tensor, nn
 
 from lerobot_wmrl.world_models.attention import SelfAttention, attention
-from lerobot_wmrl.world_models.conditioning import ConditionTokens, make_conditioning, pooled
+from lerobot_wmrl.world_models.conditioning import (
+    Conditioning,
+    ConditionTokens,
+    CrossAttention,
+    make_conditioning,
+    pooled,
+)
 from lerobot_wmrl.world_models.temporal_memory import ClipMemory, TemporalCache, TemporalMemory
 
 LayerHook = Callable[[int, Tensor], Tensor]
@@ -24,6 +30,13 @@ def unchanged(layer: int, x: Tensor) -> Tensor:
     return x
 
 
+def make_mlp(width: int) -> nn.Sequential:
+    """Pre-norm and the MLP of a block."""
+    return nn.Sequential(
+        nn.LayerNorm(width), nn.Linear(width, 4 * width), nn.GELU("tanh"), nn.Linear(4 * width, width)
+    )
+
+
 class SpatialTemporalBlock(nn.Module):
     """Space, time, condition, MLP; each with pre-norm and a skip."""
 
@@ -32,9 +45,7 @@ class SpatialTemporalBlock(nn.Module):
         self.space = SelfAttention(width, heads)
         self.time = SelfAttention(width, heads)
         self.condition = make_conditioning(conditioning, width, heads)
-        self.mlp = nn.Sequential(
-            nn.LayerNorm(width), nn.Linear(width, 4 * width), nn.GELU("tanh"), nn.Linear(4 * width, width)
-        )
+        self.mlp = make_mlp(width)
 
     def forward(
         self, x: Tensor, condition: ConditionTokens, attend_time: Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -48,6 +59,39 @@ class SpatialTemporalBlock(nn.Module):
         x = self.condition(x, condition)
         norm, expand, activate, contract = self.mlp
         return x + mlp.leave(contract(activate(expand(mlp.enter(norm(x))))))
+
+
+class SpatialBlock(nn.Module):
+    """Space, condition, MLP."""
+
+    def __init__(self, width: int, heads: int, conditioning: Conditioning) -> None:
+        super().__init__()
+        self.space = SelfAttention(width, heads)
+        self.condition = conditioning
+        self.mlp = make_mlp(width)
+
+    def forward(self, x: Tensor, condition: ConditionTokens) -> Tensor:
+        """x (B, T, S, D) → same."""
+        x = x + self.space.merge_heads(attention(*self.space.split_heads(self.space.norm(x))))
+        x = self.condition(x, condition)
+        return x + self.mlp(x)
+
+
+class TrajectoryBlock(nn.Module):
+    """Time, scene, MLP for one token a frame."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.time = SelfAttention(width, heads)
+        self.scene = CrossAttention(width, heads)
+        self.mlp = make_mlp(width)
+
+    def forward(self, x: Tensor, scene: ConditionTokens, layer: int, memory: TemporalMemory) -> Tensor:
+        """x (B, 1, T, D) → same; the scene has tokens (B, 1, M, D)."""
+        heads = self.time.split_heads(self.time.norm(x))
+        x = x + self.time.merge_heads(memory.attend(layer, *heads))
+        x = self.scene(x, scene)
+        return x + self.mlp(x)
 
 
 class SpatialTemporalTransformer(nn.Module):

@@ -20,6 +20,17 @@ class TemporalMemory(Protocol):
         """(B, S, h, T, d) each → (B, S, h, T, d)."""
 
 
+class FrameCache(Protocol):
+    """What a network remembers of the imaginations that it steps."""
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """What the network computes in."""
+
+    def restart(self, mask: Tensor) -> None:
+        """The next frame of the environments in `mask` (B,) is their first."""
+
+
 def banded_causal_mask(length: int, window: int, device: torch.device) -> Tensor:
     """True where frame q may see frame k: q − window < k ≤ q. → (T, T)."""
     index = torch.arange(length, device=device)
@@ -87,6 +98,11 @@ class TemporalCache:
         keys, values = (torch.zeros(shape, device=device, dtype=dtype) for _ in range(2))
         started, position = (torch.zeros(n, dtype=torch.long, device=device) for n in (shape[1], 1))
         return cls(keys, values, started, position, 0 if grows else shape[-2], grows)
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """What the network computes in."""
+        return self.keys.dtype
 
     @property
     def window(self) -> int:

@@ -7,7 +7,7 @@ import torch
 from lerobot.utils.constants import ACTION, DONE, OBS_STATE
 from torch import Tensor
 
-from lerobot_wmrl.world_models.losses import Clip
+from lerobot_wmrl.world_models.losses import Clip, take_rows
 
 
 def clip_from_windows(
@@ -49,8 +49,3 @@ def clip_from_windows(
     tokens, state, action = (take_rows(values, index) for values in (tokens, state, action))
     depth = depth if depth is None else take_rows(depth, index)
     return Clip(tokens, state, action, done, valid, known, list(batch.get("task", [""] * rows)), depth)
-
-
-def take_rows(values: Tensor, index: Tensor) -> Tensor:
-    """Rows `index` (B, T) of every window: values (B, T, …) → same shape."""
-    return values[torch.arange(len(values), device=values.device)[:, None], index]

@@ -11,7 +11,6 @@ from lerobot.rewards.pretrained import PreTrainedRewardModel
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from lerobot_wmrl.precision import computing_dtype
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.compatibility import (
     check_cameras,
@@ -21,23 +20,15 @@ from lerobot_wmrl.world_models.compatibility import (
 )
 from lerobot_wmrl.world_models.configuration_world_model import WorldModelConfig
 from lerobot_wmrl.world_models.context import Context
-from lerobot_wmrl.world_models.decoding import Condition, FramesSeen, make_decoding
+from lerobot_wmrl.world_models.decoding import Condition, make_decoding
 from lerobot_wmrl.world_models.depth_maps import depth_of_windows
+from lerobot_wmrl.world_models.dynamics import make_dynamics
+from lerobot_wmrl.world_models.frame_network import Prediction
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
 from lerobot_wmrl.world_models.hub_card import HubCard
 from lerobot_wmrl.world_models.imagination import Imagination
-from lerobot_wmrl.world_models.keypoints import keypoint_loss
-from lerobot_wmrl.world_models.losses import (
-    Clip,
-    corrupt_digits,
-    force_predictions,
-    forced_share,
-    next_frame_loss,
-    self_rollout_rows,
-    token_weights,
-)
+from lerobot_wmrl.world_models.losses import Clip
 from lerobot_wmrl.world_models.modeling_frame_tokenizer import stack_cameras
-from lerobot_wmrl.world_models.next_frame import NextFrameNetwork, Prediction
 from lerobot_wmrl.world_models.windows import clip_from_windows
 
 MIN_SPREAD = 1e-3
@@ -77,12 +68,11 @@ class WorldModelRewardModel(HubCard, Imagination, PreTrainedRewardModel):
             raise ValueError(
                 f"--model.patch={config.patch}: must divide the tokenizer's grid, {self.tokenizer.grid}"
             )
-        self.network = NextFrameNetwork(
+        self.dynamics = make_dynamics(config)
+        self.network = self.dynamics.make_network(
             levels=config.levels, grid=self.tokenizer.grid, num_cameras=len(config.cameras),
-            state_size=config.state_size, patch=config.patch, layers=config.layers, width=config.width,
-            heads=config.heads, window=config.window, code_width=config.code_width,
-            quantizer=config.quantizer,
-            conditioning=config.conditioning, depth=config.depth,
+            state_size=config.state_size, patch=config.patch, width=config.width,
+            code_width=config.code_width, quantizer=config.quantizer,
         )  # fmt: skip
         self.tokenizer.eval()
         self.decoding = make_decoding(config, self.network.embedding.local.in_channels)
@@ -135,66 +125,8 @@ class WorldModelRewardModel(HubCard, Imagination, PreTrainedRewardModel):
         raise NotImplementedError
 
     def loss(self, clip: Clip) -> tuple[Tensor, dict[str, float]]:
-        """Eqs. 2-4 on a clip of tokens, with part of the inputs replaced by the model's own predictions."""
-        condition = self.condition(clip)
-        digits, state = self.network.codebook.digits(clip.tokens), self.normalize_state(clip.state)
-        depth = self.network.depth.normalize(clip.depth, clip.tokens)
-        seen, seen_state, seen_depth = self.inputs(clip, condition, digits, state, depth)
-        torch.clear_autocast_cache()  # older torch keeps the casts made without gradients
-        memory = self.network.transformer.clip_memory(digits.shape[1], digits.device)
-        prediction = self.network(seen, seen_state, *condition, memory, seen_depth)
-        weights = token_weights(self.network.codebook, digits, clip, self.config.motion_weight)
-        loss, metrics = next_frame_loss(
-            prediction, self.network.codebook, digits, state, clip, weights, self.config
-        )
-        frames = FramesSeen(seen, condition, prediction, memory)
-        decoding_loss, decoding_metrics = self.decoding.loss(
-            self.network, frames, digits[:, 1:], weights.weight
-        )
-        depth_loss, depth_metrics = self.network.depth.loss(prediction.depth, depth, clip.valid)
-        loss = loss + decoding_loss + self.config.depth_weight * depth_loss
-        metrics = metrics | decoding_metrics | depth_metrics
-        if self.config.keypoint_weight > 0:
-            consistency = keypoint_loss(
-                prediction.logits[:, :-1], self.network.codebook, digits, clip.valid,
-                self.network.num_cameras,
-            )  # fmt: skip
-            loss = loss + self.config.keypoint_weight * consistency
-            metrics["keypoint_loss"] = consistency.item()
-        return loss, metrics
-
-    @torch.no_grad()
-    def inputs(
-        self, clip: Clip, condition: Condition, digits: Tensor, state: Tensor, depth: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """What the network sees instead of a clip's digits (B, T, S, C), normalised state (B, T, P) and
-        normalised depth (B, T, S or 0).
-
-        Against drift: noise, one-pass predictions of single frames, and whole rollouts from first frames.
-        """
-        codebook, progress = self.network.codebook, self.training_progress
-        seen, seen_state = corrupt_digits(digits, codebook, self.config.token_noise), state
-        share = forced_share(self.config.self_forcing, progress)
-        if share > 0:
-            guess = self.network(seen, seen_state, *condition, depth=depth)
-            seen, seen_state, depth = force_predictions(guess, codebook, seen, seen_state, depth, share)
-        rows = self_rollout_rows(self.config.self_rollout, progress, len(digits), digits.device)
-        if len(rows):
-            rolled, rolled_state, rolled_depth = self._roll_out_rows(rows, clip, condition)
-            seen, seen_state = seen.index_copy(0, rows, rolled), seen_state.index_copy(0, rows, rolled_state)
-            depth = depth.index_copy(0, rows, rolled_depth)
-        return seen, seen_state, depth
-
-    def _roll_out_rows(self, rows: Tensor, clip: Clip, condition: Condition) -> tuple[Tensor, Tensor, Tensor]:
-        """Clips `rows` imagined from their first frames: in float32 if they are learnt from in it, so that
-        the format does not depend on how many rows a process has; else as imagination chooses."""
-        tokens, mask = condition
-        own = tokens[rows].float(), None if mask is None else mask[rows]
-        exact = computing_dtype(clip.tokens.device) == torch.float32
-        dtype = torch.float32 if exact else None
-        steps = clip.tokens.shape[1] - 1
-        depth = None if clip.depth is None else clip.depth[rows, 0]
-        return self.roll_out(clip.tokens[rows, 0], clip.state[rows, 0], own, steps, dtype, depth)
+        """Eqs. 2-4 on a clip of tokens."""
+        return self.dynamics.loss(self, clip)
 
     def forward(self, batch: Clip | dict[str, Any]) -> tuple[Tensor, dict[str, float]]:
         """The loss on a clip, or on LeRobot's batch, of which `clip_from_windows` has the shapes."""
@@ -223,7 +155,5 @@ class WorldModelRewardModel(HubCard, Imagination, PreTrainedRewardModel):
 
     @torch.no_grad()
     def predict(self, clip: Clip) -> Prediction:
-        """Teacher-forced predictions on a clip."""
-        digits = self.network.codebook.digits(clip.tokens)
-        depth = self.network.depth.normalize(clip.depth, clip.tokens)
-        return self.network(digits, self.normalize_state(clip.state), *self.condition(clip), depth=depth)
+        """Predictions about the frame after every row of a clip, not fed back."""
+        return self.dynamics.predict(self, clip)

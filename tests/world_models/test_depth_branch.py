@@ -9,9 +9,9 @@ from torch import Tensor
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig
 from lerobot_wmrl.world_models.decoding import DECODINGS
 from lerobot_wmrl.world_models.depth_branch import FAR
+from lerobot_wmrl.world_models.frame_network import Prediction
 from lerobot_wmrl.world_models.losses import Clip
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
-from lerobot_wmrl.world_models.next_frame import Prediction
 
 SIZES: dict[str, Any] = {
     "device": "cpu", "image_size": 32, "tokenizer_widths": [8, 16], "levels": [5, 4], "layers": 2,
@@ -145,8 +145,8 @@ def test_a_moving_depth_is_learnt_and_imagined():
     """Open loop, much better than depth that stays: the branch heeds actions and its own predictions."""
     model = world_model(cameras=["third_view"], state_size=0, patch=1, layers=1, self_forcing=0.0).train()
     clip = moving_depth_clip()
-    optimizer = torch.optim.Adam(model.network.parameters(), 1e-2)
-    for _ in range(60):
+    optimizer = torch.optim.Adam(model.network.parameters(), 3e-3)
+    for _ in range(120):
         loss, _ = model.loss(clip)
         optimizer.zero_grad()
         loss.backward()
@@ -170,7 +170,7 @@ def test_rollouts_in_training_show_the_depth_that_was_imagined():
     model, clip = random_model(self_rollout=1.0, self_forcing=0.0), random_clip()
     depth = model.network.depth.normalize(clip.depth, clip.tokens)
     digits, state = model.network.codebook.digits(clip.tokens), model.normalize_state(clip.state)
-    _, _, seen = model.inputs(clip, model.condition(clip), digits, state, depth)
+    _, _, seen = model.dynamics.inputs(model, clip, model.condition(clip), digits, state, depth)
     imagination = model.start(clip.tokens[:, 0], clip.state[:, 0], depth=clip.depth[:, 0])
     imagined = model.step(imagination, clip.action[:, 0]).depth
     assert torch.equal(seen[:, 0], depth[:, 0])

@@ -3,14 +3,14 @@ from types import SimpleNamespace
 import torch
 
 from lerobot_wmrl.world_models.codebook import CodeBook
+from lerobot_wmrl.world_models.frame_network import Prediction
 from lerobot_wmrl.world_models.losses import (
     Clip,
     corrupt_digits,
     force_predictions,
     next_frame_loss,
-    token_weights,
+    next_frames,
 )
-from lerobot_wmrl.world_models.next_frame import Prediction
 
 CONFIG = SimpleNamespace(motion_weight=3.0, done_weight=1.0, done_positive_weight=2.0, state_weight=1.0)
 CODEBOOK = CodeBook((4, 3))
@@ -34,8 +34,8 @@ def clip_and_prediction(valid: torch.Tensor) -> tuple[Clip, Prediction, torch.Te
 def loss_of(
     prediction: Prediction, digits: torch.Tensor, clip: Clip
 ) -> tuple[torch.Tensor, dict[str, float]]:
-    weights = token_weights(CODEBOOK, digits, clip, CONFIG.motion_weight)
-    return next_frame_loss(prediction, CODEBOOK, digits, clip.state, clip, weights, CONFIG)
+    frames = next_frames(CODEBOOK, digits, clip, CONFIG.motion_weight)
+    return next_frame_loss(prediction, CODEBOOK, frames, clip.state, clip, CONFIG)
 
 
 def test_padding_does_not_count():

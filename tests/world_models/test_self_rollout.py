@@ -10,7 +10,7 @@ from lerobot.rewards.factory import make_reward_model
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.clips import ClipSampler
 from lerobot_wmrl.world_models.episode_table import read_episodes
-from lerobot_wmrl.world_models.losses import SELF_ROLLOUT_FROM, Clip, next_frame_loss, token_weights
+from lerobot_wmrl.world_models.losses import SELF_ROLLOUT_FROM, Clip, next_frame_loss, next_frames
 from lerobot_wmrl.world_models.world_model import WorldModelRewardModel
 from tests.trained import action_config
 
@@ -31,7 +31,7 @@ def model_and_clip(name: str, trained_models, dataset, **settings) -> tuple[Worl
 def seen_by(model: WorldModelRewardModel, clip: Clip) -> tuple[torch.Tensor, torch.Tensor]:
     digits, state = model.network.codebook.digits(clip.tokens), model.normalize_state(clip.state)
     depth = model.network.depth.normalize(clip.depth, clip.tokens)
-    return model.inputs(clip, model.condition(clip), digits, state, depth)[:2]
+    return model.dynamics.inputs(model, clip, model.condition(clip), digits, state, depth)[:2]
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -58,8 +58,8 @@ def test_the_real_frames_are_still_what_is_to_be_predicted(name, trained_models,
     real, state = model.network.codebook.digits(clip.tokens), model.normalize_state(clip.state)
     prediction = model.network(*seen_by(model, clip), *model.condition(clip))
     codebook = model.network.codebook
-    weights = token_weights(codebook, real, clip, model.config.motion_weight)
-    expected, _ = next_frame_loss(prediction, codebook, real, state, clip, weights, model.config)
+    frames = next_frames(codebook, real, clip, model.config.motion_weight)
+    expected, _ = next_frame_loss(prediction, codebook, frames, state, clip, model.config)
     torch.testing.assert_close(loss, expected)
 
 

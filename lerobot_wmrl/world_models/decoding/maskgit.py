@@ -17,7 +17,7 @@ from lerobot_wmrl.world_models.conditioning import pooled
 from lerobot_wmrl.world_models.decoding.shifted import FramesSeen, ShiftedDecoding
 from lerobot_wmrl.world_models.distributed import draw_own_rows, masked_mean
 from lerobot_wmrl.world_models.next_frame import NextFrameNetwork
-from lerobot_wmrl.world_models.temporal_memory import DraftMemory
+from lerobot_wmrl.world_models.temporal_memory import ClipMemory, DraftMemory, TemporalCache
 
 CHOICE_TEMPERATURE: Final = 4.5
 """Of the noise on confidences, annealed to 0, as in the authors' code: without it, of two equally likely
@@ -37,6 +37,12 @@ def largest(confidence: Tensor, fixed: Tensor, count: int) -> Tensor:
     return torch.zeros_like(fixed).scatter(-1, best, True)
 
 
+def drafts_of(seen: FramesSeen) -> DraftMemory:
+    """For drafts of the frames after those seen."""
+    assert isinstance(seen.memory, ClipMemory | TemporalCache)  # all that an autoregressive network has
+    return seen.memory.drafts()
+
+
 class MaskGitDecoding(ShiftedDecoding):
     """`maskgit_steps` passes a frame; in training, a second pass over drafts with a random share masked."""
 
@@ -48,12 +54,12 @@ class MaskGitDecoding(ShiftedDecoding):
 
     def decode(
         self,
-        network: NextFrameNetwork,
+        network: Any,
         seen: FramesSeen,
         temperature: float,
         generator: torch.Generator | None,
     ) -> Tensor:
-        codebook, logits, memory = network.codebook, seen.prediction.logits, seen.memory.drafts()
+        codebook, logits, memory = network.codebook, seen.prediction.logits, drafts_of(seen)
         digits = codebook.sample(logits, temperature, generator)
         fixed = torch.zeros_like(digits[..., 0], dtype=torch.bool)
         for done, count in enumerate(fixed_counts(digits.shape[2], self.passes)[:-1], start=1):
@@ -66,7 +72,7 @@ class MaskGitDecoding(ShiftedDecoding):
         return digits
 
     def loss(
-        self, network: NextFrameNetwork, seen: FramesSeen, target: Tensor, weight: Tensor
+        self, network: Any, seen: FramesSeen, target: Tensor, weight: Tensor
     ) -> tuple[Tensor, dict[str, float]]:
         """Cross-entropy of masked tokens; a frame's masked share is cos(π/2 · u), u uniform (eq. 1 there).
 
@@ -76,7 +82,7 @@ class MaskGitDecoding(ShiftedDecoding):
         chance = draw_own_rows(torch.rand, following.shape[:2], target.device)[..., None]
         drawn = draw_own_rows(torch.rand, following.shape[:3], target.device)
         masked = drawn < (chance * math.pi / 2).cos()
-        logits = self.draft_logits(network, seen, seen.memory.drafts(), following, ~masked)[:, :-1]
+        logits = self.draft_logits(network, seen, drafts_of(seen), following, ~masked)[:, :-1]
         losses = network.codebook.cross_entropy(logits.float(), target)
         loss = masked_mean(losses, weight * masked[:, :-1])
         return loss, {"draft_loss": loss.item()}

@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from lerobot_wmrl.world_models.next_frame import NextFrameNetwork, Prediction
-from lerobot_wmrl.world_models.temporal_memory import ClipMemory, TemporalCache
+from lerobot_wmrl.world_models.frame_network import FrameNetwork, Prediction
+from lerobot_wmrl.world_models.temporal_memory import ClipMemory, FrameCache
 
 Condition = tuple[Tensor, Tensor | None]
 """Condition tokens (B, T or 1, M, D) and their mask (B, 1, 1, 1, M)."""
@@ -19,7 +19,7 @@ class FramesSeen(NamedTuple):
     digits: Tensor
     condition: Condition
     prediction: Prediction
-    memory: ClipMemory | TemporalCache
+    memory: ClipMemory | FrameCache
 
 
 class ShiftedDecoding(nn.Module):
@@ -31,7 +31,7 @@ class ShiftedDecoding(nn.Module):
 
     def decode(
         self,
-        network: NextFrameNetwork,
+        network: FrameNetwork,
         seen: FramesSeen,
         temperature: float,
         generator: torch.Generator | None,
@@ -40,7 +40,7 @@ class ShiftedDecoding(nn.Module):
         return network.codebook.sample(seen.prediction.logits, temperature, generator)
 
     def loss(
-        self, network: NextFrameNetwork, seen: FramesSeen, target: Tensor, weight: Tensor
+        self, network: FrameNetwork, seen: FramesSeen, target: Tensor, weight: Tensor
     ) -> tuple[Tensor, dict[str, float]]:
         """What is learnt beyond the one-pass prediction: nothing.
 

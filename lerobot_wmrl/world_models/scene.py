@@ -1,0 +1,64 @@
+"""What the anchored network keeps of a first frame, and what it knows of the past since."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lerobot_wmrl.world_models.path import Path
+from lerobot_wmrl.world_models.temporal_memory import RingMemory, TemporalCache
+
+
+class Scene(NamedTuple):
+    """First frames of B clips, seen once: digits (B, 1, S, C), transformer tokens (B, 1, 1 + S', D), local
+    features (B, N, code_width, g, g)."""
+
+    digits: Tensor
+    tokens: Tensor
+    local: Tensor
+
+
+def put_rows[T: tuple[Tensor, ...]](old: T, rows: Tensor, new: T) -> T:
+    """`old` with `new` in the rows `rows` (R,) of every tensor."""
+    replaced = (a.index_copy(0, rows, b.to(a.dtype)) for a, b in zip(old, new, strict=True))
+    return type(old)(*replaced)
+
+
+@dataclass
+class AnchoredCache:
+    """Imaginations that each began at a frame of their own: its scene, the path since, a ring of the past.
+
+    Whoever has imagined as many frames as the ring holds begins anew at the frame that was imagined last.
+    """
+
+    ring: TemporalCache
+    scene: Scene | None = None
+    path: Path | None = None
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """What the network computes in."""
+        return self.ring.dtype
+
+    def restart(self, mask: Tensor) -> None:
+        """The next frame of the environments in `mask` (B,) is their first."""
+        self.ring.restart(mask)
+
+    def due(self) -> Tensor:
+        """Environments that have to begin now: rows (R,). Waits for the device to say which."""
+        age = self.ring.position - self.ring.started
+        return (age % self.ring.window == 0).nonzero().squeeze(1)
+
+    def begin(self, rows: Tensor, scene: Scene, path: Path) -> None:
+        """Rows (R,) begin at scenes and paths of R rows."""
+        started = self.ring.started.index_copy(0, rows, self.ring.position.expand(len(rows)))
+        self.ring.started.copy_(started)
+        if self.scene is None or self.path is None:
+            self.scene, self.path = scene, path
+            return
+        self.scene, self.path = put_rows(self.scene, rows, scene), put_rows(self.path, rows, path)
+
+    def advance(self) -> RingMemory:
+        """Begin a frame in the ring."""
+        return self.ring.advance()

@@ -1,0 +1,181 @@
+"""Dynamics that never look at an imagined frame: exact in steps, causal, and learnt from few drawn frames."""
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from lerobot_wmrl.world_models.codebook import CodeBook
+from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig, TextWorldModelConfig
+from lerobot_wmrl.world_models.imagination import Imagined
+from lerobot_wmrl.world_models.losses import Clip, draw_rows, frames_since_start
+from lerobot_wmrl.world_models.modeling_world_model import (
+    ActionWorldModelRewardModel,
+    TextWorldModelRewardModel,
+)
+
+BATCH, LENGTH, TOKENS, CODES = 3, 6, 32, 20
+SIZES: dict[str, Any] = {
+    "device": "cpu", "cameras": ["third_view", "wrist"], "image_size": 32, "tokenizer_widths": [8, 16],
+    "levels": [5, 4], "layers": 2, "width": 32, "heads": 2, "clip_length": LENGTH, "code_width": 8,
+    "dynamics": "anchored",
+}  # fmt: skip
+
+
+def world_model(**settings: Any) -> ActionWorldModelRewardModel:
+    """With random weights everywhere, so that everything matters."""
+    torch.manual_seed(0)
+    model = ActionWorldModelRewardModel(ActionWorldModelConfig(**SIZES | settings)).eval()
+    for parameter in model.parameters():
+        torch.nn.init.normal_(parameter, std=0.2)
+    return model
+
+
+def random_clip(seed: int = 0, length: int = LENGTH) -> Clip:
+    torch.manual_seed(seed)
+    yes = torch.ones(BATCH, length, dtype=torch.bool)
+    tokens, state = torch.randint(0, CODES, (BATCH, length, TOKENS)), torch.randn(BATCH, length, 8)
+    return Clip(
+        tokens, state, torch.randn(BATCH, length, 7), torch.zeros(BATCH, length), yes, yes, [""] * BATCH
+    )
+
+
+def imagine(model: ActionWorldModelRewardModel, clip: Clip) -> list[Imagined]:
+    """Step by step from the clip's first frame."""
+    state = model.start(clip.tokens[:, 0], clip.state[:, 0], dtype=torch.float32)
+    return [model.step(state, action) for action in clip.action.unbind(1)]
+
+
+def over_time(steps: list[Imagined], name: str) -> Tensor:
+    return torch.stack([getattr(step, name) for step in steps], 1)
+
+
+def test_steps_are_one_pass_over_the_clip():
+    model, clip = world_model(), random_clip()
+    steps, whole = imagine(model, clip), model.predict(clip)
+    codebook = model.network.codebook
+    assert torch.equal(over_time(steps, "tokens"), codebook.tokens(codebook.sample(whole.logits, 0.0, None)))
+    torch.testing.assert_close(over_time(steps, "done_logit"), whole.done_logit, atol=1e-4, rtol=0)
+    torch.testing.assert_close(over_time(steps, "hidden"), whole.hidden, atol=1e-4, rtol=0)
+    state = whole.proprioception * model.state_std + model.state_mean
+    torch.testing.assert_close(over_time(steps, "proprioception"), state, atol=1e-4, rtol=0)
+
+
+def test_nothing_comes_from_the_future_nor_from_later_frames():
+    model, clip = world_model(), random_clip()
+    before = model.predict(clip)
+    other = random_clip(seed=1)
+    changed = torch.cat([clip.tokens[:, :1], other.tokens[:, 1:]], 1)
+    moved = torch.cat([clip.state[:, :1], other.state[:, 1:]], 1)
+    unseen = model.predict(clip._replace(tokens=changed, state=moved))
+    assert all(torch.equal(a, b) for a, b in zip(before, unseen, strict=True))
+    actions = torch.cat([clip.action[:, :3], other.action[:, 3:]], 1)
+    after = model.predict(clip._replace(action=actions))
+    for a, b in zip(before[:4], after[:4], strict=True):
+        torch.testing.assert_close(a[:, :3], b[:, :3], atol=1e-5, rtol=0)
+        assert (a[:, 3:] - b[:, 3:]).abs().max() > 1e-3
+
+
+def test_whoever_has_imagined_a_clip_begins_anew_at_its_last_frame():
+    model, clip = world_model(), random_clip(length=2 * LENGTH)
+    steps = imagine(model, clip)
+    last = steps[LENGTH - 1]
+    again = model.start(last.tokens, last.proprioception, dtype=torch.float32)
+    for step, action in zip(steps[LENGTH:], clip.action[:, LENGTH:].unbind(1), strict=True):
+        anew = model.step(again, action)
+        assert torch.equal(anew.tokens, step.tokens)
+        torch.testing.assert_close(anew.done_logit, step.done_logit, atol=1e-4, rtol=0)
+
+
+def test_a_restarted_imagination_is_a_new_one():
+    model, clip, new = world_model(), random_clip(length=2 * LENGTH), random_clip(seed=1)
+    whole = over_time(imagine(model, clip), "tokens")
+    running = model.start(clip.tokens[:, 0], clip.state[:, 0], dtype=torch.float32)
+    before = [model.step(running, action) for action in clip.action[:, :4].unbind(1)]
+    model.restart(running, torch.tensor([True, False, False]), new.tokens[:, 0], new.state[:, 0])
+    after = [model.step(running, action) for action in clip.action[:, 4:].unbind(1)]
+    assert torch.equal(over_time(before + after, "tokens")[1:], whole[1:])
+    fresh = clip._replace(tokens=new.tokens, state=new.state, action=clip.action[:, 4:])
+    assert torch.equal(over_time(after, "tokens")[0], over_time(imagine(model, fresh), "tokens")[0])
+
+
+def test_the_text_model_imagines_the_same_way():
+    torch.manual_seed(0)
+    model = TextWorldModelRewardModel(TextWorldModelConfig(**SIZES)).eval()
+    for parameter in model.network.parameters():
+        torch.nn.init.normal_(parameter, std=0.2)
+    clip = random_clip()._replace(instructions=["push the can", "pull the box", "push the can"])
+    state = model.start(clip.tokens[:, 0], clip.state[:, 0], clip.instructions, torch.float32)
+    steps = [model.step(state) for _ in range(LENGTH)]
+    expected = model.predict(clip).done_logit
+    torch.testing.assert_close(over_time(steps, "done_logit"), expected, atol=1e-4, rtol=0)
+    assert model.loss(clip)[0].isfinite()
+
+
+def reached(clip: Clip) -> Clip:
+    """Done where the first action's sum has passed 1; then all tokens change."""
+    done = clip.action[..., 0].cumsum(1) > 1
+    later = torch.cat([torch.zeros(BATCH, 1, dtype=torch.bool), done[:, :-1]], 1)
+    first = clip.tokens[:, :1]
+    tokens = torch.where(later[..., None], (first + 7) % CODES, first)
+    state = torch.cat([clip.action.new_zeros(BATCH, 1), clip.action[:, :-1, 0].cumsum(1)], 1)[..., None]
+    return clip._replace(tokens=tokens, state=state, done=done.float())
+
+
+def test_frames_done_and_state_are_learnt_though_few_frames_are_drawn():
+    torch.manual_seed(0)
+    model = ActionWorldModelRewardModel(
+        ActionWorldModelConfig(**SIZES | {"state_size": 1, "drawn_frames": 1, "token_noise": 0.0})
+    ).train()
+    clip = reached(random_clip())
+    assert 0 < clip.done.mean() < 1
+    optimizer = torch.optim.Adam(model.network.parameters(), 3e-3)
+    for _ in range(300):
+        loss, _ = model.loss(clip)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    steps = imagine(model.eval(), clip)
+    assert torch.equal(over_time(steps, "done_logit") > 0, clip.done > 0.5)
+    assert (over_time(steps, "tokens")[:, :-1] == clip.tokens[:, 1:]).float().mean() > 0.9
+    assert (over_time(steps, "proprioception")[:, :-1] - clip.state[:, 1:]).abs().mean() < 0.1
+
+
+def test_rows_are_drawn_among_those_with_a_valid_next_one():
+    valid = torch.tensor([[True] * 6, [True] * 3 + [False] * 3, [True] + [False] * 5])
+    rows = torch.stack([draw_rows(valid, 5) for _ in range(200)])
+    assert [sorted(set(rows[:, clip].flatten().tolist())) for clip in range(3)] == [
+        [0, 1, 2, 3, 4],
+        [0, 1],
+        [0],
+    ]
+
+
+def test_tokens_that_are_not_as_at_the_start_count_more_and_padding_nothing():
+    codebook, clip = CodeBook([5, 4]), random_clip()
+    valid = clip.valid.clone()
+    valid[1, 2:] = False
+    tokens = clip.tokens.clone()
+    tokens[0, 3] = tokens[0, 0]
+    clip = clip._replace(tokens=tokens, valid=valid)
+    frames = frames_since_start(codebook, codebook.digits(tokens), clip, 2.0, torch.tensor([[2], [1], [0]]))
+    assert torch.equal(frames.digits[0], codebook.digits(tokens[0, 3:4]))
+    assert torch.equal(frames.weight[0], torch.ones(1, TOKENS))
+    assert torch.equal(frames.weight[1], torch.zeros(1, TOKENS))
+    assert set(frames.weight[2].unique().tolist()) == {1.0, 3.0}
+    assert torch.equal(frames.moved, frames.weight == 3)
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [("decoding", "maskgit"), ("depth", True), ("self_rollout", 0.5), ("keypoint_weight", 1.0)],
+)
+def test_what_anchored_dynamics_do_not_have_is_named(setting, value):
+    with pytest.raises(ValueError, match=rf"--model.{setting}={value}: anchored dynamics do not have it"):
+        ActionWorldModelConfig(**SIZES | {setting: value})
+
+
+def test_unknown_dynamics_are_named():
+    with pytest.raises(ValueError, match=r"--model.dynamics=still: choose one of autoregressive, anchored"):
+        world_model(dynamics="still")
