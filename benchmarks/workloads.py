@@ -20,7 +20,7 @@ Work = Callable[[], object]
 
 @dataclass
 class Imagination:
-    """B imaginations whose ring is full, as it is in the long run."""
+    """B imaginations that remember as much as they do in the long run."""
 
     model: ActionWorldModelRewardModel
     batch: int
@@ -29,13 +29,13 @@ class Imagination:
 
     def __post_init__(self) -> None:
         self.action = self.model.action_mean.expand(self.batch, -1).clone()
-        self.state = self._full_ring()
+        self.state = self._running()
         tokenizer = self.model.tokenizer
         size, cameras = tokenizer.image_size, tokenizer.num_cameras
         first = torch.zeros(self.batch, cameras, 3, size, size, device=self.device)
         self.context = tokenizer.context(first)
 
-    def _full_ring(self) -> ImaginationState:
+    def _running(self) -> ImaginationState:
         tokens = torch.zeros(
             self.batch, self.model.tokenizer.tokens_per_frame, dtype=torch.long, device=self.device
         )
@@ -43,9 +43,15 @@ class Imagination:
             tokens, self.model.state_mean.expand(self.batch, -1), dtype=self.dtype,
             depth=torch.ones(tokens.shape, device=self.device),
         )  # fmt: skip
-        state.cache.visible = state.cache.window
-        state.cache.position.fill_(state.cache.window)
+        for _ in range(self.frames):
+            self.model.step(state, self.action)
         return state
+
+    @property
+    def frames(self) -> int:
+        """That are remembered in the long run: the window, or half of what an anchor is kept for."""
+        config = self.model.config
+        return config.clip_length // 2 if config.dynamics == "anchored" else config.window
 
     def step(self) -> Tensor:
         """Tokens of one more frame, (B, S)."""
@@ -56,29 +62,33 @@ class Imagination:
         return self.model.decode(self.step(), self.context).images
 
     @torch.no_grad()
-    def step_without_ring(self) -> Tensor:
-        """The same frame from the whole window's digits and actions, all layers computed anew."""
-        window, model = self.state.cache.window, self.model
-        condition = model.encode_actions(self.action[:, None].expand(-1, window, -1))
-        digits = self.state.digits.expand(-1, window, -1, -1)
+    def step_without_memory(self) -> Tensor:
+        """The same frame from all digits and actions that are remembered, all layers computed anew."""
+        model, state, frames = self.model, self.state, self.frames
+        condition = model.encode_actions(self.action[:, None].expand(-1, frames, -1))
         with compute_in(self.dtype, self.device):
-            prediction = model.network(
-                digits, self.state.proprioception.expand(-1, window, -1), *condition,
-                depth=self.state.depth.expand(-1, window, -1),
-            )  # fmt: skip
+            if model.config.dynamics == "anchored":
+                last = torch.full((self.batch, 1), frames - 1, device=self.device)
+                prediction = model.network(
+                    state.digits, state.proprioception, *condition, length=frames, frames=last
+                )
+            else:
+                seen = (x.expand(-1, frames, *x.shape[2:]) for x in (state.digits, state.proprioception))
+                depth = state.depth.expand(-1, frames, -1)
+                prediction = model.network(*seen, *condition, depth=depth)
         return model.network.codebook.sample(prediction.logits[:, -1], 0.0, None)
 
     def bytes_a_frame(self) -> float:
-        """Weights, shared by the batch, and the ring of one imagination, each read once."""
+        """Weights, shared by the batch, and what one imagination remembers, each read once."""
         weights = sum(parameter.numel() for parameter in self.model.network.parameters())
-        ring = 2 * self.state.cache.keys.numel() / self.batch
-        return (weights / self.batch + ring) * self.dtype.itemsize
+        return (weights / self.batch + self.state.cache.numbers / self.batch) * self.dtype.itemsize
 
 
-def repeated(work: Work, device: torch.device) -> Work:
-    """`STEPS` times `work`; on CUDA as replays of one graph, captured after a warm-up on a side stream."""
+def repeated(work: Work, graphed: bool) -> Work:
+    """`STEPS` times `work`; if `graphed`, which needs CUDA, as replays of one graph, captured after a warm-up
+    on a side stream."""
     replay = work
-    if device.type == "cuda":
+    if graphed:
         side = torch.cuda.Stream()
         side.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(side):

@@ -39,17 +39,22 @@ from lerobot_wmrl.world_models.frame_cache import cached_frames
 
 RESULTS: Final = Path(__file__).parents[1] / "docs" / "results" / "world_model_ablation.json"
 
+NONE: Final[Flags] = {"model.dynamics": "autoregressive", "batch_size": 2}
+"""RoboScape's network without its options; two clips take as long as sixteen of anchored dynamics."""
+
 VARIANTS: Final[dict[str, Flags]] = {
-    "none": {},
-    "keypoints": {"model.keypoint_weight": 1.0},
-    "depth": {"model.depth": True},
-    "both": {"model.depth": True, "model.keypoint_weight": 1.0},
-    "self_rollout": {"model.self_rollout": 0.4},
-    "no_self_forcing": {"model.self_forcing": 0.0},
-    "adaln": {"model.conditioning": "adaln"},
-    "additive": {"model.conditioning": "additive"},
-    "no_state": {"model.state_size": 0},
-    "maskgit": {"model.decoding": "maskgit"},
+    "none": NONE,
+    "keypoints": {**NONE, "model.keypoint_weight": 1.0},
+    "depth": {**NONE, "model.depth": True},
+    "both": {**NONE, "model.depth": True, "model.keypoint_weight": 1.0},
+    "self_rollout": {**NONE, "model.self_rollout": 0.4},
+    "no_self_forcing": {**NONE, "model.self_forcing": 0.0},
+    "adaln": {**NONE, "model.conditioning": "adaln"},
+    "additive": {**NONE, "model.conditioning": "additive"},
+    "no_state": {**NONE, "model.state_size": 0},
+    "maskgit": {**NONE, "model.decoding": "maskgit"},
+    "anchored": {"model.dynamics": "anchored"},
+    "anchored_no_state": {"model.dynamics": "anchored", "model.state_size": 0},
 }
 """Name → what differs from the preset. Depth needs a dataset recorded with it."""
 

@@ -23,8 +23,10 @@ class WorldModelConfig(RewardModelConfig):
         cameras, image_size, tokenizer_widths, levels, quantizer, tokenizer_context: of that tokenizer, filled
             in from its checkpoint.
         state_size: width of `observation.state`, 0 to do without proprioception; filled in from the dataset.
+        dynamics: what a frame is predicted from: `autoregressive`, the frame before it (eq. 1); `anchored`,
+            the episode's first frame and what was done since, so that errors in pictures do not add up.
         layers, width, heads: of the spatial-temporal transformer.
-        window: frames the model remembers.
+        window: frames the model remembers; with anchored dynamics `clip_length` says that.
         clip_length: frames of a training clip. Success is learnt only that far from an episode's start, so
             give it the number of frames that episodes are imagined for.
         patch: side of the square of tokens that forms one transformer token.
@@ -38,7 +40,10 @@ class WorldModelConfig(RewardModelConfig):
         motion_weight: how much more a token counts in the loss when it moves. A high weight makes the model
             believe in motion: it then pushes objects that the hand misses.
         done_weight, done_positive_weight, state_weight, depth_weight: of the losses beside the tokens' one.
-        self_forcing: share of input frames replaced by the model's own predictions in training.
+        drawn_frames: of each clip that anchored dynamics draw in a training step, at random; done and state
+            are learnt from all of them.
+        self_forcing: share of input frames replaced by the model's own predictions in training
+            (autoregressive).
         self_rollout: share of clips that in the last quarter of training show what the model itself makes of
             their first frame and actions, instead of the real frames; what it has to predict stays real.
         keypoint_weight: of RoboScape's keypoint consistency: the tokens that move most should look, wherever
@@ -147,10 +152,12 @@ class ActionWorldModelConfig(WorldModelConfig):
     """Answers a policy: c = a in eq. 1. Its reward is the probability that success holds.
 
     Args:
+        dynamics: as of both models, but `anchored` by default.
         action_size: width of `action`, filled in from the dataset.
         condition_tokens: tokens the action is embedded into for cross-attention.
     """
 
+    dynamics: str = "anchored"
     action_size: int = 7
     condition_tokens: int = 4
 

@@ -41,6 +41,12 @@ class AnchoredCache:
         """What the network computes in."""
         return self.ring.dtype
 
+    @property
+    def numbers(self) -> int:
+        """That it holds: the ring's, the scenes' and the paths'."""
+        held = [*(self.scene or ()), *(self.path or ())]
+        return self.ring.numbers + sum(tensor.numel() for tensor in held)
+
     def restart(self, mask: Tensor) -> None:
         """The next frame of the environments in `mask` (B,) is their first."""
         self.ring.restart(mask)

@@ -27,6 +27,10 @@ class FrameCache(Protocol):
     def dtype(self) -> torch.dtype:
         """What the network computes in."""
 
+    @property
+    def numbers(self) -> int:
+        """That it holds."""
+
     def restart(self, mask: Tensor) -> None:
         """The next frame of the environments in `mask` (B,) is their first."""
 
@@ -103,6 +107,11 @@ class TemporalCache:
     def dtype(self) -> torch.dtype:
         """What the network computes in."""
         return self.keys.dtype
+
+    @property
+    def numbers(self) -> int:
+        """That it holds, keys and values."""
+        return 2 * self.keys.numel()
 
     @property
     def window(self) -> int:

@@ -14,9 +14,9 @@ from lerobot_wmrl.world_models.losses import Clip
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 
 SIZES: dict[str, Any] = {
-    "device": "cpu", "image_size": 32, "tokenizer_widths": [8, 16], "levels": [5, 4], "layers": 2,
-    "width": 32, "heads": 2, "window": 4, "code_width": 8, "maskgit_steps": 3, "depth": True,
-    "cameras": ["third_view", "wrist"], "token_noise": 0.0,
+    "device": "cpu", "dynamics": "autoregressive", "image_size": 32, "tokenizer_widths": [8, 16],
+    "levels": [5, 4], "layers": 2, "width": 32, "heads": 2, "window": 4, "code_width": 8, "maskgit_steps": 3,
+    "depth": True, "cameras": ["third_view", "wrist"], "token_noise": 0.0,
 }  # fmt: skip
 BATCH, TOKENS, CODES, FRAMES = 3, 32, 20, 12
 CHANGED = 5

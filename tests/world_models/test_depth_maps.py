@@ -1,6 +1,7 @@
 """LeRobot's depth maps on the tokens' grid, and a world model trained, replayed and lived in with them."""
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,10 @@ def deep_dataset(make_synthetic_dataset, tmp_path_factory) -> LeRobotDataset:
 @pytest.fixture(scope="module")
 def models(deep_dataset, trained_models, tmp_path_factory) -> dict[str, Path]:
     folder, tokenizer = tmp_path_factory.mktemp("models"), trained_models["frame_tokenizer"]
-    configs = {"action_world_model": action_config, "text_world_model": text_config}
+    configs = {
+        "action_world_model": partial(action_config, dynamics="autoregressive"),
+        "text_world_model": text_config,
+    }
     return {
         name: run_training(config(tokenizer, depth=True), Path(deep_dataset.root), folder / name)
         for name, config in configs.items()
@@ -147,7 +151,7 @@ def test_the_environment_begins_with_the_depth_of_its_starts(deep_dataset, model
 def test_a_dataset_without_depth_is_named_before_anything_is_trained(small_dataset, trained_models, tmp_path):
     with pytest.raises(ValueError, match=r"--model\.depth=true: .*third_view_depth .*--depth=true"):
         run_training(
-            action_config(trained_models["frame_tokenizer"], depth=True),
+            action_config(trained_models["frame_tokenizer"], dynamics="autoregressive", depth=True),
             Path(small_dataset.root), tmp_path / "out",
         )  # fmt: skip
     assert not (tmp_path / "out").exists()

@@ -23,11 +23,11 @@ SIZES = {
     "action_world_model": [
         "--model.layers=1", "--model.width=32", "--model.heads=2", "--model.clip_length=14",
         "--model.code_width=8", "--model.token_noise=0.1", "--model.self_rollout=0.5",
-        "--model.keypoint_weight=1",
+        "--model.keypoint_weight=1", "--model.dynamics=autoregressive",
     ],
     "text_world_model": [
         "--model.layers=1", "--model.width=32", "--model.heads=2", "--model.clip_length=14",
-        "--model.code_width=8", "--model.state_size=0",
+        "--model.code_width=8", "--model.state_size=0", "--model.dynamics=anchored",
     ],
 }  # fmt: skip
 

@@ -24,8 +24,8 @@ from tests.trained import TINY, tokenizer_config
 EPISODES, ROWS, TOKENS, CODES = 4, 14, 16, 20
 GOLDEN = {
     "frame_tokenizer": [0.804, 1.4174, 1.3384, 1.2073, 1.2096, 0.7358, 1.4921, 1.9857],
-    "action_world_model": [3.8262, 3.7196, 3.5669, 3.6501, 3.6174, 3.609, 3.4422, 3.57],
-    "anchored": [5.6803, 5.5644, 4.9155, 5.1745, 4.5523, 4.5432, 4.2745, 4.6519],
+    "autoregressive": [3.8262, 3.7196, 3.5669, 3.6501, 3.6174, 3.609, 3.4422, 3.57],
+    "action_world_model": [5.6803, 5.5644, 4.9155, 5.1745, 4.5523, 4.5432, 4.2745, 4.6519],
     "text_world_model": [3.7513, 3.5552, 3.3833, 3.4729, 3.4508, 3.4538, 3.2883, 3.4127],
 }
 WORLD_MODEL: dict[str, Any] = {
@@ -67,7 +67,7 @@ def test_the_loss_of_a_short_training_is_the_golden_one(model, tmp_path: Path):
     configs = {
         "frame_tokenizer": tokenizer_config,
         "action_world_model": partial(ActionWorldModelConfig, **WORLD_MODEL),
-        "anchored": partial(ActionWorldModelConfig, **WORLD_MODEL, dynamics="anchored"),
+        "autoregressive": partial(ActionWorldModelConfig, **WORLD_MODEL, dynamics="autoregressive"),
         "text_world_model": partial(TextWorldModelConfig, **WORLD_MODEL),
     }
     set_seed(0)

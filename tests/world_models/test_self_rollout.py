@@ -7,21 +7,25 @@ import pytest
 import torch
 from lerobot.rewards.factory import make_reward_model
 
-from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.clips import ClipSampler
 from lerobot_wmrl.world_models.episode_table import read_episodes
 from lerobot_wmrl.world_models.losses import SELF_ROLLOUT_FROM, Clip, next_frame_loss, next_frames
 from lerobot_wmrl.world_models.world_model import WorldModelRewardModel
-from tests.trained import action_config
+from tests.trained import action_config, text_config
 
-MODELS = ("action_world_model", "text_world_model")
+CONFIGS = {"action_world_model": action_config, "text_world_model": text_config}
 
 
 def model_and_clip(name: str, trained_models, dataset, **settings) -> tuple[WorldModelRewardModel, Clip]:
     """Nothing but rollouts replaces what is seen, and that is made up: no model expects it."""
-    model = load_model(trained_models[name], name)
-    for setting, value in {"token_noise": 0.0, "self_forcing": 0.0, **settings}.items():
-        setattr(model.config, setting, value)
+    torch.manual_seed(0)
+    config = CONFIGS[name](
+        trained_models["frame_tokenizer"], dynamics="autoregressive", token_noise=0.0, self_forcing=0.0,
+        **settings,
+    )  # fmt: skip
+    model = make_reward_model(config)
+    for parameter in model.network.parameters():
+        torch.nn.init.normal_(parameter, std=0.2)
     shape = dataset.num_frames, model.tokenizer.tokens_per_frame
     tokens = np.random.default_rng(0).integers(0, 20, shape)
     sampler = ClipSampler(read_episodes(dataset), tokens, np.arange(6), 9, batch_size=6, seed=3, device="cpu")
@@ -34,7 +38,7 @@ def seen_by(model: WorldModelRewardModel, clip: Clip) -> tuple[torch.Tensor, tor
     return model.dynamics.inputs(model, clip, model.condition(clip), digits, state, depth)[:2]
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", CONFIGS)
 @torch.no_grad()
 def test_clips_show_what_the_model_imagines_of_them(name, trained_models, small_dataset):
     model, clip = model_and_clip(name, trained_models, small_dataset, self_rollout=1.0)
@@ -50,7 +54,7 @@ def test_clips_show_what_the_model_imagines_of_them(name, trained_models, small_
     assert not torch.equal(model.network.codebook.tokens(digits), clip.tokens)
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", CONFIGS)
 @torch.no_grad()
 def test_the_real_frames_are_still_what_is_to_be_predicted(name, trained_models, small_dataset):
     model, clip = model_and_clip(name, trained_models, small_dataset, self_rollout=1.0)
@@ -65,7 +69,7 @@ def test_the_real_frames_are_still_what_is_to_be_predicted(name, trained_models,
 
 @torch.no_grad()
 def test_a_share_of_the_clips_and_only_late_in_training(trained_models, small_dataset):
-    model, clip = model_and_clip(MODELS[0], trained_models, small_dataset, self_rollout=0.5)
+    model, clip = model_and_clip("action_world_model", trained_models, small_dataset, self_rollout=0.5)
     real = model.network.codebook.digits(clip.tokens)
     model.training_progress = SELF_ROLLOUT_FROM - 0.01
     assert torch.equal(seen_by(model, clip)[0], real)
@@ -80,7 +84,9 @@ def test_a_share_of_the_clips_and_only_late_in_training(trained_models, small_da
 @pytest.mark.parametrize("decoding", ["shifted", "maskgit"])
 def test_rollouts_draw_no_global_random_number(decoding, trained_models):
     """Processes roll out different numbers of clips, and must go on with the same random numbers."""
-    config = action_config(Path(trained_models["frame_tokenizer"]), decoding=decoding, temperature=1.0)
+    config = action_config(
+        trained_models["frame_tokenizer"], dynamics="autoregressive", decoding=decoding, temperature=1.0
+    )
     model = make_reward_model(config)
     tokens, state = torch.zeros(2, model.tokenizer.tokens_per_frame, dtype=torch.long), torch.zeros(2, 8)
     condition = model.encode_actions(torch.zeros(2, 3, 7))
