@@ -40,7 +40,7 @@ from lerobot_wmrl.world_models.frame_cache import cached_frames
 RESULTS: Final = Path(__file__).parents[1] / "docs" / "results" / "world_model_ablation.json"
 
 NONE: Final[Flags] = {"model.dynamics": "autoregressive", "batch_size": 2}
-"""RoboScape's network without its options; two clips take as long as sixteen of anchored dynamics."""
+"""RoboScape's network without its options. Sixteen clips a step would take it eight times as long."""
 
 VARIANTS: Final[dict[str, Flags]] = {
     "none": NONE,

@@ -73,7 +73,8 @@ def test_a_world_model_of_any_dataset_goes_on_bit_for_bit(
 ):
     """As `lerobot-train --resume=true` continues it: with its samples, but not with its random numbers."""
     model = ["--reward_model.type=action_world_model", f"--reward_model.tokenizer_path={foreign_tokenizer}",
-             "--reward_model.token_noise=0", "--reward_model.self_forcing=0"]  # fmt: skip
+             "--reward_model.dynamics=autoregressive", "--reward_model.token_noise=0",
+             "--reward_model.self_forcing=0"]  # fmt: skip
     whole = lerobot_trained(monkeypatch, tmp_path / "run", *on(foreign_dataset, 4), *model, *SMALL)
     expected = load_file(whole / LAST / "model.safetensors")
     (whole / "checkpoints" / "000004").rename(tmp_path / "lost")
