@@ -50,8 +50,8 @@ class Experiment:
     """The commands of the experiment, all paths below `out`.
 
     Args:
-        episodes: planned ones; in each manner a tenth as many of the policy that is asked about, a sixteenth of
-            the others.
+        episodes: planned ones; in each manner a tenth as many of the policy that is asked about, a sixteenth
+            of the others.
         model_flags: further flags of the action world model's training.
     """
 
