@@ -133,10 +133,10 @@ class Experiment:
 
     def train_tokenizer(self) -> list[str]:
         flags: Flags = {
-            "model.type": "frame_tokenizer", "model.cameras": CAMERAS, "model.context": True,
+            "model.type": "frame_tokenizer", "model.cameras": CAMERAS, "model.context": True, "steps": 1600,
             "dataset.root": self.path("planned"), "output_dir": self.path("frame_tokenizer"),
         }  # fmt: skip
-        return ["lerobot-wmrl-train-world-model", "--preset=cpu", *format_flags(flags)]
+        return ["lerobot-wmrl-train-world-model", "--preset=demo", *format_flags(flags)]
 
     def train_model(self) -> list[str]:
         flags: Flags = {

@@ -27,6 +27,16 @@ TINY_WORLD_MODEL: Final[Flags] = {
     "log_freq": 5,
 }
 
+CPU_TOKENIZER: Final[Flags] = {
+    "model.cameras": "[third_view,side_view]",
+    "model.widths": "[32,64,128]",
+    "model.context": True,
+    "steps": 1600,
+    "batch_size": 48,
+    "save_freq": 200,
+}
+"""64 tokens for each of the two views that stand still, of 128 pixels a side as the recipe has them."""
+
 CPU_ACTION_MODEL: Final[Flags] = {
     "model.dynamics": "anchored",
     "model.layers": 4,
@@ -179,12 +189,7 @@ PRESETS: Final[dict[str, dict[str, Flags]]] = {
         "eval-imagined": {"eval.batch_size": 50},
     },
     "cpu": {
-        "train-world-model:frame_tokenizer": {
-            "model.image_size": DEMO_IMAGE_SIZE,
-            "steps": 1600,
-            "batch_size": 48,
-            "save_freq": 200,
-        },
+        "train-world-model:frame_tokenizer": CPU_TOKENIZER,
         "train-world-model:action_world_model": CPU_ACTION_MODEL,
         "train-world-model:text_world_model": CPU_TEXT_MODEL,
     },
