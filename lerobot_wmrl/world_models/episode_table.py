@@ -22,8 +22,8 @@ VALIDATION_EVERY = 20
 class EpisodeTable:
     """Per frame (N rows): state (N, P), action (N, A), done (N,). Per episode (E): start, length, ….
 
-    `kind` holds indices into `constants.KINDS`, `scene` those of the recorded scenes, −1 where the dataset
-    does not say.
+    `kind` and `task` hold indices into `constants.KINDS` and `TASKS`, `scene` those of the recorded scenes,
+    −1 where the dataset does not say.
     """
 
     dataset: LeRobotDataset
@@ -34,6 +34,7 @@ class EpisodeTable:
     length: np.ndarray
     kind: np.ndarray
     scene: np.ndarray
+    task: np.ndarray
     instructions: list[str]
 
     @property
@@ -97,7 +98,7 @@ def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
             f"{', '.join(dataset.features)}); world models need what was done beside what was seen"
         )
     columns = [ACTION, "episode_index"]
-    optional = (OBS_STATE, "next.done", "start.kind", "start.scene")
+    optional = (OBS_STATE, "next.done", "start.kind", "start.scene", "start.task")
     columns += [name for name in optional if name in dataset.features]
     rows = dataset.hf_dataset.with_format("numpy", columns=columns)[:]
     for column in (ACTION, OBS_STATE, "next.done"):
@@ -105,9 +106,9 @@ def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
             check_finite(dataset, column, np.asarray(rows[column]), rows["episode_index"])
     frames = len(rows["episode_index"])
     _, start, length = np.unique(rows["episode_index"], return_index=True, return_counts=True)
-    kind, scene = (
+    kind, scene, task = (
         np.asarray(rows[name]).reshape(-1)[start] if name in rows else np.full(len(start), -1)
-        for name in ("start.kind", "start.scene")
+        for name in ("start.kind", "start.scene", "start.task")
     )
     done = np.asarray(rows["next.done"]).reshape(-1) if "next.done" in rows else np.zeros(frames, bool)
     state = (
@@ -115,7 +116,9 @@ def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
     )
     instructions = [episode["tasks"][0] for episode in dataset.meta.episodes]
     action = np.asarray(rows[ACTION], np.float32)
-    return EpisodeTable(dataset, state, action, done.astype(bool), start, length, kind, scene, instructions)
+    return EpisodeTable(
+        dataset, state, action, done.astype(bool), start, length, kind, scene, task, instructions
+    )
 
 
 def check_finite(dataset: LeRobotDataset, column: str, values: np.ndarray, episode: np.ndarray) -> None:

@@ -41,10 +41,10 @@ def made_up_episodes() -> EpisodeTable:
     action = rng.normal(size=(rows, 7)).astype(np.float32)
     done = np.tile(np.arange(2 * ROWS) >= 2 * ROWS - 3, EPISODES // 2)
     start, length = np.arange(EPISODES) * ROWS, np.full(EPISODES, ROWS)
-    kind = scene = np.zeros(EPISODES, int)
+    kind = scene = task = np.zeros(EPISODES, int)
     instructions = ["push the can", "pull the box"] * (EPISODES // 2)
     dataset: Any = SimpleNamespace(root="made up")
-    return EpisodeTable(dataset, state, action, done, start, length, kind, scene, instructions)
+    return EpisodeTable(dataset, state, action, done, start, length, kind, scene, task, instructions)
 
 
 def made_up_sampler(model: str) -> ClipSampler | FrameSampler:

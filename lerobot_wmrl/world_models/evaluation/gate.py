@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import mannwhitneyu
 
-from lerobot_wmrl.constants import KINDS, PLAY
+from lerobot_wmrl.constants import KINDS, PLAY, TASKS
 from lerobot_wmrl.statistics import Proportion
 from lerobot_wmrl.world_models.compatibility import check_dataset
 from lerobot_wmrl.world_models.episode_table import EpisodeTable, open_dataset, read_episodes
@@ -56,8 +56,10 @@ class Outcomes:
     def attempts(self, table: EpisodeTable) -> "Outcomes":
         """Without play, which attempts nothing; all of them, if there is nothing else."""
         kept = table.kind[self.episodes] != KINDS.index(PLAY)
-        if not kept.any():
-            return self
+        return self.where(kept) if kept.any() else self
+
+    def where(self, kept: np.ndarray) -> "Outcomes":
+        """Some of the episodes: kept (E,)."""
         return Outcomes(self.episodes[kept], self.probability[kept], self.done[kept])
 
     @property
@@ -135,6 +137,15 @@ def gate_at(outcomes: Outcomes, threshold: float, frames: int) -> Gate:
         Proportion(int((called & real).sum()), int(real.sum())),
         outcomes.auc(frames),
     )
+
+
+def gates_by_task(outcomes: Outcomes, table: EpisodeTable, threshold: float, frames: int) -> dict[str, Gate]:
+    """The gate of each task in the dataset, from the same replay; none if it does not say."""
+    tasks = table.task[outcomes.episodes]
+    return {
+        TASKS[task]: gate_at(outcomes.where(tasks == task), threshold, frames)
+        for task in np.unique(tasks[tasks >= 0])
+    }
 
 
 def sweep(outcomes: Outcomes) -> list[Gate]:

@@ -12,6 +12,7 @@ from lerobot_wmrl.world_models.evaluation.extreme_actions import robustness
 from lerobot_wmrl.world_models.evaluation.gate import (
     best_operating_point,
     gate_at,
+    gates_by_task,
     success_agreement,
     sweep,
 )
@@ -44,6 +45,7 @@ def report_action_model(
     play = [e for e in evaluation.accuracy if source.table.kind[e.episode] == KINDS.index(PLAY)]
     steps, gates = by_step(evaluation.accuracy, HORIZON), sweep(outcomes)
     best = best_operating_point(gates)
+    by_task = gates_by_task(outcomes, source.table, threshold, frames)
     extremes = robustness(model, source, outcomes.episodes, threshold, frames)
     numbers = {
         **success_agreement(outcomes, threshold, frames),
@@ -52,6 +54,7 @@ def report_action_model(
         **steps,
         "play": {"episodes": len(play), **by_step(play, LONGEST)},
         "operating_point": best.as_json() if best else None,
+        "gate_by_task": {task: gate.as_json() for task, gate in by_task.items()},
         "gate_sweep": [gate.as_json() for gate in gates],
         "extreme_actions": extremes,
     }
@@ -66,6 +69,7 @@ def report_action_model(
     page = (
         tables.headline_table(estimates),
         tables.gate_lines(gate_at(outcomes, threshold, frames), best),
+        tables.task_table(by_task),
         "Failures called successes / successes recognised, in percent:",
         tables.sweep_table(gates),
         tables.robustness_table(extremes),

@@ -69,6 +69,17 @@ def gate_lines(gate: Gate, best: Gate | None) -> str:
     return "\n".join(lines)
 
 
+def task_table(gates: Mapping[str, Gate]) -> str:
+    """The gate of each task, at one operating point."""
+    rows = [
+        (task, gate.false_success, gate.recognised, f"{gate.auc:.2f}", "yes" if gate.passed else "no")
+        for task, gate in gates.items()
+    ]
+    return markdown_table(
+        ("task", "failures called successes", "successes recognised", "AUC", "passed"), rows
+    )
+
+
 def sweep_table(gates: Sequence[Gate]) -> str:
     """Percent of false successes / of recognised successes by threshold and frames."""
     at = {(gate.threshold, gate.frames): gate for gate in gates}

@@ -2,6 +2,8 @@
 
 import json
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from lerobot_wmrl.world_models.evaluation.gate import (
     best_operating_point,
     first_run,
     gate_at,
+    gates_by_task,
     success_agreement,
     sweep,
 )
@@ -92,3 +95,15 @@ def test_without_any_success_rates_are_no_numbers():
     assert math.isnan(done_quality(never, 0.5, 3)["done_f1"].value)
     assert success_agreement(never, 0.5, 3)["recognised_rate"]["share"] is None
     assert not gate_at(never, 0.5, 3).passed
+
+
+def test_every_task_has_a_gate_of_its_own(outcomes):
+    table: Any = SimpleNamespace(task=np.array([0, 0, 1, 1, -1]))
+    gates = gates_by_task(outcomes, table, 0.5, 3)
+    assert list(gates) == ["push", "pull"]
+    assert (gates["push"].recognised.k, gates["push"].recognised.n, gates["push"].false_success.n) == (
+        2,
+        2,
+        0,
+    )
+    assert (gates["pull"].recognised.k, gates["pull"].false_success.k) == (0, 1)
