@@ -66,14 +66,14 @@ def report_action_model(
         shown = pictures.side_by_side(model, source, run)
         pictures.save_animation(shown, folder / f"comparison_{name}.gif")
         pictures.save_strip(shown, folder / f"comparison_{name}_strip.png")
-    page = (
+    page = [
         tables.headline_table(estimates),
         tables.gate_lines(gate_at(outcomes, threshold, frames), best),
-        tables.task_table(by_task),
+        *([tables.task_table(by_task)] if by_task else []),
         "Failures called successes / successes recognised, in percent:",
         tables.sweep_table(gates),
         tables.robustness_table(extremes),
-    )
+    ]
     return Report(numbers, "\n\n".join(page))
 
 
