@@ -83,9 +83,8 @@ class AnchoredNetwork(FrameNetwork):
         nothing = ConditionTokens(x[:, :, :1], None, x[:, :, 0])
         for block in self.scene:
             x = block(x, nothing)
-        return Scene(digits, self.scene_norm(x), local.unflatten(0, (len(digits), -1))), self.path.begin(
-            state
-        )
+        scene = Scene(digits, self.scene_norm(x), local.unflatten(0, (len(digits), -1)))
+        return scene, self.path.begin(state)
 
     def make_cache(self, batch: int, device: torch.device, dtype: torch.dtype) -> AnchoredCache:
         """Imaginations of which none has begun."""

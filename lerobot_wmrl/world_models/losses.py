@@ -93,14 +93,27 @@ class NextFrames(NamedTuple):
     moved: Tensor
 
 
+def known_transitions(valid: Tensor) -> Tensor:
+    """Where a valid frame follows a valid one: (B, T) → (B, T − 1)."""
+    return valid[:, 1:] & valid[:, :-1]
+
+
+def weighted_frames(
+    codebook: CodeBook, target: Tensor, reference: Tensor, known: Tensor, motion_weight: float
+) -> NextFrames:
+    """Frames with digits `target` (B, K, S, C), of which those `known` (B, K) count; tokens that are not as
+    in `reference` (B, K or 1, S, C) count `motion_weight` times more."""
+    moved = known[..., None] & (codebook.distance(target, reference) >= MOTION_LEVELS)
+    return NextFrames(target, (1 + motion_weight * moved) * known[..., None].float(), moved)
+
+
 def next_frames(codebook: CodeBook, digits: Tensor, clip: Clip, motion_weight: float) -> NextFrames:
     """Frames 1 … T − 1 of clips with digits (B, T, S, C).
 
     Tokens that move count `motion_weight` times more: most of a frame is still, and what moves decides.
     """
-    known = (clip.valid[:, 1:] & clip.valid[:, :-1])[..., None]
-    moved = known & (codebook.distance(digits[:, 1:], digits[:, :-1]) >= MOTION_LEVELS)
-    return NextFrames(digits[:, 1:], (1 + motion_weight * moved) * known.float(), moved)
+    known = known_transitions(clip.valid)
+    return weighted_frames(codebook, digits[:, 1:], digits[:, :-1], known, motion_weight)
 
 
 def frames_since_start(
@@ -110,10 +123,8 @@ def frames_since_start(
 
     Tokens that are not as in the first frame count `motion_weight` times more.
     """
-    known = take_rows(clip.valid[:, 1:] & clip.valid[:, :-1], rows)[..., None]
-    target = take_rows(digits[:, 1:], rows)
-    moved = known & (codebook.distance(target, digits[:, :1]) >= MOTION_LEVELS)
-    return NextFrames(target, (1 + motion_weight * moved) * known.float(), moved)
+    known, target = (take_rows(x, rows) for x in (known_transitions(clip.valid), digits[:, 1:]))
+    return weighted_frames(codebook, target, digits[:, :1], known, motion_weight)
 
 
 def draw_rows(valid: Tensor, count: int) -> Tensor:
@@ -137,7 +148,7 @@ def next_frame_loss(
     state_losses = F.smooth_l1_loss(
         state_error, torch.zeros_like(state_error), reduction="none", beta=STATE_PRECISION
     )
-    known = (clip.valid[:, 1:] & clip.valid[:, :-1])[..., None]
+    known = known_transitions(clip.valid)[..., None]
     state_loss = masked_mean(state_losses, known.expand_as(state_losses))
     done_loss = masked_done_loss(prediction.done_logit, clip, config.done_positive_weight)
     loss = token_loss + config.done_weight * done_loss + config.state_weight * state_loss
