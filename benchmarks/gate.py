@@ -5,8 +5,8 @@
 One task (push) in the demo's three scenes. Planners and three cloned policies, as they are and disturbed,
 give the data; a fourth policy, too, is rolled out in ManiSkill, in these scenes and in those held out from
 all training, and replayed in the world model. Every stage is one of the package's commands; the same call
-again continues. About two and a half hours on two cores; the results are metrics.json in outputs/gate/check
-and outputs/gate/check_ood. Flags of the action world model's training may follow.
+again continues. Two to three hours on two cores, by estimate; the results are metrics.json in
+outputs/gate/check and outputs/gate/check_ood. Flags of the action world model's training may follow.
 """
 
 import argparse
