@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from lerobot_wmrl.precision import compute_in
+from lerobot_wmrl.world_models.context import Context
 from lerobot_wmrl.world_models.imagination import ImaginationState
 from lerobot_wmrl.world_models.losses import Clip
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
@@ -30,10 +31,6 @@ class Imagination:
     def __post_init__(self) -> None:
         self.action = self.model.action_mean.expand(self.batch, -1).clone()
         self.state = self._running()
-        tokenizer = self.model.tokenizer
-        size, cameras = tokenizer.image_size, tokenizer.num_cameras
-        first = torch.zeros(self.batch, cameras, 3, size, size, device=self.device)
-        self.context = tokenizer.context(first)
 
     def _running(self) -> ImaginationState:
         tokens = torch.zeros(
@@ -42,6 +39,7 @@ class Imagination:
         state = self.model.start(
             tokens, self.model.state_mean.expand(self.batch, -1), dtype=self.dtype,
             depth=torch.ones(tokens.shape, device=self.device),
+            context=black_context(self.model, self.batch, self.device),
         )  # fmt: skip
         for _ in range(self.frames):
             self.model.step(state, self.action)
@@ -59,7 +57,7 @@ class Imagination:
 
     def step_and_decode(self) -> Tensor:
         """Its pictures, (B, N, 3, H, W)."""
-        return self.model.decode(self.step(), self.context).images
+        return self.model.decode(self.step(), self.state.context).images
 
     @torch.no_grad()
     def step_without_memory(self) -> Tensor:
@@ -70,8 +68,9 @@ class Imagination:
             if model.config.dynamics == "anchored":
                 last = torch.full((self.batch, 1), frames - 1, device=self.device)
                 prediction = model.network(
-                    state.digits, state.proprioception, *condition, length=frames, frames=last
-                )
+                    state.digits, state.proprioception, *condition, length=frames, frames=last,
+                    context=state.context,
+                )  # fmt: skip
             else:
                 seen = (x.expand(-1, frames, *x.shape[2:]) for x in (state.digits, state.proprioception))
                 depth = state.depth.expand(-1, frames, -1)
@@ -107,6 +106,12 @@ def repeated(work: Work, graphed: bool) -> Work:
     return repeat
 
 
+def black_context(model: ActionWorldModelRewardModel, batch: int, device: torch.device) -> Context:
+    """Of black first frames."""
+    size, cameras = model.tokenizer.image_size, model.tokenizer.num_cameras
+    return model.tokenizer.context(torch.zeros(batch, cameras, 3, size, size, device=device))
+
+
 def random_clip(model: ActionWorldModelRewardModel, batch: int, device: torch.device) -> Clip:
     """A batch of clips of the length the model is trained on."""
     config, shape = model.config, (batch, model.config.clip_length)
@@ -116,7 +121,9 @@ def random_clip(model: ActionWorldModelRewardModel, batch: int, device: torch.de
     )
     yes = torch.ones(shape, dtype=torch.bool, device=device)
     done, depth = torch.zeros(shape, device=device), torch.ones(tokens.shape, device=device)
-    return Clip(tokens, state, action, done, yes, yes, [""] * batch, depth)
+    return Clip(
+        tokens, state, action, done, yes, yes, [""] * batch, depth, black_context(model, batch, device)
+    )
 
 
 def training_step(model: ActionWorldModelRewardModel, clip: Clip, dtype: torch.dtype) -> Work:

@@ -72,9 +72,9 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         if isinstance(seed, list):
             self.generator.manual_seed(seed[0])
             drawn = torch.tensor(seed, device=self.device) % len(self.starts.tokens)
-        self._start_index, self._context = drawn, self.starts.context[drawn]
+        self._start_index, context = drawn, self.starts.context[drawn]
         tokens, state = self.starts.tokens[drawn], self.starts.proprioception[drawn]
-        self._imagination = self.model.start(tokens, state, depth=self._start_depth())
+        self._imagination = self.model.start(tokens, state, depth=self._start_depth(), context=context)
         self._elapsed = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
         self._done_streak = torch.zeros_like(self._elapsed)
         self._similarity = self.starts.similarity[drawn]
@@ -86,7 +86,7 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         clipped = actions.to(self.device).clamp(self.action_low, self.action_high)
         imagined = self.model.step(self._imagination, clipped, self.generator)
         terminated, truncated = self._advance(imagined)
-        decoded = self.model.decode(imagined.tokens, self._context)
+        decoded = self.model.decode(imagined.tokens, self._imagination.context)
         closeness = self._similarity_to_goal(decoded.features)
         parts = {
             "success": terminated.float(),
@@ -122,9 +122,9 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
     def _restart(self, mask: Tensor, observation: Observation) -> Observation:
         """New starts where `mask` (B,) is True; other rows of the observation stay."""
         self._start_index = torch.where(mask, self._draw_starts(), self._start_index)
-        self._context = self.starts.context[self._start_index]
+        context = self.starts.context[self._start_index]
         tokens, state = self.starts.tokens[self._start_index], self.starts.proprioception[self._start_index]
-        self.model.restart(self._imagination, mask, tokens, state, self._start_depth())
+        self.model.restart(self._imagination, mask, tokens, state, self._start_depth(), context)
         self._elapsed = self._elapsed.masked_fill(mask, 0)
         self._done_streak = self._done_streak.masked_fill(mask, 0)
         self._similarity = torch.where(mask, self.starts.similarity[self._start_index], self._similarity)

@@ -38,7 +38,9 @@ def reward_along_episode(
     known = torch.ones(1, len(tokens), dtype=torch.bool, device=device)
     instruction = [table.instructions[episode]]
     depth = depth_at(model, table.dataset, np.arange(rows.start, rows.stop)[None])
-    clip = Clip(tokens[None], state[None], action[None], known.float(), known, known, instruction, depth)
+    clip = Clip(
+        tokens[None], state[None], action[None], known.float(), known, known, instruction, depth, start
+    )
     done_logit = model.predict(clip).done_logit[0, :-1]
     first_depth = depth_at(text_model, table.dataset, slice(rows.start, rows.start + 1))
     goal = imagine_goal(text_model, tokens[:1], state[:1], instruction, start, first_depth)

@@ -13,7 +13,9 @@ from torch import Tensor, nn
 
 from lerobot_wmrl.precision import compute_in
 from lerobot_wmrl.world_models.conditioning import AddedCondition, Conditioning, ConditionTokens, pooled
+from lerobot_wmrl.world_models.context import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.depth_branch import NoDepth
+from lerobot_wmrl.world_models.frame_grids import ContextEmbedding
 from lerobot_wmrl.world_models.frame_network import STATE_STEP, FrameNetwork, Prediction
 from lerobot_wmrl.world_models.losses import take_rows
 from lerobot_wmrl.world_models.path import Path, PathNetwork
@@ -27,14 +29,18 @@ class AnchoredNetwork(FrameNetwork):
 
     Args:
         layers: of the trajectory and of the renderer; the scene's encoder has half as many.
+        context_channels: of the coarsest features of the tokenizer's context, 0 without.
         heads, window: of the attention; `window` is the longest trajectory. Others as in `FrameNetwork`.
     """
 
-    def __init__(self, *, layers: int, heads: int, window: int, **sizes: Any) -> None:
+    def __init__(
+        self, *, layers: int, heads: int, window: int, context_channels: int = 0, **sizes: Any
+    ) -> None:
         super().__init__(**sizes)
         width = sizes["width"]
         self.window, self.heads, self.head_width = window, heads, width // heads
         self.path = PathNetwork(sizes["state_size"], width)
+        self.context = ContextEmbedding(context_channels, self.patch, width) if context_channels else None
         self.scene = nn.ModuleList(
             SpatialBlock(width, heads, Conditioning(width, heads)) for _ in range(max(1, layers // 2))
         )
@@ -55,21 +61,22 @@ class AnchoredNetwork(FrameNetwork):
         *,
         length: int,
         frames: Tensor | None = None,
+        context: Context = NO_CONTEXT,
     ) -> Prediction:
         """`length` frames T at once, from first digits (B, 1, S, C), first state (B, 1, P) and condition
         (B, T or 1, M, D). Logits are of the frames after rows `frames` (B, K), by default after all."""
         memory = ClipMemory(length, self.window, self.head_width, digits.device)
         mean = pooled(condition, mask).expand(-1, length, -1)
-        return self._follow(*self.encode(digits, state), mean, memory, frames)[0]
+        return self._follow(*self.encode(digits, state, context), mean, memory, frames)[0]
 
     def step(
         self, digits: Tensor, state: Tensor, condition: Tensor, mask: Tensor | None, cache: AnchoredCache,
-        depth: Tensor | None = None,
+        depth: Tensor | None = None, context: Context = NO_CONTEXT,
     ) -> Prediction:  # fmt: skip
-        """One frame more (T = 1) than the cache holds; digits and state are looked at where one begins."""
+        """One frame more (T = 1) than the cache holds; what was seen is looked at where one begins."""
         rows = cache.due()
         if len(rows):
-            cache.begin(rows, *self.encode(digits[rows], state[rows]))
+            cache.begin(rows, *self.encode(digits[rows], state[rows], context[rows]))
         assert cache.scene is not None
         assert cache.path is not None
         mean = pooled(condition, mask)
@@ -77,9 +84,19 @@ class AnchoredNetwork(FrameNetwork):
         cache.path = path.end()
         return prediction
 
-    def encode(self, digits: Tensor, state: Tensor) -> tuple[Scene, Path]:
-        """First frames' digits (B, 1, S, C) and states (B, 1, P)."""
+    def encode(self, digits: Tensor, state: Tensor, context: Context) -> tuple[Scene, Path]:
+        """First frames' digits (B, 1, S, C), states (B, 1, P) and their episodes' context.
+
+        ValueError if that is missing.
+        """
         x, local = self.embed(digits, state, 0.0)
+        if self.context is not None:
+            if len(context) != len(digits):
+                raise ValueError(
+                    f"the context of {len(context)} first frames for {len(digits)} imaginations: this world "
+                    "model needs one each; give what its tokenizer's `context` returns"
+                )
+            x = torch.cat([x[:, :, :1], x[:, :, 1:] + self.context(context.scales[0])[:, None]], 2)
         nothing = ConditionTokens(x[:, :, :1], None, x[:, :, 0])
         for block in self.scene:
             x = block(x, nothing)

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lerobot_wmrl.world_models.context import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.distributed import own_rows, rank_and_size
 from lerobot_wmrl.world_models.episode_table import EpisodeTable
 from lerobot_wmrl.world_models.frame_cache import frames_to_tensor
@@ -16,15 +17,15 @@ from lerobot_wmrl.world_models.losses import Clip
 
 FROM_START = 0.75
 """Share of training clips that begin with their episode. Success can depend on where the episode began
-(an object pushed 10 cm), so only these carry done labels."""
+(an object pushed 10 cm), so only these carry done labels, unless the context shows it to all."""
 
 
 @dataclass
 class ClipSampler:
     """Clips of tokens for the world models.
 
-    tokens (rows, S) is the memory map; `episodes` the indices of the episodes to draw from; depth (rows, S),
-    metres of each token, for models that look at it.
+    tokens (rows, S) is the memory map; `episodes` the indices of the episodes to draw from. For models that
+    look at them: depth (rows, S), metres of each token; context (E, N, C, g, g), of episodes' first frames.
     """
 
     table: EpisodeTable
@@ -35,6 +36,7 @@ class ClipSampler:
     seed: int
     device: str
     depth: np.ndarray | None = None
+    context: np.ndarray | None = None
 
     def __call__(self, step: int) -> Clip:
         """This process's share of the batch of one training step."""
@@ -52,7 +54,8 @@ class ClipSampler:
         rows = self.table.start[episodes][:, None] + np.minimum(
             rows, self.table.length[episodes][:, None] - 1
         )
-        known = valid & (offsets == 0)[:, None]
+        known = valid if self.context is not None else valid & (offsets == 0)[:, None]
+        context = NO_CONTEXT if self.context is None else Context((self._tensor(self.context[episodes]),))
         return Clip(
             self._tensor(self.tokens[rows]).long(),
             self._tensor(self.table.state[rows]),
@@ -62,6 +65,7 @@ class ClipSampler:
             self._tensor(known),
             [self.table.instructions[episode] for episode in episodes],
             None if self.depth is None else self._tensor(self.depth[rows]),
+            context,
         )
 
     def _tensor(self, array: np.ndarray) -> Tensor:

@@ -138,6 +138,11 @@ class WorldModelConfig(RewardModelConfig):
         return [f"observation.images.{camera}" for camera in self.cameras]
 
     @property
+    def context_channels(self) -> int:
+        """Of the tokenizer's context, as far as the dynamics look at it; 0 if they do not."""
+        return self.tokenizer_widths[-1] if self.tokenizer_context and self.dynamics == "anchored" else 0
+
+    @property
     def observation_delta_indices(self) -> list[int]:
         return list(range(1 - self.clip_length, 1))
 

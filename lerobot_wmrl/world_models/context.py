@@ -27,6 +27,15 @@ class Context:
     def __len__(self) -> int:
         return len(self.scales[0]) if self.scales else 0
 
+    def replaced(self, mask: Tensor, new: "Context") -> "Context":
+        """The rows of `new` where `mask` (B,) is True, else one's own."""
+        return Context(
+            tuple(
+                torch.where(mask[:, None, None, None, None], b, a)
+                for a, b in zip(self.scales, new.scales, strict=True)
+            )
+        )
+
     def flat(self) -> list[Tensor]:
         """[(B·N, C, h, w), …], cameras as rows of the batch."""
         return [scale.flatten(0, 1) for scale in self.scales]

@@ -53,8 +53,6 @@ def cached_tokens(
     A context-conditioned tokenizer is given the first frame of each row's episode.
     """
     frames = cached_frames(dataset, camera_keys)
-    weights = hashlib.sha256(b"".join(p.detach().cpu().numpy().tobytes() for p in tokenizer.parameters()))
-    key = digest([weights.hexdigest(), *camera_keys, *file_stamps(dataset)])
     device = next(tokenizer.parameters()).device
     episodes = dataset.meta.episodes
     starts = np.repeat(np.asarray(episodes["dataset_from_index"]), np.asarray(episodes["length"]))
@@ -69,7 +67,37 @@ def cached_tokens(
                 target[part] = tokenizer.encode(images, context).cpu().numpy()
 
     shape = (len(frames), tokenizer.tokens_per_frame)
-    return memory_map(cache_dir(dataset) / f"tokens-{key}.npy", shape, np.int32, fill)
+    return memory_map(encoded_path("tokens", dataset, camera_keys, tokenizer), shape, np.int32, fill)
+
+
+def cached_context(
+    dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer: FrameTokenizer
+) -> np.ndarray:
+    """The coarsest features of every episode's context as a read-only memory map, float32 (E, N, C, g, g);
+    encoded on the first call."""
+    frames, device = cached_frames(dataset, camera_keys), next(tokenizer.parameters()).device
+    starts = np.asarray(dataset.meta.episodes["dataset_from_index"])
+
+    def features(rows: np.ndarray) -> np.ndarray:
+        with torch.no_grad():
+            context = tokenizer.context(frames_to_tensor(frames[rows]).to(device))
+        return context.scales[0].cpu().numpy()
+
+    def fill(target: np.ndarray) -> None:
+        for begin in range(0, len(starts), ENCODE_BATCH):
+            target[begin : begin + ENCODE_BATCH] = features(starts[begin : begin + ENCODE_BATCH])
+
+    shape = (len(starts), *features(starts[:1]).shape[1:])
+    return memory_map(encoded_path("context", dataset, camera_keys, tokenizer), shape, np.float32, fill)
+
+
+def encoded_path(
+    name: str, dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer: FrameTokenizer
+) -> Path:
+    """Where the cache `name` of what exactly this tokenizer makes of these cameras stands."""
+    weights = hashlib.sha256(b"".join(p.detach().cpu().numpy().tobytes() for p in tokenizer.parameters()))
+    key = digest([weights.hexdigest(), *camera_keys, *file_stamps(dataset)])
+    return cache_dir(dataset) / f"{name}-{key}.npy"
 
 
 def frames_to_tensor(frames: np.ndarray) -> torch.Tensor:

@@ -24,6 +24,23 @@ class FrameEmbedding(nn.Module):
         return self.patches(local).flatten(2).transpose(1, 2) + self.position, local
 
 
+class ContextEmbedding(nn.Module):
+    """What a context-conditioned tokenizer sees in an episode's first frame, to the transformer's tokens.
+
+    Its features are continuous: they say where things lie twice as exactly as the first frame's codes.
+    """
+
+    def __init__(self, channels: int, patch: int, width: int) -> None:
+        super().__init__()
+        self.norm = nn.GroupNorm(1, channels)
+        self.patches = nn.Conv2d(channels, width, patch, stride=patch)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Coarsest features (B, N, C, g, g) of N cameras → tokens (B, N·(g/patch)², D)."""
+        tokens = self.patches(self.norm(features.flatten(0, 1))).flatten(2).transpose(1, 2)
+        return tokens.unflatten(0, features.shape[:2]).flatten(1, 2)
+
+
 class FrameHead(nn.Module):
     """Transformer tokens back to the code grid: logits of each factor, biased towards staying the same."""
 

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from lerobot_wmrl.world_models.codebook import make_codebook
+from lerobot_wmrl.world_models.context import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.depth_branch import NoDepth
 from lerobot_wmrl.world_models.frame_grids import FrameEmbedding, FrameHead
 from lerobot_wmrl.world_models.temporal_memory import FrameCache
@@ -90,9 +91,10 @@ class FrameNetwork(nn.Module):
 
     def step(
         self, digits: Tensor, state: Tensor, condition: Tensor, mask: Tensor | None, cache: Any,
-        depth: Tensor | None = None,
+        depth: Tensor | None = None, context: Context = NO_CONTEXT,
     ) -> Prediction:  # fmt: skip
-        """About the frame after the newest one (T = 1), given what the network's own `cache` remembers."""
+        """About the frame after the newest one (T = 1), given what the network's own `cache` remembers, and,
+        where a network looks at them, depth (B, 1, S) and the context of B first frames."""
         raise NotImplementedError
 
     def make_cache(self, batch: int, device: torch.device, dtype: torch.dtype) -> FrameCache:

@@ -35,7 +35,7 @@ def imagine_goal(
     tokens (B, S) of the start frames, proprioception (B, P), one instruction each, the start frames' context
     if the tokenizer is conditioned on it, and their depth (B, S) in metres if the model looks at it.
     """
-    state = model.start(tokens, proprioception, instructions, depth=depth)
+    state = model.start(tokens, proprioception, instructions, depth=depth, context=context)
     goal, best = tokens, torch.full((tokens.shape[0],), -1.0, device=tokens.device)
     reached = torch.zeros_like(best, dtype=torch.bool)
     for _ in range(model.config.goal_horizon):

@@ -37,7 +37,7 @@ class Imagined(NamedTuple):
 @dataclass
 class ImaginationState:
     """Where B imaginations stand: digits (B, 1, S, C), normalised state (B, 1, P), depth (B, 1, S) as the
-    network has it or (B, 1, 0), what is remembered of the past.
+    network has it or (B, 1, 0), what is remembered of the past, the tokenizer's context of where they began.
 
     Its tensors are allocated once and advanced in place. The network computes in the cache's dtype.
     """
@@ -47,6 +47,7 @@ class ImaginationState:
     depth: Tensor
     cache: FrameCache
     condition: Condition | None = None
+    context: Context = NO_CONTEXT
 
 
 class Imagination:
@@ -71,9 +72,13 @@ class Imagination:
         instructions: Sequence[str] | None = None,
         dtype: torch.dtype | None = None,
         depth: Tensor | None = None,
+        context: Context = NO_CONTEXT,
     ) -> ImaginationState:
         """Imagination from one frame: tokens (B, S), proprioception (B, P) in dataset units, and if the model
         looks at it the depth (B, S), metres of each token; ValueError without.
+
+        The context is that of B first frames, where the tokenizer has the option; dynamics that look at it
+        raise ValueError in the first step without.
 
         The network computes in `dtype`, by default the fastest; samples, done, state and entropy are float32.
         """
@@ -84,11 +89,11 @@ class Imagination:
         condition = self.encode_instructions(instructions, batch) if instructions is not None else None
         digits = self.network.codebook.digits(tokens)[:, None]
         first, depth = self.normalize_state(proprioception), self.network.depth.normalize(depth, tokens)
-        return ImaginationState(digits, first[:, None], depth[:, None], cache, condition)
+        return ImaginationState(digits, first[:, None], depth[:, None], cache, condition, context)
 
     def restart(
         self, state: ImaginationState, mask: Tensor, tokens: Tensor, proprioception: Tensor,
-        depth: Tensor | None = None,
+        depth: Tensor | None = None, context: Context = NO_CONTEXT,
     ) -> None:  # fmt: skip
         """Put the environments in `mask` (B,) back to a first frame; their past is masked, not moved."""
         digits = self.network.codebook.digits(tokens)[:, None]
@@ -97,6 +102,7 @@ class Imagination:
         state.proprioception.copy_(torch.where(mask[:, None, None], first, state.proprioception))
         depth = self.network.depth.normalize(depth, tokens)[:, None]
         state.depth.copy_(torch.where(mask[:, None, None], depth, state.depth))
+        state.context = state.context.replaced(mask, context)
         state.cache.restart(mask)
 
     @torch.no_grad()
@@ -156,7 +162,7 @@ class Imagination:
         """Put `state` one frame further. → what was predicted"""
         with compute_in(state.cache.dtype, state.digits.device):
             prediction = self.network.step(
-                state.digits, state.proprioception, *condition, state.cache, state.depth
+                state.digits, state.proprioception, *condition, state.cache, state.depth, state.context
             )
             seen = FramesSeen(state.digits, condition, prediction, state.cache)
             digits = self.decoding.decode(self.network, seen, temperature, generator)

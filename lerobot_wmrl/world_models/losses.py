@@ -7,6 +7,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from lerobot_wmrl.world_models.codebook import CodeBook
+from lerobot_wmrl.world_models.context import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.distributed import draw_own_rows, masked_mean
 from lerobot_wmrl.world_models.frame_network import STATE_STEP, Prediction
 
@@ -26,7 +27,8 @@ class Clip(NamedTuple):
 
     tokens (B, T, S); state (B, T, P) in dataset units; action (B, T, A); done (B, T), success at frame
     t + 1; valid (B, T), False where the episode is padded; done_known (B, T); one instruction an episode;
-    depth (B, T, S), metres of each token, for models that look at it.
+    depth (B, T, S), metres of each token, and the context of the episode's first frame, for models that look
+    at them.
     """
 
     tokens: Tensor
@@ -37,6 +39,7 @@ class Clip(NamedTuple):
     done_known: Tensor
     instructions: list[str]
     depth: Tensor | None = None
+    context: Context = NO_CONTEXT
 
 
 def take_rows(values: Tensor, index: Tensor) -> Tensor:

@@ -114,7 +114,7 @@ class TextWorldModelRewardModel(WorldModelRewardModel):
     @torch.no_grad()
     def compute_reward(self, batch: dict[str, Any]) -> Tensor:
         """Similarity of the window's last frame to the goal imagined from its first one. → (B,)"""
-        clip, context = self.clip_from_batch(batch), self._context(batch)
+        clip = self.clip_from_batch(batch)
         depth = clip.depth if clip.depth is None else clip.depth[:, 0]
-        goal = imagine_goal(self, clip.tokens[:, 0], clip.state[:, 0], clip.instructions, context, depth)
-        return similarity_to_goal(self.tokenizer, clip.tokens[:, -1], goal.features, context)
+        goal = imagine_goal(self, clip.tokens[:, 0], clip.state[:, 0], clip.instructions, clip.context, depth)
+        return similarity_to_goal(self.tokenizer, clip.tokens[:, -1], goal.features, clip.context)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from lerobot_wmrl.precision import compute_in
 from lerobot_wmrl.world_models.conditioning import pooled
+from lerobot_wmrl.world_models.context import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.depth_branch import DepthBranch, NoDepth
 from lerobot_wmrl.world_models.frame_network import STATE_STEP, FrameNetwork, Prediction
 from lerobot_wmrl.world_models.st_transformer import SpatialTemporalTransformer
@@ -61,9 +62,9 @@ class NextFrameNetwork(FrameNetwork):
 
     def step(
         self, digits: Tensor, state: Tensor, condition: Tensor, mask: Tensor | None, cache: TemporalCache,
-        depth: Tensor | None = None,
+        depth: Tensor | None = None, context: Context = NO_CONTEXT,
     ) -> Prediction:  # fmt: skip
-        """The same for one new frame (T = 1) against the cache."""
+        """The same for one new frame (T = 1) against the cache; the context is not looked at."""
         prediction: Prediction = self(digits, state, condition, mask, cache.advance(), depth)
         return prediction
 

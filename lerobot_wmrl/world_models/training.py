@@ -41,7 +41,7 @@ from lerobot_wmrl.world_models.configuration_world_model import TextWorldModelCo
 from lerobot_wmrl.world_models.depth_maps import cached_depth
 from lerobot_wmrl.world_models.distributed import mean_over_processes
 from lerobot_wmrl.world_models.episode_table import EpisodeTable, golden_episodes
-from lerobot_wmrl.world_models.frame_cache import cached_frames, cached_tokens
+from lerobot_wmrl.world_models.frame_cache import cached_context, cached_frames, cached_tokens
 
 
 def build_model(config: RewardModelConfig, table: EpisodeTable, output_dir: Path) -> PreTrainedRewardModel:
@@ -88,9 +88,13 @@ def make_sampler(
     tokenizer: Any = model.tokenizer
     tokens = cached_tokens(table.dataset, config.camera_keys, tokenizer)
     depth = cached_depth(table.dataset, config.camera_keys, tokenizer.grid) if config.depth else None
+    context = None
+    if config.context_channels:
+        context = cached_context(table.dataset, config.camera_keys, tokenizer)
     return ClipSampler(
-        table, tokens, episodes.nonzero()[0], config.clip_length, batch_size, seed, config.device, depth
-    )
+        table, tokens, episodes.nonzero()[0], config.clip_length, batch_size, seed, config.device, depth,
+        context,
+    )  # fmt: skip
 
 
 def load_progress(output_dir: Path, optimizer: Optimizer, scheduler: LRScheduler, state: PartialState) -> int:

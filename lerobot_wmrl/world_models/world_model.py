@@ -19,7 +19,6 @@ from lerobot_wmrl.world_models.compatibility import (
     check_tokenizer_source,
 )
 from lerobot_wmrl.world_models.configuration_world_model import WorldModelConfig
-from lerobot_wmrl.world_models.context import Context
 from lerobot_wmrl.world_models.decoding import Condition, make_decoding
 from lerobot_wmrl.world_models.depth_maps import depth_of_windows
 from lerobot_wmrl.world_models.dynamics import make_dynamics
@@ -134,24 +133,23 @@ class WorldModelRewardModel(HubCard, Imagination, PreTrainedRewardModel):
 
     @torch.no_grad()
     def clip_from_batch(self, batch: dict[str, Any]) -> Clip:
-        """Tokenise a batch of LeRobot's windows."""
+        """Tokenise a batch of LeRobot's windows, beside their first frames: they lack their episodes'."""
         images = stack_cameras(batch, self.config.camera_keys, self.config.image_size)
         shape = images.shape[:2]
-        context = self.tokenizer.context(images[:, 0])[torch.arange(shape[0]).repeat_interleave(shape[1])]
-        tokens = self.tokenizer.encode(images.flatten(0, 1), context).unflatten(0, shape)
+        context, rows = (
+            self.tokenizer.context(images[:, 0]),
+            torch.arange(shape[0]).repeat_interleave(shape[1]),
+        )
+        tokens = self.tokenizer.encode(images.flatten(0, 1), context[rows]).unflatten(0, shape)
         depth = self._depth(batch)
-        return clip_from_windows(tokens, batch, self.config.camera_keys[0], self.config.state_size, depth)
+        clip = clip_from_windows(tokens, batch, self.config.camera_keys[0], self.config.state_size, depth)
+        return clip._replace(context=context)
 
     def _depth(self, batch: dict[str, Any]) -> Tensor | None:
         """Of the windows' frames, (B, T, S) metres, if the model looks at depth."""
         if not self.config.depth:
             return None
         return depth_of_windows(batch, self.config.camera_keys, self.tokenizer.grid)
-
-    def _context(self, batch: dict[str, Any]) -> Context:
-        """Of the windows' first frames, since a window does not hold its episode's. B rows, or none."""
-        images = stack_cameras(batch, self.config.camera_keys, self.config.image_size)
-        return self.tokenizer.context(images[:, 0])
 
     @torch.no_grad()
     def predict(self, clip: Clip) -> Prediction:

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from lerobot_wmrl.world_models.codebook import CodeBook
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig, TextWorldModelConfig
+from lerobot_wmrl.world_models.context import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.imagination import Imagined
 from lerobot_wmrl.world_models.losses import Clip, draw_rows, frames_since_start
 from lerobot_wmrl.world_models.modeling_world_model import (
@@ -18,7 +19,8 @@ from lerobot_wmrl.world_models.modeling_world_model import (
 BATCH, LENGTH, TOKENS, CODES = 3, 6, 32, 20
 SIZES: dict[str, Any] = {
     "device": "cpu", "cameras": ["third_view", "wrist"], "image_size": 32, "tokenizer_widths": [8, 16],
-    "levels": [5, 4], "layers": 2, "width": 32, "heads": 2, "clip_length": LENGTH, "code_width": 8,
+    "levels": [5, 4], "tokenizer_context": True, "layers": 2, "width": 32, "heads": 2, "code_width": 8,
+    "clip_length": LENGTH,
 }  # fmt: skip
 
 
@@ -36,13 +38,14 @@ def random_clip(seed: int = 0, length: int = LENGTH) -> Clip:
     yes = torch.ones(BATCH, length, dtype=torch.bool)
     tokens, state = torch.randint(0, CODES, (BATCH, length, TOKENS)), torch.randn(BATCH, length, 8)
     return Clip(
-        tokens, state, torch.randn(BATCH, length, 7), torch.zeros(BATCH, length), yes, yes, [""] * BATCH
-    )
+        tokens, state, torch.randn(BATCH, length, 7), torch.zeros(BATCH, length), yes, yes, [""] * BATCH,
+        context=Context((torch.randn(BATCH, 2, 16, 4, 4),)),
+    )  # fmt: skip
 
 
 def imagine(model: ActionWorldModelRewardModel, clip: Clip) -> list[Imagined]:
     """Step by step from the clip's first frame."""
-    state = model.start(clip.tokens[:, 0], clip.state[:, 0], dtype=torch.float32)
+    state = model.start(clip.tokens[:, 0], clip.state[:, 0], dtype=torch.float32, context=clip.context)
     return [model.step(state, action) for action in clip.action.unbind(1)]
 
 
@@ -80,7 +83,7 @@ def test_whoever_has_imagined_a_clip_begins_anew_at_its_last_frame():
     model, clip = world_model(), random_clip(length=2 * LENGTH)
     steps = imagine(model, clip)
     last = steps[LENGTH - 1]
-    again = model.start(last.tokens, last.proprioception, dtype=torch.float32)
+    again = model.start(last.tokens, last.proprioception, dtype=torch.float32, context=clip.context)
     for step, action in zip(steps[LENGTH:], clip.action[:, LENGTH:].unbind(1), strict=True):
         anew = model.step(again, action)
         assert torch.equal(anew.tokens, step.tokens)
@@ -90,12 +93,13 @@ def test_whoever_has_imagined_a_clip_begins_anew_at_its_last_frame():
 def test_a_restarted_imagination_is_a_new_one():
     model, clip, new = world_model(), random_clip(length=2 * LENGTH), random_clip(seed=1)
     whole = over_time(imagine(model, clip), "tokens")
-    running = model.start(clip.tokens[:, 0], clip.state[:, 0], dtype=torch.float32)
+    running = model.start(clip.tokens[:, 0], clip.state[:, 0], dtype=torch.float32, context=clip.context)
     before = [model.step(running, action) for action in clip.action[:, :4].unbind(1)]
-    model.restart(running, torch.tensor([True, False, False]), new.tokens[:, 0], new.state[:, 0])
+    mask, first = torch.tensor([True, False, False]), (new.tokens[:, 0], new.state[:, 0])
+    model.restart(running, mask, *first, context=new.context)
     after = [model.step(running, action) for action in clip.action[:, 4:].unbind(1)]
     assert torch.equal(over_time(before + after, "tokens")[1:], whole[1:])
-    fresh = clip._replace(tokens=new.tokens, state=new.state, action=clip.action[:, 4:])
+    fresh = new._replace(action=clip.action[:, 4:])
     assert torch.equal(over_time(after, "tokens")[0], over_time(imagine(model, fresh), "tokens")[0])
 
 
@@ -105,11 +109,24 @@ def test_the_text_model_imagines_the_same_way():
     for parameter in model.network.parameters():
         torch.nn.init.normal_(parameter, std=0.2)
     clip = random_clip()._replace(instructions=["push the can", "pull the box", "push the can"])
-    state = model.start(clip.tokens[:, 0], clip.state[:, 0], clip.instructions, torch.float32)
+    first = clip.tokens[:, 0], clip.state[:, 0], clip.instructions
+    state = model.start(*first, torch.float32, context=clip.context)
     steps = [model.step(state) for _ in range(LENGTH)]
     expected = model.predict(clip).done_logit
     torch.testing.assert_close(over_time(steps, "done_logit"), expected, atol=1e-4, rtol=0)
     assert model.loss(clip)[0].isfinite()
+
+
+def test_what_the_tokenizer_sees_in_the_first_frame_is_looked_at_and_needed():
+    model, clip = world_model(), random_clip()
+    before = model.predict(clip)
+    other = model.predict(clip._replace(context=random_clip(seed=1).context))
+    assert all((a - b).abs().max() > 1e-3 for a, b in zip(before[:4], other[:4], strict=True))
+    alone = clip._replace(context=NO_CONTEXT)
+    for ask in (lambda: model.predict(alone), lambda: imagine(model, alone)):
+        with pytest.raises(ValueError, match=r"the context of 0 first frames for 3 imaginations"):
+            ask()
+    assert world_model(tokenizer_context=False).predict(alone).done_logit.isfinite().all()
 
 
 def reached(clip: Clip) -> Clip:

@@ -17,6 +17,7 @@ from lerobot_wmrl.world_models.evaluation.pictures import side_by_side, to_uint8
 from lerobot_wmrl.world_models.evaluation.replay import Source, replay_episodes
 from lerobot_wmrl.world_models.frame_cache import cached_frames, cached_tokens, frames_to_tensor
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
+from lerobot_wmrl.world_models.training import make_sampler
 from tests.trained import action_config, run_training, text_config
 
 CAMERA = "observation.images.third_view"
@@ -114,6 +115,25 @@ def test_cached_tokens_are_those_beside_the_episodes_first_frame(models, small_d
         images = frames_to_tensor(frames[start : start + length])
         context = tokenizer.context(images[:1])[[0] * length]
         assert np.array_equal(tokens[start : start + length], tokenizer.encode(images, context))
+
+
+@torch.no_grad()
+def test_clips_carry_what_the_tokenizer_sees_in_their_episodes_first_frame(
+    models, small_dataset, table, frames
+):
+    """And may therefore say in the midst of an episode whether it has succeeded."""
+    model = load_model(models["action_world_model"], "action_world_model")
+    sampler = make_sampler(model, table, None, batch_size=4, seed=0)
+    clip = sampler.clips(np.array([2, 0]), np.array([3, 0]))
+    expected = model.tokenizer.context(frames_to_tensor(frames[table.start[[2, 0]]])).scales[0]
+    torch.testing.assert_close(clip.context.scales[0], expected)
+    assert torch.equal(clip.done_known, clip.valid)
+    model.config.tokenizer_context = False
+    plain = make_sampler(model, table, None, batch_size=4, seed=0)
+    clip = plain.clips(np.array([2, 0]), np.array([3, 0]))
+    assert clip.context is NO_CONTEXT
+    assert clip.valid[0].any()
+    assert not clip.done_known[0].any()
 
 
 @torch.no_grad()

@@ -24,7 +24,10 @@ class AnchoredDynamics:
 
     def make_network(self, **sizes: Any) -> AnchoredNetwork:
         config = self.config
-        return AnchoredNetwork(layers=config.layers, heads=config.heads, window=config.clip_length, **sizes)
+        return AnchoredNetwork(
+            layers=config.layers, heads=config.heads, window=config.clip_length,
+            context_channels=config.context_channels, **sizes,
+        )  # fmt: skip
 
     def loss(self, model: Any, clip: Clip) -> tuple[Tensor, dict[str, float]]:
         """Eqs. 2-4: of some frames of a clip the tokens, of all of them done and the state."""
@@ -32,7 +35,10 @@ class AnchoredDynamics:
         digits, state = network.codebook.digits(clip.tokens), model.normalize_state(clip.state)
         rows = draw_rows(clip.valid, config.drawn_frames)
         first = corrupt_digits(digits[:, :1], network.codebook, config.token_noise)
-        prediction = network(first, state[:, :1], *model.condition(clip), length=digits.shape[1], frames=rows)
+        prediction = network(
+            first, state[:, :1], *model.condition(clip), length=digits.shape[1], frames=rows,
+            context=clip.context,
+        )  # fmt: skip
         frames = frames_since_start(network.codebook, digits, clip, config.motion_weight, rows)
         return next_frame_loss(prediction, network.codebook, frames, state, clip, config)
 
@@ -42,6 +48,6 @@ class AnchoredDynamics:
         digits = model.network.codebook.digits(clip.tokens[:, :1])
         state = model.normalize_state(clip.state[:, :1])
         prediction: Prediction = model.network(
-            digits, state, *model.condition(clip), length=clip.tokens.shape[1]
+            digits, state, *model.condition(clip), length=clip.tokens.shape[1], context=clip.context
         )
         return prediction

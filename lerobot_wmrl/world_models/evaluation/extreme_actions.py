@@ -45,7 +45,7 @@ def robustness(
     low, high = source.table.action.min(0), source.table.action.max(0)
     result: dict[str, Any] = {"episodes": len(episodes), "frames": HORIZON}
     for name, actions in extreme_actions(own, low, high).items():
-        imagined = open_loop(model, tokens, state, actions, depth)
+        imagined = open_loop(model, tokens, state, actions, depth, context)
         called = first_run((imagined.done_probability >= threshold).cpu().numpy(), frames) >= 0
         first, last = (model.tokenizer.decode(t, context) for t in (tokens, imagined.tokens[:, -1]))
         result[name] = {

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from lerobot_wmrl.world_models.context import Context
+from lerobot_wmrl.world_models.context import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.depth_maps import depth_at
 from lerobot_wmrl.world_models.episode_table import EpisodeTable
 from lerobot_wmrl.world_models.frame_cache import frames_to_tensor
@@ -100,11 +100,11 @@ class EpisodeReplay:
 @torch.no_grad()
 def open_loop(
     model: ActionWorldModelRewardModel, tokens: Tensor, state: Tensor, actions: Tensor,
-    depth: Tensor | None = None,
+    depth: Tensor | None = None, context: Context = NO_CONTEXT,
 ) -> OpenLoop:  # fmt: skip
-    """Imagine from tokens (B, S), state (B, P) and, if the model looks at it, depth (B, S) with actions
-    (B, T, A). The same noise at every call."""
-    imagination = model.start(tokens, state, depth=depth)
+    """Imagine from tokens (B, S), state (B, P) and, if the model looks at them, depth (B, S) and context with
+    actions (B, T, A). The same noise at every call."""
+    imagination = model.start(tokens, state, depth=depth, context=context)
     generator = torch.Generator(tokens.device).manual_seed(0)
     steps = [model.step(imagination, action, generator) for action in actions.unbind(1)]
     return OpenLoop(
@@ -139,11 +139,11 @@ def _replay_batch(
     longest = min(int(table.length[episodes].max()), LONGEST)
     tokens, context = source.starts(episodes, model.tokenizer)
     state, depth = source.first_state(episodes, device), source.first_depth(model, episodes)
-    own = open_loop(model, tokens, state, source.actions(episodes, longest, device), depth)
+    own = open_loop(model, tokens, state, source.actions(episodes, longest, device), depth, context)
     comparable = (table.length[episodes] > DELTA_PSNR_STEP) & (episodes != others)
     if comparable.any():
         actions = source.actions(others, DELTA_PSNR_STEP, device)
-        shuffled = open_loop(model, tokens, state, actions, depth).tokens[:, -1]
+        shuffled = open_loop(model, tokens, state, actions, depth, context).tokens[:, -1]
     for row, episode in enumerate(episodes.tolist()):
         rows = source.rows(episode)
         steps = slice(0, rows.stop - rows.start)
