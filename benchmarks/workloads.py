@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from lerobot_wmrl.precision import compute_in
+from lerobot_wmrl.world_models.clip import Clip
 from lerobot_wmrl.world_models.context import Context
 from lerobot_wmrl.world_models.imagination import ImaginationState
-from lerobot_wmrl.world_models.losses import Clip
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 
 STEPS = 8

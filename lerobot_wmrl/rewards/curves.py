@@ -7,11 +7,11 @@ import torch
 
 from lerobot_wmrl.rewards.configuration_general import GeneralConfig
 from lerobot_wmrl.rewards.general import consecutive_count, general_reward, sparse_reward
+from lerobot_wmrl.world_models.clip import Clip
 from lerobot_wmrl.world_models.depth_maps import depth_at
 from lerobot_wmrl.world_models.episode_table import EpisodeTable
 from lerobot_wmrl.world_models.frame_cache import frames_to_tensor
 from lerobot_wmrl.world_models.goal import imagine_goal, similarity_to_goal
-from lerobot_wmrl.world_models.losses import Clip
 from lerobot_wmrl.world_models.modeling_world_model import (
     ActionWorldModelRewardModel,
     TextWorldModelRewardModel,

@@ -12,12 +12,12 @@ import torch
 from torch import Tensor, nn
 
 from lerobot_wmrl.precision import compute_in
+from lerobot_wmrl.world_models.clip import take_rows
 from lerobot_wmrl.world_models.conditioning import AddedCondition, Conditioning, ConditionTokens, pooled
 from lerobot_wmrl.world_models.context import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.depth_branch import NoDepth
 from lerobot_wmrl.world_models.frame_grids import ContextEmbedding
 from lerobot_wmrl.world_models.frame_network import STATE_STEP, FrameNetwork, Prediction
-from lerobot_wmrl.world_models.losses import take_rows
 from lerobot_wmrl.world_models.path import Path, PathNetwork
 from lerobot_wmrl.world_models.scene import AnchoredCache, Scene
 from lerobot_wmrl.world_models.st_transformer import SpatialBlock, TrajectoryBlock

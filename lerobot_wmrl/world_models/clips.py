@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lerobot_wmrl.world_models.clip import Clip
 from lerobot_wmrl.world_models.context import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.distributed import own_rows, rank_and_size
 from lerobot_wmrl.world_models.episode_table import EpisodeTable
 from lerobot_wmrl.world_models.frame_cache import frames_to_tensor
-from lerobot_wmrl.world_models.losses import Clip
 
 FROM_START = 0.75
 """Share of training clips that begin with their episode. Success can depend on where the episode began

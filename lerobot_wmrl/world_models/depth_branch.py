@@ -13,6 +13,7 @@ from typing import Final
 import torch
 from torch import Tensor, nn
 
+from lerobot_wmrl.world_models.clip import known_transitions
 from lerobot_wmrl.world_models.distributed import masked_mean
 from lerobot_wmrl.world_models.frame_grids import FrameEmbedding, FrameHead
 from lerobot_wmrl.world_models.st_transformer import LayerHook, SpatialTemporalTransformer, unchanged
@@ -116,6 +117,6 @@ class DepthBranch(NoDepth):
 
     def loss(self, predicted: Tensor, depth: Tensor, valid: Tensor) -> tuple[Tensor, dict[str, float]]:
         errors = (predicted[:, :-1].float() - depth[:, 1:]).abs()
-        known = (valid[:, 1:] & valid[:, :-1])[..., None]
+        known = known_transitions(valid)[..., None]
         error = masked_mean(errors, known.expand_as(errors))
         return error, {"depth_error_mm": 1000 * FAR / 2 * error.item()}

@@ -12,9 +12,12 @@ import torch
 from torch import Tensor
 
 from lerobot_wmrl.precision import compute_in
+from lerobot_wmrl.world_models.clip import known_transitions
 from lerobot_wmrl.world_models.codebook import CodeBook
 from lerobot_wmrl.world_models.distributed import masked_mean
-from lerobot_wmrl.world_models.losses import MOTION_LEVELS
+from lerobot_wmrl.world_models.losses import (
+    MOTION_LEVELS,
+)
 
 KEYPOINTS = 16
 """K, the most active tracks a camera and clip. A gripper and an object cover about as many tokens."""
@@ -64,7 +67,7 @@ def most_active(places: Tensor, valid: Tensor, num_cameras: int) -> Tracks:
 
     By camera, since in one on the wrist everything moves. valid (B, T): frames of the episode.
     """
-    moves = (places[:, 1:] != places[:, :-1]) & (valid[:, 1:] & valid[:, :-1])[..., None]
+    moves = (places[:, 1:] != places[:, :-1]) & known_transitions(valid)[..., None]
     activity = moves.sum(1).unflatten(-1, (num_cameras, -1))
     order = activity.argsort(dim=-1, descending=True, stable=True)[..., :KEYPOINTS]
     first = torch.arange(num_cameras, device=places.device)[:, None] * activity.shape[-1]

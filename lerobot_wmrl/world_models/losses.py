@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from lerobot_wmrl.world_models.clip import Clip, known_transitions, take_rows
 from lerobot_wmrl.world_models.codebook import CodeBook
-from lerobot_wmrl.world_models.context import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.distributed import draw_own_rows, masked_mean
 from lerobot_wmrl.world_models.frame_network import STATE_STEP, Prediction
 
@@ -20,31 +20,6 @@ STATE_PRECISION = 0.1
 
 SELF_ROLLOUT_FROM = 0.75
 """Progress of the training after which clips are replaced by rollouts: earlier ones soon leave the data."""
-
-
-class Clip(NamedTuple):
-    """Rows t = 0 … T − 1 of an episode: what is seen, what is done, and what that leads to.
-
-    tokens (B, T, S); state (B, T, P) in dataset units; action (B, T, A); done (B, T), success at frame
-    t + 1; valid (B, T), False where the episode is padded; done_known (B, T); one instruction an episode;
-    depth (B, T, S), metres of each token, and the context of the episode's first frame, for models that look
-    at them.
-    """
-
-    tokens: Tensor
-    state: Tensor
-    action: Tensor
-    done: Tensor
-    valid: Tensor
-    done_known: Tensor
-    instructions: list[str]
-    depth: Tensor | None = None
-    context: Context = NO_CONTEXT
-
-
-def take_rows(values: Tensor, index: Tensor) -> Tensor:
-    """Rows `index` (B, K) of every clip: values (B, T, …) → (B, K, …)."""
-    return values[torch.arange(len(values), device=values.device)[:, None], index]
 
 
 def corrupt_digits(digits: Tensor, codebook: CodeBook, share: float) -> Tensor:
@@ -94,11 +69,6 @@ class NextFrames(NamedTuple):
     digits: Tensor
     weight: Tensor
     moved: Tensor
-
-
-def known_transitions(valid: Tensor) -> Tensor:
-    """Where a valid frame follows a valid one: (B, T) → (B, T − 1)."""
-    return valid[:, 1:] & valid[:, :-1]
 
 
 def weighted_frames(

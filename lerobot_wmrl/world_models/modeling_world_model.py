@@ -9,6 +9,7 @@ from lerobot.configs.rewards import RewardModelConfig
 from lerobot.utils.constants import ACTION
 from torch import Tensor, nn
 
+from lerobot_wmrl.world_models.clip import Clip
 from lerobot_wmrl.world_models.configuration_world_model import (
     ActionWorldModelConfig,
     TextWorldModelConfig,
@@ -17,9 +18,6 @@ from lerobot_wmrl.world_models.decoding import Condition
 from lerobot_wmrl.world_models.frozen_t5 import CHECKPOINT_FOLDER, FrozenT5
 from lerobot_wmrl.world_models.goal import imagine_goal, similarity_to_goal
 from lerobot_wmrl.world_models.instructions import check_one_each
-from lerobot_wmrl.world_models.losses import (
-    Clip,
-)
 from lerobot_wmrl.world_models.text_encoder import make_text_encoder
 from lerobot_wmrl.world_models.world_model import WorldModelRewardModel
 

@@ -7,7 +7,7 @@ import torch
 from lerobot.utils.constants import ACTION, DONE, OBS_STATE
 from torch import Tensor
 
-from lerobot_wmrl.world_models.losses import Clip, take_rows
+from lerobot_wmrl.world_models.clip import Clip, take_rows
 
 
 def clip_from_windows(

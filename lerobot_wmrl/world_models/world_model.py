@@ -12,6 +12,7 @@ from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
 from lerobot_wmrl.world_models.checkpoint import load_model
+from lerobot_wmrl.world_models.clip import Clip
 from lerobot_wmrl.world_models.compatibility import (
     check_cameras,
     check_dataset,
@@ -26,7 +27,6 @@ from lerobot_wmrl.world_models.frame_network import Prediction
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
 from lerobot_wmrl.world_models.hub_card import HubCard
 from lerobot_wmrl.world_models.imagination import Imagination
-from lerobot_wmrl.world_models.losses import Clip
 from lerobot_wmrl.world_models.modeling_frame_tokenizer import stack_cameras
 from lerobot_wmrl.world_models.windows import clip_from_windows
 

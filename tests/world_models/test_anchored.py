@@ -6,11 +6,15 @@ import pytest
 import torch
 from torch import Tensor
 
+from lerobot_wmrl.world_models.clip import Clip
 from lerobot_wmrl.world_models.codebook import CodeBook
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig, TextWorldModelConfig
 from lerobot_wmrl.world_models.context import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.imagination import Imagined
-from lerobot_wmrl.world_models.losses import Clip, draw_rows, frames_since_start
+from lerobot_wmrl.world_models.losses import (
+    draw_rows,
+    frames_since_start,
+)
 from lerobot_wmrl.world_models.modeling_world_model import (
     ActionWorldModelRewardModel,
     TextWorldModelRewardModel,

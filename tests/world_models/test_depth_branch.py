@@ -6,11 +6,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from lerobot_wmrl.world_models.clip import Clip
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig
 from lerobot_wmrl.world_models.decoding import DECODINGS
 from lerobot_wmrl.world_models.depth_branch import FAR
 from lerobot_wmrl.world_models.frame_network import Prediction
-from lerobot_wmrl.world_models.losses import Clip
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 
 SIZES: dict[str, Any] = {

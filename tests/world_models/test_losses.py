@@ -2,10 +2,10 @@ from types import SimpleNamespace
 
 import torch
 
+from lerobot_wmrl.world_models.clip import Clip
 from lerobot_wmrl.world_models.codebook import CodeBook
 from lerobot_wmrl.world_models.frame_network import Prediction
 from lerobot_wmrl.world_models.losses import (
-    Clip,
     corrupt_digits,
     force_predictions,
     next_frame_loss,

@@ -10,7 +10,9 @@ from lerobot_wmrl.tracking import read_metrics
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.codebook import BinaryCodeBook, CodeBook
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
-from lerobot_wmrl.world_models.losses import corrupt_digits
+from lerobot_wmrl.world_models.losses import (
+    corrupt_digits,
+)
 from lerobot_wmrl.world_models.next_frame import NextFrameNetwork
 from lerobot_wmrl.world_models.quantizer import COMMITMENT_WEIGHT, ENTROPY_WEIGHT, LookupFreeQuantizer
 from tests.trained import action_config, run_training

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from lerobot_wmrl.world_models.anchored import AnchoredNetwork
+from lerobot_wmrl.world_models.clip import Clip
 from lerobot_wmrl.world_models.frame_network import Prediction
 from lerobot_wmrl.world_models.losses import (
-    Clip,
     corrupt_digits,
     draw_rows,
     frames_since_start,

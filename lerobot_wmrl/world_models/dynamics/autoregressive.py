@@ -6,11 +6,11 @@ import torch
 from torch import Tensor
 
 from lerobot_wmrl.precision import computing_dtype
+from lerobot_wmrl.world_models.clip import Clip
 from lerobot_wmrl.world_models.decoding import Condition, FramesSeen
 from lerobot_wmrl.world_models.frame_network import FrameNetwork, Prediction
 from lerobot_wmrl.world_models.keypoints import keypoint_loss
 from lerobot_wmrl.world_models.losses import (
-    Clip,
     corrupt_digits,
     force_predictions,
     forced_share,
