@@ -25,7 +25,10 @@ if TYPE_CHECKING:
     from lerobot_wmrl.world_models.evaluation.evaluate import Evaluation
     from lerobot_wmrl.world_models.evaluation.replay import Source
     from lerobot_wmrl.world_models.evaluation.report import Report
-    from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
+    from lerobot_wmrl.world_models.modeling_world_model import (
+        ActionWorldModelRewardModel,
+        TextWorldModelRewardModel,
+    )
 
 
 @dataclass
@@ -92,6 +95,7 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     model = load_model(cfg.model.path, "action_world_model", cfg.device)
     table = read_episodes(open_dataset(cfg.dataset.root, cfg.dataset.repo_id))
     check_dataset(model.config, table.dataset.features)
+    text_model = load_text_model(cfg, model)
     unseen = {scene.index for scene in scenes_of("ood")}
     episodes = choose_episodes(table, cfg.split, cfg.max_episodes, unseen)
     claim_output_dir(cfg.output_dir, draccus.encode(cfg))
@@ -100,8 +104,8 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     numbers, page = report_action_model(
         model, source, evaluation, cfg.done_threshold, cfg.done_frames, cfg.output_dir
     )
-    if cfg.text_model.path:
-        goals, goal_page = report_text_model(cfg, model, source, evaluation)
+    if text_model is not None:
+        goals, goal_page = report_text_model(cfg, model, text_model, source, evaluation)
         numbers, page = numbers | goals, f"{page}\n\n{goal_page}"
     numbers["tokenizer"] = reconstruction_metrics(model, table, source.frames, episodes)
     write_json(cfg.output_dir / "metrics.json", {**numbers, "dataset": cfg.dataset.root, "split": cfg.split})
@@ -109,21 +113,32 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     print(f"{page}\n\n{len(episodes)} real episodes replayed. Written to {cfg.output_dir}")
 
 
+def load_text_model(
+    cfg: EvalWorldModelConfig, model: "ActionWorldModelRewardModel"
+) -> "TextWorldModelRewardModel | None":
+    """The one that is named. ValueError if it speaks of frames in other tokens."""
+    from lerobot_wmrl.world_models.checkpoint import load_model
+    from lerobot_wmrl.world_models.compatibility import check_same_tokenizer
+
+    if not cfg.text_model.path:
+        return None
+    text_model: TextWorldModelRewardModel = load_model(cfg.text_model.path, "text_world_model", cfg.device)
+    check_same_tokenizer(model, text_model, f"--text_model.path={cfg.text_model.path}")
+    return text_model
+
+
 def report_text_model(
     cfg: EvalWorldModelConfig,
     model: "ActionWorldModelRewardModel",
+    text_model: "TextWorldModelRewardModel",
     source: "Source",
     evaluation: "Evaluation",
 ) -> "Report":
     """Goal frames, and the reward along the shown episodes."""
     from lerobot_wmrl.rewards.curves import reward_along_episode
-    from lerobot_wmrl.world_models.checkpoint import load_model
-    from lerobot_wmrl.world_models.compatibility import check_same_tokenizer
     from lerobot_wmrl.world_models.evaluation.pictures import save_reward_curves
     from lerobot_wmrl.world_models.evaluation.report import report_goals
 
-    text_model = load_model(cfg.text_model.path, "text_world_model", cfg.device)
-    check_same_tokenizer(model, text_model, f"--text_model.path={cfg.text_model.path}")
     curves = {
         name: reward_along_episode(
             model, text_model, cfg.reward, source.table, source.frames, run.episode,

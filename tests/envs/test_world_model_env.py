@@ -6,8 +6,10 @@ import torch
 from gymnasium.vector import AutoresetMode
 
 from lerobot_wmrl.constants import ACTION_HIGH
+from lerobot_wmrl.dataset_source import DatasetSource
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
+from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
 
 B = 4
 IMAGE, STATE = "observation.images.third_view", "observation.state"
@@ -144,5 +146,12 @@ def test_models_that_do_not_fit_together_are_refused(config, small_dataset, trai
     text = run_training(text_config(other), root, tmp_path / "text", steps=1)
     with pytest.raises(ValueError, match="another tokenizer"):
         replace(config, text_world_model_path=str(text)).create_tensor_env(1)
+    evaluation = EvalWorldModelConfig(
+        model=Checkpoint(str(trained_models["action_world_model"])), text_model=Checkpoint(str(text)),
+        dataset=DatasetSource(str(root)), output_dir=tmp_path / "evaluation",
+    )  # fmt: skip
+    with pytest.raises(ValueError, match="another tokenizer"):
+        eval_world_model(evaluation)
+    assert not evaluation.output_dir.exists()
     with pytest.raises(ValueError, match="'text_world_model' is needed"):
         replace(config, text_world_model_path=str(trained_models["action_world_model"])).create_tensor_env(1)
