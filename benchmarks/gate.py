@@ -32,6 +32,12 @@ CAMERAS = "[third_view,side_view]"
 KINDS = "{optimal: 0.22, waypoint: 0.06, interpolated: 0.08, disturbed: 0.16, near_miss: 0.48}"
 IMAGE_SIZE = 64
 
+LONGEST_PUSH = 44
+"""Frames: the horizon of push and what is recorded after success."""
+
+STEPS = 5500
+"""Of the action world model: with the tokenizer an hour on two cores with AVX2."""
+
 CLONES = {"A": (range(0, 20), 400), "B": (range(20, 40), 600), "C": (range(40, 60), 250)}
 """Policies whose attempts are learnt from: demonstrations, training steps."""
 
@@ -142,6 +148,7 @@ class Experiment:
         flags: Flags = {
             "model.type": "action_world_model", "model.tokenizer_path": self.path("frame_tokenizer"),
             "dataset.root": self.path("dataset"), "output_dir": self.path("action_world_model"),
+            "model.clip_length": LONGEST_PUSH, "steps": STEPS,
         }  # fmt: skip
         return [
             "lerobot-wmrl-train-world-model", "--preset=cpu", *format_flags(flags), *self.model_flags
