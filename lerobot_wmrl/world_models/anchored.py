@@ -1,9 +1,10 @@
 """The anchored network: a clip's first frame and all that was done since give its frame t + 1 (eq. 1).
 
-Three parts. The scene is the first frame, encoded once. The trajectory, one token a frame, follows states and
-actions through the scene; done and the next state are read from it. The renderer draws any frame asked for,
-from the scene and the trajectory's token. No imagined frame is ever looked at again, so errors in pictures do
-not add up, training meets what imagination meets, and it need not draw every frame that it learns from.
+Four parts. The scene is the first frame, encoded once. The path is where the robot gets to in it, action by
+action. The trajectory, one token a frame, follows the path through the scene; done is read from it. The
+renderer draws any frame asked for, from the scene and the trajectory's token. No imagined frame is looked at
+again, so errors in pictures do not add up, training meets what imagination meets, and it need not draw every
+frame that it learns from.
 """
 
 from typing import Any
@@ -17,8 +18,8 @@ from lerobot_wmrl.world_models.conditioning import AddedCondition, Conditioning,
 from lerobot_wmrl.world_models.context import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.depth_branch import NoDepth
 from lerobot_wmrl.world_models.frame_grids import ContextEmbedding
-from lerobot_wmrl.world_models.frame_network import STATE_STEP, FrameNetwork, Prediction
-from lerobot_wmrl.world_models.path import Path, PathNetwork
+from lerobot_wmrl.world_models.frame_network import FrameNetwork, Prediction
+from lerobot_wmrl.world_models.path import Path, PathNetwork, Places
 from lerobot_wmrl.world_models.scene import AnchoredCache, Scene
 from lerobot_wmrl.world_models.st_transformer import SpatialBlock, TrajectoryBlock
 from lerobot_wmrl.world_models.temporal_memory import ClipMemory, TemporalCache, TemporalMemory
@@ -49,6 +50,7 @@ class AnchoredNetwork(FrameNetwork):
         self.renderer = nn.ModuleList(
             SpatialBlock(width, heads, AddedCondition(width, heads)) for _ in range(layers)
         )
+        self.places = Places(self.transformer_tokens, width)
         self.scene_norm, self.norm, self.drawn_norm = (nn.LayerNorm(width) for _ in range(3))
         self.depth = NoDepth()
 
@@ -100,7 +102,8 @@ class AnchoredNetwork(FrameNetwork):
         nothing = ConditionTokens(x[:, :, :1], None, x[:, :, 0])
         for block in self.scene:
             x = block(x, nothing)
-        scene = Scene(digits, self.scene_norm(x), local.unflatten(0, (len(digits), -1)))
+        tokens = self.scene_norm(x)
+        scene = Scene(digits, tokens, self.places(tokens), local.unflatten(0, (len(digits), -1)))
         return scene, self.path.begin(state)
 
     def make_cache(self, batch: int, device: torch.device, dtype: torch.dtype) -> AnchoredCache:
@@ -112,7 +115,7 @@ class AnchoredNetwork(FrameNetwork):
         self, scene: Scene, begin: Path, mean: Tensor, memory: TemporalMemory, frames: Tensor | None
     ) -> tuple[Prediction, Path]:
         """The trajectory under the conditions' means (B, T, D), and what is read from it."""
-        path = self.path(begin, mean)
+        path = self.path(begin, scene.places, mean)
         x = (self.register + mean + self.motion(path.hidden) + self.state_in(path.state))[:, None]
         given = ConditionTokens(scene.tokens, None, scene.tokens[:, :, 0])
         for layer, block in enumerate(self.trajectory):
@@ -121,9 +124,8 @@ class AnchoredNetwork(FrameNetwork):
         logits = self._draw(scene, hidden if frames is None else take_rows(hidden, frames))
         with compute_in(torch.float32, x.device):
             hidden = hidden.float()
-            state = path.state + STATE_STEP * self.state_out(hidden)
             nothing = hidden.new_zeros(*hidden.shape[:2], 0)
-            return Prediction(logits, self.done(hidden).squeeze(-1), state, hidden, nothing), path
+            return Prediction(logits, self.done(hidden).squeeze(-1), path.state, hidden, nothing), path
 
     def _draw(self, scene: Scene, hidden: Tensor) -> Tensor:
         """Frames of the scene as the trajectory's tokens (B, K, D) have them. → logits (B, K, S, V)"""

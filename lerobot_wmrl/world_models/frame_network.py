@@ -60,7 +60,6 @@ class FrameNetwork(nn.Module):
         self.state_in = nn.Linear(state_size, width)
         self.head = FrameHead(len(levels), sum(levels), patch, code_width, width)
         self.done = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, 1))
-        self.state_out = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, state_size))
 
     @property
     def transformer_tokens(self) -> int:

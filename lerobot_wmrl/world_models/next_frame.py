@@ -7,7 +7,7 @@ success holds there and, on request, the next depth.
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from lerobot_wmrl.precision import compute_in
 from lerobot_wmrl.world_models.conditioning import pooled
@@ -34,7 +34,8 @@ class NextFrameNetwork(FrameNetwork):
         depth: bool = False, **sizes: Any,
     ) -> None:  # fmt: skip
         super().__init__(**sizes)
-        width = sizes["width"]
+        width, state_size = sizes["width"], sizes["state_size"]
+        self.state_out = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, state_size))
         self.transformer = SpatialTemporalTransformer(layers, width, heads, window, conditioning)
         self.depth = NoDepth()
         if depth:
