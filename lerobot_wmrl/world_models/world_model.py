@@ -33,6 +33,10 @@ from lerobot_wmrl.world_models.windows import clip_from_windows
 MIN_SPREAD = 1e-3
 """Components that vary less than this are constants, and left alone by normalisation."""
 
+STATE_SPREAD = 0.02
+"""In the dataset's units: what varies less (a closed gripper's opening, the rotation of a hand that is held
+upright) is scaled as if it varied so much, lest its noise weigh as much as centimetres."""
+
 STATE_LIMIT = 5.0
 """In standard deviations."""
 
@@ -75,7 +79,7 @@ class WorldModelRewardModel(HubCard, Imagination, PreTrainedRewardModel):
         )  # fmt: skip
         self.tokenizer.eval()
         self.decoding = make_decoding(config, self.network.embedding.local.in_channels)
-        self._register_statistics("state", OBS_STATE, config.state_size, dataset_stats)
+        self._register_statistics("state", OBS_STATE, config.state_size, dataset_stats, STATE_SPREAD)
 
     def train(self, mode: bool = True) -> "WorldModelRewardModel":
         """The tokenizer is fixed: it stays in evaluation mode."""
@@ -102,12 +106,13 @@ class WorldModelRewardModel(HubCard, Imagination, PreTrainedRewardModel):
         if self.config.state_size:
             self.config.state_size = features[OBS_STATE]["shape"][0] if OBS_STATE in features else 0
 
-    def _register_statistics(self, name: str, key: str, size: int, stats: Any) -> None:
+    def _register_statistics(self, name: str, key: str, size: int, stats: Any, least: float = 0.0) -> None:
+        """Mean and spread of the feature `key`, the spread at least `least`."""
         mean, std = torch.zeros(size), torch.ones(size)
         if stats is not None and size:
             mean = torch.as_tensor(stats[key]["mean"], dtype=torch.float32)
             std = torch.as_tensor(stats[key]["std"], dtype=torch.float32)
-            std = torch.where(std < MIN_SPREAD, 1.0, std)
+            std = torch.where(std < MIN_SPREAD, 1.0, std).clamp_min(least)
         self.register_buffer(f"{name}_mean", mean)
         self.register_buffer(f"{name}_std", std)
 

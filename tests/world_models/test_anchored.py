@@ -19,6 +19,7 @@ from lerobot_wmrl.world_models.modeling_world_model import (
     ActionWorldModelRewardModel,
     TextWorldModelRewardModel,
 )
+from lerobot_wmrl.world_models.world_model import STATE_SPREAD
 
 BATCH, LENGTH, TOKENS, CODES = 3, 6, 32, 20
 SIZES: dict[str, Any] = {
@@ -200,3 +201,17 @@ def test_what_anchored_dynamics_do_not_have_is_named(setting, value):
 def test_unknown_dynamics_are_named():
     with pytest.raises(ValueError, match=r"--model.dynamics=still: choose one of autoregressive, anchored"):
         world_model(dynamics="still")
+
+
+def test_noise_of_what_hardly_varies_does_not_weigh_as_much_as_motion():
+    spread = torch.tensor([0.07, 0.002, 0.0, 0.03, 0.03, 0.03, 0.03, 0.4])
+    model = ActionWorldModelRewardModel(
+        ActionWorldModelConfig(**SIZES),
+        dataset_stats={
+            "observation.state": {"mean": torch.zeros(8), "std": spread},
+            "action": {"mean": torch.zeros(7), "std": torch.full((7,), 0.01)},
+        },
+    )
+    expected = torch.tensor([0.07, STATE_SPREAD, 1.0, 0.03, 0.03, 0.03, 0.03, 0.4])
+    torch.testing.assert_close(model.state_std, expected)
+    torch.testing.assert_close(model.action_std, torch.full((7,), 0.01))
