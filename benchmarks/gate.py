@@ -36,7 +36,7 @@ LONGEST_PUSH = 44
 """Frames: the horizon of push and what is recorded after success."""
 
 STEPS = 5500
-"""Of the action world model: with the tokenizer an hour on two cores with AVX2."""
+"""Of the action world model: an hour on two cores with AVX2, by estimate."""
 
 CLONES = {"A": (range(0, 20), 400), "B": (range(20, 40), 600), "C": (range(40, 60), 250)}
 """Policies whose attempts are learnt from: demonstrations, training steps."""

@@ -141,10 +141,8 @@ class WorldModelRewardModel(HubCard, Imagination, PreTrainedRewardModel):
         """Tokenise a batch of LeRobot's windows, beside their first frames: they lack their episodes'."""
         images = stack_cameras(batch, self.config.camera_keys, self.config.image_size)
         shape = images.shape[:2]
-        context, rows = (
-            self.tokenizer.context(images[:, 0]),
-            torch.arange(shape[0]).repeat_interleave(shape[1]),
-        )
+        context = self.tokenizer.context(images[:, 0])
+        rows = torch.arange(shape[0]).repeat_interleave(shape[1])
         tokens = self.tokenizer.encode(images.flatten(0, 1), context[rows]).unflatten(0, shape)
         depth = self._depth(batch)
         clip = clip_from_windows(tokens, batch, self.config.camera_keys[0], self.config.state_size, depth)
