@@ -130,6 +130,9 @@ class AnchoredNetwork(FrameNetwork):
     def _draw(self, scene: Scene, hidden: Tensor) -> Tensor:
         """Frames of the scene as the trajectory's tokens (B, K, D) have them. → logits (B, K, S, V)"""
         count = hidden.shape[1]
+        if not count:  # convolutions want something to work on
+            sizes = scene.digits.shape[2], len(self.codebook.factor_of_logit)
+            return hidden.new_zeros(len(hidden), 0, *sizes)
         given = ConditionTokens(hidden[:, :, None], None, hidden)
         x = scene.tokens.expand(-1, count, -1, -1)
         for block in self.renderer:

@@ -63,7 +63,7 @@ class ActionWorldModelRewardModel(WorldModelRewardModel):
         """Probability that success holds after the window's last action. → (B,)"""
         clip = self.clip_from_batch(batch)
         last = clip.valid.sum(1, keepdim=True) - 1
-        return self.predict(clip).done_logit.gather(1, last).squeeze(1).sigmoid()
+        return self.predict(clip, drawn=False).done_logit.gather(1, last).squeeze(1).sigmoid()
 
 
 class TextWorldModelRewardModel(WorldModelRewardModel):
@@ -115,4 +115,4 @@ class TextWorldModelRewardModel(WorldModelRewardModel):
         clip = self.clip_from_batch(batch)
         depth = clip.depth if clip.depth is None else clip.depth[:, 0]
         goal = imagine_goal(self, clip.tokens[:, 0], clip.state[:, 0], clip.instructions, clip.context, depth)
-        return similarity_to_goal(self.tokenizer, clip.tokens[:, -1], goal.features, clip.context)
+        return similarity_to_goal(self.tokenizer, clip.tokens[:, -1], goal.decoded.features, clip.context)

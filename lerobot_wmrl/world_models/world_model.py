@@ -155,6 +155,7 @@ class WorldModelRewardModel(HubCard, Imagination, PreTrainedRewardModel):
         return depth_of_windows(batch, self.config.camera_keys, self.tokenizer.grid)
 
     @torch.no_grad()
-    def predict(self, clip: Clip) -> Prediction:
-        """Predictions about the frame after every row of a clip, not fed back."""
-        return self.dynamics.predict(self, clip)
+    def predict(self, clip: Clip, drawn: bool = True) -> Prediction:
+        """Predictions about the frame after every row of a clip, not fed back. Where its tokens are not
+        needed, `drawn` = False is faster."""
+        return self.dynamics.predict(self, clip, drawn)

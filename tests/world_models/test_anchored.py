@@ -11,6 +11,7 @@ from lerobot_wmrl.world_models.codebook import CodeBook
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig, TextWorldModelConfig
 from lerobot_wmrl.world_models.context import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.imagination import Imagined
+from lerobot_wmrl.world_models.look_ahead import look_ahead
 from lerobot_wmrl.world_models.losses import (
     draw_rows,
     frames_since_start,
@@ -67,6 +68,24 @@ def test_steps_are_one_pass_over_the_clip():
     torch.testing.assert_close(over_time(steps, "hidden"), whole.hidden, atol=1e-4, rtol=0)
     state = whole.proprioception * model.state_std + model.state_mean
     torch.testing.assert_close(over_time(steps, "proprioception"), state, atol=1e-4, rtol=0)
+
+
+def test_what_is_not_drawn_is_predicted_all_the_same():
+    model, clip = world_model(), random_clip()
+    drawn, undrawn = model.predict(clip), model.predict(clip, drawn=False)
+    assert undrawn.logits.shape == (BATCH, 0, *drawn.logits.shape[2:])
+    assert all(torch.equal(a, b) for a, b in zip(drawn[1:], undrawn[1:], strict=True))
+
+
+@pytest.mark.parametrize("length", [LENGTH, 2 * LENGTH])
+def test_looking_ahead_ends_where_steps_do(length):
+    """In one pass, and by steps where imagination begins anew on the way."""
+    model, clip = world_model(), random_clip(length=length)
+    steps = imagine(model, clip)
+    ahead = look_ahead(model, clip.tokens[:, 0], clip.state[:, 0], clip.action, clip.context)
+    assert torch.equal(ahead.tokens, steps[-1].tokens)
+    for name in ("done_logit", "proprioception"):
+        torch.testing.assert_close(getattr(ahead, name), over_time(steps, name), atol=1e-3, rtol=1e-4)
 
 
 def test_nothing_comes_from_the_future_nor_from_later_frames():

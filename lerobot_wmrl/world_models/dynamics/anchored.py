@@ -5,9 +5,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from lerobot_wmrl.precision import compute_in, imagination_dtype
 from lerobot_wmrl.world_models.anchored import AnchoredNetwork
 from lerobot_wmrl.world_models.clip import Clip
+from lerobot_wmrl.world_models.context import Context
 from lerobot_wmrl.world_models.frame_network import Prediction
+from lerobot_wmrl.world_models.look_ahead import Ahead, step_ahead
 from lerobot_wmrl.world_models.losses import (
     corrupt_digits,
     draw_rows,
@@ -43,11 +46,32 @@ class AnchoredDynamics:
         return next_frame_loss(prediction, network.codebook, frames, state, clip, config)
 
     @torch.no_grad()
-    def predict(self, model: Any, clip: Clip) -> Prediction:
-        """About every row's next frame, given the first frame and all actions until then."""
+    def predict(self, model: Any, clip: Clip, drawn: bool) -> Prediction:
+        """Given the first frame and all actions until then."""
         digits = model.network.codebook.digits(clip.tokens[:, :1])
         state = model.normalize_state(clip.state[:, :1])
+        none = torch.empty(len(digits), 0, dtype=torch.long, device=digits.device)
         prediction: Prediction = model.network(
-            digits, state, *model.condition(clip), length=clip.tokens.shape[1], context=clip.context
-        )
+            digits, state, *model.condition(clip), length=clip.tokens.shape[1],
+            frames=None if drawn else none, context=clip.context,
+        )  # fmt: skip
         return prediction
+
+    def look_ahead(
+        self, model: Any, tokens: Tensor, state: Tensor, actions: Tensor, context: Context,
+        depth: Tensor | None, generator: torch.Generator,
+    ) -> Ahead:  # fmt: skip
+        """In one pass, unless imagination would begin anew on the way."""
+        network, length = model.network, actions.shape[1]
+        if length > self.config.clip_length:
+            return step_ahead(model, tokens, state, actions, context, depth, generator)
+        digits, first = network.codebook.digits(tokens), model.normalize_state(state)
+        last = torch.full((len(tokens), 1), length - 1, device=tokens.device)
+        with compute_in(imagination_dtype(tokens.device), tokens.device):
+            prediction = network(
+                digits[:, None], first[:, None], *model.encode_actions(actions), length=length, frames=last,
+                context=context,
+            )  # fmt: skip
+        drawn = network.codebook.sample(prediction.logits.float(), self.config.temperature, generator)
+        states = prediction.proprioception * model.state_std + model.state_mean
+        return Ahead(prediction.done_logit, states, network.codebook.tokens(drawn[:, 0]))

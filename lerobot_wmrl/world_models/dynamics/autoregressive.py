@@ -7,9 +7,11 @@ from torch import Tensor
 
 from lerobot_wmrl.precision import computing_dtype
 from lerobot_wmrl.world_models.clip import Clip
+from lerobot_wmrl.world_models.context import Context
 from lerobot_wmrl.world_models.decoding import Condition, FramesSeen
 from lerobot_wmrl.world_models.frame_network import FrameNetwork, Prediction
 from lerobot_wmrl.world_models.keypoints import keypoint_loss
+from lerobot_wmrl.world_models.look_ahead import Ahead, step_ahead
 from lerobot_wmrl.world_models.losses import (
     corrupt_digits,
     force_predictions,
@@ -32,8 +34,14 @@ class Dynamics(Protocol):
     def loss(self, model: Any, clip: Clip) -> tuple[Tensor, dict[str, float]]:
         """Of the model on a clip, and what it is made of."""
 
-    def predict(self, model: Any, clip: Clip) -> Prediction:
-        """About the frame after every row of a clip."""
+    def predict(self, model: Any, clip: Clip, drawn: bool) -> Prediction:
+        """About the frame after every row of a clip. What is not `drawn` may have no logits, (B, 0, S, V)."""
+
+    def look_ahead(
+        self, model: Any, tokens: Tensor, state: Tensor, actions: Tensor, context: Context,
+        depth: Tensor | None, generator: torch.Generator,
+    ) -> Ahead:  # fmt: skip
+        """As `look_ahead.look_ahead`."""
 
 
 class AutoregressiveDynamics:
@@ -115,11 +123,17 @@ class AutoregressiveDynamics:
         return rolled
 
     @torch.no_grad()
-    def predict(self, model: Any, clip: Clip) -> Prediction:
-        """About every row's next frame, given the real frames until then."""
+    def predict(self, model: Any, clip: Clip, drawn: bool) -> Prediction:
+        """Given the real frames until then; the logits cost next to nothing."""
         network = model.network
         digits, depth = network.codebook.digits(clip.tokens), network.depth.normalize(clip.depth, clip.tokens)
         prediction: Prediction = network(
             digits, model.normalize_state(clip.state), *model.condition(clip), depth=depth
         )
         return prediction
+
+    def look_ahead(
+        self, model: Any, tokens: Tensor, state: Tensor, actions: Tensor, context: Context,
+        depth: Tensor | None, generator: torch.Generator,
+    ) -> Ahead:  # fmt: skip
+        return step_ahead(model, tokens, state, actions, context, depth, generator)

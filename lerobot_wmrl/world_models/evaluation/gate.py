@@ -5,20 +5,22 @@ the model was not trained on.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.stats import mannwhitneyu
+from torch import Tensor
 
 from lerobot_wmrl.constants import KINDS, PLAY, TASKS
 from lerobot_wmrl.statistics import Proportion
 from lerobot_wmrl.world_models.compatibility import check_dataset
 from lerobot_wmrl.world_models.episode_table import EpisodeTable, open_dataset, read_episodes
-from lerobot_wmrl.world_models.evaluation.replay import EpisodeReplay, Source, replay_episodes
+from lerobot_wmrl.world_models.evaluation.replay import LONGEST, EpisodeReplay, Source, in_batches
 from lerobot_wmrl.world_models.frame_cache import cached_frames
+from lerobot_wmrl.world_models.look_ahead import look_ahead
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 
 MOST_FALSE = 0.05
@@ -29,6 +31,14 @@ FEWEST_RECOGNISED = 0.9
 
 SWEEP_THRESHOLDS = tuple(round(0.3 + 0.05 * step, 2) for step in range(14))
 SWEEP_FRAMES = tuple(range(1, 7))
+
+
+class Judged(NamedTuple):
+    """An episode of T actions: done_probability (T,) as the model has it, done (T,) really."""
+
+    episode: int
+    done_probability: Tensor
+    done: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -43,9 +53,9 @@ class Outcomes:
     done: np.ndarray
 
     @classmethod
-    def of(cls, runs: Sequence[EpisodeReplay]) -> "Outcomes":
-        """From replays, by episode."""
-        runs = sorted(runs, key=lambda run: run.episode)
+    def of(cls, judged: Iterable[EpisodeReplay | Judged]) -> "Outcomes":
+        """From replays or verdicts, by episode."""
+        runs = sorted(judged, key=lambda run: run.episode)
         shape = len(runs), max(len(run.done) for run in runs)
         probability, done = np.full(shape, np.nan), np.zeros(shape, bool)
         for row, run in enumerate(runs):
@@ -123,8 +133,20 @@ def success_gate(
     table = read_episodes(open_dataset(dataset_root))
     check_dataset(model.config, table.dataset.features)
     source = Source(table, cached_frames(table.dataset, model.config.camera_keys))
-    runs = list(replay_episodes(model, source, np.arange(len(table.start)), shuffled=False))
-    return gate_at(Outcomes.of(runs).attempts(table), threshold, frames)
+    return gate_at(Outcomes.of(judged_episodes(model, source)).attempts(table), threshold, frames)
+
+
+def judged_episodes(model: ActionWorldModelRewardModel, source: Source) -> Iterator[Judged]:
+    """All episodes open loop, without pictures, short ones first."""
+    device, length = model.state_mean.device, source.table.length
+    for batch in in_batches(np.argsort(length, kind="stable")):
+        tokens, context = source.starts(batch, model.tokenizer)
+        state, depth = source.first_state(batch, device), source.first_depth(model, batch)
+        actions = source.actions(batch, min(int(length[batch].max()), LONGEST), device)
+        probability = look_ahead(model, tokens, state, actions, context, depth).done_logit.sigmoid()
+        for row, episode in enumerate(batch.tolist()):
+            done = source.table.done[source.rows(episode)]
+            yield Judged(episode, probability[row, : len(done)], done)
 
 
 def gate_at(outcomes: Outcomes, threshold: float, frames: int) -> Gate:

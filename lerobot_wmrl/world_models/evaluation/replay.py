@@ -115,18 +115,22 @@ def open_loop(
     )
 
 
+def in_batches(episodes: np.ndarray) -> list[np.ndarray]:
+    """At most `BATCH` of them in each."""
+    return [episodes[begin : begin + BATCH] for begin in range(0, len(episodes), BATCH)]
+
+
 def replay_episodes(
-    model: ActionWorldModelRewardModel, source: Source, episodes: np.ndarray, shuffled: bool = True
+    model: ActionWorldModelRewardModel, source: Source, episodes: np.ndarray
 ) -> Iterator[EpisodeReplay]:
     """Replay the episodes, short ones first, one batch of imagined tokens in memory at a time.
 
-    `shuffled`: each is also imagined with the actions of the one before it in `episodes`, for delta-PSNR.
+    Each is also imagined with the actions of the one before it in `episodes`, for delta-PSNR.
     """
     by_length = np.argsort(source.table.length[episodes], kind="stable")
-    others = np.roll(episodes, 1) if shuffled else episodes
+    others = np.roll(episodes, 1)
     with tqdm(total=len(episodes), desc="Replaying episodes", unit="episode") as bar:
-        for begin in range(0, len(episodes), BATCH):
-            part = by_length[begin : begin + BATCH]
+        for part in in_batches(by_length):
             for run in _replay_batch(model, source, episodes[part], others[part]):
                 yield run
                 bar.update()

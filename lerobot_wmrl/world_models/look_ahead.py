@@ -1,0 +1,44 @@
+"""What would come of many actions: how done and the state develop, and the last frame. No other is drawn
+where the dynamics can do without, so it is much faster than imagining frame by frame."""
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from lerobot_wmrl.world_models.context import NO_CONTEXT, Context
+
+
+class Ahead(NamedTuple):
+    """After each of T actions of B imaginations: done_logit (B, T), proprioception (B, T, P) in the dataset's
+    units; tokens (B, S) of the last frame."""
+
+    done_logit: Tensor
+    proprioception: Tensor
+    tokens: Tensor
+
+
+@torch.no_grad()
+def look_ahead(
+    model: Any, tokens: Tensor, state: Tensor, actions: Tensor, context: Context = NO_CONTEXT,
+    depth: Tensor | None = None,
+) -> Ahead:  # fmt: skip
+    """Open loop from tokens (B, S), state (B, P) and, if the model looks at them, context and depth (B, S),
+    with actions (B, T, A). The same noise at every call."""
+    generator = torch.Generator(tokens.device).manual_seed(0)
+    ahead: Ahead = model.dynamics.look_ahead(model, tokens, state, actions, context, depth, generator)
+    return ahead
+
+
+def step_ahead(
+    model: Any, tokens: Tensor, state: Tensor, actions: Tensor, context: Context, depth: Tensor | None,
+    generator: torch.Generator,
+) -> Ahead:  # fmt: skip
+    """Frame by frame, as imagination goes."""
+    imagination = model.start(tokens, state, depth=depth, context=context)
+    steps = [model.step(imagination, action, generator) for action in actions.unbind(1)]
+    return Ahead(
+        torch.stack([step.done_logit for step in steps], 1),
+        torch.stack([step.proprioception for step in steps], 1),
+        steps[-1].tokens,
+    )
