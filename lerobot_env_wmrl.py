@@ -10,10 +10,12 @@ CONFIGURATION_MODULES = (
     "lerobot_wmrl.world_models.configuration_frame_tokenizer",
     "lerobot_wmrl.world_models.configuration_world_model",
     "lerobot_wmrl.rewards.configuration_general",
+    "lerobot_wmrl.rewards.configuration_learned",
     "lerobot_wmrl.envs.configuration_world_model",
     "lerobot_wmrl.envs.configuration_wmrl_maniskill",
     "lerobot_wmrl.rl.configuration_ppo",
     "lerobot_policy_cnn.configuration_cnn",
+    "lerobot_policy_wm_mpc.configuration_wm_mpc",
 )
 
 for _name in CONFIGURATION_MODULES:

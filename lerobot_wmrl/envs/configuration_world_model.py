@@ -9,7 +9,7 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
-from lerobot_wmrl.constants import FPS
+from lerobot_wmrl.constants import FPS, TASKS
 from lerobot_wmrl.dataset_source import DatasetSource
 from lerobot_wmrl.rewards.configuration_general import GeneralConfig
 
@@ -19,11 +19,15 @@ class StartFrames(DatasetSource):
     """Where imagined episodes begin: the first frames of a LeRobotDataset's episodes.
 
     Args:
-        split: `train` (what the world model was trained on), `validation` (held out) or `all`.
+        split: `train` (what the world model was trained on), `validation` (held out) or `all`; `ind` or
+            `ood`, scenes that training may see and those held out. Joined by a comma: what is in both.
+        tasks, scenes: only episodes of these tasks (by name) and scenes (by index).
         max_starts: at most so many episodes, drawn evenly; each needs a goal frame.
     """
 
     split: str = "all"
+    tasks: list[str] | None = None
+    scenes: list[int] | None = None
     max_starts: int = 256
 
 
@@ -33,9 +37,11 @@ class WorldModelEnv(EnvConfig):
     """The action world model answers a policy; the text world model sets the goal (method: Algorithm 1).
 
     Args:
-        world_model_path, text_world_model_path: checkpoints, or output folders of their trainings.
+        world_model_path: the action world model, a checkpoint or the output folder of its training.
+        text_world_model_path: the text world model, for goal frames; not needed by rewards that know no goal.
         dataset: start frames and instructions.
-        reward: `--env.reward.type=general` and its settings.
+        reward: `--env.reward.type=general` and its settings, or `embedding` or `proxy` with the output folder
+            of its training as `--env.reward.pretrained_path`.
         episode_length: frames after which an episode is truncated.
         done_threshold: θ_sps of eq. 7. done_frames: k, consecutive frames that must reach it.
         device: where the models live; the best there is by default.
@@ -65,8 +71,16 @@ class WorldModelEnv(EnvConfig):
             raise ValueError(f"--env.done_threshold={self.done_threshold}: must be a probability")
         if self.dataset.max_starts < 1:
             raise ValueError(f"--env.dataset.max_starts={self.dataset.max_starts}: must be at least 1")
+        unknown = sorted({*(self.dataset.tasks or ())} - {*TASKS})
+        if unknown:
+            raise ValueError(f"--env.dataset.tasks={unknown}: choose from {', '.join(TASKS)}")
         if not self.world_model_path:
             return
+        if getattr(self.reward, "needs_goal", False) and not self.text_world_model_path:
+            raise ValueError(
+                "--env.text_world_model_path is missing: the dense part of the general reward needs goal "
+                "frames; give a text world model, or --env.reward.type=general --env.reward.alpha=1"
+            )
         from lerobot_wmrl.world_models.checkpoint import read_config
 
         model: Any = read_config(self.world_model_path, "action_world_model")
@@ -91,7 +105,10 @@ class WorldModelEnv(EnvConfig):
     def create_envs(
         self, n_envs: int, use_async_envs: bool = False
     ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
-        """The same behind numpy, for lerobot-eval. Batched natively, so `use_async_envs` changes nothing."""
+        """The same behind numpy and one for each task, for lerobot-eval. Batched natively, so
+        `use_async_envs` changes nothing."""
         from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
+        from lerobot_wmrl.envs.world_model_env import make_task_envs
 
-        return {self.type: {0: EvaluationAdapter(self.create_tensor_env(n_envs))}}
+        envs = make_task_envs(self, n_envs, self.device)
+        return {self.type: {task: EvaluationAdapter(env) for task, env in envs.items()}}

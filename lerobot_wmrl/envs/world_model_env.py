@@ -1,25 +1,30 @@
 """The world model as a natively batched environment: many imagined episodes, one forward pass a step."""
 
-from typing import Any, ClassVar
+from dataclasses import replace
+from typing import Any, ClassVar, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode
-from lerobot.rewards.factory import make_reward_model
 from lerobot.rewards.pretrained import PreTrainedRewardModel
 from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
-from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, FPS
+from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, FPS, TASKS
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
-from lerobot_wmrl.envs.start_frames import Starts, load_starts
+from lerobot_wmrl.envs.start_frames import Goals, Starts, load_starts, tasks_of_starts
 from lerobot_wmrl.rewards.general import consecutive_count, sparse_reward
+from lerobot_wmrl.rewards.loading import load_reward
+from lerobot_wmrl.rewards.similarity import Similarity, make_similarity, of_rows
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.compatibility import check_same_tokenizer
-from lerobot_wmrl.world_models.goal import similarity
+from lerobot_wmrl.world_models.frame_tokenizer import Decoded
 from lerobot_wmrl.world_models.imagination import Imagined
-from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
+from lerobot_wmrl.world_models.modeling_world_model import (
+    ActionWorldModelRewardModel,
+    TextWorldModelRewardModel,
+)
 
 Observation = dict[str, Any]
 
@@ -34,10 +39,11 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
     metadata: ClassVar[dict[str, Any]] = {"render_fps": FPS, "autoreset_mode": AutoresetMode.SAME_STEP}
 
     def __init__(
-        self, model: ActionWorldModelRewardModel, starts: Starts, reward: PreTrainedRewardModel,
-        config: WorldModelEnv, n_envs: int,
+        self, model: ActionWorldModelRewardModel, starts: Starts, goals: Goals | None,
+        reward: PreTrainedRewardModel, config: WorldModelEnv, n_envs: int,
     ) -> None:  # fmt: skip
-        self.model, self.starts, self.reward, self.config = model, starts, reward, config
+        self.model, self.starts, self.goals = model, starts, goals
+        self.reward, self.config = reward, config
         self.num_envs, self.max_episode_steps = n_envs, config.episode_length
         self.device = starts.tokens.device
         self.action_low, self.action_high = (
@@ -77,7 +83,8 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         self._imagination = self.model.start(tokens, state, depth=self._start_depth(), context=context)
         self._elapsed = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
         self._done_streak = torch.zeros_like(self._elapsed)
-        self._similarity = self.starts.similarity[drawn]
+        if self.goals is not None:
+            self._similarity = self.goals.similarity[drawn]
         return self._observe(self.starts.images[drawn], state), {}
 
     @torch.no_grad()
@@ -87,23 +94,11 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         imagined = self.model.step(self._imagination, clipped, self.generator)
         terminated, truncated = self._advance(imagined)
         decoded = self.model.decode(imagined.tokens, self._imagination.context)
-        closeness = self._similarity_to_goal(decoded.features)
-        parts = {
-            "success": terminated.float(),
-            "similarity": closeness,
-            "previous.similarity": self._similarity,
-        }
-        reward = self.reward.compute_reward({**parts, "hidden": imagined.hidden})
-        self._similarity = closeness
         observation = self._observe(decoded.images, imagined.proprioception)
-        info = {
-            "reward_parts": {
-                **parts,
-                "entropy": imagined.entropy,
-                "goal_reached": self.starts.goal_reached[self._start_index],
-                "done_probability": imagined.done_logit.sigmoid(),
-            }
-        }
+        parts = {"success": terminated.float(), **self._progress(decoded)}
+        reward = self.reward.compute_reward({**observation, **parts, "hidden": imagined.hidden})
+        doubt = {"entropy": imagined.entropy, "done_probability": imagined.done_logit.sigmoid()}
+        info: dict[str, Any] = {"reward_parts": {**parts, **doubt}}
         finished = terminated | truncated
         if bool(finished.any()):
             info["final_obs"] = observation
@@ -127,7 +122,9 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         self.model.restart(self._imagination, mask, tokens, state, self._start_depth(), context)
         self._elapsed = self._elapsed.masked_fill(mask, 0)
         self._done_streak = self._done_streak.masked_fill(mask, 0)
-        self._similarity = torch.where(mask, self.starts.similarity[self._start_index], self._similarity)
+        if self.goals is not None:
+            closeness = self.goals.similarity[self._start_index]
+            self._similarity = torch.where(mask, closeness, self._similarity)
         fresh = self._observe(self.starts.images[self._start_index], state)
         for key, value in observation.items():
             if isinstance(value, Tensor):
@@ -143,10 +140,18 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         depth = self.starts.depth
         return depth if depth is None else depth[self._start_index]
 
-    def _similarity_to_goal(self, features: list[Tensor]) -> Tensor:
-        cameras = self.model.tokenizer.num_cameras
-        rows = (self._start_index[:, None] * cameras + torch.arange(cameras, device=self.device)).flatten()
-        return similarity(features, [goal[rows] for goal in self.starts.goal_features], self.num_envs)
+    def _progress(self, frame: Decoded) -> dict[str, Tensor]:
+        """How near to their goals the frames are, and the ones before were; nothing without goals."""
+        if self.goals is None:
+            return {}
+        cameras, before = self.model.tokenizer.num_cameras, self._similarity
+        described, wanted = self.goals.alike.describe(frame), self.goals.described
+        self._similarity = self.goals.alike(described, of_rows(wanted, self._start_index, cameras), cameras)
+        return {
+            "similarity": self._similarity,
+            "previous.similarity": before,
+            "goal_reached": self.goals.reached[self._start_index],
+        }
 
     def _observe(self, images: Tensor, state: Tensor) -> Observation:
         observation: Observation = {
@@ -159,15 +164,46 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         return observation
 
 
-def make_world_model_env(config: WorldModelEnv, n_envs: int, device: str | None) -> WorldModelVectorEnv:
-    """Load both world models and the start frames. ValueError says which of them does not fit."""
+class WorldModels(NamedTuple):
+    """What environments of one configuration share: both world models, and how similarity to a goal is
+    measured and paid."""
+
+    model: ActionWorldModelRewardModel
+    text_model: TextWorldModelRewardModel | None
+    alike: Similarity
+    reward: PreTrainedRewardModel
+
+
+def load_world_models(config: WorldModelEnv, device: str | None) -> WorldModels:
+    """ValueError says which of them is not there or does not fit."""
     model = load_model(config.world_model_path, "action_world_model", device)
     if model.config.action_size != len(ACTION_LOW):
         raise ValueError(
             f"--env.world_model_path={config.world_model_path}: was trained on {model.config.action_size} "
             f"action components; the action box has {len(ACTION_LOW)}, so record with lerobot-wmrl-record"
         )
-    text_model = load_model(config.text_world_model_path, "text_world_model", device)
-    check_same_tokenizer(model, text_model, f"--env.text_world_model_path={config.text_world_model_path}")
-    starts = load_starts(config.dataset, model, text_model)
-    return WorldModelVectorEnv(model, starts, make_reward_model(config.reward), config, n_envs)
+    text_model = None
+    if config.text_world_model_path:
+        text_model = load_model(config.text_world_model_path, "text_world_model", device)
+        check_same_tokenizer(model, text_model, f"--env.text_world_model_path={config.text_world_model_path}")
+    alike = make_similarity(getattr(config.reward, "similarity", "tokenizer"), model.state_mean.device)
+    return WorldModels(model, text_model, alike, load_reward(config.reward, model))
+
+
+def make_world_model_env(
+    config: WorldModelEnv, n_envs: int, device: str | None, models: WorldModels | None = None
+) -> WorldModelVectorEnv:
+    """Load what is not given, and the start frames."""
+    models = models or load_world_models(config, device)
+    starts, goals = load_starts(config.dataset, models.model, models.text_model, models.alike)
+    return WorldModelVectorEnv(models.model, starts, goals, models.reward, config, n_envs)
+
+
+def make_task_envs(config: WorldModelEnv, n_envs: int, device: str | None) -> dict[int, WorldModelVectorEnv]:
+    """One environment for each task among the start frames, by its index; one in all if they do not say."""
+    tasks, models = tasks_of_starts(config.dataset), load_world_models(config, device)
+    chosen = {task: replace(config.dataset, tasks=[TASKS[task]]) for task in tasks} or {0: config.dataset}
+    return {
+        task: make_world_model_env(replace(config, dataset=source), n_envs, device, models)
+        for task, source in chosen.items()
+    }

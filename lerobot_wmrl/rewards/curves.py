@@ -7,11 +7,12 @@ import torch
 
 from lerobot_wmrl.rewards.configuration_general import GeneralConfig
 from lerobot_wmrl.rewards.general import consecutive_count, general_reward, sparse_reward
+from lerobot_wmrl.rewards.similarity import make_similarity, of_rows
 from lerobot_wmrl.world_models.clip import Clip
 from lerobot_wmrl.world_models.depth_maps import depth_at
 from lerobot_wmrl.world_models.episode_table import EpisodeTable
 from lerobot_wmrl.world_models.frame_cache import frames_to_tensor
-from lerobot_wmrl.world_models.goal import imagine_goal, similarity_to_goal
+from lerobot_wmrl.world_models.goal import imagine_goal
 from lerobot_wmrl.world_models.modeling_world_model import (
     ActionWorldModelRewardModel,
     TextWorldModelRewardModel,
@@ -41,16 +42,18 @@ def reward_along_episode(
     clip = Clip(
         tokens[None], state[None], action[None], known.float(), known, known, instruction, depth, start
     )
-    done_logit = model.predict(clip).done_logit[0, :-1]
+    done_logit = model.predict(clip, drawn=False).done_logit[0, :-1]
     first_depth = depth_at(text_model, table.dataset, slice(rows.start, rows.start + 1))
     goal = imagine_goal(text_model, tokens[:1], state[:1], instruction, start, first_depth)
-    features = [layer.repeat(len(tokens), 1, 1, 1) for layer in goal.features]
-    closeness = similarity_to_goal(model.tokenizer, tokens, features, context)
+    alike, cameras = make_similarity(reward.similarity, device), model.tokenizer.num_cameras
+    seen = alike.describe(model.tokenizer.decode_with_features(tokens, context))
+    every = torch.zeros(len(tokens), dtype=torch.long, device=device)
+    closeness = alike(seen, of_rows(alike.describe(goal.decoded), every, cameras), cameras)
     paid = success_once(done_logit, threshold, frames)
     earned = general_reward(
         paid, closeness[1:], closeness[:-1], alpha=reward.alpha, form=reward.form, gamma=reward.gamma
     )
-    picture = model.tokenizer.decode(goal.tokens, start)[0].permute(0, 2, 3, 1)
+    picture = goal.decoded.images[0].permute(0, 2, 3, 1)
     return {
         "done_probability": done_logit.sigmoid().tolist(),
         "similarity": closeness[1:].tolist(),

@@ -20,8 +20,10 @@ class GeneralRewardModel(PreTrainedRewardModel):
         self.config: GeneralConfig = config
 
     def compute_reward(self, batch: dict[str, Tensor]) -> Tensor:
-        """Keys `success` (1 once, on the frame at which the k-frame done fires), `similarity`,
-        `previous.similarity`, each (B,). → (B,)"""
+        """Keys `success` (1 once, on the frame at which the k-frame done fires) and, unless α is 1,
+        `similarity` and `previous.similarity`, each (B,). → (B,)"""
+        if not self.config.needs_goal:
+            return batch["success"]
         return general_reward(
             batch["success"], batch["similarity"], batch["previous.similarity"],
             alpha=self.config.alpha, form=self.config.form, gamma=self.config.gamma,

@@ -21,7 +21,7 @@ FLAGS: Final = {
 
 def read_config(path: str | Path, expected_type: str, device: str | None = "cpu") -> RewardModelConfig:
     """The configuration of a checkpoint of exactly `expected_type`, else ValueError. No device: the best."""
-    flag = FLAGS[expected_type]
+    flag = FLAGS.get(expected_type, "--env.reward.pretrained_path")
     folder = resolve_checkpoint(path)
     if not (folder / "config.json").is_file():
         if folder.is_dir() or str(path).startswith((".", "/", "outputs")) or str(path).count("/") != 1:
@@ -33,7 +33,7 @@ def read_config(path: str | Path, expected_type: str, device: str | None = "cpu"
         if found != expected_type:
             raise ValueError(
                 f"{flag}={path}: is a checkpoint of type {found!r}, but {expected_type!r} is needed here: "
-                f"give the output folder of a training with --model.type={expected_type}"
+                f"give the output folder of a training with that type"
             )
     if device is None:
         accelerator = torch.accelerator.current_accelerator(check_available=True)

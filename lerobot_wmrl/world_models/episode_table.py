@@ -141,12 +141,14 @@ def golden_episodes(table: EpisodeTable) -> np.ndarray:
 
 
 def choose_episodes(
-    table: EpisodeTable, split: str, at_most: int, unseen: Collection[int] | None = None
-) -> np.ndarray:
+    table: EpisodeTable, split: str, at_most: int, unseen: Collection[int] | None = None,
+    wanted: np.ndarray | None = None,
+) -> np.ndarray:  # fmt: skip
     """Indices of at most `at_most` episodes, evenly spread, that belong to every split named in `split`.
 
     Splits, joined by commas: `train`, `validation` (as in the training of world models), `all`, and if the
-    scenes `unseen` in training are given, `ind` (all others) and `ood` (those). ValueError if there is none.
+    scenes `unseen` in training are given, `ind` (all others) and `ood` (those). `wanted` (E,) leaves others
+    out. ValueError if there is none.
     """
     masks = {"train": ~table.validation, "validation": table.validation, "all": table.length > 0}
     if unseen is not None:
@@ -161,7 +163,9 @@ def choose_episodes(
                 f"split={name!r}: dataset {table.dataset.root} does not say which scenes its episodes are in "
                 "(no column start.scene); use --split=all, train or validation"
             )
-    episodes = np.logical_and.reduce([masks[name] for name in names]).nonzero()[0]
+    chosen = [masks[name] for name in names] + ([] if wanted is None else [wanted])
+    episodes = np.logical_and.reduce(chosen).nonzero()[0]
     if not len(episodes):
-        raise ValueError(f"dataset {table.dataset.root}: no episode in its {split} split")
+        those = "" if wanted is None else " of those that are asked for"
+        raise ValueError(f"dataset {table.dataset.root}: no episode{those} in its {split} split")
     return episodes[np.linspace(0, len(episodes) - 1, min(len(episodes), at_most)).astype(int)]

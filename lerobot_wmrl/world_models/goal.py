@@ -7,17 +7,17 @@ import torch
 from torch import Tensor
 
 from lerobot_wmrl.world_models.context import NO_CONTEXT, Context
-from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer, feature_distance
+from lerobot_wmrl.world_models.frame_tokenizer import Decoded, FrameTokenizer, feature_distance
 
 if TYPE_CHECKING:
     from lerobot_wmrl.world_models.modeling_world_model import TextWorldModelRewardModel
 
 
 class Goal(NamedTuple):
-    """tokens (B, S); features of the decoded frame; reached (B,), False where θ was never reached."""
+    """tokens (B, S); the decoded frame; reached (B,), False where θ was never reached."""
 
     tokens: Tensor
-    features: list[Tensor]
+    decoded: Decoded
     reached: Tensor
 
 
@@ -47,7 +47,7 @@ def imagine_goal(
         reached = reached | (probability >= model.config.goal_threshold)
         if bool(reached.all()):
             break
-    return Goal(goal, model.tokenizer.decode_with_features(goal, context).features, reached)
+    return Goal(goal, model.tokenizer.decode_with_features(goal, context), reached)
 
 
 def similarity_to_goal(

@@ -49,7 +49,7 @@ class FrameTokenizerRewardModel(HubCard, PreTrainedRewardModel):
         if dataset_meta is not None:
             check_cameras(config, dataset_meta.features)
             if config.perceptual_weight:
-                require_backbone()
+                require_backbone("vgg", "--model.perceptual_weight", "0")
         self.tokenizer = FrameTokenizer(
             config.image_size, config.widths, config.levels, len(config.cameras), config.quantizer,
             config.context,

@@ -15,6 +15,7 @@ from torch import Tensor
 from torchvision.models import AlexNet_Weights, VGG16_Weights
 
 BACKBONES: Final = {"vgg": VGG16_Weights.IMAGENET1K_V1, "alex": AlexNet_Weights.IMAGENET1K_V1}
+CONSTRUCTORS: Final = {"vgg": ("VGG-16", "vgg16"), "alex": ("AlexNet", "alexnet")}
 
 
 @dataclass(frozen=True)
@@ -34,15 +35,16 @@ def backbone_path(net: str) -> Path:
     return Path(torch.hub.get_dir()) / "checkpoints" / PurePosixPath(BACKBONES[net].url).name
 
 
-def require_backbone() -> None:
-    """ValueError says where the loss's backbone belongs and how to get it there, unless it is there."""
-    path = backbone_path("vgg")
+def require_backbone(net: str, flag: str, otherwise: str) -> None:
+    """ValueError says where the backbone that `flag` asks for belongs and how to get it there, unless it is
+    there; `otherwise` is what to set the flag to without."""
+    path, (name, constructor) = backbone_path(net), CONSTRUCTORS[net]
     if not path.is_file():
         raise ValueError(
-            f"--model.perceptual_weight: LPIPS needs the VGG-16 of torchvision, and {path} is missing. On a "
-            'machine with network access run python -c "import torchvision; torchvision.models.vgg16('
-            "weights='IMAGENET1K_V1')\" and copy the file there (TORCH_HOME says where the cache is), or "
-            "train with --model.perceptual_weight=0"
+            f"{flag}: LPIPS needs the {name} of torchvision, and {path} is missing. On a machine with a "
+            f'network run python -c "import torchvision; torchvision.models.{constructor}('
+            "weights='IMAGENET1K_V1')\" and copy the file there (TORCH_HOME says where the cache is), or set "
+            f"it to {otherwise}"
         )
 
 

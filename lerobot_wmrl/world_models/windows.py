@@ -39,8 +39,7 @@ def clip_from_windows(
         if not torch.isfinite(values).all():
             raise ValueError(f"{name}: holds NaN or infinity; remove the episodes that do from the dataset")
     padded = batch.get(f"{camera_key}_is_pad", torch.zeros(rows, length, dtype=torch.bool)).to(device)
-    before = padded.sum(1, keepdim=True)
-    index = (torch.arange(length, device=device) + before).clamp(max=length - 1)
+    before, index = padded.sum(1, keepdim=True), unpadded_rows(padded)
     valid = torch.arange(length, device=device) < length - before
     last = torch.arange(length, device=device) == length - 1 - before
     done, known = torch.zeros(rows, length, device=device), torch.zeros_like(last)
@@ -49,3 +48,9 @@ def clip_from_windows(
     tokens, state, action = (take_rows(values, index) for values in (tokens, state, action))
     depth = depth if depth is None else take_rows(depth, index)
     return Clip(tokens, state, action, done, valid, known, list(batch.get("task", [""] * rows)), depth)
+
+
+def unpadded_rows(padded: Tensor) -> Tensor:
+    """Where to take a clip's rows from in windows of which the first rows are padding. (B, T) → (B, T)"""
+    length = padded.shape[1]
+    return (torch.arange(length, device=padded.device) + padded.sum(1, keepdim=True)).clamp(max=length - 1)

@@ -1,15 +1,20 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import torch
 from gymnasium.vector import AutoresetMode
 
-from lerobot_wmrl.constants import ACTION_HIGH
+from lerobot_wmrl.constants import ACTION_HIGH, TASKS
 from lerobot_wmrl.dataset_source import DatasetSource
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
+from lerobot_wmrl.rewards.configuration_general import GeneralConfig
+from lerobot_wmrl.rewards.similarity import TokenizerSimilarity
 from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
+from lerobot_wmrl.world_models.frame_tokenizer import Decoded
 
 B = 4
 IMAGE, STATE = "observation.images.third_view", "observation.state"
@@ -89,9 +94,58 @@ def test_done_must_hold_for_k_frames_and_is_paid_once(env):
 def test_goals_that_were_never_reached_are_counted(env):
     """Eq. 6 without a frame that reaches θ: the metric is the share of environments with a reached goal."""
     env.reset(seed=list(range(B)))
-    env.starts = env.starts._replace(goal_reached=torch.arange(len(env.starts.tokens)) % 2 == 0)
+    env.goals = env.goals._replace(reached=torch.arange(len(env.starts.tokens)) % 2 == 0)
     *_, info = env.step(torch.zeros(B, 7))
     assert info["reward_parts"]["goal_reached"].tolist() == [True, False, True, False]
+
+
+def test_goals_are_described_once_and_every_frame_once(config):
+    """However often an episode begins from the same start."""
+    calls: list[int] = []
+    describe = TokenizerSimilarity.describe
+
+    def counted(self: TokenizerSimilarity, frame: Decoded) -> list[torch.Tensor]:
+        calls.append(len(frame.images))
+        return describe(self, frame)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(TokenizerSimilarity, "describe", counted)
+        env = config.create_tensor_env(B)
+        starts = len(env.starts.tokens)
+        assert sorted(calls) == [starts, starts]
+        env.reset(seed=0)
+        for _ in range(2 * config.episode_length):
+            env.step(torch.zeros(B, 7))
+    assert calls[2:] == [B] * 2 * config.episode_length
+
+
+def test_without_a_dense_part_no_goal_and_no_text_model_is_needed(config):
+    sparse = replace(config, text_world_model_path="", reward=GeneralConfig(device="cpu", alpha=1.0))
+    env = sparse.create_tensor_env(B)
+    env.reset(seed=0)
+    always_done(env, torch.tensor([True, False, True, False]))
+    for _ in range(3):
+        _, reward, *_, info = env.step(torch.zeros(B, 7))
+    assert reward.tolist() == [1, 0, 1, 0]
+    assert "similarity" not in info["reward_parts"]
+    with pytest.raises(ValueError, match=r"--env\.text_world_model_path is missing.*alpha=1"):
+        replace(config, text_world_model_path="")
+
+
+def test_starts_can_be_chosen_by_task_and_scene(config):
+    def count(**chosen) -> int:
+        env = replace(config, dataset=replace(config.dataset, **chosen)).create_tensor_env(1)
+        return len(env.starts.tokens)
+
+    assert count() == 6
+    assert count(scenes=[1], tasks=[TASKS[0]]) == 3
+    assert count(split="train,ind", scenes=[0]) == 3
+    with pytest.raises(ValueError, match=r"--env\.dataset\.scenes=\[7\]: no episode"):
+        count(scenes=[7])
+    with pytest.raises(ValueError, match=rf"--env\.dataset\.tasks=\['{TASKS[1]}'\]: no episode"):
+        count(tasks=[TASKS[1]])
+    with pytest.raises(ValueError, match=r"--env\.dataset\.tasks=\['fly'\]: choose from"):
+        count(tasks=["fly"])
 
 
 def test_an_episode_that_restarts_forgets_what_came_before(env):
@@ -136,9 +190,20 @@ def test_lerobot_eval_gets_numpy_and_frozen_episodes(config):
     assert info["final_info"]["is_success"][0]
 
 
-def test_models_that_do_not_fit_together_are_refused(config, small_dataset, trained_models, tmp_path):
-    from dataclasses import replace
+def test_lerobot_eval_gets_an_environment_for_each_task(config, make_synthetic_dataset, tmp_path):
+    """Episodes of two tasks; both environments share their models."""
+    dataset = make_synthetic_dataset(tmp_path / "two", episodes=6)
+    file = next((tmp_path / "two" / "data").rglob("*.parquet"))
+    rows = pq.read_table(file)
+    index = rows.schema.get_field_index("start.task")
+    task = (rows["episode_index"].to_numpy() < 2) * 2
+    pq.write_table(rows.set_column(index, rows.schema.field(index), [task]), file)
+    envs = replace(config, dataset=StartFrames(root=str(dataset.root))).create_envs(B)["world_model"]
+    assert {task: len(env.env.starts.tokens) for task, env in envs.items()} == {0: 4, 2: 2}
+    assert envs[0].env.model is envs[2].env.model
 
+
+def test_models_that_do_not_fit_together_are_refused(config, small_dataset, trained_models, tmp_path):
     from tests.trained import run_training, text_config, train_tokenizer
 
     root = Path(small_dataset.root)

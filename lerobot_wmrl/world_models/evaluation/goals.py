@@ -64,12 +64,12 @@ def imagine_goals(model: TextWorldModelRewardModel, source: Source, episodes: np
     start_distance = distance
     if finals is not None:
         same = np.array([[table.instructions[f] == text for f in finals.episodes] for text in instructions])
-        pairs = feature_distances(goal.features, finals.features, tokenizer.num_cameras)
+        pairs = feature_distances(goal.decoded.features, finals.features, tokenizer.num_cameras)
         distance, nearest = least(pairs, same)
         pairs = feature_distances(start.features, finals.features, tokenizer.num_cameras)
         start_distance = least(pairs, same)[0]
     return Goals(
-        starts, start.images, tokenizer.decode(goal.tokens, context), goal.reached.cpu().numpy(), finals,
+        starts, start.images, goal.decoded.images, goal.reached.cpu().numpy(), finals,
         nearest, distance, start_distance,
     )  # fmt: skip
 

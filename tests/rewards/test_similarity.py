@@ -1,0 +1,63 @@
+"""How like its goal a frame looks."""
+
+import pytest
+import torch
+from lpips import LPIPS
+
+from lerobot_wmrl.rewards.configuration_general import SIMILARITIES, GeneralConfig
+from lerobot_wmrl.rewards.similarity import PerceptualSimilarity, Similarity, make_similarity, of_rows
+from lerobot_wmrl.world_models.frame_tokenizer import Decoded, FrameTokenizer
+
+CPU = torch.device("cpu")
+CAMERAS = 2
+
+
+@pytest.fixture(scope="module")
+def network() -> LPIPS:
+    """LPIPS with its own linear heads, on a backbone that was never trained: nothing is downloaded."""
+    torch.manual_seed(0)
+    return LPIPS(net="alex", pnet_rand=True, verbose=False).requires_grad_(False)
+
+
+@pytest.fixture(params=["tokenizer", "mse", "lpips"])
+def alike(request, network) -> Similarity:
+    return PerceptualSimilarity(network) if request.param == "lpips" else make_similarity(request.param, CPU)
+
+
+def decoded(tokens: torch.Tensor) -> Decoded:
+    torch.manual_seed(1)
+    tokenizer = FrameTokenizer(64, [8, 16], [5, 4], CAMERAS).eval()
+    with torch.no_grad():
+        return tokenizer.decode_with_features(tokens)
+
+
+def frames() -> Decoded:
+    """A frame, one that differs from it in a few tokens, and one that differs in all of them."""
+    tokens = torch.randint(0, 20, (1, CAMERAS * 64), generator=torch.Generator().manual_seed(0))
+    near = tokens.clone()
+    near[:, :8] = (near[:, :8] + 7) % 20
+    return decoded(torch.cat([tokens, near, (tokens + 7) % 20]))
+
+
+def test_what_is_nearer_to_the_goal_is_more_alike(alike):
+    described = alike.describe(frames())
+    goal = of_rows(described, torch.zeros(3, dtype=torch.long), CAMERAS)
+    same, near, far = alike(described, goal, CAMERAS).tolist()
+    assert same == pytest.approx(1)
+    assert 0 <= far < near < same
+
+
+def test_lpips_is_that_of_its_package(network):
+    alike, images = PerceptualSimilarity(network), torch.rand(2, 3, CAMERAS, 3, 64, 64)
+    a, b = (alike.describe(Decoded(part, [])) for part in images)
+    expected = network(images[0].flatten(0, 1), images[1].flatten(0, 1), normalize=True).flatten()
+    torch.testing.assert_close(alike.distance(a, b), expected, atol=1e-6, rtol=1e-5)
+
+
+def test_lpips_without_its_backbone_is_an_error_and_never_something_else(tmp_path, monkeypatch):
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    message = r"--env\.reward\.similarity=lpips_alex: .*hub/checkpoints/alexnet-.*\.pth is missing.*tokenizer"
+    with pytest.raises(ValueError, match=message):
+        make_similarity("lpips_alex", CPU)
+    with pytest.raises(ValueError, match=r"--reward\.similarity=ssim: choose " + ", ".join(SIMILARITIES)):
+        GeneralConfig(device="cpu", similarity="ssim")
