@@ -5,23 +5,27 @@
 
 Each episode is imagined from its first frame with its own actions. `metrics.json` and `metrics.md` get the
 accuracy by step and the gate: of the episodes that failed in reality, how many the model believes in.
-Add `--text_model.path=…` for goal frames and the reward along a successful and a failed episode.
+Add `--text_model.path=…` for goal frames and the reward along a successful and a failed episode, and
+`--policies=[outputs/rl] --real_env.type=wmrl_maniskill …` to see whether policies succeed as in reality.
 docs/world_models.md explains every number.
 """
 
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import draccus
+from lerobot.envs.configs import EnvConfig
 
 from lerobot_wmrl.command import RunConfig, claim_output_dir, run_command
+from lerobot_wmrl.constants import EVALUATION_SEED
 from lerobot_wmrl.dataset_source import DatasetSource
 from lerobot_wmrl.presets import expand_preset
 from lerobot_wmrl.rewards.configuration_general import GeneralConfig
 
 if TYPE_CHECKING:
+    from lerobot_wmrl.world_models.evaluation.agreement import Agreement
     from lerobot_wmrl.world_models.evaluation.evaluate import Evaluation
     from lerobot_wmrl.world_models.evaluation.replay import Source
     from lerobot_wmrl.world_models.evaluation.report import Report
@@ -29,6 +33,10 @@ if TYPE_CHECKING:
         ActionWorldModelRewardModel,
         TextWorldModelRewardModel,
     )
+
+
+IMAGINED_AT_ONCE, REAL_AT_ONCE = 50, 2
+"""Episodes of a policy that run at once."""
 
 
 @dataclass
@@ -53,6 +61,10 @@ class EvalWorldModelConfig(RunConfig):
         max_episodes: at most so many, evenly spread.
         done_threshold, done_frames: when an imagined episode counts as a success; as in the environment.
         reward: the general reward of the curves (--reward.alpha …); as in the environment.
+        policies: checkpoints, or output folders of trainings, of which every checkpoint counts: their success
+            in the world model, from the dataset's start frames, beside that in `real_env`.
+        policy_episodes: of each of them, in either place.
+        real_env: `--real_env.type=wmrl_maniskill` and its settings.
         device: where the models run; the best there is by default.
         output_dir: where metrics.json, metrics.md and the pictures go.
     """
@@ -65,17 +77,25 @@ class EvalWorldModelConfig(RunConfig):
     done_threshold: float = 0.5
     done_frames: int = 3
     reward: GeneralConfig = field(default_factory=GeneralConfig)
+    policies: list[str] = field(default_factory=list)
+    policy_episodes: int = 50
+    real_env: EnvConfig | None = None
     device: str | None = None
     output_dir: Path = Path("outputs/eval_world_model")
 
 
 def check_config(cfg: EvalWorldModelConfig) -> None:
     """ValueError names the setting that cannot be."""
-    for name in ("max_episodes", "done_frames"):
+    for name in ("max_episodes", "done_frames", "policy_episodes"):
         if getattr(cfg, name) < 1:
             raise ValueError(f"--{name}={getattr(cfg, name)}: must be at least 1")
     if not 0 < cfg.done_threshold < 1:
         raise ValueError(f"--done_threshold={cfg.done_threshold}: must be a probability between 0 and 1")
+    if cfg.policies and cfg.real_env is None:
+        raise ValueError(
+            "--real_env.type is missing: success in the world model is compared with success in an "
+            "environment; give --real_env.type=wmrl_maniskill and its settings, or leave out --policies"
+        )
 
 
 def eval_world_model(cfg: EvalWorldModelConfig) -> None:
@@ -107,6 +127,10 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     if text_model is not None:
         goals, goal_page = report_text_model(cfg, model, text_model, source, evaluation)
         numbers, page = numbers | goals, f"{page}\n\n{goal_page}"
+    if cfg.policies:
+        agreement = policy_agreement(cfg)
+        agreement.draw(cfg.output_dir / "policies.png")
+        numbers["policies"], page = agreement.as_json(), f"{page}\n\n{agreement.table()}"
     numbers["tokenizer"] = reconstruction_metrics(model, table, source.frames, episodes)
     write_json(cfg.output_dir / "metrics.json", {**numbers, "dataset": cfg.dataset.root, "split": cfg.split})
     write_text(cfg.output_dir / "metrics.md", f"{page}\n")
@@ -125,6 +149,26 @@ def load_text_model(
     text_model: TextWorldModelRewardModel = load_model(cfg.text_model.path, "text_world_model", cfg.device)
     check_same_tokenizer(model, text_model, f"--text_model.path={cfg.text_model.path}")
     return text_model
+
+
+def policy_agreement(cfg: EvalWorldModelConfig) -> "Agreement":
+    """Every policy's success in the world model and in `real_env`."""
+    from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
+    from lerobot_wmrl.envs.policy_success import policy_checkpoints, policy_outcomes
+    from lerobot_wmrl.world_models.evaluation.agreement import Agreement
+
+    imagination = WorldModelEnv(
+        world_model_path=cfg.model.path, reward=GeneralConfig(alpha=1.0), device=cfg.device,
+        dataset=StartFrames(cfg.dataset.root, cfg.dataset.repo_id, split=cfg.split),
+        done_threshold=cfg.done_threshold, done_frames=cfg.done_frames,
+    )  # fmt: skip
+    places = ((imagination, IMAGINED_AT_ONCE), (cfg.real_env, REAL_AT_ONCE))
+
+    def outcomes(path: Path) -> Any:
+        count = cfg.policy_episodes
+        return tuple(policy_outcomes(env, path, count, EVALUATION_SEED, at_once) for env, at_once in places)
+
+    return Agreement.of({str(path): outcomes(path) for path in policy_checkpoints(cfg.policies)})
 
 
 def report_text_model(
