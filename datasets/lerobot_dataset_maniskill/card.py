@@ -47,6 +47,7 @@ def write_card(root: Path, repo_id: str, table: Mapping[str, np.ndarray]) -> Non
     vocabulary = json.loads((root / VOCABULARY_FILE).read_text())
     text = CARD.format(
         title=title(repo_id),
+        what=IMAGINED if "world_model" in vocabulary["recording"] else "ManiSkill trajectories",
         name=repo_id,
         fps=FPS,
         episodes=len(table["episode"]),
@@ -118,6 +119,8 @@ def markdown_table(head: Sequence[str], rows: Iterator[tuple[Any, ...]]) -> str:
 
 DEPTH = "- `observation.images.<camera>_depth`: LeRobot depth maps, millimetres along the camera's axis.\n"
 
+IMAGINED = "A policy's episodes, imagined by a world model from the first frames of real ones,"
+
 CARD = """---
 license: apache-2.0
 task_categories: [robotics]
@@ -128,7 +131,7 @@ configs:
 ---
 {title}
 
-ManiSkill trajectories recorded by `lerobot-wmrl-record`: {episodes} episodes, {frames} frames
+{what} recorded by `lerobot-wmrl-record`: {episodes} episodes, {frames} frames
 ({minutes:.1f} minutes at {fps} Hz).
 
 {success}

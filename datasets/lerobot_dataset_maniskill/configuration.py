@@ -1,7 +1,7 @@
 """What to record: the flags of `lerobot-wmrl-record`."""
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -16,6 +16,7 @@ from lerobot_dataset_maniskill.planners import MOTIONS
 from lerobot_wmrl.command import RunConfig
 from lerobot_wmrl.constants import EVALUATION_SEED, KINDS
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.maniskill.tasks import task_of
 from lerobot_wmrl.policy_checkpoints import read_policy_config
 
@@ -34,8 +35,9 @@ def default_kinds() -> dict[str, float]:
 class RecordConfig(RunConfig):
     """Record trajectories in ManiSkill as a LeRobotDataset.
 
-    Planned trajectories by default; with --policy.path=… the real rollouts of that policy. The same command
-    again continues an interrupted recording, or reports that it is complete.
+    Planned trajectories by default; with --policy.path=… the real rollouts of that policy, or, with
+    --env.type=world_model, its imagined ones. The same command again continues an interrupted recording, or
+    reports that it is complete.
     `--preset=tiny` or `--preset=demo` stands for the flags of that size; flags further right override it.
     """
 
@@ -57,7 +59,8 @@ class RecordConfig(RunConfig):
     """Recorded in turn; the environment's own by default."""
 
     env: EnvConfig = field(default_factory=WmrlManiSkillEnv)
-    """Task, scenes, cameras and image size (--env.type=wmrl_maniskill --env.task=push …)."""
+    """Task, scenes, cameras and image size (--env.type=wmrl_maniskill --env.task=push …), or a world model,
+    and the dataset whose first frames it begins with (--env.type=world_model --env.world_model_path=…)."""
 
     depth: bool = False
     """Record every camera's depth too, as LeRobot's depth maps (observation.images.<camera>_depth)."""
@@ -107,8 +110,8 @@ class RecordConfig(RunConfig):
         """ValueError that names the field, its value and the remedy."""
         if self.output_dir is None:
             raise ValueError("--output_dir is missing: give the folder in which the dataset is to appear")
-        if not isinstance(self.env, WmrlManiSkillEnv):
-            raise ValueError(f"--env.type={self.env.type}: only wmrl_maniskill can be recorded so far")
+        if not isinstance(self.env, WmrlManiSkillEnv | WorldModelEnv):
+            raise ValueError(f"--env.type={self.env.type}: choose wmrl_maniskill or world_model")
         for name in ("num_episodes", "num_workers", "part_episodes"):
             if getattr(self, name) < 1:
                 raise ValueError(f"--{name}={getattr(self, name)}: must be at least 1")
@@ -128,9 +131,25 @@ class RecordConfig(RunConfig):
         self._validate_kinds()
         if self.push_to_hub:
             self._validate_publishing()
-        self.env.selected_scenes()
+        if isinstance(self.env, WorldModelEnv):
+            self._validate_imagination()
+        else:
+            self.env.selected_scenes()
         for task in self.tasks:
             task_of(task)
+
+    def _validate_imagination(self) -> None:
+        """What only the simulator can do is not asked of a world model."""
+        if self.policy is None:
+            raise ValueError(
+                "--env.type=world_model: give the policy that is to be imagined, --policy.path=…"
+            )
+        for name in ("depth", "tasks"):
+            if getattr(self, name):
+                raise ValueError(
+                    f"--{name}={getattr(self, name)}: cannot be chosen in a world model; leave it out "
+                    "(--env.dataset.tasks chooses among the starts)"
+                )
 
     def _validate_kinds(self) -> None:
         planned = [kind for kind in KINDS if kind != POLICY_KIND]
@@ -167,6 +186,11 @@ class RecordConfig(RunConfig):
         return self.output_dir
 
     @property
+    def imagination(self) -> WorldModelEnv | None:
+        """The environment, if it is a world model."""
+        return self.env if isinstance(self.env, WorldModelEnv) else None
+
+    @property
     def maniskill(self) -> WmrlManiSkillEnv:
         """The environment, once `validate` has made sure of its type."""
         assert isinstance(self.env, WmrlManiSkillEnv)
@@ -191,18 +215,10 @@ class RecordConfig(RunConfig):
 
     def recorded_content(self) -> dict[str, Any]:
         """What decides the episodes, and so whether a folder continues this recording. JSON values only."""
-        env = self.maniskill
         return {
-            "tasks": self.recorded_tasks,
-            "scenes": [scene.index for scene in env.selected_scenes()],
-            "cameras": list(env.cameras),
-            "image_size": env.image_size,
+            **(self._simulated_content() if self.imagination is None else imagined_content(self.imagination)),
             "depth": self.depth,
-            "light_jitter": env.light_jitter,
-            "camera_jitter": env.camera_jitter,
-            "assets": env.described_assets(),
-            "episode_length": env.episode_length,
-            "robot_mesh_detail": env.robot_mesh_detail,
+            "episode_length": self.env.episode_length,
             "num_episodes": self.num_episodes,
             "part_episodes": self.part_episodes,
             "shard": list(self.shard_of),
@@ -212,3 +228,32 @@ class RecordConfig(RunConfig):
             "policy": None if self.policy is None else str(self.policy.pretrained_path),
             "exploration": self.exploration,
         }
+
+    def _simulated_content(self) -> dict[str, Any]:
+        env = self.maniskill
+        return {
+            "tasks": self.recorded_tasks,
+            "scenes": [scene.index for scene in env.selected_scenes()],
+            "cameras": list(env.cameras),
+            "image_size": env.image_size,
+            "light_jitter": env.light_jitter,
+            "camera_jitter": env.camera_jitter,
+            "assets": env.described_assets(),
+            "robot_mesh_detail": env.robot_mesh_detail,
+        }
+
+
+def imagined_content(env: WorldModelEnv) -> dict[str, Any]:
+    """What decides the frames of imagined episodes, beside the policy."""
+    from lerobot_wmrl.world_models.checkpoint import read_config
+
+    model: Any = read_config(env.world_model_path, "action_world_model")
+    return {
+        "world_model": env.world_model_path,
+        "starts": asdict(env.dataset),
+        "cameras": list(model.cameras),
+        "image_size": model.image_size,
+        "done_threshold": env.done_threshold,
+        "done_frames": env.done_frames,
+        "reward": env.reward.type,
+    }

@@ -2,22 +2,28 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from lerobot_dataset_maniskill.configuration import POLICY_KIND, RecordConfig
-from lerobot_wmrl.constants import KINDS
-from lerobot_wmrl.maniskill.scenes import Scene, scene_for_seed
+from lerobot_wmrl.constants import KINDS, START_COLUMNS, TASKS
+from lerobot_wmrl.episodes import recorded_episodes
+from lerobot_wmrl.maniskill.scenes import SCENES, Scene, scene_for_seed
 
 
 @dataclass(frozen=True)
 class EpisodePlan:
-    """One episode to record: task, scene and seed rebuild its start."""
+    """One episode to record: task, scene and seed rebuild its start.
+
+    `start`: of an imagined one, which of the environment's start frames that is.
+    """
 
     task: str
     kind: str
     scene: Scene
     seed: int
+    start: int = 0
 
 
 @dataclass(frozen=True)
@@ -33,22 +39,51 @@ class Part:
 
 
 def planned_parts(config: RecordConfig) -> list[Part]:
-    """All parts of the shard in order; episode i of the whole has the seed `config.seed + i`.
-
-    Consecutive seeds visit scenes and tasks in turn; every round of the scenes gives each the next task.
-    """
-    scenes, tasks = config.maniskill.selected_scenes(), config.recorded_tasks
-    seeds = range(config.seed, config.seed + config.num_episodes)
-    episodes = [
-        EpisodePlan(task_for_seed(tasks, len(scenes), seed), kind, scene_for_seed(scenes, seed), seed)
-        for kind, seed in zip(planned_kinds(config), seeds, strict=True)
-    ]
+    """All parts of the shard in order."""
+    episodes = simulated_episodes(config) if config.imagination is None else imagined_episodes(config)
     size, (shard, shards) = config.part_episodes, config.shard_of
     parts = [
         Part(index, tuple(episodes[first : first + size]))
         for index, first in enumerate(range(0, len(episodes), size))
     ]
     return parts[shard::shards]
+
+
+def simulated_episodes(config: RecordConfig) -> list[EpisodePlan]:
+    """Episode i of the whole has the seed `config.seed + i`.
+
+    Consecutive seeds visit scenes and tasks in turn; every round of the scenes gives each the next task.
+    """
+    scenes, tasks = config.maniskill.selected_scenes(), config.recorded_tasks
+    seeds = range(config.seed, config.seed + config.num_episodes)
+    return [
+        EpisodePlan(task_for_seed(tasks, len(scenes), seed), kind, scene_for_seed(scenes, seed), seed)
+        for kind, seed in zip(planned_kinds(config), seeds, strict=True)
+    ]
+
+
+def imagined_episodes(config: RecordConfig) -> list[EpisodePlan]:
+    """From the environment's start frames in turn. Task, scene and seed are those of the real episodes that
+    began so: an imagined episode can be repeated for real."""
+    from lerobot_wmrl.envs.start_frames import chosen_episodes
+    from lerobot_wmrl.world_models.episode_table import open_dataset, read_episodes
+
+    assert config.imagination is not None
+    source = config.imagination.dataset
+    table = read_episodes(open_dataset(source.root, source.repo_id))
+    missing = [name for name in START_COLUMNS if name not in table.dataset.features]
+    if missing:
+        raise ValueError(
+            f"--env.dataset.root={source.root}: does not say how its episodes began ({', '.join(missing)}); "
+            "imagined episodes are recorded from the starts of what lerobot-wmrl-record recorded"
+        )
+    starts, real = chosen_episodes(table, source), recorded_episodes(Path(source.root))
+    plans = []
+    for number in range(config.num_episodes):
+        start = (config.seed + number) % len(starts)
+        task, scene, seed = (int(real[name][starts[start]]) for name in ("task", "scene", "seed"))
+        plans.append(EpisodePlan(TASKS[task], POLICY_KIND, SCENES[scene], seed, start))
+    return plans
 
 
 def task_for_seed(tasks: Sequence[str], scenes: int, seed: int) -> str:

@@ -14,6 +14,7 @@ from typing import Any
 from tqdm import tqdm
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
+from lerobot_dataset_maniskill.imagined import ImaginedPartRecorder
 from lerobot_dataset_maniskill.integrity import whole_dataset
 from lerobot_dataset_maniskill.manifest import Part, planned_parts
 from lerobot_dataset_maniskill.merging import finish, merge_folders
@@ -39,14 +40,21 @@ def record(config: RecordConfig) -> None:
     if already_recorded(root, content, count_episodes(parts)):
         discard(work, content)
     else:
-        render_backend()
         if config.policy is not None:
             check_weights(config.policy)
-            check_fit(config.policy, config.maniskill.shown(), len(ACTION_NAMES))
+        if config.imagination is None:
+            check_simulation(config)
         with writing("output_dir", root), claimed(work, content):
             record_parts(config, work, parts)
             merge(config, work, parts)
         shutil.rmtree(work, ignore_errors=True)
+
+
+def check_simulation(config: RecordConfig) -> None:
+    """ValueError unless there is a renderer, and it shows what the policy looks at."""
+    render_backend()
+    if config.policy is not None:
+        check_fit(config.policy, config.maniskill.shown(), len(ACTION_NAMES))
 
 
 def already_recorded(output_dir: Path, content: Mapping[str, Any], episodes: int) -> bool:
@@ -123,10 +131,11 @@ def record_parts(config: RecordConfig, work: Path, parts: list[Part]) -> None:
     missing = missing_parts(work, parts)
     if not missing:
         return
-    count = min(config.num_workers, len(missing))
+    count = min(config.num_workers, len(missing)) if config.imagination is None else 1
     with progress_bar(count_episodes(parts), missing) as report:
         if count == 1:
-            recorder = PartRecorder(config, work)
+            make = PartRecorder if config.imagination is None else ImaginedPartRecorder
+            recorder = make(config, work)
             for part in missing:
                 recorder.record(part, report)
         else:

@@ -2,7 +2,8 @@
 
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,20 @@ class EpisodeResult:
 Report = Callable[[EpisodeResult], None]
 
 
+@contextmanager
+def whole_part(config: RecordConfig, folder: Path, part: Part) -> Iterator[LeRobotDataset]:
+    """An empty dataset to fill; it then stands in `folder` under the part's name, unless that fails."""
+    partial = folder / f".{part.name}.{os.getpid()}.partial"
+    shutil.rmtree(partial, ignore_errors=True)
+    content = config.recorded_content()
+    dataset = create_dataset(
+        partial, config.dataset_id, content["cameras"], content["image_size"], config.depth
+    )
+    yield dataset
+    dataset.finalize()
+    partial.replace(folder / part.name)
+
+
 class PartRecorder:
     """A simulation and a driver that record parts one after the other."""
 
@@ -48,16 +63,9 @@ class PartRecorder:
 
     def record(self, part: Part, report: Report) -> None:
         """Record `part`; its folder appears under its final name only when it is whole."""
-        partial = self.folder / f".{part.name}.{os.getpid()}.partial"
-        shutil.rmtree(partial, ignore_errors=True)
-        env = self.config.maniskill
-        dataset = create_dataset(
-            partial, self.config.dataset_id, env.cameras, env.image_size, self.config.depth
-        )
-        for plan in part.episodes:
-            report(EpisodeResult(part.index, plan.kind, self._record_episode(dataset, plan)))
-        dataset.finalize()
-        partial.replace(self.folder / part.name)
+        with whole_part(self.config, self.folder, part) as dataset:
+            for plan in part.episodes:
+                report(EpisodeResult(part.index, plan.kind, self._record_episode(dataset, plan)))
 
     def _steps(self, plan: EpisodePlan) -> int:
         """At most so many rows."""

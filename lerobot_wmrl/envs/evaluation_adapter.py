@@ -66,13 +66,7 @@ class EvaluationAdapter(gym.vector.VectorEnv):
         return kept
 
     def _to_numpy(self, observation: Observation) -> Observation:
-        prefix = f"{OBS_IMAGES}."
-        pixels = {
-            key.removeprefix(prefix): (value.permute(0, 2, 3, 1) * 255).round().byte().cpu().numpy()
-            for key, value in observation.items()
-            if key.startswith(prefix)
-        }
-        converted: Observation = {"pixels": pixels}
+        converted: Observation = {"pixels": pictures(observation)}
         if OBS_STATE in observation:
             converted["agent_pos"] = observation[OBS_STATE].cpu().numpy()
         return converted
@@ -90,3 +84,13 @@ class EvaluationAdapter(gym.vector.VectorEnv):
 
     def close(self, **kwargs: Any) -> None:
         self.env.close(**kwargs)
+
+
+def pictures(observation: Observation) -> dict[str, np.ndarray]:
+    """Camera → (B, H, W, 3) uint8."""
+    prefix = f"{OBS_IMAGES}."
+    return {
+        key.removeprefix(prefix): (value.permute(0, 2, 3, 1) * 255).round().byte().cpu().numpy()
+        for key, value in observation.items()
+        if key.startswith(prefix)
+    }

@@ -1,0 +1,98 @@
+"""A policy's imagined episodes: a part's are imagined at once, and written as simulated ones are."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.utils.constants import OBS_STATE
+from torch import Tensor
+
+from lerobot_dataset_maniskill.configuration import RecordConfig
+from lerobot_dataset_maniskill.drivers import ExplorationNoise
+from lerobot_dataset_maniskill.manifest import EpisodePlan, Part
+from lerobot_dataset_maniskill.worker import EpisodeResult, Report, whole_part
+from lerobot_dataset_maniskill.writer import Outcome, StartColumns, add_step
+from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, ACTION_NAMES, STATE_NAMES
+from lerobot_wmrl.envs.evaluation_adapter import pictures
+from lerobot_wmrl.maniskill.simulation import Frame
+from lerobot_wmrl.maniskill.tasks import task_of
+from lerobot_wmrl.policy_checkpoints import check_fit, load_policy, load_processors
+
+Row = tuple[Frame, np.ndarray, Outcome]
+
+
+class ImaginedPartRecorder:
+    """A world model and a policy that record parts one after the other."""
+
+    def __init__(self, config: RecordConfig, folder: Path) -> None:
+        assert config.imagination is not None
+        assert config.policy is not None
+        self.config, self.folder, self.threshold = config, folder, config.imagination.done_threshold
+        self.env: Any = config.imagination.create_tensor_env(min(config.part_episodes, config.num_episodes))
+        shown = {name: tuple(space.shape) for name, space in self.env.single_observation_space.items()}
+        if shown.get(OBS_STATE) != (len(STATE_NAMES),):
+            raise ValueError(
+                f"--env.world_model_path={config.imagination.world_model_path}: imagines no state like the "
+                f"recorder's ({len(STATE_NAMES)} numbers); train it on what lerobot-wmrl-record recorded"
+            )
+        check_fit(config.policy, shown, len(ACTION_NAMES))
+        self.policy: Any = load_policy(config.policy).eval()
+        self.preprocess, self.postprocess = load_processors(config.policy)
+
+    def record(self, part: Part, report: Report) -> None:
+        """Record `part`; its folder appears under its final name only when it is whole."""
+        with whole_part(self.config, self.folder, part) as dataset:
+            for plan, (instruction, rows) in zip(part.episodes, self._imagine(part.episodes), strict=True):
+                start = StartColumns(instruction, task_of(plan.task).index, plan)
+                for before, action, outcome in rows:
+                    add_step(dataset, start, before, action, outcome)
+                dataset.save_episode()
+                report(EpisodeResult(part.index, plan.kind, not rows[-1][-1].truncated))
+
+    @torch.no_grad()
+    def _imagine(self, plans: Sequence[EpisodePlan]) -> list[tuple[str, list[Row]]]:
+        """Each episode's instruction and rows, to the k-frame done or to the horizon."""
+        count = self.env.num_envs
+        noises = [ExplorationNoise(self.config.exploration, plan.seed) for plan in plans]
+        torch.manual_seed(plans[0].seed)
+        for part in (self.policy, self.preprocess, self.postprocess):
+            part.reset()
+        spare = [0] * (count - len(plans))
+        observation, _ = self.env.reset(seed=[*(plan.start for plan in plans), *spare])
+        instructions = list(observation["task"])
+        before = self._frames(observation, torch.zeros(count), torch.zeros(count))
+        rows: list[list[Row]] = [[] for _ in plans]
+        running = set(range(len(plans)))
+        while running:
+            action = self._act(observation, noises)
+            observation, reward, terminated, truncated, info = self.env.step(torch.from_numpy(action))
+            fired = info["reward_parts"]["done_probability"] >= self.threshold
+            after = self._frames(info.get("final_obs", observation), reward, fired)
+            for index in running:
+                outcome = Outcome(after[index], bool(truncated[index]))
+                rows[index].append((before[index], action[index], outcome))
+            running -= set((terminated | truncated).nonzero().flatten().tolist())
+            before = after
+        return list(zip(instructions, rows, strict=False))
+
+    def _act(self, observation: dict[str, Any], noises: list[ExplorationNoise]) -> np.ndarray:
+        """(B, 7) in the action box."""
+        known = {*(self.policy.config.input_features or {}), "task"}
+        batch = self.preprocess({name: value for name, value in observation.items() if name in known})
+        action = self.postprocess(self.policy.select_action(batch)).cpu().numpy()
+        action[: len(noises), :3] += np.stack([noise() for noise in noises])
+        return np.clip(action, ACTION_LOW, ACTION_HIGH).astype(np.float32)
+
+    def _frames(self, observation: dict[str, Any], reward: Tensor, success: Tensor) -> list[Frame]:
+        """What each environment shows, as the simulator has it."""
+        images = pictures(observation)
+        state = observation[OBS_STATE].cpu().numpy()
+        return [
+            Frame(
+                {camera: frames[index] for camera, frames in images.items()}, {}, state[index],
+                float(reward[index]), bool(success[index]),
+            )
+            for index in range(len(state))
+        ]  # fmt: skip

@@ -1,0 +1,87 @@
+"""Imagined episodes, recorded as a LeRobotDataset: no simulator."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from lerobot_dataset_maniskill.configuration import RecordConfig
+from lerobot_dataset_maniskill.recorder import record
+from lerobot_wmrl.constants import KINDS
+from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
+from lerobot_wmrl.episodes import recorded_episodes
+from lerobot_wmrl.policy_checkpoints import read_policy_config
+from lerobot_wmrl.rewards.configuration_general import GeneralConfig
+from tests.rl.checkpoints import save_untrained_policy
+
+LENGTH = 4
+IMAGE = "observation.images.third_view"
+
+
+@pytest.fixture
+def config(small_dataset, trained_models, tmp_path) -> RecordConfig:
+    """Seven episodes, from six starts, in parts of three, of which none succeeds."""
+    env = WorldModelEnv(
+        world_model_path=str(trained_models["action_world_model"]),
+        dataset=StartFrames(root=str(Path(small_dataset.root))), reward=GeneralConfig(alpha=1.0),
+        episode_length=LENGTH, done_threshold=0.9999, done_frames=2, device="cpu",
+    )  # fmt: skip
+    policy = save_untrained_policy(tmp_path / "policy", actions=7)
+    return RecordConfig(
+        output_dir=tmp_path / "imagined", env=env, num_episodes=7, part_episodes=3,
+        policy=read_policy_config(str(policy), []),
+    )  # fmt: skip
+
+
+def test_every_row_is_what_the_world_model_imagined(config, small_dataset):
+    """The first frames are those of the dataset's episodes, as the tokenizer draws them; the next states
+    are those that the same actions lead to in the environment."""
+    record(config)
+    found, real = recorded_episodes(config.root), recorded_episodes(Path(small_dataset.root))
+    assert found["length"].tolist() == [LENGTH] * 7
+    assert set(found["kind"]) == {KINDS.index("policy")}
+    for name in ("seed", "scene", "task"):
+        assert found[name].tolist() == [real[name][index % 6] for index in range(7)]
+    dataset = LeRobotDataset("local/imagined", root=config.root)
+    rows = dataset.hf_dataset.with_format("torch")[: 3 * LENGTH]
+    env = config.env.create_tensor_env(3)
+    observation, _ = env.reset(seed=[0, 1, 2])
+    actions, states = (rows[name].unflatten(0, (3, LENGTH)) for name in ("action", "observation.state"))
+    for step in range(LENGTH):
+        torch.testing.assert_close(observation["observation.state"], states[:, step], atol=1e-5, rtol=1e-4)
+        if step == 0:
+            shown = torch.stack([dataset[LENGTH * index][IMAGE] for index in range(3)])
+            assert (shown - observation[IMAGE]).abs().mean() < 0.02
+        observation, *_ = env.step(actions[:, step])
+    ends = np.arange(1, 7 * LENGTH + 1) % LENGTH == 0
+    truncated = dataset.hf_dataset.with_format("numpy")["next.truncated"][:].reshape(-1)
+    assert np.array_equal(truncated, ends)
+
+
+def test_an_episode_ends_with_the_k_frame_done(config):
+    config.env.done_threshold = 0.0001
+    record(config)
+    found = recorded_episodes(config.root)
+    assert found["length"].tolist() == [2] * 7
+    assert found["success"].all()
+
+
+def test_the_same_command_again_finds_it_complete_and_other_settings_are_refused(config, capsys):
+    record(config)
+    record(config)
+    assert "already recorded: 7 episodes" in capsys.readouterr().out
+    config.env.done_frames = 1
+    with pytest.raises(ValueError, match=r"other settings \(done_frames 2 → 1\)"):
+        record(config)
+
+
+def test_what_a_world_model_cannot_do_is_refused(config, make_synthetic_dataset, tmp_path):
+    config.depth = True
+    with pytest.raises(ValueError, match="--depth=True: cannot be chosen in a world model"):
+        record(config)
+    config.depth, config.policy = False, None
+    with pytest.raises(ValueError, match=r"--env\.type=world_model: give the policy"):
+        record(config)
+    assert not config.root.exists()
