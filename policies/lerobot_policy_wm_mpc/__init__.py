@@ -1,0 +1,1 @@
+"""Model-predictive control inside a world model, as a LeRobot policy."""

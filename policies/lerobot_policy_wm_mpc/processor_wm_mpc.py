@@ -1,0 +1,17 @@
+"""Pre- and postprocessor of planning: LeRobot's own. Frames stay in [0, 1], actions in metres."""
+
+from typing import Any
+
+from lerobot.processor import PolicyAction, PolicyProcessorPipeline, make_default_pre_post_processors
+
+from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
+
+
+def make_wm_mpc_pre_post_processors(
+    config: WmMpcConfig, dataset_stats: Any = None
+) -> tuple[
+    PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
+    PolicyProcessorPipeline[PolicyAction, PolicyAction],
+]:
+    """Nothing is normalised: the world model has its own statistics."""
+    return make_default_pre_post_processors(config, dataset_stats, normalizer_device=config.device)

@@ -1,0 +1,125 @@
+"""Planning inside a world model."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from lerobot.scripts import lerobot_eval
+
+from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
+from lerobot_policy_wm_mpc.modeling_wm_mpc import WmMpcPolicy
+from lerobot_policy_wm_mpc.planning import best_knots, interpolated, longest_success
+from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW
+
+SMALL = {"horizon": 8, "execute": 3, "samples": 6, "elites": 2, "iterations": 2, "knots": 3, "device": "cpu"}
+IMAGE = "observation.images.third_view"
+
+
+def test_the_planner_finds_the_sequence_that_is_wanted():
+    wanted = torch.linspace(-0.5, 0.5, 12)[:, None].expand(-1, 2)
+
+    def value(actions: torch.Tensor) -> torch.Tensor:
+        return -(actions - wanted).square().sum((1, 2))
+
+    low, high = torch.full((2,), -1.0), torch.ones(2)
+    found = best_knots(
+        value, torch.zeros(4, 2), torch.ones(2), low, high, horizon=12, samples=64, elites=8, iterations=12,
+        generator=torch.Generator().manual_seed(0),
+    )  # fmt: skip
+    assert (interpolated(found[None], 12)[0] - wanted).abs().max() < 0.1
+
+
+def test_the_planner_keeps_to_the_box_and_never_returns_worse_than_it_was_given():
+    low, high = torch.tensor([-0.2]), torch.tensor([0.3])
+    asked = []
+
+    def value(actions: torch.Tensor) -> torch.Tensor:
+        asked.append(actions)
+        return ((actions - 0.1).abs() < 1e-6).all((1, 2)).float()
+
+    mean = torch.full((3, 1), 0.1)
+    found = best_knots(
+        value, mean, torch.ones(1), low, high, horizon=6, samples=16, elites=4, iterations=3,
+        generator=torch.Generator().manual_seed(0),
+    )  # fmt: skip
+    assert torch.equal(found, mean)
+    assert torch.cat(asked).min() >= low - 1e-6
+    assert torch.cat(asked).max() <= high + 1e-6
+
+
+def test_done_counts_as_long_as_it_holds():
+    logits = torch.tensor([[9.0, -9, 9, -9, 9], [-9, 1, 2, 3, -9]])
+    assert longest_success(logits, 3).tolist() == [-9, 1]
+
+
+@pytest.fixture
+def config(trained_models) -> WmMpcConfig:
+    return WmMpcConfig(
+        world_model_path=str(trained_models["action_world_model"]),
+        text_world_model_path=str(trained_models["text_world_model"]), **SMALL,
+    )  # fmt: skip
+
+
+def observation(small_dataset, rows: list[int]) -> dict:
+    found = [small_dataset[row] for row in rows]
+    names = (IMAGE, "observation.state")
+    return {
+        **{name: torch.stack([row[name] for row in found]) for name in names},
+        "task": [row["task"] for row in found],
+    }
+
+
+@pytest.mark.parametrize("objective", ["success", "goal"])
+def test_it_plans_anew_when_the_plan_is_carried_out(config, objective, small_dataset):
+    config.objective = objective
+    policy = WmMpcPolicy(config)
+    plans = []
+    predict = policy.predict_action_chunk
+    policy.predict_action_chunk = lambda batch: plans.append(predict(batch)) or plans[-1]
+    seen = observation(small_dataset, [0, 20])
+    actions = torch.stack([policy.select_action(seen) for _ in range(2 * SMALL["execute"])])
+    assert len(plans) == 2
+    assert plans[0].shape == (2, SMALL["horizon"], 7)
+    carried_out = torch.cat([plan[:, : SMALL["execute"]] for plan in plans], 1).transpose(0, 1)
+    assert torch.equal(actions, carried_out)
+    assert (actions >= torch.tensor(ACTION_LOW) - 1e-6).all()
+    assert (actions <= torch.tensor(ACTION_HIGH) + 1e-6).all()
+    assert torch.allclose(actions[..., -1], torch.tensor(-1.0))  # the gripper's action never varied
+
+
+def test_episodes_that_begin_alike_are_planned_alike(config, small_dataset):
+    policy, seen = WmMpcPolicy(config), observation(small_dataset, [0])
+    first = policy.predict_action_chunk(seen)
+    assert not torch.equal(policy.predict_action_chunk(seen), first)
+    policy.reset()
+    assert torch.equal(policy.predict_action_chunk(seen), first)
+
+
+def test_lerobot_eval_runs_it_in_imagination(config, trained_models, small_dataset, tmp_path, monkeypatch):
+    given = [f"--policy.{name}={value}" for name, value in SMALL.items()]
+    path = trained_models["action_world_model"]
+    monkeypatch.setattr(sys, "argv", [
+        "lerobot-eval", "--policy.type=wm_mpc", f"--policy.world_model_path={path}", *given,
+        "--env.type=world_model", f"--env.world_model_path={path}", "--env.reward.type=general",
+        "--env.reward.alpha=1", f"--env.dataset.root={Path(small_dataset.root)}", "--env.episode_length=5",
+        "--eval.n_episodes=2", "--eval.batch_size=2", f"--output_dir={tmp_path}",
+    ])  # fmt: skip
+    lerobot_eval.main()
+    found = json.loads((tmp_path / "eval_info.json").read_text())
+    assert len(found["per_task"][0]["metrics"]["successes"]) == 2
+
+
+def test_bad_settings_name_the_field_and_the_remedy(trained_models):
+    path = str(trained_models["action_world_model"])
+    with pytest.raises(ValueError, match=r"--policy\.world_model_path is missing"):
+        WmMpcPolicy(WmMpcConfig(device="cpu"))
+    with pytest.raises(ValueError, match=r"--policy\.text_world_model_path is missing.*objective=success"):
+        WmMpcPolicy(WmMpcConfig(device="cpu", world_model_path=path, objective="goal"))
+    with pytest.raises(ValueError, match=r"--policy\.objective=reward: choose"):
+        WmMpcConfig(device="cpu", objective="reward")
+    with pytest.raises(ValueError, match=r"--policy\.elites=9: must be at most samples=4"):
+        WmMpcConfig(device="cpu", elites=9, samples=4)
+    with pytest.raises(ValueError, match=r"--policy\.knots=1: must be from 2"):
+        WmMpcConfig(device="cpu", knots=1)
