@@ -1,0 +1,208 @@
+"""Which reward knows success from failure? The curves of the paper's Fig. 3, for every kind of reward.
+
+    python benchmarks/reward_curves.py ind=outputs/gate/rollouts ood=outputs/gate/rollouts_ood \\
+        --model.path=outputs/gate/action_world_model --proxy=outputs/proxy --embedding=outputs/embedding \\
+        --text_model.path=outputs/imagined_ppo/text_world_model
+
+Real episodes are imagined from their first frame with their own actions, as a policy would meet them, and
+every reward says what each frame is worth: `rule_based` (recorded in the simulator, the yardstick), `general`
+(alpha on success, the rest on similarity to the goal, absolute), its two parts, `embedding` and `proxy`. Of
+each: the mean curve of successes and of failures, Spearman's correlation with the rule-based reward within
+an episode, and the AUC of its highest run of three frames, success against failure. The same starts are also
+given to hands that move at random, not at all, and to one corner: they should earn less than the planner's
+actions. Writes docs/results/reward_curves.json and a picture beside it.
+"""
+
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from lerobot.rewards.pretrained import PreTrainedRewardModel
+from lerobot.utils.import_utils import register_third_party_plugins
+from matplotlib.figure import Figure
+from scipy.stats import spearmanr
+from torch import Tensor
+
+from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW
+from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
+from lerobot_wmrl.envs.start_frames import chosen_episodes
+from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv, make_world_model_env
+from lerobot_wmrl.files import write_json
+from lerobot_wmrl.report.figures import COLOURS, tidy
+from lerobot_wmrl.rewards.configuration_general import GeneralConfig
+from lerobot_wmrl.statistics import Estimate
+from lerobot_wmrl.world_models.checkpoint import load_model
+from lerobot_wmrl.world_models.episode_table import EpisodeTable, open_dataset, read_episodes
+from lerobot_wmrl.world_models.evaluation.gate import Outcomes
+from lerobot_wmrl.world_models.evaluation.tables import markdown_table
+
+RESULTS: Final = Path(__file__).parents[1] / "docs" / "results" / "reward_curves.json"
+FRAMES = 3
+"""In a row that count together, as in the environment."""
+
+NEVER = 10**6
+"""No episode ends while it is judged."""
+
+HANDS: Final = ("random", "frozen", "saturated")
+
+
+class EveryReward:
+    """Stands where the environment's reward stands and remembers what each of the trained ones says."""
+
+    def __init__(self, rewards: Mapping[str, PreTrainedRewardModel]) -> None:
+        self.rewards = rewards
+        self.said: dict[str, list[Tensor]] = {}
+
+    @torch.no_grad()
+    def compute_reward(self, batch: dict[str, Any]) -> Tensor:
+        """(B,) of zeros: nobody learns from it."""
+        for name, reward in self.rewards.items():
+            self.said.setdefault(name, []).append(reward.compute_reward(batch))
+        return torch.zeros_like(batch["success"])
+
+
+def judged(env: WorldModelVectorEnv, actions: Tensor, config: GeneralConfig) -> dict[str, np.ndarray]:
+    """What every reward says of the frames after actions (B, T, A) from the first B starts. → (B, T) each"""
+    env.reward.said.clear()
+    env.reset(seed=list(range(env.num_envs)))
+    parts = [env.step(action)[-1]["reward_parts"] for action in actions.unbind(1)]
+    success = torch.stack([part["done_probability"] for part in parts], 1)
+    similarity = torch.stack([part["similarity"] for part in parts], 1)
+    level = config.alpha * (success >= 0.5).float() + (1 - config.alpha) * similarity
+    learned = {name: torch.stack(values, 1) for name, values in env.reward.said.items()}
+    every = {"general": level, "success": success, "similarity": similarity, **learned}
+    return {name: values.cpu().numpy() for name, values in every.items()}
+
+
+def recorded(table: EpisodeTable, episodes: np.ndarray, column: np.ndarray, steps: int) -> np.ndarray:
+    """A column of the dataset by episode, NaN after its end. (rows,) → (E, steps)"""
+    values = np.full((len(episodes), steps), np.nan)
+    for row, episode in enumerate(episodes):
+        length = min(int(table.length[episode]), steps)
+        values[row, :length] = column[table.start[episode] :][:length]
+    return values
+
+
+def within_episodes(reward: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Spearman's correlation over each episode's frames, NaN where one of both is constant. (E, T) → (E,)"""
+    found = np.full(len(reward), np.nan)
+    for row, (own, real) in enumerate(zip(reward, truth, strict=True)):
+        known = np.isfinite(real)
+        if np.ptp(own[known]) > 0 and np.ptp(real[known]) > 0:
+            found[row] = spearmanr(own[known], real[known]).statistic
+    return found
+
+
+def measure(
+    curves: Mapping[str, np.ndarray], done: np.ndarray, alone: Mapping[str, Mapping[str, np.ndarray]]
+) -> dict[str, Any]:
+    """Of every reward the numbers above; done (E, T) real success; `alone`: what other hands earn."""
+    truth, success = curves["rule_based"], done.any(1)
+    found = {}
+    for name, values in curves.items():
+        cut = np.where(np.isfinite(truth), values, np.nan)
+        outcomes = Outcomes(np.arange(len(cut)), cut, done)
+        earned = np.nanmean(cut[success], 1)
+        found[name] = {
+            "auc": outcomes.auc(FRAMES),
+            "spearman": Estimate.mean(within_episodes(cut, truth)).as_json(),
+            "mean_of_successes": np.nanmean(cut[success], 0).tolist(),
+            "mean_of_failures": np.nanmean(cut[~success], 0).tolist(),
+            "earned_by_successes": float(earned.mean()),
+            "earned_by": {hand: float(said[name].mean()) for hand, said in alone.items() if name in said},
+        }
+    return {"successes": int(success.sum()), "failures": int((~success).sum()), "rewards": found}
+
+
+def other_hands(shape: tuple[int, int]) -> dict[str, Tensor]:
+    """Actions (B, T, A) of hands that attempt nothing."""
+    low, high = torch.tensor(ACTION_LOW), torch.tensor(ACTION_HIGH)
+    drawn = torch.rand(*shape, len(low), generator=torch.Generator().manual_seed(0))
+    return {
+        "random": low + drawn * (high - low),
+        "frozen": torch.zeros_like(drawn),
+        "saturated": high.expand_as(drawn),
+    }
+
+
+def curves_of(given: argparse.Namespace, root: str, rewards: Mapping[str, Any]) -> dict[str, Any]:
+    """All numbers of one dataset of real episodes."""
+    table, config = read_episodes(open_dataset(root)), GeneralConfig(device="cpu")
+    source = StartFrames(root=root, max_starts=given.max_episodes)
+    episodes = chosen_episodes(table, source)
+    env = make_world_model_env(
+        WorldModelEnv(
+            world_model_path=given.model_path, text_world_model_path=given.text_model_path, dataset=source,
+            reward=config, done_frames=NEVER, episode_length=NEVER,
+        ),
+        len(episodes), "cpu",
+    )  # fmt: skip
+    env.reward = EveryReward(rewards)  # type: ignore[assignment]
+    steps = int(table.length[episodes].max())
+    offset = np.minimum(np.arange(steps), table.length[episodes][:, None] - 1)
+    actions = torch.from_numpy(table.action[table.start[episodes][:, None] + offset])
+    column = np.asarray(table.dataset.hf_dataset.with_format("numpy")["next.reward"][:]).reshape(-1)
+    curves = {
+        "rule_based": recorded(table, episodes, column, steps), **judged(env, actions, config),
+    }  # fmt: skip
+    done = recorded(table, episodes, table.done, steps) == 1
+    hands = {name: judged(env, moves, config) for name, moves in other_hands((len(episodes), steps)).items()}
+    return measure(curves, done, hands)
+
+
+def results_table(found: Mapping[str, Mapping[str, Any]]) -> str:
+    """A line a dataset and reward."""
+    lines = []
+    for dataset, numbers in found.items():
+        for name, row in numbers["rewards"].items():
+            earned = [f"{row['earned_by'][hand]:.2f}" if hand in row["earned_by"] else "–" for hand in HANDS]
+            lines.append([
+                dataset, name, f"{row['auc']:.3f}", f"{row['spearman']['value']:.2f}",
+                f"{row['earned_by_successes']:.2f}", *earned,
+            ])  # fmt: skip
+    return markdown_table(["episodes", "reward", "AUC", "Spearman", "successes earn", *HANDS], lines)
+
+
+def draw(found: Mapping[str, Mapping[str, Any]], path: Path) -> None:
+    """A row a dataset, a column a reward: mean curves of successes and failures."""
+    names = list(next(iter(found.values()))["rewards"])
+    figure = Figure(figsize=(2.2 * len(names), 2.2 * len(found)), layout="constrained")
+    grid = figure.subplots(len(found), len(names), squeeze=False, sharex=True)
+    for row, (dataset, numbers) in zip(grid, found.items(), strict=True):
+        for axes, name in zip(row, names, strict=True):
+            for colour, kind in zip(COLOURS, ("successes", "failures"), strict=False):
+                axes.plot(numbers["rewards"][name][f"mean_of_{kind}"], color=colour, label=kind)
+            axes.set_title(f"{name}, {dataset}", fontsize=9)
+    grid[0, 0].legend(fontsize=8)
+    tidy(figure).savefig(path, dpi=130)
+
+
+def main() -> None:
+    """Entry point."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("datasets", nargs="+", help="name=root of real episodes")
+    parser.add_argument("--model.path", dest="model_path", required=True, help="action world model")
+    parser.add_argument("--text_model.path", dest="text_model_path", required=True)
+    for kind in ("proxy", "embedding"):
+        parser.add_argument(f"--{kind}", help=f"trained {kind} reward; left out by default")
+    parser.add_argument("--max_episodes", type=int, default=300, help="of each dataset, evenly spread")
+    parser.add_argument("--output", type=Path, default=RESULTS, help="JSON file")
+    given = parser.parse_args()
+    register_third_party_plugins()
+    paths = {kind: getattr(given, kind) for kind in ("proxy", "embedding") if getattr(given, kind)}
+    rewards = {kind: load_model(path, kind) for kind, path in paths.items()}
+    found = {
+        name: curves_of(given, root, rewards) for name, _, root in (d.partition("=") for d in given.datasets)
+    }
+    write_json(given.output, found)
+    draw(found, given.output.with_suffix(".png"))
+    print(results_table(found))
+
+
+if __name__ == "__main__":
+    main()
