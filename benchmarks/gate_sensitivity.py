@@ -1,0 +1,107 @@
+"""How exactly must one know where the object is, to judge a rollout from its first frame and its actions?
+
+    python benchmarks/gate_sensitivity.py --dataset.root=outputs/gate/rollouts
+
+The gate replays real actions open loop. Here the simulator itself is asked in the world model's place: each
+recorded episode is repeated with its own actions, but the object stands a little off, by a normal error
+along x and y. The share of failures that then succeed, and of successes that still do, is what a perfect model
+of physics would get at the gate, were its eyes so good. With an error of 0 it is how exactly the simulator
+repeats itself. Writes docs/results/gate_sensitivity.json.
+"""
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from lerobot.utils.import_utils import register_third_party_plugins
+from tqdm import tqdm
+
+from lerobot_wmrl.constants import TASKS
+from lerobot_wmrl.episodes import recorded_episodes
+from lerobot_wmrl.files import write_json
+from lerobot_wmrl.maniskill.rendering import Rendering
+from lerobot_wmrl.maniskill.scenes import SCENES
+from lerobot_wmrl.maniskill.simulation import Simulation
+from lerobot_wmrl.maniskill.tasks import task_of
+from lerobot_wmrl.statistics import Proportion
+from lerobot_wmrl.world_models.episode_table import EpisodeTable, open_dataset, read_episodes
+from lerobot_wmrl.world_models.evaluation.tables import markdown_table
+
+RESULTS: Final = Path(__file__).parents[1] / "docs" / "results" / "gate_sensitivity.json"
+ERRORS_MM: Final = (0.0, 0.5, 1.0, 2.0, 3.0, 5.0)
+
+
+def put_aside(simulation: Simulation, shift: np.ndarray) -> None:
+    """Let the episode begin with the object displaced by `shift` (2,), in metres."""
+    episode = simulation.episode
+    episode.start = replace(episode.start, object_xy=episode.start.object_xy + shift)
+    simulation.env.place(episode.scene, episode.start)
+    episode.begin(simulation.object_position)
+
+
+def succeeds(simulation: Simulation, actions: np.ndarray) -> bool:
+    """Whether success holds after one of the actions (T, 7)."""
+    return any(simulation.step(action).success for action in actions)
+
+
+def repeated(
+    simulation: Simulation, table: EpisodeTable, real: dict[str, np.ndarray], errors_mm: Sequence[float]
+) -> np.ndarray:
+    """Success of every episode with each error. → (E, errors)"""
+    found = np.zeros((len(table.start), len(errors_mm)), bool)
+    for episode in tqdm(range(len(table.start)), desc="Repeating episodes", unit="episode"):
+        task, scene, seed = (int(real[name][episode]) for name in ("task", "scene", "seed"))
+        actions = table.action[table.start[episode] :][: table.length[episode]]
+        direction = np.random.default_rng(seed).normal(size=2)
+        simulation.task = task_of(TASKS[task])
+        for column, error in enumerate(errors_mm):
+            simulation.reset(SCENES[scene], seed)
+            put_aside(simulation, error / 1000 * direction)
+            found[episode, column] = succeeds(simulation, actions)
+    return found
+
+
+def measure(found: np.ndarray, success: np.ndarray, errors_mm: Sequence[float]) -> list[dict[str, Any]]:
+    """The gate of each error; success (E,) as recorded."""
+    return [
+        {
+            "error_mm": error,
+            "false_success_rate": Proportion(int(calls[~success].sum()), int((~success).sum())).as_json(),
+            "recognised_rate": Proportion(int(calls[success].sum()), int(success.sum())).as_json(),
+        }
+        for error, calls in zip(errors_mm, found.T, strict=True)
+    ]
+
+
+def results_table(rows: Sequence[dict[str, Any]]) -> str:
+    """A line an error."""
+    lines = []
+    for row in rows:
+        rates = (row[name] for name in ("false_success_rate", "recognised_rate"))
+        lines.append([row["error_mm"], *(str(Proportion(rate["k"], rate["n"])) for rate in rates)])
+    return markdown_table(["error (mm)", "failures called successes", "successes recognised"], lines)
+
+
+def main() -> None:
+    """Entry point."""
+    register_third_party_plugins()
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--dataset.root", dest="root", required=True, help="recorded rollouts")
+    parser.add_argument("--errors", type=float, nargs="+", default=list(ERRORS_MM), help="in millimetres")
+    parser.add_argument("--output", type=Path, default=RESULTS, help="JSON file")
+    given = parser.parse_args()
+    table, real = read_episodes(open_dataset(given.root)), recorded_episodes(Path(given.root))
+    scenes = [SCENES[scene] for scene in np.unique(real["scene"])]
+    simulation = Simulation(task_of(TASKS[int(real["task"][0])]), scenes, Rendering(cameras=()))
+    rows = measure(repeated(simulation, table, real, given.errors), real["success"], given.errors)
+    write_json(given.output, {"episodes": len(table.start), "errors": rows})
+    print(results_table(rows))
+
+
+if __name__ == "__main__":
+    main()
