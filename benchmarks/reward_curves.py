@@ -28,7 +28,7 @@ from torch import Tensor
 
 from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
-from lerobot_wmrl.envs.start_frames import chosen_episodes
+from lerobot_wmrl.envs.first_frames import chosen_episodes
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv, make_world_model_env
 from lerobot_wmrl.files import write_json
 from lerobot_wmrl.report.figures import COLOURS, tidy

@@ -65,7 +65,7 @@ def simulated_episodes(config: RecordConfig) -> list[EpisodePlan]:
 def imagined_episodes(config: RecordConfig) -> list[EpisodePlan]:
     """From the environment's start frames in turn. Task, scene and seed are those of the real episodes that
     began so: an imagined episode can be repeated for real."""
-    from lerobot_wmrl.envs.start_frames import chosen_episodes
+    from lerobot_wmrl.envs.first_frames import chosen_episodes
     from lerobot_wmrl.world_models.episode_table import open_dataset, read_episodes
 
     assert config.imagination is not None

@@ -1,6 +1,7 @@
 """Configuration of the world model as an environment."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -16,9 +17,14 @@ from lerobot_wmrl.rewards.configuration_general import GeneralConfig
 
 @dataclass
 class StartFrames(DatasetSource):
-    """Where imagined episodes begin: the first frames of a LeRobotDataset's episodes.
+    """Where imagined episodes begin: in the first frames of a LeRobotDataset's episodes, in saved frames, or
+    in ManiSkill's resets.
 
     Args:
+        frames: a file by numpy.savez, in place of a dataset: `observation.images.<camera>` (K, H, W, 3)
+            uint8, `observation.state` (K, P) and `task` (K,), the instructions.
+        resets: start frames to take from ManiSkill, in place of a dataset, of `tasks` (push by default),
+            `scenes` and the split `ind` or `ood`.
         split: `train` (what the world model was trained on), `validation` (held out) or `all`; `ind` or
             `ood`, scenes that training may see and those held out. Joined by a comma: what is in both.
         tasks, scenes: only episodes of these tasks (by name) and scenes (by index).
@@ -29,6 +35,17 @@ class StartFrames(DatasetSource):
     tasks: list[str] | None = None
     scenes: list[int] | None = None
     max_starts: int = 256
+    frames: Path | None = None
+    resets: int = 0
+
+    def check(self) -> None:
+        """ValueError unless there is exactly one place to begin in."""
+        given = [name for name in ("root", "frames", "resets") if getattr(self, name)]
+        if len(given) != 1:
+            raise ValueError(
+                f"--env.dataset: starts are given by {' and '.join(given) or 'nothing'}; give one of "
+                "--env.dataset.root, --env.dataset.frames and --env.dataset.resets"
+            )
 
 
 @EnvConfig.register_subclass("world_model")

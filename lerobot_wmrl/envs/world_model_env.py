@@ -1,6 +1,5 @@
 """The world model as a natively batched environment: many imagined episodes, one forward pass a step."""
 
-from dataclasses import replace
 from typing import Any, ClassVar, NamedTuple
 
 import gymnasium as gym
@@ -11,9 +10,10 @@ from lerobot.rewards.pretrained import PreTrainedRewardModel
 from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
-from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, FPS, TASKS
+from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, FPS
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
-from lerobot_wmrl.envs.start_frames import Goals, Starts, load_starts, tasks_of_starts
+from lerobot_wmrl.envs.first_frames import FirstFrames, read_first_frames
+from lerobot_wmrl.envs.start_frames import Goals, Starts, load_starts
 from lerobot_wmrl.rewards.general import consecutive_count, sparse_reward
 from lerobot_wmrl.rewards.loading import load_reward
 from lerobot_wmrl.rewards.similarity import Similarity, make_similarity, of_rows
@@ -190,20 +190,23 @@ def load_world_models(config: WorldModelEnv, device: str | None) -> WorldModels:
     return WorldModels(model, text_model, alike, load_reward(config.reward, model))
 
 
-def make_world_model_env(
-    config: WorldModelEnv, n_envs: int, device: str | None, models: WorldModels | None = None
-) -> WorldModelVectorEnv:
-    """Load what is not given, and the start frames."""
-    models = models or load_world_models(config, device)
-    starts, goals = load_starts(config.dataset, models.model, models.text_model, models.alike)
-    return WorldModelVectorEnv(models.model, starts, goals, models.reward, config, n_envs)
+def make_world_model_env(config: WorldModelEnv, n_envs: int, device: str | None) -> WorldModelVectorEnv:
+    """One environment for all start frames."""
+    models = load_world_models(config, device)
+    return begin_in(read_first_frames(config.dataset, models.model.config), models, config, n_envs)
 
 
 def make_task_envs(config: WorldModelEnv, n_envs: int, device: str | None) -> dict[int, WorldModelVectorEnv]:
     """One environment for each task among the start frames, by its index; one in all if they do not say."""
-    tasks, models = tasks_of_starts(config.dataset), load_world_models(config, device)
-    chosen = {task: replace(config.dataset, tasks=[TASKS[task]]) for task in tasks} or {0: config.dataset}
-    return {
-        task: make_world_model_env(replace(config, dataset=source), n_envs, device, models)
-        for task, source in chosen.items()
-    }
+    models = load_world_models(config, device)
+    frames = read_first_frames(config.dataset, models.model.config)
+    tasks = np.unique(frames.tasks).tolist()
+    return {max(task, 0): begin_in(frames.of_task(task), models, config, n_envs) for task in tasks}
+
+
+def begin_in(
+    frames: FirstFrames, models: WorldModels, config: WorldModelEnv, n_envs: int
+) -> WorldModelVectorEnv:
+    """An environment whose episodes begin in these frames."""
+    starts, goals = load_starts(frames, models.model, models.text_model, models.alike)
+    return WorldModelVectorEnv(models.model, starts, goals, models.reward, config, n_envs)

@@ -190,6 +190,32 @@ def test_lerobot_eval_gets_numpy_and_frozen_episodes(config):
     assert info["final_info"]["is_success"][0]
 
 
+def test_episodes_begin_in_saved_frames_as_in_those_of_the_dataset(config, env, small_dataset, tmp_path):
+    """The same frames, saved by hand; and a file that lacks something, or has it in another shape."""
+    rows = [small_dataset[int(row)] for row in small_dataset.meta.episodes["dataset_from_index"]]
+    whole = {
+        IMAGE: np.stack([(255 * row[IMAGE]).round().byte().permute(1, 2, 0).numpy() for row in rows]),
+        STATE: np.stack([row[STATE].numpy() for row in rows]),
+        "task": np.array([row["task"] for row in rows]),
+    }  # fmt: skip
+    path = tmp_path / "starts.npz"
+    saved = replace(config, dataset=StartFrames(frames=path, max_starts=4))
+    np.savez(path, **whole)
+    found = saved.create_tensor_env(2).starts
+    assert torch.equal(found.tokens, env.starts.tokens[:4])
+    assert torch.equal(found.proprioception, env.starts.proprioception[:4])
+    assert found.instructions == env.starts.instructions[:4]
+    for name, value in ((IMAGE, whole[IMAGE][:, :16]), (STATE, whole[STATE][:, :3])):
+        np.savez(path, **{**whole, name: value})
+        with pytest.raises(ValueError, match=rf"--env\.dataset\.frames=.*needs {name} of shape"):
+            saved.create_tensor_env(2)
+    path.write_text("no frames")
+    with pytest.raises(ValueError, match=r"cannot be read.*numpy\.savez"):
+        saved.create_tensor_env(2)
+    with pytest.raises(ValueError, match="starts are given by root and frames; give one"):
+        replace(config, dataset=replace(config.dataset, frames=path)).create_tensor_env(2)
+
+
 def test_lerobot_eval_gets_an_environment_for_each_task(config, make_synthetic_dataset, tmp_path):
     """Episodes of two tasks; both environments share their models."""
     dataset = make_synthetic_dataset(tmp_path / "two", episodes=6)

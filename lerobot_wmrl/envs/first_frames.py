@@ -1,0 +1,148 @@
+"""Where imagined episodes may begin: as those of a dataset, in saved frames, in the simulator's resets."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from lerobot.utils.constants import OBS_STATE
+from torch import Tensor
+
+from lerobot_wmrl.constants import TASKS
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.envs.configuration_world_model import StartFrames
+from lerobot_wmrl.maniskill.scenes import scene_for_seed, scenes_of
+from lerobot_wmrl.maniskill.tasks import task_of
+from lerobot_wmrl.world_models.compatibility import check_dataset
+from lerobot_wmrl.world_models.depth_maps import depth_at
+from lerobot_wmrl.world_models.episode_table import (
+    EpisodeTable,
+    choose_episodes,
+    open_dataset,
+    read_episodes,
+)
+from lerobot_wmrl.world_models.frame_cache import cached_frames
+
+INSTRUCTION = "task"
+"""Name of the instructions in a file of saved frames."""
+
+
+class FirstFrames(NamedTuple):
+    """K first frames: images (K, N, H, W, 3) uint8, state (K, P), one instruction each; tasks (K,), indices
+    into `TASKS`, −1 where unknown; depth of a model's frames, (K, S) metres, None if it looks at none."""
+
+    images: np.ndarray
+    state: np.ndarray
+    instructions: list[str]
+    tasks: np.ndarray
+    depth: Callable[[Any], Tensor | None]
+
+    def of_task(self, task: int) -> "FirstFrames":
+        """Those of one task."""
+        rows = np.flatnonzero(self.tasks == task)
+
+        def depth(model: Any) -> Tensor | None:
+            every = self.depth(model)
+            return every if every is None else every[torch.from_numpy(rows).to(every.device)]
+
+        instructions = [self.instructions[row] for row in rows]
+        return FirstFrames(self.images[rows], self.state[rows], instructions, self.tasks[rows], depth)
+
+
+def read_first_frames(source: StartFrames, config: Any) -> FirstFrames:
+    """As a world model of this configuration sees them. ValueError if they do not fit it."""
+    source.check()
+    if source.frames is not None:
+        return saved_frames(source.frames, source.max_starts, config)
+    return simulated_frames(source, config) if source.resets else dataset_frames(source, config)
+
+
+def chosen_episodes(table: EpisodeTable, source: StartFrames) -> np.ndarray:
+    """Episodes to begin like, of the split, tasks and scenes asked for. (K,) ValueError if there is none."""
+    unseen = {scene.index for scene in scenes_of("ood")}
+    wanted = np.ones(len(table.start), bool)
+    for name, column, values in (
+        ("tasks", table.task, [TASKS.index(task) for task in source.tasks or ()]),
+        ("scenes", table.scene, source.scenes or ()),
+    ):
+        if values and not np.isin(column, values).any():
+            raise ValueError(
+                f"--env.dataset.{name}={getattr(source, name)}: no episode of {source.root} has one of them"
+            )
+        wanted &= np.isin(column, values) if values else True
+    return choose_episodes(table, source.split, source.max_starts, unseen, wanted)
+
+
+def dataset_frames(source: StartFrames, config: Any) -> FirstFrames:
+    """Of a LeRobotDataset's episodes."""
+    table = read_episodes(open_dataset(source.root, source.repo_id))
+    check_dataset(config, table.dataset.features)
+    episodes = chosen_episodes(table, source)
+    rows = table.start[episodes]
+
+    def depth(model: Any) -> Tensor | None:
+        check_dataset(model.config, table.dataset.features)
+        return depth_at(model, table.dataset, rows)
+
+    return FirstFrames(
+        np.asarray(cached_frames(table.dataset, config.camera_keys)[rows]),
+        table.state[rows],
+        [table.instructions[episode] for episode in episodes],
+        table.task[episodes],
+        depth,
+    )
+
+
+def saved_frames(path: Path, at_most: int, config: Any) -> FirstFrames:
+    """Of a file by `numpy.savez`: `observation.images.<camera>` (K, H, W, 3) uint8, `observation.state`
+    (K, P) and `task` (K,), the instructions."""
+    try:
+        with np.load(path) as file:
+            found = {name: file[name][:at_most] for name in file.files}
+    except (OSError, ValueError) as error:
+        raise ValueError(
+            f"--env.dataset.frames={path}: cannot be read ({error}); write it with numpy.savez"
+        ) from error
+    shape = (config.image_size, config.image_size, 3)
+    wanted = {**dict.fromkeys(config.camera_keys, shape), OBS_STATE: (config.state_size,), INSTRUCTION: ()}
+    for name, size in wanted.items():
+        if name not in found or found[name].shape[1:] != size:
+            has = found[name].shape if name in found else "nothing of that name"
+            raise ValueError(f"--env.dataset.frames={path}: needs {name} of shape {('K', *size)}, has {has}")
+    images = np.stack([found[name] for name in config.camera_keys], 1)
+    if images.dtype != np.uint8:
+        raise ValueError(f"--env.dataset.frames={path}: pictures are {images.dtype}, they must be uint8")
+    return FirstFrames(
+        images, found[OBS_STATE].astype(np.float32), [str(text) for text in found[INSTRUCTION]],
+        np.full(len(images), -1), _no_depth,
+    )  # fmt: skip
+
+
+def simulated_frames(source: StartFrames, config: Any) -> FirstFrames:
+    """Of ManiSkill's resets, seeds 0, 1, …: consecutive ones visit the scenes in turn, then the next task."""
+    tasks = source.tasks or TASKS[:1]
+    env = WmrlManiSkillEnv(
+        task=tasks[0], split="ood" if source.split == "ood" else "ind", scenes=source.scenes,
+        cameras=list(config.cameras), image_size=config.image_size,
+    )  # fmt: skip
+    scenes, simulation = env.selected_scenes(), env.create_simulation()
+    frames, instructions, indices = [], [], []
+    for seed in range(source.resets):
+        simulation.task = task_of(tasks[seed // len(scenes) % len(tasks)])
+        frames.append(simulation.reset(scene_for_seed(scenes, seed), seed))
+        instructions.append(simulation.instruction)
+        indices.append(simulation.task.index)
+    simulation.close()
+    images = np.stack([np.stack([frame.images[camera] for camera in config.cameras]) for frame in frames])
+    state = np.stack([frame.state for frame in frames])
+    return FirstFrames(images, state, instructions, np.array(indices), _no_depth)
+
+
+def _no_depth(model: Any) -> None:
+    """ValueError if the model looks at it."""
+    if model.config.depth:
+        raise ValueError(
+            "--env.dataset: this world model looks at depth, which only a dataset of depth recordings has; "
+            "give --env.dataset.root"
+        )
