@@ -5,8 +5,8 @@
 The gate replays real actions open loop. Here the simulator itself is asked in the world model's place: each
 recorded episode is repeated with its own actions, but the object stands a little off, by a normal error
 along x and y. The share of failures that then succeed, and of successes that still do, is what a perfect
-model of physics would get at the gate, were its eyes so good. With an error of 0 it is how exactly the simulator
-repeats itself. Writes docs/results/gate_sensitivity.json.
+model of physics would get at the gate, were its eyes so good. With an error of 0 it is how exactly the
+simulator repeats itself. Writes docs/results/gate_sensitivity.json.
 """
 
 import argparse
