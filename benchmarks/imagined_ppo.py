@@ -45,6 +45,7 @@ PROCESSES: Final = 2
 """Simulators at once, for PPO in ManiSkill."""
 
 DOMAINS: Final[dict[str, Flags]] = {"ind": SCENES, "ood": UNSEEN_SCENES}
+SHOWN: Final = {"unseen": "new policy"}
 TITLES: Final = {"cloned": "cloned", "imagined": "PPO in imagination", "simulated": "PPO in ManiSkill"}
 
 
@@ -197,14 +198,13 @@ def draw(results: Mapping[str, Any], path: Path) -> None:
             spread = [[abs(rate.share - rate.interval[side]) for rate in rates] for side in (0, 1)]
             axes.bar(
                 places, [rate.share for rate in rates], 0.22, yerr=spread, color=COLOURS[offset],
-                label=TITLES[kind], capsize=3,
+                label=TITLES[kind] if axes is panels[-1] else None, capsize=3,
             )  # fmt: skip
-        names = list(shown["cloned"]["policies"])
+        names = [SHOWN.get(name, f"policy {name}") for name in shown["cloned"]["policies"]]
         axes.set_xticks([place + 0.125 * (len(shown) - 1) for place in range(len(names))], names)
         axes.set_title({"ind": "scenes the world model knows", "ood": "unseen scenes"}[domain])
-        axes.set_ylim(0, 1.05)
+        axes.set_ylim(0, 1.2)
     panels[0].set_ylabel("success in ManiSkill")
-    panels[0].legend()
     tidy(figure).savefig(path, dpi=130)
 
 
