@@ -36,13 +36,19 @@ class ProxyConfig(LearnedRewardConfig):
 
     Args:
         cameras: whose frames it sees.
-        image_size: side of the square frames, filled in from the dataset.
         width: channels of its first convolution.
+        image_size: side of the square frames in the dataset, in pixels; filled in from it where training
+            begins.
     """
 
     cameras: list[str] = field(default_factory=lambda: ["third_view"])
     image_size: int = 0
     width: int = 32
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.width < 1:
+            raise ValueError(f"--reward_model.width={self.width}: must be at least 1")
 
     @property
     def camera_keys(self) -> list[str]:

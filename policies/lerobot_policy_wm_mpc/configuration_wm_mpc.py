@@ -26,8 +26,9 @@ class WmMpcConfig(PreTrainedConfig):
         samples, elites, iterations: sequences drawn at a time, those that the mean moves to, and how often.
         knots: actions that are drawn of a sequence, evenly spaced; those between them are interpolated.
         spread: of the first draw, in standard deviations of the dataset's actions.
-        done_frames: as in the environment.
         seed: of the draws.
+        done_frames: for how many frames in a row done has to hold where success is the objective; as in the
+            environment.
     """
 
     world_model_path: str = ""
@@ -43,7 +44,11 @@ class WmMpcConfig(PreTrainedConfig):
     done_frames: int = 3
     seed: int = 0
     normalization_mapping: dict[str, NormalizationMode] = field(
-        default_factory=lambda: dict.fromkeys(("VISUAL", "STATE", "ACTION"), NormalizationMode.IDENTITY)
+        default_factory=lambda: {
+            "VISUAL": NormalizationMode.IDENTITY,
+            "STATE": NormalizationMode.IDENTITY,
+            "ACTION": NormalizationMode.IDENTITY,
+        }
     )
 
     def __post_init__(self) -> None:
