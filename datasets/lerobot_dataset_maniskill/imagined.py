@@ -19,6 +19,7 @@ from lerobot_wmrl.envs.evaluation_adapter import pictures
 from lerobot_wmrl.maniskill.simulation import Frame
 from lerobot_wmrl.maniskill.tasks import task_of
 from lerobot_wmrl.policy_checkpoints import check_fit, load_policy, load_processors
+from lerobot_wmrl.rl.protocol import make_pipeline
 
 Row = tuple[Frame, np.ndarray, Outcome]
 
@@ -39,11 +40,13 @@ class ImaginedPartRecorder:
             )
         check_fit(config.policy, shown, len(ACTION_NAMES))
         self.policy: Any = load_policy(config.policy).eval()
-        self.preprocess, self.postprocess = load_processors(config.policy)
+        self.processors = load_processors(config.policy)
+        self.pipeline = make_pipeline(config.policy, *self.processors)
 
     def record(self, part: Part, report: Report) -> None:
         """Record `part`; its folder appears under its final name only when it is whole."""
-        with whole_part(self.config, self.folder, part) as dataset:
+        model = self.env.model.config
+        with whole_part(self.config, self.folder, part, model.cameras, model.image_size) as dataset:
             for plan, (instruction, rows) in zip(part.episodes, self._imagine(part.episodes), strict=True):
                 start = StartColumns(instruction, task_of(plan.task).index, plan)
                 for before, action, outcome in rows:
@@ -57,7 +60,7 @@ class ImaginedPartRecorder:
         count = self.env.num_envs
         noises = [ExplorationNoise(self.config.exploration, plan.seed) for plan in plans]
         torch.manual_seed(plans[0].seed)
-        for part in (self.policy, self.preprocess, self.postprocess):
+        for part in (self.policy, *self.processors):
             part.reset()
         spare = [0] * (count - len(plans))
         observation, _ = self.env.reset(seed=[*(plan.start for plan in plans), *spare])
@@ -79,9 +82,8 @@ class ImaginedPartRecorder:
 
     def _act(self, observation: dict[str, Any], noises: list[ExplorationNoise]) -> np.ndarray:
         """(B, 7) in the action box."""
-        known = {*(self.policy.config.input_features or {}), "task"}
-        batch = self.preprocess({name: value for name, value in observation.items() if name in known})
-        action = self.postprocess(self.policy.select_action(batch)).cpu().numpy()
+        chosen = self.policy.select_action(self.pipeline.prepare(observation))
+        action = self.pipeline.to_action(chosen).cpu().numpy()
         action[: len(noises), :3] += np.stack([noise() for noise in noises])
         return np.clip(action, ACTION_LOW, ACTION_HIGH).astype(np.float32)
 

@@ -2,7 +2,7 @@
 
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,14 +35,13 @@ Report = Callable[[EpisodeResult], None]
 
 
 @contextmanager
-def whole_part(config: RecordConfig, folder: Path, part: Part) -> Iterator[LeRobotDataset]:
+def whole_part(
+    config: RecordConfig, folder: Path, part: Part, cameras: Sequence[str], image_size: int
+) -> Iterator[LeRobotDataset]:
     """An empty dataset to fill; it then stands in `folder` under the part's name, unless that fails."""
     partial = folder / f".{part.name}.{os.getpid()}.partial"
     shutil.rmtree(partial, ignore_errors=True)
-    content = config.recorded_content()
-    dataset = create_dataset(
-        partial, config.dataset_id, content["cameras"], content["image_size"], config.depth
-    )
+    dataset = create_dataset(partial, config.dataset_id, cameras, image_size, config.depth)
     yield dataset
     dataset.finalize()
     partial.replace(folder / part.name)
@@ -63,7 +62,8 @@ class PartRecorder:
 
     def record(self, part: Part, report: Report) -> None:
         """Record `part`; its folder appears under its final name only when it is whole."""
-        with whole_part(self.config, self.folder, part) as dataset:
+        env = self.config.maniskill
+        with whole_part(self.config, self.folder, part, env.cameras, env.image_size) as dataset:
             for plan in part.episodes:
                 report(EpisodeResult(part.index, plan.kind, self._record_episode(dataset, plan)))
 

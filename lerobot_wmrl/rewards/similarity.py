@@ -13,6 +13,7 @@ from torch.nn import functional as F
 
 from lerobot_wmrl.rewards.configuration_general import LPIPS_BACKBONES
 from lerobot_wmrl.world_models.frame_tokenizer import Decoded, feature_distance
+from lerobot_wmrl.world_models.goal import alikeness
 from lerobot_wmrl.world_models.perceptual import lpips_network, require_backbone
 
 Description = list[Tensor]
@@ -31,8 +32,8 @@ class Similarity(ABC):
 
     def __call__(self, frame: Description, goal: Description, cameras: int) -> Tensor:
         """→ (B,)"""
-        distance = self.distance(frame, goal).unflatten(0, (-1, cameras)).mean(1)
-        return (1 - distance).clamp(0, 1)
+        distance = self.distance(frame, goal)
+        return alikeness(distance, len(distance) // cameras)
 
 
 class TokenizerSimilarity(Similarity):

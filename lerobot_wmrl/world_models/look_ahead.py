@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from lerobot_wmrl.world_models.context import NO_CONTEXT, Context
+from lerobot_wmrl.world_models.imagination import Imagined
 
 
 class Ahead(NamedTuple):
@@ -35,10 +36,18 @@ def step_ahead(
     generator: torch.Generator,
 ) -> Ahead:  # fmt: skip
     """Frame by frame, as imagination goes."""
-    imagination = model.start(tokens, state, depth=depth, context=context)
-    steps = [model.step(imagination, action, generator) for action in actions.unbind(1)]
+    steps = imagined_steps(model, tokens, state, actions, context, depth, generator)
     return Ahead(
         torch.stack([step.done_logit for step in steps], 1),
         torch.stack([step.proprioception for step in steps], 1),
         steps[-1].tokens,
     )
+
+
+def imagined_steps(
+    model: Any, tokens: Tensor, state: Tensor, actions: Tensor, context: Context, depth: Tensor | None,
+    generator: torch.Generator,
+) -> list[Imagined]:  # fmt: skip
+    """What is imagined after each of the actions (B, T, A)."""
+    imagination = model.start(tokens, state, depth=depth, context=context)
+    return [model.step(imagination, action, generator) for action in actions.unbind(1)]

@@ -104,10 +104,12 @@ def test_windows_and_imagination_meet_the_same_hidden_states(embedding, trained_
     images = batch[IMAGE][:, -3:]
     tokens = model.tokenizer.encode(images[:, 0][:, None])
     imagination = model.start(tokens, batch["observation.state"][:, -3])
-    for step in range(3):
-        imagined = model.step(imagination, batch["action"][:, -3 + step])
-    stepped = reward.compute_reward({"hidden": imagined.hidden})
-    torch.testing.assert_close(stepped, whole, atol=1e-4, rtol=1e-4)
+    steps = [model.step(imagination, action) for action in batch["action"][:, -3:].unbind(1)]
+    stepped = torch.cat([reward.compute_reward({"hidden": step.hidden}) for step in steps])
+    batch["next.reward"] = torch.arange(length)[None].float()
+    loss, _ = reward({**batch, "task": [""]})
+    torch.testing.assert_close(loss, (stepped - batch["next.reward"][0, -3:]).square().mean())
+    torch.testing.assert_close(stepped[-1:], whole, atol=1e-4, rtol=1e-4)
 
 
 def test_the_world_model_is_no_part_of_the_heads_checkpoint(embedding, trained_models):

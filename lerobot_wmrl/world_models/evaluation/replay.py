@@ -14,6 +14,7 @@ from lerobot_wmrl.world_models.depth_maps import depth_at
 from lerobot_wmrl.world_models.episode_table import EpisodeTable
 from lerobot_wmrl.world_models.frame_cache import frames_to_tensor
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
+from lerobot_wmrl.world_models.look_ahead import imagined_steps
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 from lerobot_wmrl.world_models.world_model import WorldModelRewardModel
 
@@ -104,9 +105,8 @@ def open_loop(
 ) -> OpenLoop:  # fmt: skip
     """Imagine from tokens (B, S), state (B, P) and, if the model looks at them, depth (B, S) and context with
     actions (B, T, A). The same noise at every call."""
-    imagination = model.start(tokens, state, depth=depth, context=context)
     generator = torch.Generator(tokens.device).manual_seed(0)
-    steps = [model.step(imagination, action, generator) for action in actions.unbind(1)]
+    steps = imagined_steps(model, tokens, state, actions, context, depth, generator)
     return OpenLoop(
         torch.stack([step.tokens for step in steps], 1),
         torch.stack([step.done_logit.sigmoid() for step in steps], 1),
