@@ -13,8 +13,10 @@ CONFIGURATION_MODULES = (
     "lerobot_wmrl.rewards.configuration_learned",
     "lerobot_wmrl.envs.configuration_world_model",
     "lerobot_wmrl.envs.configuration_wmrl_maniskill",
+    "lerobot_wmrl.rl.configuration_grpo",
     "lerobot_wmrl.rl.configuration_ppo",
     "lerobot_policy_cnn.configuration_cnn",
+    "lerobot_policy_openvla.configuration_openvla",
     "lerobot_policy_wm_mpc.configuration_wm_mpc",
 )
 

@@ -104,7 +104,10 @@ class Experiment:
         }  # fmt: skip
 
     def record(self, name: str, kinds: str, episodes: int, seed: int, cameras: str) -> list[str]:
-        flags: Flags = {"kinds": kinds, "num_episodes": episodes, "seed": seed, "output_dir": self.path(name)}
+        flags: Flags = {
+            "kinds": kinds, "num_episodes": episodes, "seed": seed, "depth": True,
+            "output_dir": self.path(name),
+        }  # fmt: skip
         return ["lerobot-wmrl-record", *format_flags({**self.simulator(cameras), **flags})]
 
     def clone(self, name: str, demonstrations: range, steps: int) -> list[str]:
@@ -124,6 +127,7 @@ class Experiment:
         flags: Flags = {
             "policy.path": str(checkpoint(self.out / f"policy_{policy}")), "exploration": exploration,
             "num_episodes": max(2, self.episodes // share), "seed": seed, "output_dir": self.path(name),
+            "depth": True,
         }  # fmt: skip
         return ["lerobot-wmrl-record", *format_flags({**self.simulator(CAMERAS, scenes), **flags})]
 

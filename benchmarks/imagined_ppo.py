@@ -111,7 +111,7 @@ class Experiment:
             "env.world_model_path": str(self.gate / "action_world_model"),
             "env.text_world_model_path": str(self.out / "text_world_model"),
             "env.dataset.root": str(self.gate / "dataset"), "env.episode_length": HORIZON,
-            **self.judgement(),
+            "gate.dataset.root": str(self.gate / "rollouts"), **self.judgement(),
         }  # fmt: skip
 
     def simulator(self, scenes: Flags = SCENES) -> Flags:

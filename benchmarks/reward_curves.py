@@ -7,10 +7,10 @@
 Real episodes are imagined from their first frame with their own actions, as a policy would meet them, and
 every reward says what each frame is worth: `rule_based` (recorded in the simulator, the yardstick), `general`
 (alpha on success, the rest on similarity to the goal, absolute), its two parts, `embedding` and `proxy`. Of
-each: the mean curve of successes and of failures, Spearman's correlation with the rule-based reward within
-an episode, and the AUC of its highest run of three frames, success against failure. The same starts are also
-given to hands that move at random, not at all, and to one corner: they should earn less than the planner's
-actions. Writes docs/results/reward_curves.json and a picture beside it.
+each: the mean curve of successes and of failures with its band, Spearman's correlation with the rule-based
+reward within an episode, and the AUC of its highest run of three frames, success against failure. The same
+starts are also given to hands that move at random, not at all, and to one corner: they should earn less than
+the planner's actions. Writes docs/results/reward_curves.json and a picture beside it.
 """
 
 import argparse
@@ -42,6 +42,9 @@ from lerobot_wmrl.world_models.evaluation.tables import markdown_table
 RESULTS: Final = Path(__file__).parents[1] / "docs" / "results" / "reward_curves.json"
 FRAMES = 3
 """In a row that count together, as in the environment."""
+
+FEWEST = 5
+"""Episodes that a mean is drawn of."""
 
 NEVER = 10**6
 """No episode ends while it is judged."""
@@ -96,6 +99,18 @@ def within_episodes(reward: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return found
 
 
+def curve(values: np.ndarray) -> dict[str, list[float]]:
+    """Mean over the episodes that last so long, and its 95 % band; ends where fewer than `FEWEST` do.
+    (E, T)"""
+    lasting = np.isfinite(values).sum(0)
+    each = [Estimate.mean(column) for column in values[:, lasting >= FEWEST].T]
+    return {
+        "mean": [estimate.value for estimate in each],
+        "low": [estimate.low for estimate in each],
+        "high": [estimate.high for estimate in each],
+    }
+
+
 def measure(
     curves: Mapping[str, np.ndarray], done: np.ndarray, alone: Mapping[str, Mapping[str, np.ndarray]]
 ) -> dict[str, Any]:
@@ -109,8 +124,8 @@ def measure(
         found[name] = {
             "auc": outcomes.auc(FRAMES),
             "spearman": Estimate.mean(within_episodes(cut, truth)).as_json(),
-            "mean_of_successes": np.nanmean(cut[success], 0).tolist(),
-            "mean_of_failures": np.nanmean(cut[~success], 0).tolist(),
+            "curve_of_successes": curve(cut[success]),
+            "curve_of_failures": curve(cut[~success]),
             "earned_by_successes": float(earned.mean()),
             "earned_by": {hand: float(said[name].mean()) for hand, said in alone.items() if name in said},
         }
@@ -174,7 +189,10 @@ def draw(found: Mapping[str, Mapping[str, Any]], path: Path) -> None:
     for row, (dataset, numbers) in zip(grid, found.items(), strict=True):
         for axes, name in zip(row, names, strict=True):
             for colour, kind in zip(COLOURS, ("successes", "failures"), strict=False):
-                axes.plot(numbers["rewards"][name][f"mean_of_{kind}"], color=colour, label=kind)
+                shown = numbers["rewards"][name][f"curve_of_{kind}"]
+                axes.plot(shown["mean"], color=colour, label=kind)
+                frames = range(len(shown["mean"]))
+                axes.fill_between(frames, shown["low"], shown["high"], color=colour, alpha=0.25)
             axes.set_title(f"{name}, {dataset}", fontsize=9)
     grid[0, 0].legend(fontsize=8)
     tidy(figure).savefig(path, dpi=130)

@@ -11,7 +11,13 @@ from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETR
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 
+ADAPTERS_FILE = "adapter_model.safetensors"
+"""PEFT's: where a policy has adapters, its checkpoints hold them alone."""
+
 LAST_CHECKPOINT = f"{CHECKPOINTS_DIR}/{LAST_CHECKPOINT_LINK}"
+
+BEST_CHECKPOINT_LINK = "best"
+"""Beside LeRobot's `last`: the checkpoint of a policy that succeeded most often on the selection seeds."""
 
 
 def resolve_checkpoint(path: str | Path) -> Path:
@@ -31,16 +37,23 @@ def write_checkpoint(output_dir: Path, total_steps: int, step: int, write: Calla
     write(partial)
     shutil.rmtree(target, ignore_errors=True)
     partial.rename(target)
-    link = target.with_name(f".{LAST_CHECKPOINT_LINK}.partial")
-    link.unlink(missing_ok=True)
-    link.symlink_to(target.name)
-    link.replace(target.with_name(LAST_CHECKPOINT_LINK))
+    link_checkpoint(target, LAST_CHECKPOINT_LINK)
     return target
 
 
-def read_weights(checkpoint: Path) -> dict[str, Any]:
-    """The tensors of a checkpoint's model. ValueError if the file is truncated."""
-    path = checkpoint / PRETRAINED_MODEL_DIR / SAFETENSORS_SINGLE_FILE
+def link_checkpoint(checkpoint: Path, name: str) -> None:
+    """Point `checkpoints/<name>` at a checkpoint beside it; a reader finds the old one or the new one."""
+    partial = checkpoint.with_name(f".{name}.partial")
+    partial.unlink(missing_ok=True)
+    partial.symlink_to(checkpoint.name)
+    partial.replace(checkpoint.with_name(name))
+
+
+def read_weights(checkpoint: Path, folder: str = PRETRAINED_MODEL_DIR) -> dict[str, Any]:
+    """The tensors of a checkpoint's model or of its adapters, or of another of its folders. ValueError if
+    they are truncated."""
+    adapters = checkpoint / folder / ADAPTERS_FILE
+    path = adapters if adapters.is_file() else checkpoint / folder / SAFETENSORS_SINGLE_FILE
     try:
         return load_file(path)
     except (SafetensorError, OSError) as error:

@@ -38,4 +38,10 @@ START_COLUMNS: Final = ("start.task", "start.scene", "start.seed", "start.kind")
 """int64 (1,) columns from which an episode's start can be rebuilt in the simulator."""
 
 EVALUATION_SEED: Final = 1_000_000
-"""Recording and training seeds are below this number, evaluation seeds at or above it."""
+"""Recording and training seeds are below this number, evaluation seeds from it to the next."""
+
+SELECTION_SEED: Final = 2_000_000
+"""First of the seeds on which the checkpoints of a training are compared."""
+
+GATE_SEED: Final = 3_000_000
+"""First of the seeds of the rollouts that a world model is asked about while a policy trains in it."""

@@ -5,11 +5,13 @@ from typing import Any
 
 from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
 from lerobot.configs import PreTrainedConfig
+from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
-from lerobot.utils.constants import ACTION, OBS_IMAGES
+from lerobot.utils.constants import OBS_IMAGES
 from safetensors import SafetensorError, safe_open
 
-from lerobot_wmrl.checkpoints import resolve_checkpoint
+from lerobot_wmrl.adapters import load_with_adapters
+from lerobot_wmrl.checkpoints import ADAPTERS_FILE, resolve_checkpoint
 
 
 def read_policy_config(path: str, overrides: list[str]) -> PreTrainedConfig:
@@ -36,16 +38,23 @@ def check_weights(config: PreTrainedConfig) -> None:
     if config.pretrained_path is None or not config.pretrained_path.is_dir():
         return
     try:
-        with safe_open(config.pretrained_path / SAFETENSORS_SINGLE_FILE, framework="pt"):
+        with safe_open(config.pretrained_path / weights_file(config), framework="pt"):
             pass
     except (SafetensorError, OSError) as error:
         raise _unreadable(config, error) from error
 
 
+def weights_file(config: PreTrainedConfig) -> str:
+    """What the trained weights of a checkpoint are called."""
+    return ADAPTERS_FILE if config.use_peft else SAFETENSORS_SINGLE_FILE
+
+
 def load_policy(config: PreTrainedConfig) -> Any:
     """The weights too, in evaluation mode. ValueError if they are truncated or of another shape."""
-    policy_class = get_policy_class(config.type)
     try:
+        if config.use_peft:
+            return load_with_adapters(config).eval()
+        policy_class = get_policy_class(config.type)
         return policy_class.from_pretrained(str(config.pretrained_path), config=config, strict=True)
     except (SafetensorError, RuntimeError, OSError) as error:
         raise _unreadable(config, error) from error
@@ -55,6 +64,17 @@ def load_processors(config: PreTrainedConfig) -> tuple[Any, Any]:
     """The checkpoint's pre- and postprocessor, on the policy's device."""
     overrides = {"device_processor": {"device": config.device}}
     return make_pre_post_processors(config, str(config.pretrained_path), preprocessor_overrides=overrides)
+
+
+def adopt_features(config: PreTrainedConfig, shown: Mapping[str, tuple[int, ...]]) -> None:
+    """A policy that was never trained on a dataset sees what the environment shows, as in lerobot-eval."""
+    if config.input_features:
+        return
+    kinds = {name: FeatureType.VISUAL if name.startswith(OBS_IMAGES) else FeatureType.STATE for name in shown}
+    config.input_features = {
+        name: PolicyFeature(type=kinds[name], shape=shape) for name, shape in shown.items()
+    }
+    config.validate_features()
 
 
 def check_fit(config: PreTrainedConfig, shown: Mapping[str, tuple[int, ...]], action_size: int) -> None:
@@ -76,7 +96,12 @@ def check_fit(config: PreTrainedConfig, shown: Mapping[str, tuple[int, ...]], ac
                 f"{where}: the policy needs {name} of shape {tuple(feature.shape)}, the environment has "
                 f"{shown[name]}; use the image size that the policy was trained on"
             )
-    wanted = (config.output_features or {})[ACTION].shape[0]
+    if config.action_feature is None:
+        raise ValueError(
+            f"{where}: does not say how many components an action has; train it on a dataset with the "
+            "environment's actions"
+        )
+    wanted = config.action_feature.shape[0]
     if wanted != action_size:
         raise ValueError(
             f"{where}: the policy has {wanted} action components, the environment {action_size}; train it "
@@ -86,7 +111,7 @@ def check_fit(config: PreTrainedConfig, shown: Mapping[str, tuple[int, ...]], ac
 
 def _unreadable(config: PreTrainedConfig, error: Exception) -> ValueError:
     return ValueError(
-        f"--policy.path={config.pretrained_path}: {SAFETENSORS_SINGLE_FILE} cannot be read "
+        f"--policy.path={config.pretrained_path}: {weights_file(config)} cannot be read "
         f"({_first_line(error)}); it is missing, truncated or of another version: use an earlier checkpoint "
         "or train again"
     )

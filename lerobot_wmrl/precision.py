@@ -8,6 +8,9 @@ from typing import Final
 
 import torch
 
+SMALL_BATCH: Final = 16
+"""In so few imaginations at once on the CPU, casts cost more than bfloat16 saves."""
+
 PRECISIONS: Final = ("auto", "float32", "bfloat16")
 
 
@@ -19,9 +22,10 @@ def multiplies_bfloat16(device: torch.device | str) -> bool:
     return kind == "cpu" and (torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported())
 
 
-def imagination_dtype(device: torch.device | str) -> torch.dtype:
-    """The fastest format on `device` that is exact enough to imagine in."""
-    return torch.bfloat16 if multiplies_bfloat16(device) else torch.float32
+def imagination_dtype(device: torch.device | str, batch: int = SMALL_BATCH) -> torch.dtype:
+    """The fastest format on `device` that is exact enough for `batch` imaginations at once."""
+    small = batch < SMALL_BATCH and torch.device(device).type == "cpu"
+    return torch.bfloat16 if multiplies_bfloat16(device) and not small else torch.float32
 
 
 def training_dtype(precision: str, device: torch.device | str) -> torch.dtype:

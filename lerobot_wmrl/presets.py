@@ -9,6 +9,9 @@ from typing import Final
 
 Flags = Mapping[str, str | int | float | bool]
 
+TYPE: Final = ".type"
+"""Ends the flags that say which of several things is meant; their settings begin alike."""
+
 DEMO_SCENES: Final = "[0,1,2]"
 """A sponge, a can and a box: what the 600 episodes of the recipe `demo` suffice for."""
 
@@ -129,6 +132,7 @@ PRESETS: Final[dict[str, dict[str, Flags]]] = {
             "num_envs": 4,
             "iterations": 2,
             "save_freq": 1,
+            "gate.action": "warn",
             "algorithm.type": "ppo",
             "algorithm.value_iterations": 1,
             "algorithm.minibatch_size": 64,
@@ -180,6 +184,7 @@ PRESETS: Final[dict[str, dict[str, Flags]]] = {
             "num_envs": 64,
             "iterations": 20,
             "save_freq": 5,
+            "gate.action": "warn",
             "algorithm.type": "ppo",
             "algorithm.epochs": 2,
             "algorithm.initial_std": 0.3,
@@ -232,8 +237,20 @@ def preset_flags(preset: str, command: str, types: Sequence[str] = ()) -> list[s
 def expand_preset(argv: Sequence[str], command: str) -> list[str]:
     """Replace `--preset=NAME` in `argv` by that preset's flags, which later flags override."""
     split = [argument.partition("=") for argument in argv]
-    types = [value for name, _, value in split if name.endswith(".type")]
+    types = {name: value for name, _, value in split if name.endswith(TYPE)}
     expanded: list[str] = []
     for argument, (name, separator, value) in zip(argv, split, strict=True):
-        expanded += preset_flags(value, command, types) if name == "--preset" and separator else [argument]
+        if name == "--preset" and separator:
+            expanded += still_meant(preset_flags(value, command, list(types.values())), types)
+        else:
+            expanded.append(argument)
     return expanded
+
+
+def still_meant(flags: Sequence[str], types: Mapping[str, str]) -> list[str]:
+    """Without the settings of what is of another type now: PPO's, where `types` has GRPO."""
+    presets = dict(flag.split("=", 1) for flag in flags)
+    replaced = [
+        name.removesuffix(TYPE) + "." for name in types if presets.get(name, types[name]) != types[name]
+    ]
+    return [flag for flag in flags if not flag.startswith(tuple(replaced))]

@@ -10,6 +10,7 @@ import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, ACTION_NAMES, FPS, KINDS, STATE_NAMES, TASKS
+from tests.hub_client import hub as hub
 
 HOLD_FRAMES = 5
 SPEED = 0.04

@@ -9,10 +9,15 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, unquote, urlsplit
 
+import httpx
+import pytest
 import yaml
+from huggingface_hub import constants, set_client_factory
+from huggingface_hub.utils._http import default_client_factory
 
 WRITE_TOKEN = "hf_may_write"
 READ_TOKEN = "hf_may_read"
@@ -301,3 +306,29 @@ def running_hub() -> Iterator[Hub]:
         server.shutdown()
         server.server_close()
         thread.join()
+
+
+class ToLoopback(httpx.HTTPTransport):
+    """Brings what is for the hub that the client knows to the one on the loopback."""
+
+    def __init__(self, url: str) -> None:
+        super().__init__()
+        self.target = httpx.URL(url)
+
+    def handle_request(self, request: httpx.Request) -> httpx.Response:
+        path = request.url.raw_path
+        request.url = self.target.copy_with(raw_path=path)
+        return super().handle_request(request)
+
+
+@contextmanager
+def hub_at_its_address(monkeypatch: pytest.MonkeyPatch, cache: Path) -> Iterator[Hub]:
+    """An empty hub where the client expects the real one, with a cache of its own. Large files go as LFS."""
+    with running_hub() as hub:
+        mounts, hub.url = {constants.ENDPOINT: ToLoopback(hub.url)}, constants.ENDPOINT
+        set_client_factory(lambda: httpx.Client(mounts=mounts, follow_redirects=True))
+        monkeypatch.setattr(constants, "HF_HUB_DISABLE_XET", True)
+        monkeypatch.setattr(constants, "HF_HUB_CACHE", str(cache))
+        monkeypatch.setenv("HF_TOKEN", WRITE_TOKEN)
+        yield hub
+        set_client_factory(default_client_factory)

@@ -12,8 +12,11 @@ BIN = Path(sys.executable).parent
 @pytest.mark.parametrize(
     ("command", "types"),
     [
-        ("lerobot-train", ("cnn", "action_world_model", "text_world_model", "world_model", "wmrl_maniskill")),
-        ("lerobot-eval", ("cnn", "world_model", "wmrl_maniskill")),
+        (
+            "lerobot-train",
+            ("cnn", "openvla", "action_world_model", "text_world_model", "world_model", "wmrl_maniskill"),
+        ),
+        ("lerobot-eval", ("cnn", "openvla", "world_model", "wmrl_maniskill")),
     ],
 )
 def test_lerobot_accepts_our_types(command: str, types: tuple[str, ...], tmp_path: Path) -> None:

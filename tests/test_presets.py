@@ -9,6 +9,7 @@ def small_table(monkeypatch: pytest.MonkeyPatch) -> None:
     table = {
         "tiny": {"train": {"steps": 4, "save": True}, "train:a": {"steps": 8}},
         "demo": {"train:b": {"x.y": 0.5}},
+        "cpu": {"rl": {"a.type": "ppo", "a.clip": 0.2, "steps": 3}},
     }
     monkeypatch.setattr(presets, "PRESETS", table)
 
@@ -25,10 +26,17 @@ def test_the_chosen_type_adds_its_own_flags() -> None:
     assert expand_preset(["--preset=demo", "--model.type=b"], "train") == ["--x.y=0.5", "--model.type=b"]
 
 
+def test_another_type_takes_the_preset_s_settings_of_it_along() -> None:
+    assert expand_preset(["--preset=cpu"], "rl") == ["--a.type=ppo", "--a.clip=0.2", "--steps=3"]
+    assert expand_preset(["--preset=cpu", "--a.type=grpo"], "rl") == ["--steps=3", "--a.type=grpo"]
+    same = ["--preset=cpu", "--a.type=ppo"]
+    assert expand_preset(same, "rl") == ["--a.type=ppo", "--a.clip=0.2", "--steps=3", "--a.type=ppo"]
+
+
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (["--preset=huge"], "--preset=huge: unknown preset; choose one of tiny, demo"),
+        (["--preset=huge"], "--preset=huge: unknown preset; choose one of tiny, demo, cpu"),
         (["--preset=demo", "--x.type=c"], "--preset=demo: train has no such preset; it has: tiny"),
         (["--preset=demo"], "--preset=demo: train has one a type; give a type: b"),
     ],

@@ -150,6 +150,11 @@ class RecordConfig(RunConfig):
                     f"--{name}={getattr(self, name)}: cannot be chosen in a world model; leave it out "
                     "(--env.dataset.tasks chooses among the starts)"
                 )
+        if self.imagination is not None and self.imagination.dataset.past:
+            raise ValueError(
+                f"--env.dataset.past={self.imagination.dataset.past}: recorded episodes begin where real "
+                "ones did, so that they can be repeated in the simulator; leave it out"
+            )
 
     def _validate_kinds(self) -> None:
         planned = [kind for kind in KINDS if kind != POLICY_KIND]

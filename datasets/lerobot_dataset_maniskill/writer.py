@@ -37,7 +37,8 @@ def video_encoder() -> RGBEncoderConfig:
 
 def depth_encoder() -> DepthEncoderConfig:
     """Lossless, in steps of 0.6 mm up to 2.5 m: further away is only background."""
-    return DepthEncoderConfig(depth_min=0.0, depth_max=2.5, use_log=False)
+    quiet = {"x265-params": "lossless=1:log-level=none"}
+    return DepthEncoderConfig(depth_min=0.0, depth_max=2.5, use_log=False, extra_options=quiet)
 
 
 def dataset_features(cameras: Sequence[str], image_size: int, depth: bool) -> dict[str, dict[str, Any]]:

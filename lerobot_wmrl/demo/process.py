@@ -3,7 +3,6 @@
 Forking from a process that has imported the libraries saves every stage the ten seconds they take to import.
 """
 
-import ctypes
 import importlib
 import importlib.metadata
 import logging
@@ -23,6 +22,7 @@ import psutil
 
 from lerobot_wmrl.malloc import keep_freed_memory
 from lerobot_wmrl.progress import own_progress_lock
+from lerobot_wmrl.subcommand import die_with
 
 SAMPLE_SECONDS = 1.0
 """How often memory is sampled and progress is reported."""
@@ -80,7 +80,7 @@ def run_measured(command: Sequence[str], log: Path, report: Report) -> int:
 def _run_command(command: list[str], output: int, parent: int) -> None:
     """In the forked process: become what a shell would have started."""
     os.setsid()
-    _die_with(parent)
+    die_with(parent)
     own_progress_lock()
     for sign in (signal.SIGTERM, signal.SIGINT):
         signal.signal(sign, signal.SIG_DFL if sign == signal.SIGTERM else signal.default_int_handler)
@@ -143,11 +143,3 @@ def _end_group(process: BaseProcess) -> None:
         except ProcessLookupError:
             break
         process.join(seconds)
-
-
-def _die_with(parent: int) -> None:
-    """Be killed when the demo is, else a second call meets two writers in a folder (Linux)."""
-    set_parent_death_signal = 1
-    ctypes.CDLL(None).prctl(set_parent_death_signal, signal.SIGKILL)
-    if os.getppid() != parent:
-        os._exit(1)

@@ -176,11 +176,17 @@ def imagination(config: DemoConfig) -> Flags:
 
 
 def reinforce(config: DemoConfig) -> list[str]:
+    """Whatever the gate says of the cloned policy's rollouts: the report shows its warning."""
     out = config.output_dir
-    flags = {"policy.path": str(checkpoint(out / "sft")), **imagination(config), "algorithm.type": "ppo"}
-    return ours(
-        config, "lerobot-wmrl-train", {**flags, "output_dir": str(out / "rl"), "seed": first_seed(config)}
-    )
+    flags: Flags = {
+        "policy.path": str(checkpoint(out / "sft")),
+        **imagination(config),
+        "gate.dataset.root": str(out / "rollouts_sft"),
+        "algorithm.type": "ppo",
+        "output_dir": str(out / "rl"),
+        "seed": first_seed(config),
+    }
+    return ours(config, "lerobot-wmrl-train", flags)
 
 
 def evaluate(config: DemoConfig, policy: str) -> list[str]:

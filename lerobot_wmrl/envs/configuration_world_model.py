@@ -12,6 +12,7 @@ from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
 from lerobot_wmrl.constants import FPS, TASKS
 from lerobot_wmrl.dataset_source import DatasetSource
+from lerobot_wmrl.envs.doubt import Doubt
 from lerobot_wmrl.rewards.configuration_general import GeneralConfig
 
 
@@ -29,12 +30,15 @@ class StartFrames(DatasetSource):
             `ood`, scenes that training may see and those held out. Joined by a comma: what is in both.
         tasks, scenes: only episodes of these tasks (by name) and scenes (by index).
         max_starts: at most so many episodes, drawn evenly; each needs a goal frame.
+        past: frames of each episode of the dataset that the world model is shown, with what was done in
+            them, before it imagines on from the next one.
     """
 
     split: str = "all"
     tasks: list[str] | None = None
     scenes: list[int] | None = None
     max_starts: int = 256
+    past: int = 0
     frames: Path | None = None
     resets: int = 0
 
@@ -45,6 +49,11 @@ class StartFrames(DatasetSource):
             raise ValueError(
                 f"--env.dataset: starts are given by {' and '.join(given) or 'nothing'}; give one of "
                 "--env.dataset.root, --env.dataset.frames and --env.dataset.resets"
+            )
+        if self.past < 0 or (self.past and not self.root):
+            raise ValueError(
+                f"--env.dataset.past={self.past}: the frames before a start are those of --env.dataset.root, "
+                "at least 0; saved frames and resets have none"
             )
 
 
@@ -58,9 +67,11 @@ class WorldModelEnv(EnvConfig):
         text_world_model_path: the text world model, for goal frames; not needed by rewards that know no goal.
         dataset: start frames and instructions.
         reward: `--env.reward.type=general` and its settings, or `embedding` or `proxy` with the output folder
-            of its training as `--env.reward.pretrained_path`.
+            of its training as `--env.reward.pretrained_path`; or one of LeRobot's own, such as
+            `reward_classifier`.
         episode_length: frames after which an episode is truncated.
         done_threshold: θ_sps of eq. 7. done_frames: k, consecutive frames that must reach it.
+        doubt: what becomes of episodes that the world model is not sure of; see `--env.doubt.*`.
         device: where the models live; the best there is by default.
     """
 
@@ -73,6 +84,7 @@ class WorldModelEnv(EnvConfig):
     episode_length: int = 40
     done_threshold: float = 0.5
     done_frames: int = 3
+    doubt: Doubt = field(default_factory=Doubt)
     device: str | None = None
     features: dict[str, PolicyFeature] = field(
         default_factory=lambda: {ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(7,))}
@@ -84,10 +96,16 @@ class WorldModelEnv(EnvConfig):
         for name in ("episode_length", "done_frames"):
             if getattr(self, name) < 1:
                 raise ValueError(f"--env.{name}={getattr(self, name)}: must be at least 1")
+        if self.episode_length < self.done_frames:
+            raise ValueError(
+                f"--env.episode_length={self.episode_length}: shorter than the {self.done_frames} frames "
+                "for which done must hold, so no episode could succeed; raise it, or lower --env.done_frames"
+            )
         if not 0 < self.done_threshold < 1:
             raise ValueError(f"--env.done_threshold={self.done_threshold}: must be a probability")
         if self.dataset.max_starts < 1:
             raise ValueError(f"--env.dataset.max_starts={self.dataset.max_starts}: must be at least 1")
+        self.doubt.check()
         unknown = sorted({*(self.dataset.tasks or ())} - {*TASKS})
         if unknown:
             raise ValueError(f"--env.dataset.tasks={unknown}: choose from {', '.join(TASKS)}")

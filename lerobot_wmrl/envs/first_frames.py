@@ -9,7 +9,7 @@ import torch
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from lerobot_wmrl.constants import TASKS
+from lerobot_wmrl.constants import ACTION_LOW, TASKS
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.maniskill.scenes import scene_for_seed, scenes_of
@@ -29,11 +29,13 @@ INSTRUCTION = "task"
 
 
 class FirstFrames(NamedTuple):
-    """K first frames: images (K, N, H, W, 3) uint8, state (K, P), one instruction each; tasks (K,), indices
-    into `TASKS`, −1 where unknown; depth of a model's frames, (K, S) metres, None if it looks at none."""
+    """Where K episodes begin, each after T − 1 frames that are only looked at: images (K, T, N, H, W, 3)
+    uint8, state (K, T, P), actions (K, T − 1, A), one instruction each; tasks (K,), indices into `TASKS`, −1
+    where unknown; depth of a model's frames, (K, T, S) metres, None if it looks at none."""
 
     images: np.ndarray
     state: np.ndarray
+    actions: np.ndarray
     instructions: list[str]
     tasks: np.ndarray
     depth: Callable[[Any], Tensor | None]
@@ -47,7 +49,9 @@ class FirstFrames(NamedTuple):
             return every if every is None else every[torch.from_numpy(rows).to(every.device)]
 
         instructions = [self.instructions[row] for row in rows]
-        return FirstFrames(self.images[rows], self.state[rows], instructions, self.tasks[rows], depth)
+        return FirstFrames(
+            self.images[rows], self.state[rows], self.actions[rows], instructions, self.tasks[rows], depth
+        )
 
 
 def read_first_frames(source: StartFrames, config: Any) -> FirstFrames:
@@ -71,7 +75,15 @@ def chosen_episodes(table: EpisodeTable, source: StartFrames) -> np.ndarray:
                 f"--env.dataset.{name}={getattr(source, name)}: no episode of {source.root} has one of them"
             )
         wanted &= np.isin(column, values) if values else True
+    if source.past:
+        wanted &= undecided_after(table, source.past)
     return choose_episodes(table, source.split, source.max_starts, unseen, wanted)
+
+
+def undecided_after(table: EpisodeTable, frames: int) -> np.ndarray:
+    """Episodes that last longer than so many frames and have not succeeded by then. (E,)"""
+    begun = [table.done[start : start + frames + 1].any() for start in table.start]
+    return (table.length > frames) & ~np.array(begun)
 
 
 def dataset_frames(source: StartFrames, config: Any) -> FirstFrames:
@@ -79,15 +91,17 @@ def dataset_frames(source: StartFrames, config: Any) -> FirstFrames:
     table = read_episodes(open_dataset(source.root, source.repo_id))
     check_dataset(config, table.dataset.features)
     episodes = chosen_episodes(table, source)
-    rows = table.start[episodes]
+    rows = table.start[episodes, None] + np.arange(source.past + 1)
 
     def depth(model: Any) -> Tensor | None:
         check_dataset(model.config, table.dataset.features)
-        return depth_at(model, table.dataset, rows)
+        every = depth_at(model, table.dataset, rows.reshape(-1))
+        return every if every is None else every.unflatten(0, rows.shape)
 
     return FirstFrames(
-        np.asarray(cached_frames(table.dataset, config.camera_keys)[rows]),
+        cached_frames(table.dataset, config.camera_keys)[rows],
         table.state[rows],
+        table.action[rows[:, :-1]],
         [table.instructions[episode] for episode in episodes],
         table.task[episodes],
         depth,
@@ -113,10 +127,8 @@ def saved_frames(path: Path, at_most: int, config: Any) -> FirstFrames:
     images = np.stack([found[name] for name in config.camera_keys], 1)
     if images.dtype != np.uint8:
         raise ValueError(f"--env.dataset.frames={path}: pictures are {images.dtype}, they must be uint8")
-    return FirstFrames(
-        images, found[OBS_STATE].astype(np.float32), [str(text) for text in found[INSTRUCTION]],
-        np.full(len(images), -1), _no_depth,
-    )  # fmt: skip
+    instructions = [str(text) for text in found[INSTRUCTION]]
+    return _without_past(images, found[OBS_STATE].astype(np.float32), instructions, np.full(len(images), -1))
 
 
 def simulated_frames(source: StartFrames, config: Any) -> FirstFrames:
@@ -136,7 +148,15 @@ def simulated_frames(source: StartFrames, config: Any) -> FirstFrames:
     simulation.close()
     images = np.stack([np.stack([frame.images[camera] for camera in config.cameras]) for frame in frames])
     state = np.stack([frame.state for frame in frames])
-    return FirstFrames(images, state, instructions, np.array(indices), _no_depth)
+    return _without_past(images, state, instructions, np.array(indices))
+
+
+def _without_past(
+    images: np.ndarray, state: np.ndarray, instructions: list[str], tasks: np.ndarray
+) -> FirstFrames:
+    """Single frames, (K, …) each, without depth."""
+    actions = np.zeros((len(images), 0, len(ACTION_LOW)), np.float32)
+    return FirstFrames(images[:, None], state[:, None], actions, instructions, tasks, _no_depth)
 
 
 def _no_depth(model: Any) -> None:

@@ -14,20 +14,23 @@ from lerobot_wmrl.world_models.modeling_world_model import (
     ActionWorldModelRewardModel,
     TextWorldModelRewardModel,
 )
+from lerobot_wmrl.world_models.past import Frames, Past
 
 GOAL_BATCH = 64
 
 
 class Starts(NamedTuple):
-    """K starts: tokens (K, S), the images they decode to (K, N, 3, H, W), the tokenizer's context of K first
-    frames, proprioception (K, P), depth (K, S) in metres if the model looks at it, instructions."""
+    """K starts: frames, the images they decode to (K, N, 3, H, W), the frames before, the tokenizer's context
+    of the earliest, instructions."""
 
-    tokens: Tensor
+    now: Frames
     images: Tensor
+    past: Past
     context: Context
-    proprioception: Tensor
-    depth: Tensor | None
     instructions: list[str]
+
+    def __len__(self) -> int:
+        return len(self.instructions)
 
 
 class Goals(NamedTuple):
@@ -47,23 +50,23 @@ def load_starts(
 ) -> tuple[Starts, Goals | None]:  # fmt: skip
     """Tokenise first frames and, with a text model, imagine each one's goal frame once (eq. 6)."""
     device = model.state_mean.device
-    images, state = frames_to_tensor(frames.images).to(device), torch.from_numpy(frames.state).to(device)
-    context = model.tokenizer.context(images)
-    tokens = model.tokenizer.encode(images, context)
-    decoded = model.tokenizer.decode_with_features(tokens, context)
-    starts = Starts(
-        tokens,
-        decoded.images,
-        context,
-        state[:, : model.config.state_size],
-        frames.depth(model),
-        frames.instructions,
-    )
+    state, actions = (torch.from_numpy(each).to(device) for each in (frames.state, frames.actions))
+    context = model.tokenizer.context(frames_to_tensor(frames.images[:, 0]).to(device))
+    depth, seen = frames.depth(model), []
+    for row in range(state.shape[1]):
+        images = frames_to_tensor(frames.images[:, row]).to(device)
+        known = None if depth is None else depth[:, row]
+        tokens = model.tokenizer.encode(images, context)
+        seen.append(Frames(tokens, state[:, row, : model.config.state_size], known))
+    *before, now = seen
+    decoded = model.tokenizer.decode_with_features(now.tokens, context)
+    past = Past(tuple(before), actions.unbind(1))
+    starts = Starts(now, decoded.images, past, context, frames.instructions)
     if text_model is None:
         return starts, None
-    return starts, imagine_goals(
-        text_model, starts, alike.describe(decoded), alike, state, frames.depth(text_model)
-    )
+    depth = frames.depth(text_model)
+    last = depth if depth is None else depth[:, -1]
+    return starts, imagine_goals(text_model, starts, alike.describe(decoded), alike, state[:, -1], last)
 
 
 @torch.no_grad()
@@ -74,7 +77,7 @@ def imagine_goals(
     """Goal frames of all starts, which are so `described`; state (K, P) as the dataset has it."""
     goals = [
         imagine_goal(
-            model, starts.tokens[part], state[part], starts.instructions[part], starts.context[part],
+            model, starts.now.tokens[part], state[part], starts.instructions[part], starts.context[part],
             depth if depth is None else depth[part],
         )
         for part in (slice(i, i + GOAL_BATCH) for i in range(0, len(state), GOAL_BATCH))

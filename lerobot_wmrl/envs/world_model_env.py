@@ -6,16 +6,18 @@ import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode
-from lerobot.rewards.pretrained import PreTrainedRewardModel
+from lerobot.rewards.factory import make_reward_model
 from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
 from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, FPS
-from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
+from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
+from lerobot_wmrl.envs.doubt import entropies
 from lerobot_wmrl.envs.first_frames import FirstFrames, read_first_frames
 from lerobot_wmrl.envs.start_frames import Goals, Starts, load_starts
+from lerobot_wmrl.rewards.configuration_general import GeneralConfig
 from lerobot_wmrl.rewards.general import consecutive_count, sparse_reward
-from lerobot_wmrl.rewards.loading import load_reward
+from lerobot_wmrl.rewards.loading import Reward, load_reward
 from lerobot_wmrl.rewards.similarity import Similarity, make_similarity, of_rows
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.compatibility import check_same_tokenizer
@@ -25,6 +27,7 @@ from lerobot_wmrl.world_models.modeling_world_model import (
     ActionWorldModelRewardModel,
     TextWorldModelRewardModel,
 )
+from lerobot_wmrl.world_models.past import restart_after, start_after
 
 Observation = dict[str, Any]
 
@@ -40,12 +43,12 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
 
     def __init__(
         self, model: ActionWorldModelRewardModel, starts: Starts, goals: Goals | None,
-        reward: PreTrainedRewardModel, config: WorldModelEnv, n_envs: int,
+        reward: Reward, config: WorldModelEnv, n_envs: int,
     ) -> None:  # fmt: skip
         self.model, self.starts, self.goals = model, starts, goals
         self.reward, self.config = reward, config
         self.num_envs, self.max_episode_steps = n_envs, config.episode_length
-        self.device = starts.tokens.device
+        self.device = starts.images.device
         self.action_low, self.action_high = (
             torch.tensor(bound, device=self.device) for bound in (ACTION_LOW, ACTION_HIGH)
         )
@@ -77,28 +80,30 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         drawn = self._draw_starts()
         if isinstance(seed, list):
             self.generator.manual_seed(seed[0])
-            drawn = torch.tensor(seed, device=self.device) % len(self.starts.tokens)
-        self._start_index, context = drawn, self.starts.context[drawn]
-        tokens, state = self.starts.tokens[drawn], self.starts.proprioception[drawn]
-        self._imagination = self.model.start(tokens, state, depth=self._start_depth(), context=context)
+            drawn = torch.tensor(seed, device=self.device) % len(self.starts)
+        self._start_index, starts = drawn, self.starts
+        now = starts.now[drawn]
+        self._imagination = start_after(self.model, starts.past[drawn], now, starts.context[drawn])
         self._elapsed = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
         self._done_streak = torch.zeros_like(self._elapsed)
         if self.goals is not None:
             self._similarity = self.goals.similarity[drawn]
-        return self._observe(self.starts.images[drawn], state), {}
+        return self._observe(self.starts.images[drawn], now.proprioception), {}
 
     @torch.no_grad()
     def step(self, actions: Tensor) -> tuple[Observation, Tensor, Tensor, Tensor, dict[str, Any]]:
         """Imagine one frame in every environment; finished ones restart at once."""
         clipped = actions.to(self.device).clamp(self.action_low, self.action_high)
         imagined = self.model.step(self._imagination, clipped, self.generator)
-        terminated, truncated = self._advance(imagined)
+        doubt = entropies(imagined)
+        terminated, truncated = self._advance(imagined, doubt)
         decoded = self.model.decode(imagined.tokens, self._imagination.context)
         observation = self._observe(decoded.images, imagined.proprioception)
         parts = {"success": terminated.float(), **self._progress(decoded)}
         reward = self.reward.compute_reward({**observation, **parts, "hidden": imagined.hidden})
-        doubt = {"entropy": imagined.entropy, "done_probability": imagined.done_logit.sigmoid()}
-        info: dict[str, Any] = {"reward_parts": {**parts, **doubt}}
+        reward = self.config.doubt.weigh(reward, doubt)
+        parts |= {**doubt, "done_probability": imagined.done_logit.sigmoid()}
+        info: dict[str, Any] = {"reward_parts": parts}
         finished = terminated | truncated
         if bool(finished.any()):
             info["final_obs"] = observation
@@ -106,39 +111,41 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
             observation = self._restart(finished, observation)
         return observation, reward, terminated, truncated, info
 
-    def _advance(self, imagined: Imagined) -> tuple[Tensor, Tensor]:
-        """Count frames; terminated after k consecutive done frames, truncated at the horizon. → (B,), (B,)"""
+    def adopt(self, model: ActionWorldModelRewardModel) -> None:
+        """Imagine with a refreshed model from the next reset on. ValueError if starts and goals mean nothing
+        to it: they are in the tokens of the first one."""
+        check_same_tokenizer(self.model, model, "the refreshed world model")
+        self.model = model
+
+    def _advance(self, imagined: Imagined, doubt: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Count frames; terminated after k consecutive done frames, truncated at the horizon or in doubt.
+        → (B,), (B,)"""
         fired = sparse_reward(imagined.done_logit, self.config.done_threshold) > 0
         self._done_streak = consecutive_count(self._done_streak, fired)
         self._elapsed = self._elapsed + 1
-        terminated = self._done_streak >= self.config.done_frames
-        return terminated, (self._elapsed >= self.max_episode_steps) & ~terminated
+        doubtful = self.config.doubt.ends(doubt)
+        terminated = (self._done_streak >= self.config.done_frames) & ~doubtful
+        return terminated, ((self._elapsed >= self.max_episode_steps) | doubtful) & ~terminated
 
     def _restart(self, mask: Tensor, observation: Observation) -> Observation:
         """New starts where `mask` (B,) is True; other rows of the observation stay."""
         self._start_index = torch.where(mask, self._draw_starts(), self._start_index)
-        context = self.starts.context[self._start_index]
-        tokens, state = self.starts.tokens[self._start_index], self.starts.proprioception[self._start_index]
-        self.model.restart(self._imagination, mask, tokens, state, self._start_depth(), context)
+        index, starts = self._start_index, self.starts
+        past, now, context = starts.past[index], starts.now[index], starts.context[index]
+        restart_after(self.model, self._imagination, mask, past, now, context)
         self._elapsed = self._elapsed.masked_fill(mask, 0)
         self._done_streak = self._done_streak.masked_fill(mask, 0)
         if self.goals is not None:
-            closeness = self.goals.similarity[self._start_index]
+            closeness = self.goals.similarity[index]
             self._similarity = torch.where(mask, closeness, self._similarity)
-        fresh = self._observe(self.starts.images[self._start_index], state)
+        fresh = self._observe(starts.images[index], now.proprioception)
         for key, value in observation.items():
             if isinstance(value, Tensor):
                 fresh[key] = torch.where(mask.reshape(-1, *[1] * (value.ndim - 1)), fresh[key], value)
         return fresh
 
     def _draw_starts(self) -> Tensor:
-        count = len(self.starts.tokens)
-        return torch.randint(count, (self.num_envs,), generator=self.generator, device=self.device)
-
-    def _start_depth(self) -> Tensor | None:
-        """Of each environment's start, (B, S) metres, if the model looks at depth."""
-        depth = self.starts.depth
-        return depth if depth is None else depth[self._start_index]
+        return torch.randint(len(self.starts), (self.num_envs,), generator=self.generator, device=self.device)
 
     def _progress(self, frame: Decoded) -> dict[str, Tensor]:
         """How near to their goals the frames are, and the ones before were; nothing without goals."""
@@ -171,7 +178,7 @@ class WorldModels(NamedTuple):
     model: ActionWorldModelRewardModel
     text_model: TextWorldModelRewardModel | None
     alike: Similarity
-    reward: PreTrainedRewardModel
+    reward: Reward
 
 
 def load_world_models(config: WorldModelEnv, device: str | None) -> WorldModels:
@@ -210,3 +217,11 @@ def begin_in(
     """An environment whose episodes begin in these frames."""
     starts, goals = load_starts(frames, models.model, models.text_model, models.alike)
     return WorldModelVectorEnv(models.model, starts, goals, models.reward, config, n_envs)
+
+
+def success_env(env: WorldModelVectorEnv, source: StartFrames) -> WorldModelVectorEnv:
+    """The same world model, and as many imaginations, from other starts: to count successes, so its reward is
+    success and there are no goals."""
+    reward = make_reward_model(GeneralConfig(alpha=1.0, device=env.device.type))
+    models = WorldModels(env.model, None, make_similarity("tokenizer", env.device), reward)
+    return begin_in(read_first_frames(source, env.model.config), models, env.config, env.num_envs)

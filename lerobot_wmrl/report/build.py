@@ -170,6 +170,7 @@ def render(
         ),
         bars=figures.success_bars({POLICIES[p]: (r["real"], r["imagined"]) for p, r in measured.items()}),
         trust=trust_rows(config.output_dir),
+        warning=sources.gate_warning(config.output_dir / "rl"),
         pictures=picture_sections(config.output_dir),
         curves=training_curves(config.output_dir),
         runs=other_seeds(config),

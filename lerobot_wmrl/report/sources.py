@@ -49,6 +49,12 @@ def metric_curves(metrics: list[dict[str, Any]], names: list[str]) -> dict[str, 
     return curves
 
 
+def gate_warning(training_dir: Path) -> str | None:
+    """What the gate last warned of while a policy was trained, if it did."""
+    records = sorted((training_dir / "gate").glob("*/record.json"))
+    return json.loads(records[-1].read_text())["warning"] if records else None
+
+
 def stage_records(output_dir: Path, names: list[str]) -> list[dict[str, Any]]:
     """Time, memory and command of each stage, in order."""
     return [json.loads((output_dir / "stages" / f"{name}.json").read_text()) for name in names]

@@ -1,4 +1,8 @@
-"""What reinforcement learning needs of a policy. B environments, K action components."""
+"""What reinforcement learning needs of a policy. B environments, K action components.
+
+A policy may decide on n steps at once, which are then acted one after the other: all (B, K) of a decision
+are (B, n, K) for it, and it is asked again after n steps, or when an episode has begun.
+"""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -35,7 +39,7 @@ class StochasticPolicy(Protocol):
         """Draw actions from the very distribution that `evaluate` measures."""
 
     def evaluate(self, observation: Observation, raw_action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """→ log-probs (B, K), entropies (B,), values (B,)"""
+        """→ log-probs (B, K), entropies (B,) of all that was decided, values (B,)"""
 
     def value(self, observation: Observation) -> Tensor:
         """→ (B,)"""

@@ -1,75 +1,28 @@
-"""Rollouts in preallocated tensors on the device. T time, B environments, K action components."""
+"""Rollouts in preallocated tensors on the device.
+
+T time, B environments, K action components, n steps that are acted by one decision.
+"""
 
 from collections.abc import Iterator
-from typing import Any
+from contextlib import contextmanager
 
 import gymnasium as gym
 import torch
-from lerobot.utils.constants import OBS_IMAGES
 from torch import Tensor
 
-from lerobot_wmrl.rl.protocol import Observation, Pipeline, Sample, StochasticPolicy
+from lerobot_wmrl.constants import EVALUATION_SEED
+from lerobot_wmrl.distributed import mean_over_processes, rank_and_size
+from lerobot_wmrl.rl.observations import ObservationBuffer, as_bytes_see_it
+from lerobot_wmrl.rl.protocol import Pipeline, Sample, StochasticPolicy
 
-TASK = "task"
-Minibatch = dict[str, Any]
-
-
-class ObservationBuffer:
-    """Observations of T x B steps. Images are kept as bytes, which is also how a policy meets them in
-    reality; it samples from what is kept, so that is bit by bit what it is trained on."""
-
-    def __init__(self, steps: int, num_envs: int) -> None:
-        self.steps, self.num_envs = steps, num_envs
-        self.tensors: dict[str, Tensor] = {}
-        self.instructions: dict[str, int] = {}
-
-    def write(self, step: int, observation: Observation) -> None:
-        """Keep the observations (B, …) that the actions of `step` answer."""
-        for name, tensor in encode(observation, self.instructions).items():
-            if name not in self.tensors:
-                self.tensors[name] = tensor.new_empty((self.steps, self.num_envs, *tensor.shape[1:]))
-            self.tensors[name][step] = tensor
-
-    def read(self, rows: Tensor) -> Observation:
-        """Observations of flat rows step * B + environment."""
-        return decode(
-            {name: tensor.flatten(0, 1)[rows] for name, tensor in self.tensors.items()}, self.instructions
-        )
-
-
-def encode(observation: Observation, instructions: dict[str, int]) -> dict[str, Tensor]:
-    """Images as bytes, instructions as indices into `instructions`, which grows."""
-    encoded = {
-        name: (value * 255).round().byte() if name.startswith(OBS_IMAGES) else value
-        for name, value in observation.items()
-        if isinstance(value, Tensor)
-    }
-    indices = [instructions.setdefault(text, len(instructions)) for text in observation.get(TASK, [])]
-    if indices:
-        device = next(iter(encoded.values())).device
-        encoded[TASK] = torch.tensor(indices, device=device)
-    return encoded
-
-
-def decode(encoded: dict[str, Tensor], instructions: dict[str, int]) -> Observation:
-    """The inverse of `encode`."""
-    texts = list(instructions)
-    observation: Observation = {
-        name: value.float() / 255 if name.startswith(OBS_IMAGES) else value for name, value in encoded.items()
-    }
-    if TASK in encoded:
-        observation[TASK] = [texts[index] for index in encoded[TASK].tolist()]
-    return observation
-
-
-def as_bytes_see_it(observation: Observation) -> Observation:
-    """Images rounded to bytes and back."""
-    instructions: dict[str, int] = {}
-    return decode(encode(observation, instructions), instructions)
+NOISE_SEED = 2**31
+"""Added to a rollout's seed: the policy's noise must not be that with which the environment draws."""
 
 
 class RolloutBuffer:
-    """One iteration's steps, all (T, B), actions and log-probs (T, B, K)."""
+    """One iteration's steps, all (T, B); raw actions and log-probs (T, B, K), or (T, B, n, K) if the policy
+    decides on n steps at once: then at the step of the decision, the only one of the n that is trained on.
+    """
 
     def __init__(self, steps: int, num_envs: int, device: torch.device | str) -> None:
         def empty(dtype: torch.dtype = torch.float32) -> Tensor:
@@ -84,18 +37,31 @@ class RolloutBuffer:
             empty(torch.bool),
             empty(torch.bool),
         )
+        self.age = empty(torch.long)
+        """Steps since the decision that is acted on; 0 where one was made."""
         self.raw_action = self.log_prob = torch.empty(0)
         self.columns: dict[str, Tensor] = {}
         """What the updates need beside observation, raw_action and log_prob: (T, B, …) by name."""
 
-    def write(self, step: int, sample: Sample, reward: Tensor, terminated: Tensor, truncated: Tensor) -> None:
-        """Keep what was sampled at `step`, and its outcome."""
+    def write_decision(self, step: int, rows: Tensor, sample: Sample) -> None:
+        """Keep what was sampled at `step` in the environments `rows`."""
         if not self.raw_action.numel():
-            shape = (self.steps, *sample.raw_action.shape)
-            self.raw_action = sample.raw_action.new_empty(shape)
-            self.log_prob = torch.empty(shape, dtype=torch.float32, device=self.device)
-        self.raw_action[step], self.log_prob[step] = sample.raw_action, sample.log_prob
-        self.value[step], self.reward[step] = sample.value, reward
+            if sample.log_prob.dtype != torch.float32:
+                raise ValueError(
+                    f"policy: its log-probabilities are {sample.log_prob.dtype}, whose rounding would look "
+                    "like a change of the policy; compute them in float32"
+                )
+            shape = (self.steps, self.num_envs, *sample.raw_action.shape[1:])
+            self.raw_action = sample.raw_action.new_zeros(shape)
+            self.log_prob = torch.zeros(shape, dtype=torch.float32, device=self.device)
+        self.raw_action[step, rows] = sample.raw_action
+        self.log_prob[step, rows] = sample.log_prob
+        self.value[step, rows] = sample.value
+
+    def write(self, step: int, age: Tensor, reward: Tensor, terminated: Tensor, truncated: Tensor) -> None:
+        """Keep the outcome of `step`, of decisions made `age` steps before. All (B,)"""
+        self.value[step].masked_fill_(age > 0, 0.0)
+        self.age[step], self.reward[step] = age, reward
         self.success[step], self.final_value[step] = False, torch.nan
         self.terminated[step], self.truncated[step] = terminated, truncated
 
@@ -119,55 +85,128 @@ class RolloutBuffer:
             )
 
     @property
+    def total_envs(self) -> int:
+        """Environments of all processes."""
+        return self.num_envs * rank_and_size()[1]
+
+    @property
     def finished(self) -> Tensor:
         return self.terminated | self.truncated
 
+    @property
+    def decided(self) -> Tensor:
+        """Where the policy made a decision. (T, B) bool"""
+        return self.age == 0
+
+    @property
+    def first_episode(self) -> Tensor:
+        """The steps of each environment's first episode, which began where its seed says. (T, B) bool"""
+        ended = self.finished.long()
+        return ended.cumsum(0) == ended
+
+    def executed(self) -> Tensor | None:
+        """Which of a decision's n steps were acted. → (T, B, n, 1) bool, None for n = 1"""
+        if self.raw_action.ndim < 4:
+            return None
+        length = torch.ones_like(self.age)
+        for step in reversed(range(self.steps - 1)):
+            length[step] += torch.where(self.decided[step + 1], 0, length[step + 1])
+        return torch.arange(self.raw_action.shape[2], device=self.device)[:, None] < length[..., None, None]
+
     def statistics(self) -> dict[str, float]:
         """Success and length of each environment's first episode; of later ones only short ones would end."""
-        first = self.finished.cumsum(0).cumsum(0) == 1
+        first = self.finished & self.first_episode
         steps = torch.arange(1, self.steps + 1, device=self.device)[:, None]
         episodes = first.sum().clamp_min(1)
         return {
             "success_rate": ((self.success & first).sum() / episodes).item(),
             "episode_length": ((steps * first).sum() / episodes).item(),
             "reward": self.reward.mean().item(),
-            "value": self.value.mean().item(),
         }
 
-    def minibatches(self, size: int, epochs: int, pipeline: Pipeline) -> Iterator[Minibatch]:
-        """Every step once an epoch, in random order, `size` steps at a time."""
-        for _ in range(epochs):
-            for rows in torch.randperm(self.steps * self.num_envs).split(size):
-                yield self.minibatch(rows.to(self.device), pipeline)
 
-    def minibatch(self, rows: Tensor, pipeline: Pipeline) -> Minibatch:
-        """The steps of flat rows step * B + environment."""
-        stored = {"raw_action": self.raw_action, "log_prob": self.log_prob, **self.columns}
-        taken = {name: tensor.flatten(0, 1)[rows] for name, tensor in stored.items()}
-        return {"observation": pipeline.prepare(self.observations.read(rows)), **taken}
+class Actor:
+    """Asks the policy where a decision is due, and otherwise goes on with the last one."""
+
+    def __init__(self, policy: StochasticPolicy, pipeline: Pipeline, buffer: RolloutBuffer) -> None:
+        self.policy, self.pipeline, self.buffer = policy, pipeline, buffer
+        self.everyone = torch.arange(buffer.num_envs)
+        self.here = self.everyone.to(buffer.device)
+        self.age = torch.zeros_like(self.here)
+        self.plan = torch.empty(0, 1, 0)
+        """The decisions that are acted on, (B, n, K)."""
+
+    def act(self, step: int) -> Tensor:
+        """The raw action of every environment at `step`. → (B, K)"""
+        if self.plan.shape[1] == 1:
+            self._decide(step, self.here, self.everyone)
+        else:
+            rows = (self.age == 0).nonzero()[:, 0]
+            if len(rows):
+                self._decide(step, rows, rows.cpu())
+        return self.plan[self.here, self.age]
+
+    def advance(self, finished: Tensor) -> None:
+        """A new decision is due after n steps, and where an episode has ended. (B,)"""
+        self.age = torch.where(finished, 0, (self.age + 1) % self.plan.shape[1])
+
+    def _decide(self, step: int, rows: Tensor, rows_on_cpu: Tensor) -> None:
+        observed = self.buffer.observations.read(step * self.buffer.num_envs + rows_on_cpu)
+        sample = self.policy.sample(self.pipeline.prepare(observed))
+        self.buffer.write_decision(step, rows, sample)
+        raw = sample.raw_action if sample.raw_action.ndim == 3 else sample.raw_action[:, None]
+        if not self.plan.numel():
+            self.plan = raw.new_zeros((self.buffer.num_envs, *raw.shape[1:]))
+        self.plan[rows] = raw
+
+
+@contextmanager
+def noise_of(seed: int, device: torch.device | str) -> Iterator[None]:
+    """Random numbers as `seed` has them, the generators as they were afterwards."""
+    on_cuda = torch.device(device).type == "cuda"
+    with torch.random.fork_rng([torch.cuda.current_device()] if on_cuda else []):
+        torch.manual_seed(seed + NOISE_SEED)
+        yield
+
+
+def start_seeds(first: int, num_envs: int, group_size: int) -> int | list[int]:
+    """What to reset with: the first seed of `num_envs`, or a drawn one for each `group_size` of them."""
+    if group_size == 1:
+        return first
+    generator = torch.Generator().manual_seed(first)
+    drawn = torch.randint(EVALUATION_SEED, (num_envs // group_size,), generator=generator)
+    return drawn.repeat_interleave(group_size).tolist()
 
 
 @torch.no_grad()
 def collect(
-    env: gym.vector.VectorEnv, policy: StochasticPolicy, pipeline: Pipeline, buffer: RolloutBuffer, seed: int
-) -> dict[str, float]:
-    """Fill `buffer` from fresh episodes; every step's `next_value` too. → numbers to log"""
-    observation, _ = env.reset(seed=seed)
-    here = torch.arange(buffer.num_envs, device=buffer.device)
-    logged: dict[str, list[Tensor]] = {}
-    for step in range(buffer.steps):
-        buffer.observations.write(step, observation)
-        prepared = pipeline.prepare(buffer.observations.read(step * buffer.num_envs + here))
-        sample = policy.sample(prepared)
-        action = pipeline.to_action(sample.raw_action).to(buffer.device)
-        observation, reward, terminated, truncated, info = env.step(action)
-        buffer.write(step, sample, reward, terminated, truncated)
-        for name, part in info.get("reward_parts", {}).items():
-            logged.setdefault(name, []).append(part.float().mean())
-        if "final_obs" in info:
-            final = pipeline.prepare(as_bytes_see_it(info["final_obs"]))
-            buffer.write_end(step, info["final_info"]["is_success"], policy.value(final))
-    last = policy.value(pipeline.prepare(as_bytes_see_it(observation)))
+    env: gym.vector.VectorEnv, policy: StochasticPolicy, pipeline: Pipeline, buffer: RolloutBuffer, seed: int,
+    group_size: int = 1,
+) -> dict[str, float]:  # fmt: skip
+    """Fill `buffer` from fresh episodes; every decision's `next_value` too. → numbers to log
+
+    Every `group_size` neighbouring environments begin alike. `seed` is the first of all processes'
+    environments; starts and noise of this one's are drawn from its share.
+    """
+    own = rank_and_size()[0] * buffer.num_envs
+    starts = start_seeds(seed, buffer.total_envs, group_size)
+    reset = seed + own if isinstance(starts, int) else starts[own : own + buffer.num_envs]
+    observation, _ = env.reset(seed=reset)
+    actor, logged = Actor(policy, pipeline, buffer), dict[str, list[Tensor]]()
+    with noise_of(seed + own, buffer.device):
+        for step in range(buffer.steps):
+            buffer.observations.write(step, observation)
+            raw_action, age = actor.act(step), actor.age
+            action = pipeline.to_action(raw_action).to(buffer.device)
+            observation, reward, terminated, truncated, info = env.step(action)
+            buffer.write(step, age, reward, terminated, truncated)
+            actor.advance(terminated | truncated)
+            for name, part in info.get("reward_parts", {}).items():
+                logged.setdefault(name, []).append(part.float().mean())
+            if "final_obs" in info:
+                final = pipeline.prepare(as_bytes_see_it(info["final_obs"]))
+                buffer.write_end(step, info["final_info"]["is_success"], policy.value(final))
+        last = policy.value(pipeline.prepare(as_bytes_see_it(observation)))
     buffer.fill_next_value(last)
     parts = {name: torch.stack(values).mean().item() for name, values in logged.items()}
-    return {**buffer.statistics(), **parts}
+    return mean_over_processes({**buffer.statistics(), **parts}, buffer.device)

@@ -6,27 +6,26 @@
         --dataset.root=D --output_dir=outputs/action_world_model
 
 Running the same command again continues from the last checkpoint. `--preset=demo` sets the sizes.
+`--model.path=outputs/action_world_model` instead of a type trains a trained model further, on other data say.
 """
 
 from dataclasses import dataclass, field, replace
-from datetime import timedelta
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import draccus
 from accelerate import PartialState
+from lerobot.configs import parser
 from lerobot.configs.rewards import RewardModelConfig
 
 from lerobot_wmrl.command import RunConfig, claim_output_dir, require_free, run_command
 from lerobot_wmrl.dataset_source import TrainingData
+from lerobot_wmrl.distributed import LONGEST_WAIT
 from lerobot_wmrl.malloc import keep_freed_memory
 from lerobot_wmrl.precision import PRECISIONS, training_dtype
 from lerobot_wmrl.presets import expand_preset
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
-
-LONGEST_WAIT = timedelta(hours=6)
-"""Of other processes for the first one, while it decodes and encodes every frame of a large dataset."""
 
 TRAINED = ("frame_tokenizer", "action_world_model", "text_world_model")
 
@@ -38,8 +37,9 @@ class TrainWorldModelConfig(RunConfig):
     `--preset=tiny` or `--preset=demo` stands for the flags of that size; flags further right override it.
 
     Args:
-        model: `--model.type=frame_tokenizer|action_world_model|text_world_model` and its settings.
-        dataset: the LeRobotDataset to learn from, or some of its episodes.
+        model: `--model.type=frame_tokenizer|action_world_model|text_world_model` and its settings; or
+            `--model.path=`, a trained one to begin with, and those of its settings that are to be others.
+        dataset: the LeRobotDataset to learn from, or some of its episodes; and `more` of them.
         output_dir: where checkpoints and metrics go; continues if it holds this run already.
         steps, batch_size: optimiser steps, and frames (tokenizer) or clips (world models) a step.
             Under `torchrun --nproc_per_node=N` every process has `batch_size` of them.
@@ -48,6 +48,8 @@ class TrainWorldModelConfig(RunConfig):
         precision: `float32`, `bfloat16` (mixed: weights and losses stay in float32), or `auto`: bfloat16 if
             the device multiplies in it. The checkpoints' train_config.json tells which it was.
     """
+
+    path_fields: ClassVar[list[str]] = ["model"]
 
     model: RewardModelConfig = field(default_factory=FrameTokenizerConfig)
     dataset: TrainingData = field(default_factory=TrainingData)
@@ -91,10 +93,13 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
     from lerobot.utils.random_utils import set_seed
 
     from lerobot_wmrl.checkpoints import latest_checkpoint
+    from lerobot_wmrl.world_models.checkpoint import config_to_continue
     from lerobot_wmrl.world_models.episode_table import open_dataset, read_episodes
     from lerobot_wmrl.world_models.reconstruction import write_reconstruction
-    from lerobot_wmrl.world_models.training import build_model, make_sampler, train
+    from lerobot_wmrl.world_models.training import build_model, make_joint_sampler, train
 
+    if path := parser.get_path_arg("model"):
+        cfg.model = config_to_continue(path, parser.get_cli_overrides("model") or [])
     check_config(cfg)
     processes = PartialState(cpu=cfg.model.device == "cpu", timeout=LONGEST_WAIT)
     check_processes(cfg, processes.num_processes)
@@ -109,7 +114,7 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
         print(f"{cfg.output_dir}: already trained for {cfg.steps} steps")
     else:
         with processes.main_process_first():
-            sampler = make_sampler(model, table, cfg.dataset.episodes, cfg.batch_size, cfg.seed)
+            sampler = make_joint_sampler(model, table, cfg.dataset, cfg.batch_size, cfg.seed)
             if processes.is_main_process:
                 claim_output_dir(cfg.output_dir, given)
         dtype = training_dtype(cfg.precision, cfg.model.device)

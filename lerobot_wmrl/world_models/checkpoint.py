@@ -1,6 +1,7 @@
 """Loading trained models of this package, with errors that say what is wrong and what to do."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -39,6 +40,24 @@ def read_config(path: str | Path, expected_type: str, device: str | None = "cpu"
         accelerator = torch.accelerator.current_accelerator(check_available=True)
         device = accelerator.type if accelerator else "cpu"
     return RewardModelConfig.from_pretrained(str(folder), cli_overrides=[f"--device={device}"])
+
+
+def config_to_continue(path: str, overrides: Sequence[str]) -> RewardModelConfig:
+    """The settings of a trained model, `overrides` on top, to train it further (`--model.path`).
+
+    ValueError if there is none.
+    """
+    folder = resolve_checkpoint(path)
+    try:
+        config = RewardModelConfig.from_pretrained(str(folder), cli_overrides=list(overrides))
+    except Exception as error:  # draccus, the hub and json each raise their own
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise ValueError(
+            f"--model.path={path}: no model can be loaded from it ({reason}); give the output folder of a "
+            "training, or a hub id"
+        ) from error
+    config.pretrained_path = str(folder)
+    return config
 
 
 def _stored_type(path: Path) -> Any:

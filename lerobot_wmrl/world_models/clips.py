@@ -3,15 +3,17 @@
 `batch_size` is a process's share: each draws the whole batch and keeps its own rows of it.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from lerobot_wmrl.distributed import own_rows, rank_and_size
 from lerobot_wmrl.world_models.clip import Clip
 from lerobot_wmrl.world_models.context import NO_CONTEXT, Context
-from lerobot_wmrl.world_models.distributed import own_rows, rank_and_size
 from lerobot_wmrl.world_models.episode_table import EpisodeTable
 from lerobot_wmrl.world_models.frame_cache import frames_to_tensor
 
@@ -97,3 +99,17 @@ class FrameSampler:
             batch[f"observation.images.{camera}"] = images[:, index]
             batch[f"reference.{camera}"] = reference[:, index]
         return batch
+
+
+@dataclass
+class InTurn:
+    """Every second batch of `first`, the ones in between of the others in turn."""
+
+    first: ClipSampler | FrameSampler
+    others: Sequence[ClipSampler | FrameSampler]
+
+    def __call__(self, step: int) -> Any:
+        """This process's share of one step's batch, as that sampler gives it."""
+        if step % 2 == 0:
+            return self.first(step)
+        return self.others[step // 2 % len(self.others)](step)

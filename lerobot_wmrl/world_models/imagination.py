@@ -14,9 +14,6 @@ from lerobot_wmrl.world_models.frame_network import FrameNetwork, Prediction
 from lerobot_wmrl.world_models.frame_tokenizer import Decoded, FrameTokenizer
 from lerobot_wmrl.world_models.temporal_memory import FrameCache
 
-SMALL_BATCH = 16
-"""In so few imaginations at once on the CPU, casts cost more than bfloat16 saves."""
-
 
 class Imagined(NamedTuple):
     """One imagined frame of every environment.
@@ -83,8 +80,7 @@ class Imagination:
         The network computes in `dtype`, by default the fastest; samples, done, state and entropy are float32.
         """
         batch, device = tokens.shape[0], tokens.device
-        small = batch < SMALL_BATCH and device.type == "cpu"
-        dtype = dtype or (torch.float32 if small else imagination_dtype(device))
+        dtype = dtype or imagination_dtype(device, batch)
         cache = self.network.make_cache(batch, device, dtype)
         condition = self.encode_instructions(instructions, batch) if instructions is not None else None
         digits = self.network.codebook.digits(tokens)[:, None]
@@ -96,14 +92,21 @@ class Imagination:
         depth: Tensor | None = None, context: Context = NO_CONTEXT,
     ) -> None:  # fmt: skip
         """Put the environments in `mask` (B,) back to a first frame; their past is masked, not moved."""
+        self.see(state, mask, tokens, proprioception, depth)
+        state.context = state.context.replaced(mask, context)
+        state.cache.restart(mask)
+
+    def see(
+        self, state: ImaginationState, mask: Tensor, tokens: Tensor, proprioception: Tensor,
+        depth: Tensor | None = None,
+    ) -> None:  # fmt: skip
+        """Let the environments in `mask` (B,) go on from frames (as in `start`) instead of imagined ones."""
         digits = self.network.codebook.digits(tokens)[:, None]
         first = self.normalize_state(proprioception)[:, None]
         state.digits.copy_(torch.where(mask[:, None, None, None], digits, state.digits))
         state.proprioception.copy_(torch.where(mask[:, None, None], first, state.proprioception))
         depth = self.network.depth.normalize(depth, tokens)[:, None]
         state.depth.copy_(torch.where(mask[:, None, None], depth, state.depth))
-        state.context = state.context.replaced(mask, context)
-        state.cache.restart(mask)
 
     @torch.no_grad()
     def step(

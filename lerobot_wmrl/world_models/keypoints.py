@@ -11,10 +11,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from lerobot_wmrl.distributed import masked_mean
 from lerobot_wmrl.precision import compute_in
 from lerobot_wmrl.world_models.clip import known_transitions
 from lerobot_wmrl.world_models.codebook import CodeBook
-from lerobot_wmrl.world_models.distributed import masked_mean
 from lerobot_wmrl.world_models.losses import (
     MOTION_LEVELS,
 )

@@ -52,6 +52,17 @@ class AnchoredCache:
         """The next frame of the environments in `mask` (B,) is their first."""
         self.ring.restart(mask)
 
+    def begin_before(self, other: "AnchoredCache", frames: int) -> None:
+        """Be empty, and so many frames behind the other cache."""
+        self.ring.begin_before(other.ring, frames)
+
+    def put(self, rows: Tensor, other: "AnchoredCache") -> None:
+        """Remember in `rows` (R,) what the other cache does."""
+        assert other.scene is not None
+        assert other.path is not None
+        self.begin(rows, other.scene, other.path)
+        self.ring.put(rows, other.ring)
+
     def due(self) -> Tensor:
         """Environments that have to begin now: rows (R,). Waits for the device to say which."""
         age = self.ring.position - self.ring.started

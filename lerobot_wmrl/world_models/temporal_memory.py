@@ -5,7 +5,7 @@ they attend to, of the same shape.
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, Self
 
 import torch
 from torch import Tensor
@@ -33,6 +33,12 @@ class FrameCache(Protocol):
 
     def restart(self, mask: Tensor) -> None:
         """The next frame of the environments in `mask` (B,) is their first."""
+
+    def begin_before(self, other: Self, frames: int) -> None:
+        """Be empty, and so many frames behind the `other` cache, of the same window."""
+
+    def put(self, rows: Tensor, other: Self) -> None:
+        """Remember in `rows` (R,) what the other cache does, of R environments at the same frame."""
 
 
 def banded_causal_mask(length: int, window: int, device: torch.device) -> Tensor:
@@ -128,6 +134,23 @@ class TemporalCache:
     def restart(self, mask: Tensor) -> None:
         """The next frame of the environments in `mask` (B,) is their first: the past is masked, not moved."""
         self.started.copy_(torch.where(mask, self.position, self.started))
+
+    def begin_before(self, other: "TemporalCache", frames: int) -> None:
+        """Slots and rotations will be those of the other's frames. ValueError if it has not had so many."""
+        if not frames < min(self.window, int(other.position) + 1):
+            raise ValueError(
+                f"a past of {frames} frames, of a world model that remembers {self.window} and imaginations "
+                f"that are {int(other.position)} frames old: it must be shorter than both"
+            )
+        self.position.copy_(other.position - frames)
+        self.started.copy_(self.position.expand_as(self.started))
+        self.visible = other.visible
+
+    def put(self, rows: Tensor, other: "TemporalCache") -> None:
+        """Keys, values, and when the rows started."""
+        for ring, theirs in ((self.keys, other.keys), (self.values, other.values)):
+            ring.index_copy_(1, rows, theirs)
+        self.started.index_copy_(0, rows, other.started)
 
     def past(self, layer: int) -> tuple[Tensor, Tensor]:
         """Keys and values of the visible slots, (B, S, h, visible, d)."""

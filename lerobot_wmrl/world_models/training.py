@@ -31,16 +31,22 @@ from torch.optim.lr_scheduler import LRScheduler
 from tqdm import tqdm
 
 from lerobot_wmrl.checkpoints import latest_checkpoint, write_checkpoint
+from lerobot_wmrl.dataset_source import TrainingData
+from lerobot_wmrl.distributed import mean_over_processes
 from lerobot_wmrl.precision import compute_in, training_dtype
 from lerobot_wmrl.tracking import append_metrics
 from lerobot_wmrl.world_models.checkpoint import load_model
-from lerobot_wmrl.world_models.clips import ClipSampler, FrameSampler
+from lerobot_wmrl.world_models.clips import ClipSampler, FrameSampler, InTurn
 from lerobot_wmrl.world_models.compatibility import check_dataset
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import cosine_schedule
 from lerobot_wmrl.world_models.configuration_world_model import TextWorldModelConfig
 from lerobot_wmrl.world_models.depth_maps import cached_depth
-from lerobot_wmrl.world_models.distributed import mean_over_processes
-from lerobot_wmrl.world_models.episode_table import EpisodeTable, golden_episodes
+from lerobot_wmrl.world_models.episode_table import (
+    EpisodeTable,
+    golden_episodes,
+    open_dataset,
+    read_episodes,
+)
 from lerobot_wmrl.world_models.frame_cache import cached_context, cached_frames, cached_tokens
 
 
@@ -97,6 +103,19 @@ def make_sampler(
     )  # fmt: skip
 
 
+def make_joint_sampler(
+    model: PreTrainedRewardModel, table: EpisodeTable, data: TrainingData, batch_size: int, seed: int
+) -> ClipSampler | FrameSampler | InTurn:
+    """Batches from the episodes of `data`, which are in `table`, and from its further datasets."""
+    first = make_sampler(model, table, data.episodes, batch_size, seed)
+    others = []
+    for root in data.more:
+        other = read_episodes(open_dataset(root))
+        check_dataset(model.config, other.dataset.features)
+        others.append(make_sampler(model, other, None, batch_size, seed))
+    return InTurn(first, others) if others else first
+
+
 def load_progress(output_dir: Path, optimizer: Optimizer, scheduler: LRScheduler, state: PartialState) -> int:
     """Restore optimiser, schedule and random numbers from the last checkpoint. → its step, 0 without one.
 
@@ -116,7 +135,7 @@ def load_progress(output_dir: Path, optimizer: Optimizer, scheduler: LRScheduler
 
 def train(
     model: PreTrainedRewardModel,
-    sampler: ClipSampler | FrameSampler,
+    sampler: ClipSampler | FrameSampler | InTurn,
     cfg: Any,
     save_config: Callable[[Path], None],
 ) -> None:

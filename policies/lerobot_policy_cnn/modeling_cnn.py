@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
+from huggingface_hub import ModelCard
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 from torch import Tensor, nn
@@ -22,6 +23,17 @@ CONSTANT_RANGE = 1e-3
 
 STD_MARGIN = 0.01
 """A standard deviation starts at least this share of the way from its bounds: at them it cannot learn."""
+
+UNKNOWN_POLICY = "This is a **cnn** policy trained with [LeRobot](https://github.com/huggingface/lerobot)."
+"""What LeRobot's card says of policies that are not its own."""
+
+SUMMARY = (
+    "A small convolutional policy, fast enough for a CPU: pictures of one or several cameras, the robot's "
+    "state and the instruction in, a Gaussian of one action out. It is cloned by `lerobot-train`; the "
+    "Gaussian's spread is then that of cloning's residuals, and its value network is untrained until "
+    "`lerobot-wmrl-train` improves the policy by reinforcement learning, in a world model or in ManiSkill."
+)
+"""What the card says instead."""
 
 Observation = dict[str, Any]
 
@@ -76,6 +88,12 @@ class CnnPolicy(PreTrainedPolicy):
 
     def reset(self) -> None:
         """Nothing is kept between steps."""
+
+    def generate_model_card(self, *args: Any, **kwargs: Any) -> ModelCard:
+        """LeRobot's card, which says what this policy is."""
+        card = super().generate_model_card(*args, **kwargs)
+        card.text = card.text.replace(UNKNOWN_POLICY, SUMMARY)
+        return card
 
     def forward(self, batch: Observation, reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
         """Cloning: Huber loss of the mean, and the Gaussian's log-likelihood for its std alone. → (), numbers

@@ -71,6 +71,18 @@ def test_lerobot_gets_what_a_policy_is_trained_on() -> None:
         envs.close()
 
 
+def test_a_sub_environment_begins_where_its_seed_in_the_list_says() -> None:
+    """So several that have one seed begin alike; one of them is enough to see it."""
+    env = ManiSkillTensorEnv(WmrlManiSkillEnv(image_size=32), 1, "cpu")
+    try:
+        first, again, other = (env.reset(seed=[seed])[0] for seed in (5, 5, 6))
+    finally:
+        env.close()
+    for name in ("observation.images.third_view", "observation.state"):
+        assert torch.equal(first[name], again[name])
+        assert not torch.equal(first[name], other[name])
+
+
 def test_the_tensor_environment_keeps_the_last_observation_of_an_episode() -> None:
     env = ManiSkillTensorEnv(WmrlManiSkillEnv(episode_length=HORIZON, image_size=64), 1, "cpu")
     try:

@@ -10,6 +10,7 @@ from gymnasium.vector import AutoresetMode
 from lerobot_wmrl.constants import ACTION_HIGH, TASKS
 from lerobot_wmrl.dataset_source import DatasetSource
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
+from lerobot_wmrl.envs.doubt import Doubt
 from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
 from lerobot_wmrl.rewards.configuration_general import GeneralConfig
 from lerobot_wmrl.rewards.similarity import TokenizerSimilarity
@@ -61,6 +62,14 @@ def test_the_same_seed_and_actions_give_the_same_episode(env):
         assert torch.equal(a, b)
 
 
+def test_environments_with_one_seed_begin_alike(env):
+    observation, _ = env.reset(seed=[1_000_003, 1_000_003, 4, 4])
+    for values in (observation[IMAGE], observation[STATE]):
+        assert torch.equal(values[0], values[1])
+        assert torch.equal(values[2], values[3])
+    assert not torch.equal(observation[STATE][0], observation[STATE][2])
+
+
 def test_truncated_at_the_horizon_with_the_final_observation_kept(env):
     env.reset(seed=0)
     always_done(env, torch.zeros(B, dtype=torch.bool))
@@ -74,7 +83,7 @@ def test_truncated_at_the_horizon_with_the_final_observation_kept(env):
     assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
     assert not info["final_info"]["is_success"].any()
     assert info["final_info"]["episode_length"].tolist() == [5] * B
-    starts = env.starts.proprioception[env._start_index]
+    starts = env.starts.now.proprioception[env._start_index]
     assert torch.equal(observation[STATE], starts)
     assert not torch.equal(info["final_obs"][STATE], starts)
 
@@ -94,7 +103,7 @@ def test_done_must_hold_for_k_frames_and_is_paid_once(env):
 def test_goals_that_were_never_reached_are_counted(env):
     """Eq. 6 without a frame that reaches θ: the metric is the share of environments with a reached goal."""
     env.reset(seed=list(range(B)))
-    env.goals = env.goals._replace(reached=torch.arange(len(env.starts.tokens)) % 2 == 0)
+    env.goals = env.goals._replace(reached=torch.arange(len(env.starts)) % 2 == 0)
     *_, info = env.step(torch.zeros(B, 7))
     assert info["reward_parts"]["goal_reached"].tolist() == [True, False, True, False]
 
@@ -111,7 +120,7 @@ def test_goals_are_described_once_and_every_frame_once(config):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(TokenizerSimilarity, "describe", counted)
         env = config.create_tensor_env(B)
-        starts = len(env.starts.tokens)
+        starts = len(env.starts)
         assert sorted(calls) == [starts, starts]
         env.reset(seed=0)
         for _ in range(2 * config.episode_length):
@@ -135,7 +144,7 @@ def test_without_a_dense_part_no_goal_and_no_text_model_is_needed(config):
 def test_starts_can_be_chosen_by_task_and_scene(config):
     def count(**chosen) -> int:
         env = replace(config, dataset=replace(config.dataset, **chosen)).create_tensor_env(1)
-        return len(env.starts.tokens)
+        return len(env.starts)
 
     assert count() == 6
     assert count(scenes=[1], tasks=[TASKS[0]]) == 3
@@ -202,8 +211,8 @@ def test_episodes_begin_in_saved_frames_as_in_those_of_the_dataset(config, env, 
     saved = replace(config, dataset=StartFrames(frames=path, max_starts=4))
     np.savez(path, **whole)
     found = saved.create_tensor_env(2).starts
-    assert torch.equal(found.tokens, env.starts.tokens[:4])
-    assert torch.equal(found.proprioception, env.starts.proprioception[:4])
+    assert torch.equal(found.now.tokens, env.starts.now.tokens[:4])
+    assert torch.equal(found.now.proprioception, env.starts.now.proprioception[:4])
     assert found.instructions == env.starts.instructions[:4]
     for name, value in ((IMAGE, whole[IMAGE][:, :16]), (STATE, whole[STATE][:, :3])):
         np.savez(path, **{**whole, name: value})
@@ -225,7 +234,7 @@ def test_lerobot_eval_gets_an_environment_for_each_task(config, make_synthetic_d
     task = (rows["episode_index"].to_numpy() < 2) * 2
     pq.write_table(rows.set_column(index, rows.schema.field(index), [task]), file)
     envs = replace(config, dataset=StartFrames(root=str(dataset.root))).create_envs(B)["world_model"]
-    assert {task: len(env.env.starts.tokens) for task, env in envs.items()} == {0: 4, 2: 2}
+    assert {task: len(env.env.starts) for task, env in envs.items()} == {0: 4, 2: 2}
     assert envs[0].env.model is envs[2].env.model
 
 
@@ -246,3 +255,56 @@ def test_models_that_do_not_fit_together_are_refused(config, small_dataset, trai
     assert not evaluation.output_dir.exists()
     with pytest.raises(ValueError, match="'text_world_model' is needed"):
         replace(config, text_world_model_path=str(trained_models["action_world_model"])).create_tensor_env(1)
+
+
+def test_episodes_can_begin_after_a_past_that_is_looked_at(config, small_dataset):
+    """From the frame after it, of episodes that are still undecided then; a restart is as a first start."""
+    env = replace(config, dataset=replace(config.dataset, past=3)).create_tensor_env(B)
+    rows = small_dataset.meta.episodes["dataset_from_index"]
+    states = [small_dataset[int(row) + 3][STATE] for row in rows]
+    observation, _ = env.reset(seed=list(range(B)))
+    for state in observation[STATE]:
+        assert any(torch.allclose(state, real) for real in states)
+    always_done(env, torch.tensor([True, False, False, False]))
+    for _ in range(3):
+        env.step(torch.full((B, 7), 0.02))
+    index = env._start_index.tolist()
+    after, *_ = env.step(torch.full((B, 7), 0.01))
+    env.reset(seed=index)
+    alone, *_ = env.step(torch.full((B, 7), 0.01))
+    torch.testing.assert_close(alone[STATE][0], after[STATE][0], atol=1e-5, rtol=1e-4)
+    with pytest.raises(ValueError, match=r"no episode of those that are asked for"):
+        replace(config, dataset=replace(config.dataset, past=500)).create_tensor_env(1)
+    with pytest.raises(ValueError, match=r"--env\.dataset\.past=1: the frames before a start are those of"):
+        replace(config, dataset=StartFrames(resets=1, past=1)).create_tensor_env(1)
+
+
+def doubtful(config, **doubt):
+    """One step of four environments, in which done is certain, as likely as not, unlikely and excluded."""
+    logits = torch.tensor([20.0, 0.0, -2.0, -20.0])
+    env = replace(config, doubt=Doubt(**doubt)).create_tensor_env(B)
+    step = env.model.step
+    env.model.step = lambda *args: step(*args)._replace(done_logit=logits, entropy=torch.arange(4.0))
+    env.reset(seed=0)
+    _, reward, terminated, truncated, info = env.step(torch.zeros(B, 7))
+    return reward, terminated, truncated, info["reward_parts"]
+
+
+def test_what_the_world_model_doubts_ends_or_pays_less(config):
+    surely = replace(config, done_frames=1, done_threshold=0.4)
+    paid, terminated, truncated, parts = doubtful(surely)
+    assert terminated.tolist() == [True, True, False, False]
+    assert not truncated.any()
+    torch.testing.assert_close(parts["done_entropy"], torch.tensor([0, 0.6931, 0.3653, 0]), atol=1e-3, rtol=0)
+    _, terminated, truncated, _ = doubtful(surely, limit=0.5)
+    assert terminated.tolist() == [True, False, False, False]
+    assert truncated.tolist() == [False, True, False, False]
+    less, terminated, truncated, parts = doubtful(surely, limit=0.5, signal="token_entropy", effect="weight")
+    assert terminated.tolist() == [True, True, False, False]
+    assert not truncated.any()
+    assert parts["token_entropy"].tolist() == [0, 1, 2, 3]
+    torch.testing.assert_close(less, paid * torch.tensor([1, 1 / 2, 1 / 4, 1 / 6]))
+    for wrong in ({"limit": 0.0}, {"signal": "mood"}, {"effect": "scold"}):
+        name, value = next(iter(wrong.items()))
+        with pytest.raises(ValueError, match=rf"--env\.doubt\.{name}={value}"):
+            doubtful(config, **wrong)

@@ -5,6 +5,8 @@ from typing import Any
 
 import pytest
 import torch
+from lerobot.configs.default import DatasetConfig
+from lerobot.configs.train import TrainPipelineConfig
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.factory import make_policy, make_pre_post_processors
@@ -12,9 +14,10 @@ from torch import nn
 from torch.distributions import Normal
 
 from lerobot_policy_cnn.configuration_cnn import CnnConfig
-from lerobot_policy_cnn.modeling_cnn import CnnPolicy
+from lerobot_policy_cnn.modeling_cnn import SUMMARY, UNKNOWN_POLICY, CnnPolicy
 from lerobot_policy_cnn.networks import ImageEncoder, InstructionEncoder, random_shift
 from lerobot_policy_cnn.processor_cnn import make_cnn_pre_post_processors
+from tests.hub_server import Hub
 
 IMAGE = "observation.images.third_view"
 
@@ -249,3 +252,20 @@ def test_depth_maps_are_left_out() -> None:
         output_features=build().config.output_features,
     )
     assert CnnPolicy(config).config.input_features == inputs
+
+
+def test_a_published_policy_is_the_trained_one_and_its_card_says_what_it_is(
+    hub: Hub, cloning: tuple[CnnPolicy, Any, Any, dict[str, Any]]
+) -> None:
+    policy, pre, _, batch = cloning
+    policy.config.repo_id = "somebody/cnn"
+    policy.push_model_to_hub(TrainPipelineConfig(DatasetConfig("somebody/data"), policy=policy.config))
+    published = hub.repos["models", "somebody/cnn"].head
+    assert {"config.json", "model.safetensors", "train_config.json", "README.md"} <= published.keys()
+    card = published["README.md"].decode()
+    assert SUMMARY in card
+    assert "somebody/data" in card
+    assert UNKNOWN_POLICY not in card
+    prepared = pre(dict(batch))
+    loaded = CnnPolicy.from_pretrained("somebody/cnn")
+    assert torch.equal(loaded.select_action(prepared), policy.select_action(prepared))

@@ -80,6 +80,16 @@ def test_page_is_self_contained_and_says_the_numbers(finished: DemoConfig) -> No
     assert page.count("data:image/png;base64,") >= 8
 
 
+def test_the_gates_last_warning_is_shown_in_red(finished: DemoConfig) -> None:
+    stages, gate = [stage.name for stage in demo_stages(finished)], finished.output_dir / "rl" / "gate"
+    shown = '<p class="warning">'
+    assert shown not in write_report(finished, stages).read_text()
+    write_json(gate / "000000" / "record.json", {"warning": "most failures are believed"})
+    assert f"{shown}most failures are believed" in write_report(finished, stages).read_text()
+    write_json(gate / "000010" / "record.json", {"warning": None})
+    assert shown not in write_report(finished, stages).read_text()
+
+
 def test_summary_holds_every_headline_number(finished: DemoConfig) -> None:
     write_report(finished, [stage.name for stage in demo_stages(finished)])
     summary = json.loads((finished.output_dir / "summary.json").read_text())

@@ -15,7 +15,8 @@ REACH = 0.15
 class PointEnv(gym.vector.VectorEnv):
     """Move a point, in steps of at most 0.1 a component, to a goal in [-1, 1]²; three components, one idle.
 
-    The state is point and goal (B, 4); with `image_size`, they are drawn as a red and a blue square instead.
+    The state is point and goal (B, 4); with `image_size`, they are drawn as a red and a blue square too.
+    Every sub-environment's episodes follow from its own seed.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
@@ -23,14 +24,16 @@ class PointEnv(gym.vector.VectorEnv):
     def __init__(self, num_envs: int, horizon: int = 15, image_size: int = 0) -> None:
         self.num_envs, self.max_episode_steps, self.image_size = num_envs, horizon, image_size
         self.single_action_space = gym.spaces.Box(-0.1, 0.1, (3,), np.float32)
-        self.generator = torch.Generator()
-        self.seeds: list[int] = []
+        self.generators = [torch.Generator() for _ in range(num_envs)]
 
-    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
-        if seed is not None:
-            self.generator.manual_seed(seed)
-            self.seeds.append(seed)
-        self.state, self.elapsed = self._draw(), torch.zeros(self.num_envs, dtype=torch.long)
+    def reset(
+        self, *, seed: int | list[int] | None = None, options: Any = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        seeds = range(seed, seed + self.num_envs) if isinstance(seed, int) else seed or []
+        for generator, own in zip(self.generators, seeds, strict=False):
+            generator.manual_seed(own)
+        self.state, self.elapsed = torch.zeros(self.num_envs, 4), torch.zeros(self.num_envs, dtype=torch.long)
+        self._restart(torch.ones(self.num_envs, dtype=torch.bool))
         return self._observe(), {}
 
     def step(self, action: Tensor) -> tuple[dict[str, Any], Tensor, Tensor, Tensor, dict[str, Any]]:
@@ -45,29 +48,28 @@ class PointEnv(gym.vector.VectorEnv):
         if finished.any():
             info["final_obs"] = self._observe()
             info["final_info"] = {"is_success": terminated, "episode_length": self.elapsed.clone()}
-            self.state = torch.where(finished[:, None], self._draw(), self.state)
-            self.elapsed = self.elapsed.masked_fill(finished, 0)
+            self._restart(finished)
         return self._observe(), reward, terminated, truncated, info
 
     def close_extras(self, **kwargs: Any) -> None:
         """Nothing to release."""
 
-    def _draw(self) -> Tensor:
-        return torch.rand(self.num_envs, 4, generator=self.generator) * 1.6 - 0.8
+    def _restart(self, rows: Tensor) -> None:
+        for row in rows.nonzero()[:, 0].tolist():
+            self.state[row] = torch.rand(4, generator=self.generators[row]) * 1.6 - 0.8
+        self.elapsed = self.elapsed.masked_fill(rows, 0)
 
     def _distance(self) -> Tensor:
         return (self.state[:, :2] - self.state[:, 2:]).norm(dim=1)
 
     def _observe(self) -> dict[str, Any]:
-        task = ["reach the blue square"] * self.num_envs
+        seen = {"observation.state": self.state.clone(), "task": ["reach the blue square"] * self.num_envs}
         if not self.image_size:
-            return {"observation.state": self.state.clone(), "task": task}
+            return seen
         size = self.image_size
         centres = ((self.state + 1) / 2 * (size - 1)).view(-1, 2, 2)
         axis = torch.arange(size)
         near = (centres[..., None] - axis).abs() <= 2
         square = (near[:, :, 1, :, None] & near[:, :, 0, None, :]).float()
-        return {
-            "observation.images.third_view": square[:, [0, 0, 1]] * torch.tensor([1.0, 0, 1])[:, None, None],
-            "task": task,
-        }
+        image = square[:, [0, 0, 1]] * torch.tensor([1.0, 0, 1])[:, None, None]
+        return {**seen, "observation.images.third_view": image}

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_wmrl.rl.advantages import generalised_advantages, normalised
+from lerobot_wmrl.rl.advantages import generalised_advantages, group_advantages, normalised
 
 GAMMA, LAMBDA = 0.97, 0.95
 STEPS, ENVS = 17, 5
@@ -60,6 +60,21 @@ def test_nothing_leaks_from_the_next_episode() -> None:
 
 
 def test_normalised_advantages() -> None:
-    advantages = normalised(torch.randn(40, 8) * 7 + 3)
+    given, chosen = torch.randn(40, 8) * 7 + 3, torch.rand(40, 8) < 0.7
+    given[~chosen] = 1e6
+    advantages = normalised(given, chosen)[chosen]
     assert advantages.mean().abs() < 1e-5
     assert abs(advantages.std().item() - 1) < 1e-4
+
+
+def test_group_advantages_are_of_the_group_not_of_the_batch() -> None:
+    """An easy start's worst episode is below 0, a hard start's best above, whatever the other group did."""
+    returns = torch.tensor([[0.9, 1.0, 1.1, 1.0], [0.0, 0.2, 0.0, 0.0], [1.0, 1.0, 1.0, 1.0]])
+    advantages, signal = group_advantages(returns, 0.05)
+    assert signal.tolist() == [True, True, False]
+    assert advantages.mean(dim=1).abs().max() < 1e-6
+    assert torch.allclose(advantages[:2].std(dim=1, correction=0), torch.ones(2))
+    assert advantages[0, 0] < 0 < advantages[1, 1]
+    assert (advantages[2] == 0).all()
+    by_hand = (returns[0] - 1) / returns[0].std(correction=0)
+    assert torch.allclose(advantages[0], by_hand, atol=1e-5)

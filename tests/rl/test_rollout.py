@@ -5,10 +5,13 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
+from lerobot_wmrl.rl.minibatches import make_minibatches, read_steps
+from lerobot_wmrl.rl.observations import ObservationBuffer
 from lerobot_wmrl.rl.protocol import Pipeline
-from lerobot_wmrl.rl.rollout import ObservationBuffer, RolloutBuffer, collect
+from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
 from tests.rl.point_env import PointEnv
 
 HORIZON = 6
@@ -91,7 +94,8 @@ def test_minibatches_visit_every_step_once_an_epoch(
 ) -> None:
     _, buffer, _ = filled(make_policy(), pipeline)
     buffer.columns = {"row": torch.arange(20 * 16).view(20, 16)}
-    rows = torch.cat([batch["row"] for batch in buffer.minibatches(50, 2, pipeline)])
+    batches = make_minibatches(buffer, buffer.decided, pipeline, 50, None, 2)
+    rows = torch.cat([steps["row"] for batch in batches for steps in batch.passes])
     assert torch.equal(rows.sort().values, torch.arange(320).repeat_interleave(2))
 
 
@@ -101,6 +105,58 @@ def test_actions_keep_their_values(make_policy: Callable[..., CnnPolicy], pipeli
     _, buffer, _ = filled(policy, pipeline, image_size=0)
     assert buffer.raw_action.dtype == buffer.log_prob.dtype == torch.float32
     assert (buffer.raw_action.abs() > 1).any()
-    batch = buffer.minibatch(torch.arange(320), pipeline)
+    batch = read_steps(buffer, torch.arange(320), pipeline)
     log_prob = policy.evaluate(batch["observation"], batch["raw_action"])[0]
     assert torch.allclose(log_prob, batch["log_prob"], atol=1e-5)
+
+
+def test_a_rollout_is_its_seed_s_and_leaves_other_random_numbers_alone(
+    make_policy: Callable[..., CnnPolicy], pipeline: Pipeline
+) -> None:
+    policy = make_policy()
+    torch.manual_seed(1)
+    expected = torch.rand(3)
+    torch.manual_seed(1)
+    _, first, _ = filled(policy, pipeline)
+    assert torch.equal(torch.rand(3), expected)
+    _, again, _ = filled(policy, pipeline)
+    assert torch.equal(first.raw_action, again.raw_action)
+    other = RolloutBuffer(20, 16, "cpu")
+    collect(Recorder(16, horizon=HORIZON), policy, pipeline, other, seed=4)
+    here = torch.arange(16)
+    noise, other_noise = (
+        each.raw_action[0] - policy.select_action(each.observations.read(here)) for each in (first, other)
+    )
+    assert not torch.allclose(noise, other_noise, atol=1e-3)
+
+
+class StillEnv(PointEnv):
+    """Episodes never end, and nothing is asked of the device."""
+
+    def step(self, action: Tensor) -> Any:
+        never = torch.zeros(self.num_envs, dtype=torch.bool)
+        return self._observe(), action.sum(dim=1), never, never, {"reward_parts": {"success": never}}
+
+
+class ReadBacks(TorchDispatchMode):
+    """Counts how often a number is fetched from a tensor, for which a device would have to be waited for."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = 0
+
+    def __torch_dispatch__(self, function: Any, types: Any, arguments: Any = (), named: Any = None) -> Any:
+        self.count += function in (torch.ops.aten._local_scalar_dense.default, torch.ops.aten.nonzero.default)
+        return function(*arguments, **(named or {}))
+
+
+def test_no_step_of_a_rollout_waits_for_the_device(
+    make_policy: Callable[..., CnnPolicy], pipeline: Pipeline
+) -> None:
+    policy, counts = make_policy(), []
+    for steps in (3, 30):
+        buffer = RolloutBuffer(steps, 4, "cpu")
+        with ReadBacks() as found:
+            collect(StillEnv(4), policy, pipeline, buffer, 0)
+        counts.append(found.count)
+    assert counts[0] == counts[1] > 0

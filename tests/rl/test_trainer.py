@@ -9,7 +9,8 @@ import torch
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_wmrl.constants import EVALUATION_SEED
 from lerobot_wmrl.rl.configuration_ppo import PPOConfig
-from lerobot_wmrl.rl.ppo import PPO, TrainingStopped
+from lerobot_wmrl.rl.policy_gradient import TrainingStopped
+from lerobot_wmrl.rl.ppo import PPO
 from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer
 from lerobot_wmrl.rl.trainer import Schedule, rollout_seed, train
@@ -44,7 +45,7 @@ def run(policy: CnnPolicy, pipeline: Pipeline, output_dir: Path, env: PointEnv, 
     """The trainer as the command calls it, from a fixed seed and the same initial policy."""
     output_dir.mkdir(exist_ok=True)
     torch.manual_seed(7)
-    algorithm = PPO(policy, PPOConfig(value_iterations=1, minibatch_size=32, policy_lr=1e-3))
+    algorithm = PPO(policy, PPOConfig(value_iterations=1, value_normalisation=True, minibatch_size=32))
     buffer = RolloutBuffer(6, env.num_envs, "cpu")
     train(env, algorithm, pipeline, buffer, Schedule(iterations, 1, 0), output_dir, policy.save_pretrained)
     return algorithm

@@ -9,6 +9,7 @@ import pytest
 
 from lerobot_dataset_maniskill.record import main as record
 from lerobot_wmrl.maniskill import renderer
+from lerobot_wmrl.scripts.convert_openvla import main as convert_openvla
 from lerobot_wmrl.scripts.demo import main as demo
 from lerobot_wmrl.scripts.eval_world_model import main as eval_world_model
 from lerobot_wmrl.scripts.train import main as train
@@ -19,6 +20,8 @@ Command = Callable[[], None]
 REPLAY = ["--model.path={action_world_model}", "--dataset.root={data}"]
 SIMULATOR = ["--env.type=wmrl_maniskill"]
 TRAIN = ["--dataset.root={data}", "--model.type=frame_tokenizer", "--model.image_size=32"]
+NEW = "--target={foreign}/new"
+IMPORT = ["--direction=import", "--source={policy}"]
 ROLL_OUT = ["--policy.path={policy}", *SIMULATOR, "--num_episodes=1"]
 
 
@@ -39,6 +42,11 @@ ROLL_OUT = ["--policy.path={policy}", *SIMULATOR, "--num_episodes=1"]
     (eval_world_model, [*REPLAY, "--output_dir={foreign}"], "foreign holds something else"),
     (eval_world_model, ["--model.path={frame_tokenizer}", "--dataset.root={data}"], "action_world_model"),
     (eval_world_model, [*REPLAY, "--max_episodes=0"], "--max_episodes=0: must be at least 1"),
+    (convert_openvla, ["--direction=sideways", NEW], "--direction=sideways: choose one of import"),
+    (convert_openvla, ["--direction=import", NEW], "--source: give the checkpoint to convert"),
+    (convert_openvla, [*IMPORT, "--target={foreign}"], "foreign: choose a new folder"),
+    (convert_openvla, [*IMPORT, NEW], "policy: tokenizer.json is missing beside"),
+    (convert_openvla, ["--direction=export", "--source={policy}", NEW], "of type cnn"),
     (demo, ["--preset=huge"], "--preset=huge: unknown preset"),
     (demo, ["--stage_preset=huge"], "--preset=huge: unknown preset"),
     (demo, ["--output_dir={foreign}"], "holds something that is not a demo"),
@@ -58,7 +66,7 @@ def test_bad_input_is_one_line_and_changes_nothing(
     }
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
     given = [flag.format(**paths, **trained_models) for flag in flags]
-    if not any(flag.startswith("--output_dir") for flag in given):
+    if not any(flag.startswith(("--output_dir", "--target")) for flag in given):
         given.append(f"--output_dir={tmp_path / 'new'}")
     assert message in error_of(command, given, monkeypatch, capfd)
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before

@@ -3,11 +3,14 @@ import pytest
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_wmrl.demo.stages import DemoConfig
+from lerobot_wmrl.scripts.convert_openvla import ConvertOpenVLAConfig
 from lerobot_wmrl.scripts.eval_world_model import EvalWorldModelConfig
 from lerobot_wmrl.scripts.train import TrainConfig
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig
 
-CONFIGS = (RecordConfig, DemoConfig, EvalWorldModelConfig, TrainConfig, TrainWorldModelConfig)
+CONFIGS = (
+    RecordConfig, DemoConfig, EvalWorldModelConfig, TrainConfig, TrainWorldModelConfig, ConvertOpenVLAConfig,
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("config", CONFIGS)

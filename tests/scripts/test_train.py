@@ -14,6 +14,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import EnvConfig
 from safetensors.torch import load_file
 
+from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 from lerobot_wmrl.scripts.train import TrainConfig, check_config, main, rollout_length
 from lerobot_wmrl.tracking import read_metrics
 from tests.rl.checkpoints import save_untrained_policy
@@ -109,6 +110,23 @@ def test_an_interrupted_training_ends_as_if_nothing_had_happened(
     assert all(torch.equal(tensor, continued[name]) for name, tensor in uninterrupted.items())
 
 
+def test_grpo_trains_by_the_same_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    policy, output_dir = save_untrained_policy(tmp_path / "policy"), tmp_path / "rl"
+    flags = [
+        f"--policy.path={policy}",
+        *POINT,
+        f"--output_dir={output_dir}",
+        "--iterations=2",
+        "--num_envs=8",
+    ]
+    grpo = ["--algorithm.type=grpo", "--algorithm.group_size=4", "--algorithm.least_group_std=1e-3"]
+    improve(monkeypatch, *flags, *grpo)
+    lines = read_metrics(output_dir)
+    assert [line["step"] for line in lines] == [1, 2]
+    assert all(line["updates"] > 0 and line["groups_with_signal"] == 1 for line in lines)
+    assert "value_loss" not in lines[0]
+
+
 def test_a_finished_training_of_something_else_is_refused(
     cloned: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -141,6 +159,7 @@ def test_bad_input_is_named_and_nothing_is_written(
 @pytest.mark.parametrize(("settings", "message"), [
     ({"env": None}, r"--env\.type"), ({"num_envs": 0}, "--num_envs=0"), ({"seed": -1}, "--seed=-1"),
     ({"seed": 1_000_000}, "--seed=1000000"),
+    ({"num_envs": 12, "algorithm": GRPOConfig(group_size=8)}, r"--num_envs=12: must be a multiple of"),
 ])  # fmt: skip
 def test_impossible_settings_are_named(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):

@@ -180,7 +180,7 @@ def test_frames_done_and_state_are_learnt_though_few_frames_are_drawn():
     steps = imagine(model.eval(), clip)
     assert torch.equal(over_time(steps, "done_logit") > 0, clip.done > 0.5)
     assert (over_time(steps, "tokens")[:, :-1] == clip.tokens[:, 1:]).float().mean() > 0.9
-    assert (over_time(steps, "proprioception")[:, :-1] - clip.state[:, 1:]).abs().mean() < 0.02
+    assert (over_time(steps, "proprioception")[:, :-1] - clip.state[:, 1:]).abs().mean() < 0.03
 
 
 def test_rows_are_drawn_among_those_with_a_valid_next_one():

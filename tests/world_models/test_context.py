@@ -145,7 +145,7 @@ def test_environments_decode_beside_their_own_start_also_after_a_restart(models,
     )  # fmt: skip
     env = config.create_tensor_env(4)
     starts = env.starts
-    assert len(starts.context) == len(starts.tokens)
+    assert len(starts.context) == len(starts)
     env.reset(seed=0)
     before = env._start_index.clone()
     for step in range(4):

@@ -1,45 +1,14 @@
 """Trained models on a hub on the loopback: published by the commands, file by file, and used from there."""
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
-import httpx
 import pytest
 import torch
-from huggingface_hub import constants, set_client_factory
-from huggingface_hub.utils._http import default_client_factory
 from lerobot.rewards.factory import get_reward_model_class
 
 from lerobot_wmrl.world_models.checkpoint import load_model
-from tests.hub_server import WRITE_TOKEN, Hub, running_hub
 from tests.trained import action_config, run_training, text_config, tokenizer_config
-
-
-class ToLoopback(httpx.HTTPTransport):
-    """Brings what is for the hub that the client knows to the one on the loopback."""
-
-    def __init__(self, url: str) -> None:
-        super().__init__()
-        self.target = httpx.URL(url)
-
-    def handle_request(self, request: httpx.Request) -> httpx.Response:
-        path = request.url.raw_path
-        request.url = self.target.copy_with(raw_path=path)
-        return super().handle_request(request)
-
-
-@pytest.fixture
-def hub(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Hub]:
-    """LeRobot publishes at one address only; large files go as LFS, which the hub here speaks."""
-    with running_hub() as hub:
-        mounts, hub.url = {constants.ENDPOINT: ToLoopback(hub.url)}, constants.ENDPOINT
-        set_client_factory(lambda: httpx.Client(mounts=mounts, follow_redirects=True))
-        monkeypatch.setattr(constants, "HF_HUB_DISABLE_XET", True)
-        monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
-        monkeypatch.setenv("HF_TOKEN", WRITE_TOKEN)
-        yield hub
-        set_client_factory(default_client_factory)
 
 
 @pytest.mark.parametrize("name", ["frame_tokenizer", "action_world_model", "text_world_model"])

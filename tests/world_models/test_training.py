@@ -10,18 +10,18 @@ from lerobot.configs.rewards import RewardModelConfig
 from lerobot.rewards.factory import make_reward_model
 from safetensors.torch import load_file
 
-from lerobot_wmrl.dataset_source import DatasetSource
+from lerobot_wmrl.dataset_source import DatasetSource, TrainingData
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.presets import PRESETS, preset_flags
 from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig
 from lerobot_wmrl.tracking import read_metrics
 from lerobot_wmrl.world_models.checkpoint import load_model
-from lerobot_wmrl.world_models.clips import ClipSampler
+from lerobot_wmrl.world_models.clips import ClipSampler, InTurn
 from lerobot_wmrl.world_models.episode_table import golden_episodes, read_episodes
 from lerobot_wmrl.world_models.frame_cache import cached_frames, cached_tokens
 from lerobot_wmrl.world_models.temporal_memory import ClipMemory
-from lerobot_wmrl.world_models.training import make_sampler
+from lerobot_wmrl.world_models.training import make_joint_sampler, make_sampler
 from tests.trained import action_config, run_training, text_config, tokenizer_config, train_tokenizer
 
 WEIGHTS = "checkpoints/last/pretrained_model/model.safetensors"
@@ -79,6 +79,21 @@ def test_only_chosen_episodes_are_learnt_from(small_dataset, trained_models):
     model = load_model(trained_models["action_world_model"], "action_world_model")
     assert make_sampler(model, table, [1, 3], batch_size=2, seed=0).episodes.tolist() == [1, 3]
     assert make_sampler(model, table, None, batch_size=2, seed=0).episodes.tolist() == list(range(6))
+
+
+def test_every_second_batch_is_of_a_further_dataset(small_dataset, trained_models):
+    table, root = read_episodes(small_dataset), str(small_dataset.root)
+    model = load_model(trained_models["action_world_model"], "action_world_model")
+    alone = make_sampler(model, table, [1, 3], batch_size=2, seed=0)
+    data = TrainingData(root, episodes=[1, 3], more=[root, root])
+    joint = make_joint_sampler(model, table, data, batch_size=2, seed=0)
+    every = make_sampler(model, table, None, batch_size=2, seed=0)
+    for step in (0, 2, 4):
+        assert torch.equal(joint(step).action, alone(step).action)
+    for step in (1, 3, 5):
+        assert torch.equal(joint(step).action, every(step).action)
+    data = TrainingData(root, episodes=[1, 3])
+    assert not isinstance(make_joint_sampler(model, table, data, batch_size=2, seed=0), InTurn)
 
 
 def test_cached_frames_are_those_of_the_dataset(small_dataset):

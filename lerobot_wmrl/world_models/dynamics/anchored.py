@@ -67,7 +67,7 @@ class AnchoredDynamics:
             return step_ahead(model, tokens, state, actions, context, depth, generator)
         digits, first = network.codebook.digits(tokens), model.normalize_state(state)
         last = torch.full((len(tokens), 1), length - 1, device=tokens.device)
-        with compute_in(imagination_dtype(tokens.device), tokens.device):
+        with compute_in(imagination_dtype(tokens.device, len(tokens)), tokens.device):
             prediction = network(
                 digits[:, None], first[:, None], *model.encode_actions(actions), length=length, frames=last,
                 context=context,

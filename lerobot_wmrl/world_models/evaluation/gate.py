@@ -130,10 +130,25 @@ def success_gate(
     model: ActionWorldModelRewardModel, dataset_root: str | Path, threshold: float = 0.5, frames: int = 3
 ) -> Gate:
     """Replay every episode of a dataset of real rollouts and count. ValueError if the model cannot."""
+    return gate_at(attempted(model, rollouts_for(model, dataset_root)), threshold, frames)
+
+
+def rollouts_for(model: ActionWorldModelRewardModel, dataset_root: str | Path) -> Source:
+    """A dataset of real rollouts to ask the model about. ValueError if it cannot replay them, or nobody knows
+    which of them succeeded."""
     table = read_episodes(open_dataset(dataset_root))
     check_dataset(model.config, table.dataset.features)
-    source = Source(table, cached_frames(table.dataset, model.config.camera_keys))
-    return gate_at(Outcomes.of(judged_episodes(model, source)).attempts(table), threshold, frames)
+    if "next.done" not in table.dataset.features:
+        raise ValueError(
+            f"dataset.root={dataset_root}: has no next.done, which says whether success holds; use rollouts "
+            "with labels"
+        )
+    return Source(table, cached_frames(table.dataset, model.config.camera_keys))
+
+
+def attempted(model: ActionWorldModelRewardModel, source: Source) -> Outcomes:
+    """What the model makes of all episodes but play."""
+    return Outcomes.of(judged_episodes(model, source)).attempts(source.table)
 
 
 def judged_episodes(model: ActionWorldModelRewardModel, source: Source) -> Iterator[Judged]:

@@ -1,0 +1,88 @@
+"""The callbacks that a training's settings ask for."""
+
+import logging
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from lerobot.envs.configs import EnvConfig
+
+from lerobot_wmrl.constants import SELECTION_SEED
+from lerobot_wmrl.envs.configuration_world_model import StartFrames
+from lerobot_wmrl.envs.policy_success import evaluate_policy, evaluate_within
+from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv, success_env
+from lerobot_wmrl.rl.callbacks import Callback
+from lerobot_wmrl.rl.configuration_callbacks import CallbackSettings
+from lerobot_wmrl.rl.dyna import DynaRounds, round_iterations
+from lerobot_wmrl.rl.gate import SuccessGate
+from lerobot_wmrl.rl.recording import RolloutRecorder
+from lerobot_wmrl.rl.selection import IMAGINED, REAL, Measure, Selection
+
+
+class Trained(NamedTuple):
+    """What is trained, and where: a policy with its processors, in `env`, made from `config`."""
+
+    policy: Any
+    processors: tuple[Any, Any]
+    env: Any
+    config: EnvConfig
+
+
+def make_callbacks(
+    settings: CallbackSettings, trained: Trained, output_dir: Path, iterations: int
+) -> list[Callback]:
+    """In the order in which they run: what renews the world model, what judges it, what judges policies."""
+    callbacks: list[Callback] = []
+    if isinstance(trained.env, WorldModelVectorEnv):
+        recorder = make_recorder(settings, trained.env)
+        if settings.dyna.rounds:
+            learnt, elsewhere = settings.learnt(trained.config), settings.dyna.dataset.roots is not None
+            callbacks.append(DynaRounds(
+                settings.dyna, trained.env, None if elsewhere else recorder, learnt, output_dir, iterations
+            ))  # fmt: skip
+        if settings.gate.action != "off":
+            refreshed = frozenset(round_iterations(settings.dyna.rounds, iterations))
+            callbacks.append(SuccessGate(settings.gate, trained.env, recorder, refreshed, iterations))
+    if settings.selection.freq:
+        measures = make_measures(settings, trained)
+        callbacks.append(Selection(settings.selection.freq, iterations, measures, output_dir))
+    return callbacks
+
+
+def make_recorder(settings: CallbackSettings, env: WorldModelVectorEnv) -> RolloutRecorder | None:
+    """Records what the policy sees and what the world model looks at; None without a simulator."""
+    simulator, model = settings.simulator, env.model.config
+    if simulator is None:
+        return None
+    cameras = list(dict.fromkeys([*simulator.cameras, *model.cameras]))
+    return RolloutRecorder(simulator, settings.real_num_envs, cameras, model.depth)
+
+
+def make_measures(settings: CallbackSettings, trained: Trained) -> dict[str, Measure]:
+    """Success where it can be measured: in `real_env`, and in the training's environment, which is imagined
+    or, being a simulator, as real as it gets."""
+    policy, processors, env, config = trained
+    episodes, dataset = settings.selection.n_episodes, settings.selection.dataset
+    measures: dict[str, Measure] = {}
+    if settings.real_env is not None:
+        measures[REAL] = partial(
+            evaluate_policy, settings.real_env, policy, processors, episodes, SELECTION_SEED,
+            settings.real_num_envs,
+        )  # fmt: skip
+
+    def within() -> Any:
+        place = env
+        if dataset.root and isinstance(env, WorldModelVectorEnv):
+            place = success_env(env, StartFrames(dataset.root, dataset.repo_id))
+        return evaluate_within(place, config, policy, processors, episodes, SELECTION_SEED)
+
+    if isinstance(env, WorldModelVectorEnv):
+        measures[IMAGINED] = within
+    elif REAL not in measures:
+        measures[REAL] = within
+    if REAL not in measures:
+        logging.warning(
+            "selection: without --real_env.type the best checkpoint is the one that succeeds most often in "
+            "imagination; nothing real is measured"
+        )
+    return measures

@@ -1,0 +1,113 @@
+"""lerobot-wmrl-convert-openvla: OpenVLA's checkpoints to LeRobot's format and back.
+
+    lerobot-wmrl-convert-openvla --direction=import --source=openvla/openvla-7b --unnorm_key=bridge_orig \\
+        --target=outputs/openvla
+    lerobot-wmrl-convert-openvla --direction=export --source=outputs/sft --target=outputs/openvla-sft
+
+The import gives a folder for `--policy.path` of lerobot-train, lerobot-eval and lerobot-wmrl-train. The
+export takes what they write, merges adapters into the weights, and gives a folder that OpenVLA's own code
+loads.
+Weights keep their number format; there and back again they are equal bit by bit.
+"""
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from lerobot_wmrl.command import RunConfig, run_command
+from lerobot_wmrl.files import foreign_files, writing
+
+DIRECTIONS = ("import", "export")
+
+
+@dataclass
+class ConvertOpenVLAConfig(RunConfig):
+    """Convert a checkpoint of OpenVLA.
+
+    Args:
+        direction: `import`, from OpenVLA's format to LeRobot's, or `export`, the reverse.
+        source: a checkpoint's folder, for the export also the output folder of a training, or a hub id.
+        target: a new folder.
+        unnorm_key: of the import: the dataset whose statistics turn tokens into actions. Without it, a
+            checkpoint that knows several can be fine-tuned, which brings statistics of its own, not run.
+    """
+
+    direction: str = ""
+    source: str = ""
+    target: Path | None = None
+    unnorm_key: str | None = None
+
+
+def convert(cfg: ConvertOpenVLAConfig) -> None:
+    """Check what is asked for, then write the target folder whole or not at all."""
+    if cfg.direction not in DIRECTIONS:
+        raise ValueError(f"--direction={cfg.direction}: choose one of {', '.join(DIRECTIONS)}")
+    if not cfg.source:
+        raise ValueError("--source: give the checkpoint to convert")
+    if cfg.target is None or cfg.target.is_file() or foreign_files(cfg.target):
+        raise ValueError(f"--target={cfg.target or ''}: choose a new folder")
+    if cfg.direction == "export" and cfg.unnorm_key is not None:
+        raise ValueError("--unnorm_key: the export keeps all statistics; leave it out")
+    write = importer(cfg.source, cfg.unnorm_key) if cfg.direction == "import" else exporter(cfg.source)
+    with writing("target", cfg.target):
+        write_whole(cfg.target, write)
+    print(f"{cfg.target}: written")
+
+
+def importer(source: str, unnorm_key: str | None) -> Callable[[Path], None]:
+    """Load OpenVLA's checkpoint. → what writes LeRobot's"""
+    from lerobot_policy_openvla.modeling_openvla import OpenVLAPolicy
+    from lerobot_policy_openvla.processor_openvla import make_openvla_pre_post_processors
+
+    policy = OpenVLAPolicy.from_openvla(source, unnorm_key=unnorm_key, as_stored=True)
+    processors = make_openvla_pre_post_processors(policy.config)
+    policy.config.device = None  # whoever loads it chooses
+
+    def write(folder: Path) -> None:
+        for part in (policy, *processors):
+            part.save_pretrained(folder)
+
+    return write
+
+
+def exporter(source: str) -> Callable[[Path], None]:
+    """Load LeRobot's checkpoint. → what writes OpenVLA's. ValueError if it is of another policy."""
+    from lerobot_policy_openvla.modeling_openvla import OpenVLAPolicy
+    from lerobot_policy_openvla.openvla_export import write_openvla
+    from lerobot_wmrl.adapters import load_with_adapters
+    from lerobot_wmrl.policy_checkpoints import read_policy_config
+
+    config = read_policy_config(source, [])
+    if config.type != OpenVLAPolicy.name:
+        raise ValueError(f"--source={source}: a policy of type {config.type}, not {OpenVLAPolicy.name}")
+    if config.use_peft:
+        policy = load_with_adapters(config, as_stored=True).merge_and_unload()
+    else:
+        policy = OpenVLAPolicy.from_pretrained(str(config.pretrained_path), config=config, as_stored=True)
+
+    def write(folder: Path) -> None:
+        weights = policy.model.state_dict()
+        write_openvla(folder, weights, config.sizes, policy.files, config.norm_stats)
+
+    return write
+
+
+def write_whole(target: Path, write: Callable[[Path], None]) -> None:
+    """Let `write` fill a folder beside the target, then rename it."""
+    partial = target.with_name(f".{target.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    write(partial)
+    if target.exists():
+        target.rmdir()
+    partial.rename(target)
+
+
+def main() -> None:
+    """Entry point of the console command."""
+    run_command(convert, ConvertOpenVLAConfig, list)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,122 @@
+"""Configuration of OpenVLA, `--policy.type=openvla`."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from lerobot.configs import PreTrainedConfig
+from lerobot.configs.types import FeatureType, NormalizationMode, PolicyFeature
+from lerobot.optim import AdamWConfig, LRSchedulerConfig
+from lerobot.utils.constants import ACTION
+
+from lerobot_policy_openvla.sizes import Sizes
+
+DTYPES = ("auto", "float32", "bfloat16")
+
+
+@PreTrainedConfig.register_subclass("openvla")
+@dataclass
+class OpenVLAConfig(PreTrainedConfig):
+    """One action, as tokens, from one picture and the instruction.
+
+    A checkpoint of OpenVLA brings its sizes and statistics along (`lerobot-wmrl-convert-openvla`); without
+    one, a model of `sizes` starts from random weights.
+
+    Args:
+        sizes: of the vision transformers, the projector and the Llama.
+        camera: the picture it sees, by its full name, `observation.images.third_view`; needed only where
+            there are several.
+        unnorm_key: the dataset whose statistics turn normalised actions into the robot's; set by the import
+            and by fine-tuning, together with the processors.
+        norm_stats: 1st and 99th percentile and mask of the actions of every dataset it knows.
+        dtype: what the network computes in: `auto` is bfloat16 on a GPU that multiplies in it, else float32.
+            Adapters and the value head stay in float32.
+        temperature: by which logits are divided in sampling, and in the log-probabilities of samples.
+        value_sizes: hidden layers of the value head (RL4VLA's, Liu et al. 2025).
+        gradient_checkpointing: recompute activations instead of keeping them: less memory, a third more time.
+        optimizer_lr, optimizer_weight_decay, optimizer_grad_clip_norm: of fine-tuning by lerobot-train.
+    """
+
+    sizes: Sizes = field(default_factory=Sizes)
+    camera: str | None = None
+    unnorm_key: str | None = None
+    norm_stats: dict[str, Any] = field(default_factory=dict)
+    dtype: str = "auto"
+    temperature: float = 1.0
+    value_sizes: list[int] = field(default_factory=lambda: [512, 128])
+    gradient_checkpointing: bool = False
+    optimizer_lr: float = 5e-4
+    optimizer_weight_decay: float = 0.0
+    optimizer_grad_clip_norm: float = 1.0
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: {
+            "VISUAL": NormalizationMode.IDENTITY,
+            "STATE": NormalizationMode.IDENTITY,
+            "ACTION": NormalizationMode.QUANTILES,
+        }
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.dtype not in DTYPES:
+            raise ValueError(f"policy.dtype={self.dtype}: choose one of {', '.join(DTYPES)}")
+        if self.temperature <= 0:
+            raise ValueError(f"policy.temperature={self.temperature}: must be above 0")
+        if self.n_obs_steps != 1:
+            raise ValueError(f"n_obs_steps={self.n_obs_steps}: this policy sees one observation, set it to 1")
+
+    @property
+    def action_size(self) -> int:
+        """Action tokens a step. ValueError while nothing says how many, or what they mean."""
+        undecided = self.unnorm_key is None and bool(self.norm_stats)
+        if self.action_feature is None or undecided:
+            known = ", ".join(sorted(self.norm_stats)) or "none"
+            raise ValueError(
+                "policy.unnorm_key: whose statistics turn tokens into actions? Import the checkpoint with "
+                f"--unnorm_key, one of: {known}; or fine-tune it on a dataset"
+            )
+        return self.action_feature.shape[0]
+
+    def validate_features(self) -> None:
+        """Keep the one camera that is looked at. ValueError if there are several and none is named.
+
+        Depth maps, pictures of one channel, and the state are left out: OpenVLA does not see them.
+        """
+        cameras = {key: feature for key, feature in self.image_features.items() if feature.shape[0] == 3}
+        names = ", ".join(sorted(cameras)) or "none"
+        if self.camera is not None and cameras and self.camera not in cameras:
+            raise ValueError(f"policy.camera={self.camera}: no such camera; choose one of {names}")
+        if self.camera is None and len(cameras) > 1:
+            raise ValueError(f"policy.camera: the policy sees one of several cameras, name it: {names}")
+        inputs = self.input_features or {}
+        if inputs and not cameras:
+            raise ValueError(f"input_features={sorted(inputs)}: needs a camera")
+        for key in [key for key in inputs if key not in cameras or self.camera not in (None, key)]:
+            del inputs[key]
+        self._validate_action()
+
+    def _validate_action(self) -> None:
+        action: PolicyFeature | None = self.action_feature
+        if action is not None and (action.type is not FeatureType.ACTION or len(action.shape) != 1):
+            raise ValueError(f"output_features={self.output_features}: needs `{ACTION}` with one dimension")
+
+    def get_optimizer_preset(self) -> AdamWConfig:
+        return AdamWConfig(
+            lr=self.optimizer_lr,
+            weight_decay=self.optimizer_weight_decay,
+            grad_clip_norm=self.optimizer_grad_clip_norm,
+        )
+
+    def get_scheduler_preset(self) -> LRSchedulerConfig | None:
+        return None
+
+    @property
+    def observation_delta_indices(self) -> None:
+        return None
+
+    @property
+    def action_delta_indices(self) -> None:
+        return None
+
+    @property
+    def reward_delta_indices(self) -> None:
+        return None

@@ -1,0 +1,142 @@
+"""Instructions as token ids. B batch, L tokens."""
+
+import json
+from collections.abc import Sequence
+from typing import Final
+
+import torch
+from tokenizers import (
+    AddedToken,
+    Tokenizer,
+    decoders,
+    models,
+    normalizers,
+    pre_tokenizers,
+    processors,
+    trainers,
+)
+from torch import Tensor
+
+from lerobot_policy_openvla.action_tokens import BINS
+
+PROMPT: Final = "In: What action should the robot take to {instruction}?\nOut:"
+SPACE: Final = "▁"
+UNKNOWN, BEGIN, END, PAD = "<unk>", "<s>", "</s>", "<PAD>"
+BEGIN_ID, END_ID = 1, 2
+BYTES: Final = tuple(f"<0x{value:02X}>" for value in range(256))
+ACTION_CHARACTERS: Final = range(0x4E00, 0x4E00 + BINS)
+"""Rare characters, as Llama's last 256 tokens are: 256 of the CJK ideographs."""
+
+
+class PromptTokenizer:
+    """Turns instructions into prompts as OpenVLA was trained on them: in lower case, and with a lone space
+    behind them, which training had between the colon and the first action token.
+
+    Args:
+        definition: content of a `tokenizer.json`.
+    """
+
+    def __init__(self, definition: str) -> None:
+        self.definition = definition
+        self.tokenizer = Tokenizer.from_str(definition)
+        space_id = self.tokenizer.token_to_id(SPACE)
+        if space_id is None:
+            raise ValueError(f"tokenizer.json: has no token {SPACE!r}: this is no tokenizer of a Llama")
+        self.space_id: int = space_id
+        self.known: dict[str, list[int]] = {}
+
+    def encode(self, instruction: str) -> list[int]:
+        """The ids of one prompt, from <s> to the lone space."""
+        if instruction not in self.known:
+            prompt = PROMPT.format(instruction=instruction.lower())
+            self.known[instruction] = [*self.tokenizer.encode(prompt).ids, self.space_id]
+        return self.known[instruction]
+
+    def batch(self, instructions: Sequence[str]) -> tuple[Tensor, Tensor | None]:
+        """Prompts of one length, padded behind <s>. → ids (B, L), mask (B, L) or None if nothing is padded"""
+        rows = [self.encode(instruction) for instruction in instructions]
+        longest = max(map(len, rows))
+        if all(len(row) == longest for row in rows):
+            return torch.tensor(rows), None
+        padding = [longest - len(row) for row in rows]
+        ids = [[BEGIN_ID] + [BEGIN_ID] * count + row[1:] for row, count in zip(rows, padding, strict=True)]
+        mask = [[1] + [0] * count + [1] * (len(row) - 1) for row, count in zip(rows, padding, strict=True)]
+        return torch.tensor(ids), torch.tensor(mask, dtype=torch.bool)
+
+
+def aligned_prompts(input_ids: Tensor, attention_mask: Tensor, space_id: int) -> tuple[Tensor, Tensor | None]:
+    """Prompts padded on the right → padded behind their first token, ending with the lone space.
+
+    OpenVLA adds the space where a prompt does not end with it; so does this.
+
+    Args:
+        input_ids: (B, L), every row beginning with <s>.
+        attention_mask: (B, L), zero or False where padded.
+
+    Returns:
+        ids (B, L') and mask (B, L'), or None for the mask if nothing is padded.
+    """
+    mask = attention_mask.bool()
+    if mask.shape != input_ids.shape or input_ids.ndim != 2:
+        raise ValueError(
+            f"input_ids {tuple(input_ids.shape)} and attention_mask {tuple(mask.shape)}: both must be (B, L)"
+        )
+    if not bool(mask[:, 0].all()):
+        raise ValueError("attention_mask: every row must begin with a token; pad prompts on the right")
+    last = mask.shape[1] - 1 - mask.flip(1).int().argmax(dim=1, keepdim=True)
+    ends = input_ids.gather(1, last) == space_id
+    ids = torch.cat([input_ids, torch.full_like(ends, space_id, dtype=input_ids.dtype)], dim=1)
+    mask = torch.cat([mask, ~ends], dim=1)
+    order = mask[:, 1:].int().argsort(dim=1, stable=True) + 1
+    order = torch.cat([torch.zeros_like(ends, dtype=order.dtype), order], dim=1)
+    ids, mask = ids.gather(1, order), mask.gather(1, order)
+    used = mask.any(dim=0)
+    ids, mask = ids[:, used], mask[:, used]
+    return ids, None if bool(mask.all()) else mask
+
+
+def train_tokenizer(instructions: Sequence[str], vocabulary: int) -> Tokenizer:
+    """A small tokenizer in the layout of Llama's, for a model that starts from nothing.
+
+    Byte-pair encoding (Sennrich et al. 2016) that falls back on bytes, learnt from the prompts of
+    `instructions`: <unk>, <s>, </s>, the bytes, what was learnt, and last the 256 action tokens.
+    ValueError if `vocabulary` ids do not hold that much.
+    """
+    learnable = vocabulary - BINS
+    fixed = [UNKNOWN, BEGIN, END, *BYTES, SPACE]
+    if learnable < len(fixed):
+        raise ValueError(f"vocabulary of {vocabulary} ids: needs at least {len(fixed) + BINS}")
+    learnt = Tokenizer(models.BPE(unk_token=UNKNOWN))
+    learnt.normalizer = _normalizer()
+    learnt.pre_tokenizer = pre_tokenizers.Split(SPACE, behavior="merged_with_next")
+    trainer = trainers.BpeTrainer(vocab_size=learnable, special_tokens=fixed, show_progress=False)
+    learnt.train_from_iterator([PROMPT.format(instruction=text.lower()) for text in instructions], trainer)
+    return _whole_tokenizer(learnt, learnable, fixed)
+
+
+def _whole_tokenizer(learnt: Tokenizer, learnable: int, fixed: Sequence[str]) -> Tokenizer:
+    """What was learnt, ids that stay unused so that the actions come last, the actions, <PAD> after them."""
+    model = json.loads(learnt.to_str())["model"]
+    vocab: dict[str, int] = model["vocab"]
+    vocab |= {f"<unused{index}>": index for index in range(len(vocab), learnable)}
+    vocab |= {chr(code): learnable + index for index, code in enumerate(ACTION_CHARACTERS)}
+    merges = [tuple(merge) for merge in model["merges"]]
+    tokenizer = Tokenizer(models.BPE(vocab, merges, unk_token=UNKNOWN, byte_fallback=True, fuse_unk=True))
+    tokenizer.normalizer = _normalizer()
+    tokenizer.post_processor = processors.TemplateProcessing(
+        single=f"{BEGIN} $A", special_tokens=[(BEGIN, vocab[BEGIN])]
+    )
+    steps = [
+        decoders.Replace(SPACE, " "),
+        decoders.ByteFallback(),
+        decoders.Fuse(),
+        decoders.Strip(" ", 1, 0),
+    ]
+    tokenizer.decoder = decoders.Sequence(steps)
+    tokenizer.add_special_tokens([AddedToken(name, normalized=False) for name in (*fixed[:3], PAD)])
+    return tokenizer
+
+
+def _normalizer() -> normalizers.Normalizer:
+    """A space before the text, and a visible character for every space, as Llama's tokenizer has it."""
+    return normalizers.Sequence([normalizers.Prepend(SPACE), normalizers.Replace(" ", SPACE)])

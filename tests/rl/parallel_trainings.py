@@ -1,0 +1,74 @@
+"""Trainings in the point environment by as many processes as there are, for `torchrun`.
+
+The argument is the folder to write to. The policy's noise is a function of what it sees, so that an
+environment's episodes do not depend on which process it is in.
+"""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import torch
+from accelerate import PartialState
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "rl"))
+
+from chunk_policy import ACTIONS, ChunkPolicy, Sample
+from point_env import PointEnv
+
+from lerobot_wmrl.distributed import rank_and_size
+from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
+from lerobot_wmrl.rl.configuration_policy_gradient import PolicyGradientConfig
+from lerobot_wmrl.rl.configuration_ppo import PPOConfig
+from lerobot_wmrl.rl.factory import make_algorithm
+from lerobot_wmrl.rl.protocol import Pipeline
+from lerobot_wmrl.rl.rollout import RolloutBuffer
+from lerobot_wmrl.rl.trainer import Schedule, train
+
+ENVS, STEPS, ITERATIONS = 24, 12, 3
+COMMON: dict[str, Any] = {"policy_lr": 1e-3, "minibatch_size": 50, "target_kl": 0.05}
+RUNS: dict[str, tuple[PolicyGradientConfig, int]] = {
+    "ppo": (PPOConfig(value_iterations=1, value_normalisation=True, **COMMON), 1),
+    "ppo_in_passes": (PPOConfig(value_iterations=0, micro_batch_size=7, ratio="token", **COMMON), 1),
+    "ppo_in_chunks": (PPOConfig(value_iterations=0, value_loss="clipped", lr_schedule="linear", **COMMON), 3),
+    "grpo": (GRPOConfig(group_size=4, least_group_std=0.1, **COMMON), 1),
+}
+"""Configurations, and steps a decision."""
+
+
+class SeeingIsDeciding(ChunkPolicy):
+    """Its noise is a function of the observation, a smooth one: rounding errors must stay small."""
+
+    def sample(self, observation: dict[str, Any]) -> Sample:
+        distribution = self._distribution(observation)
+        keys = torch.arange(1, self.chunk * ACTIONS + 1) * 2.0
+        turned = (observation["observation.state"].sum(dim=1, keepdim=True) * keys).sin()
+        noise = 1.4 * turned.view(-1, self.chunk, ACTIONS)
+        raw_action = distribution.mean + distribution.stddev * noise
+        return Sample(raw_action, distribution.log_prob(raw_action), self.value(observation))
+
+
+def run(name: str, output_dir: Path) -> None:
+    """One training, of this process's environments."""
+    config, chunk = RUNS[name]
+    torch.manual_seed(0)
+    policy = SeeingIsDeciding(chunk)
+    algorithm = make_algorithm(policy, config, ITERATIONS)
+    num_envs = ENVS // rank_and_size()[1]
+    buffer = RolloutBuffer(STEPS, num_envs, "cpu")
+    pipeline = Pipeline(prepare=lambda observation: observation, to_action=lambda raw: raw * 0.1)
+
+    def save_pretrained(folder: Path) -> None:
+        folder.mkdir(parents=True)
+        torch.save(policy.state_dict(), folder / "policy.pt")
+
+    output_dir.mkdir(parents=True, exist_ok=True)
+    env, schedule = PointEnv(num_envs, horizon=6), Schedule(ITERATIONS, 1, seed=5)
+    train(env, algorithm, pipeline, buffer, schedule, output_dir, save_pretrained)
+
+
+if __name__ == "__main__":
+    PartialState(cpu=True)
+    for each in RUNS:
+        run(each, Path(sys.argv[1]) / each)
+    PartialState().destroy_process_group()

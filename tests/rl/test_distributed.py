@@ -1,0 +1,63 @@
+"""Two processes that each have half of the environments learn what one process learns from all of them."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from lerobot_wmrl.tracking import read_metrics
+from tests.rl.parallel_trainings import ITERATIONS, RUNS, run
+
+HERE = Path(__file__).parent
+ROOT = HERE.parents[1]
+
+
+def torchrun(script: list[str]) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2", *script]
+    folders = os.pathsep.join(str(ROOT / folder) for folder in ("", "policies", "datasets"))
+    return subprocess.run(
+        command, env={**os.environ, "PYTHONPATH": folders}, capture_output=True, text=True, cwd=ROOT
+    )
+
+
+@pytest.fixture(scope="module")
+def trained_twice(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Folders of all trainings, by one process and by two."""
+    one, two = tmp_path_factory.mktemp("one"), tmp_path_factory.mktemp("two")
+    for name in RUNS:
+        run(name, one / name)
+    result = torchrun([str(HERE / "parallel_trainings.py"), str(two)])
+    assert result.returncode == 0, result.stderr[-3000:]
+    return one, two
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_two_processes_log_what_one_does(name: str, trained_twice: tuple[Path, Path]) -> None:
+    one, two = (read_metrics(folder / name) for folder in trained_twice)
+    assert [line["step"] for line in two] == list(range(1, ITERATIONS + 1))
+    for first, second in zip(one, two, strict=True):
+        timeless = [
+            {key: value for key, value in line.items() if key[-2:] != "_s"} for line in (first, second)
+        ]
+        assert timeless[1] == pytest.approx(timeless[0], rel=1e-3, abs=1e-5)
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_two_processes_learn_what_one_does(name: str, trained_twice: tuple[Path, Path]) -> None:
+    checkpoints = [folder / name / "checkpoints" / "last" for folder in trained_twice]
+    one, two = (torch.load(folder / "pretrained_model" / "policy.pt") for folder in checkpoints)
+    for key, value in one.items():
+        torch.testing.assert_close(two[key], value, rtol=1e-3, atol=1e-5)
+    one, two = (load_file(folder / "algorithm" / "model.safetensors") for folder in checkpoints)
+    assert one.keys() == two.keys()
+    for key, value in one.items():
+        torch.testing.assert_close(two[key], value, rtol=1e-4, atol=1e-6)
+
+
+def test_a_run_goes_on_with_as_many_processes_as_it_began_with(trained_twice: tuple[Path, Path]) -> None:
+    with pytest.raises(ValueError, match=r"began with 2 processes, here are 1; .*--nproc_per_node=2"):
+        run("grpo", trained_twice[1] / "grpo")

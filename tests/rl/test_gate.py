@@ -1,0 +1,110 @@
+"""The gate asks what the evaluation asks, stops or warns, and never passes what nobody has asked about."""
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from lerobot_wmrl.dataset_source import DatasetSource
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
+from lerobot_wmrl.rewards.configuration_general import GeneralConfig
+from lerobot_wmrl.rl.configuration_callbacks import GateConfig
+from lerobot_wmrl.rl.gate import SuccessGate
+from lerobot_wmrl.rl.policy_gradient import TrainingStopped
+from lerobot_wmrl.rl.recording import RolloutRecorder, env_flags
+from lerobot_wmrl.world_models.evaluation.gate import success_gate
+
+BELIEVES_ALL, BELIEVES_NONE = 0.0001, 0.9999
+"""Done thresholds."""
+
+
+@pytest.fixture(scope="module")
+def env(small_dataset: LeRobotDataset, trained_models: dict[str, Path]) -> Any:
+    config = WorldModelEnv(
+        world_model_path=str(trained_models["action_world_model"]),
+        dataset=StartFrames(root=str(small_dataset.root)), reward=GeneralConfig(alpha=1.0),
+        done_threshold=BELIEVES_ALL, done_frames=2, episode_length=4, device="cpu",
+    )  # fmt: skip
+    return config.create_tensor_env(2)
+
+
+@pytest.fixture
+def make_gate(env: Any, small_dataset: LeRobotDataset) -> Any:
+    def make(threshold: float, labelled: bool = True, **config: Any) -> SuccessGate:
+        env.config = replace(env.config, done_threshold=threshold)
+        dataset = DatasetSource(str(small_dataset.root) if labelled else "")
+        return SuccessGate(GateConfig(dataset=dataset, **config), env, None, frozenset({3}), total=8)
+
+    return make
+
+
+def test_a_verdict_is_the_evaluations_own(
+    make_gate: Any, env: Any, small_dataset: Any, tmp_path: Path
+) -> None:
+    gate = make_gate(BELIEVES_ALL)
+    found = gate.run(0, tmp_path, tmp_path / "gate")
+    asked = success_gate(env.model, small_dataset.root, BELIEVES_ALL, frames=2)
+    assert found["labelled"] == asked.as_json()
+    assert found["labelled"]["false_success_rate"]["share"] == 1.0
+    assert found["failed"]
+    assert found["real_steps"] == 0
+    strips = {path.name for path in (tmp_path / "gate").glob("*.png")}
+    assert strips == {"labelled_success.png", "labelled_failure.png"}
+
+
+def test_above_the_limit_it_stops_or_warns_with_advice(
+    make_gate: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    gate = make_gate(BELIEVES_ALL)
+    records = {0: gate.run(0, tmp_path, tmp_path / "gate")}
+    with pytest.raises(
+        TrainingStopped, match=r"failures successes, 100 % \(2 of 2.*near misses.*--dyna\.rounds"
+    ):
+        gate.apply(records)
+    warning = make_gate(BELIEVES_ALL, action="warn")
+    with caplog.at_level(logging.WARNING):
+        warning.apply(records)
+    assert "the world model calls real failures successes" in caplog.text
+    tolerant = make_gate(BELIEVES_ALL, limit=1.0)
+    record = tolerant.run(0, tmp_path, tmp_path / "tolerant")
+    assert (record["failed"], record["warning"]) == (False, None)
+
+
+def test_at_the_limit_training_goes_on(
+    make_gate: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    gate = make_gate(BELIEVES_NONE)
+    record = gate.run(0, tmp_path, tmp_path / "gate")
+    assert record["labelled"]["false_success_rate"]["k"] == 0
+    with caplog.at_level(logging.WARNING):
+        gate.apply({0: record})
+    assert not [entry for entry in caplog.records if entry.levelno >= logging.WARNING]
+
+
+def test_what_nobody_has_asked_about_has_not_passed(
+    make_gate: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    gate = make_gate(BELIEVES_ALL, labelled=False, action="warn")
+    record = gate.run(0, tmp_path, tmp_path / "gate")
+    assert "passed" not in str(record)
+    with caplog.at_level(logging.WARNING):
+        gate.apply({0: record})
+    assert "nobody has asked" in caplog.text
+
+
+def test_it_asks_in_every_new_world_model_and_again_where_it_can_roll_out(make_gate: Any, env: Any) -> None:
+    gate = make_gate(BELIEVES_ALL, freq=2)
+    assert [iteration for iteration in range(9) if gate.due(iteration)] == [0, 3]
+    gate.recorder = RolloutRecorder(WmrlManiSkillEnv(), 1, ["third_view"], False)
+    assert [iteration for iteration in range(9) if gate.due(iteration)] == [0, 2, 3, 4, 6]
+
+
+def test_the_recorder_gets_what_is_not_as_by_default() -> None:
+    env = WmrlManiSkillEnv(task="pull", scenes=[0, 2], image_size=64, cameras=["wrist"])
+    assert env_flags(env) == {
+        "env.type": "wmrl_maniskill", "env.task": "pull", "env.scenes": [0, 2], "env.image_size": 64,
+    }  # fmt: skip

@@ -1,0 +1,155 @@
+"""What PPO and GRPO share: passes, schedules, the reference, what a checkpoint keeps."""
+
+import copy
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import nn
+
+from lerobot_policy_cnn.modeling_cnn import CnnPolicy
+from lerobot_wmrl.rl.configuration_ppo import PPOConfig
+from lerobot_wmrl.rl.policy_gradient import schedule_factor
+from lerobot_wmrl.rl.ppo import PPO
+from lerobot_wmrl.rl.protocol import Pipeline
+from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
+from tests.rl.chunk_policy import ChunkPolicy
+from tests.rl.point_env import PointEnv
+
+MakePolicy = Callable[..., CnnPolicy]
+
+
+def improved(policy: CnnPolicy, pipeline: Pipeline, iterations: int = 2, **settings: Any) -> tuple[PPO, Any]:
+    """`policy` after some iterations of PPO, and what the last one logged."""
+    torch.manual_seed(1)
+    options = {"value_iterations": 0, "minibatch_size": 70, "policy_lr": 1e-3, **settings}
+    algorithm = PPO(policy, PPOConfig(**options), iterations)
+    env, buffer = PointEnv(16, horizon=6), RolloutBuffer(12, 16, "cpu")
+    for iteration in range(iterations):
+        collect(env, policy, pipeline, buffer, 16 * iteration)
+        stats = algorithm.improve(buffer, pipeline)
+    return algorithm, stats.to_log_dict()
+
+
+@pytest.mark.parametrize(
+    "settings", [{}, {"ratio": "token", "value_loss": "clipped", "entropy_coefficient": 0.1}]
+)
+def test_passes_of_a_minibatch_give_its_gradient(
+    make_policy: MakePolicy, pipeline: Pipeline, settings: dict[str, Any]
+) -> None:
+    initial = make_policy()
+    (whole, logged), (in_passes, logged_in_passes) = (
+        improved(copy.deepcopy(initial), pipeline, micro_batch_size=size, **settings) for size in (None, 16)
+    )
+    for name, value in whole.policy.state_dict().items():
+        torch.testing.assert_close(in_passes.policy.state_dict()[name], value, rtol=1e-4, atol=1e-6)
+    assert logged_in_passes == pytest.approx(logged, rel=1e-3, abs=1e-5)
+    assert not torch.equal(whole.policy.actor.head.weight, initial.actor.head.weight)
+
+
+def test_learning_rates_follow_the_schedule(make_policy: MakePolicy, pipeline: Pipeline) -> None:
+    assert [schedule_factor("linear", i, 4) for i in range(4)] == [1, 0.75, 0.5, 0.25]
+    assert schedule_factor("cosine", 0, 4) == 1
+    assert schedule_factor("cosine", 2, 4) == pytest.approx(0.5)
+    assert schedule_factor("constant", 3, 4) == 1
+    algorithm, logged = improved(make_policy(), pipeline, iterations=4, lr_schedule="linear", value_lr=1e-2)
+    assert [group["lr"] for group in algorithm.optimizer.param_groups] == pytest.approx([2.5e-4, 2.5e-3])
+    assert logged["policy_lr"] == pytest.approx(2.5e-4)
+    with pytest.raises(ValueError, match=r"lr_schedule=linear: needs the number of iterations"):
+        PPO(make_policy(), PPOConfig(lr_schedule="linear"))
+
+
+def test_clip_fraction_and_norms_are_logged(make_policy: MakePolicy, pipeline: Pipeline) -> None:
+    _, gentle = improved(make_policy(), pipeline, policy_lr=1e-6)
+    _, bold = improved(make_policy(), pipeline, policy_lr=3e-2, target_kl=10.0, clip=0.05)
+    assert gentle["clip_fraction"] == 0
+    assert bold["clip_fraction"] > 0.1
+    assert bold["policy_grad_norm"] > 0
+    assert bold["value_grad_norm"] > 0
+
+
+def test_the_entropy_bonus_widens_exploration(make_policy: MakePolicy, pipeline: Pipeline) -> None:
+    entropies = [
+        improved(make_policy(), pipeline, 4, entropy_coefficient=coefficient, reference_coefficient=0.0)[1][
+            "entropy"
+        ]
+        for coefficient in (0.0, 1.0)
+    ]
+    assert entropies[1] > entropies[0] + 1e-3
+
+
+def test_the_reference_shares_what_is_not_trained(make_policy: MakePolicy) -> None:
+    """A large frozen network under LoRA is in memory once."""
+    policy = make_policy()
+    policy.actor.mix.requires_grad_(False)
+    algorithm = PPO(policy, PPOConfig())
+    assert algorithm.reference.actor.mix[0].weight is policy.actor.mix[0].weight
+    assert algorithm.reference.actor.head.weight is not policy.actor.head.weight
+    assert policy.actor.head.weight.requires_grad
+    assert not any(parameter.requires_grad for parameter in algorithm.reference.parameters())
+
+
+def test_the_value_learns_large_returns_only_if_they_are_normalised(
+    make_policy: MakePolicy, pipeline: Pipeline
+) -> None:
+    """Returns of about −1000, as Pendulum's: by Huber's loss a value takes thousands of updates there."""
+    explained = {}
+    for normalisation in (False, True):
+        torch.manual_seed(0)
+        policy = make_policy()
+        settings = {"value_normalisation": normalisation, "value_iterations": 99, "value_lr": 3e-3}
+        algorithm = PPO(policy, PPOConfig(**settings, minibatch_size=64, gamma=0.5))
+        env, buffer = PointEnv(32, horizon=6), RolloutBuffer(12, 32, "cpu")
+        for iteration in range(12):
+            collect(env, policy, pipeline, buffer, 32 * iteration)
+            state = buffer.observations.tensors["observation.state"]
+            buffer.reward = -1000 * (state[..., :2] - state[..., 2:]).norm(dim=-1)
+            stats = algorithm.improve(buffer, pipeline)
+        explained[normalisation] = stats.extra["explained_variance"]
+    assert explained[True] > 0.5 > explained[False]
+
+
+def test_a_checkpoint_keeps_the_scale_of_the_returns_apart_from_the_policy(
+    make_policy: MakePolicy, pipeline: Pipeline, tmp_path: Path
+) -> None:
+    algorithm, _ = improved(make_policy(), pipeline, value_normalisation=True)
+    algorithm.save_pretrained(tmp_path)
+    loaded = PPO.from_pretrained(tmp_path, policy=make_policy())
+    assert loaded.config == algorithm.config
+    returns = torch.randn(5)
+    assert torch.equal(loaded.returns.normalise(returns), algorithm.returns.normalise(returns))
+    assert not torch.equal(loaded.returns.normalise(returns), returns)
+    with pytest.raises(ValueError, match=r"its tensors are \['returns"):
+        loaded.load_state_dict({"std": torch.zeros(())})
+
+
+@pytest.mark.parametrize(("settings", "message"), [
+    ({"clip": 0.0}, r"algorithm\.clip=0\.0"), ({"micro_batch_size": 0}, r"algorithm\.micro_batch_size=0"),
+    ({"ratio": "sentence"}, "ratio=sentence: choose one of action, token"),
+    ({"value_loss": "mse"}, "value_loss=mse: choose one of huber, clipped"),
+    ({"lr_schedule": "step"}, "lr_schedule=step: choose one of constant, linear, cosine"),
+])  # fmt: skip
+def test_impossible_settings_are_named(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        PPOConfig(**settings)
+
+
+class Dropping(ChunkPolicy):
+    """Its layers behave otherwise while a network is trained by a cloning loss."""
+
+    def __init__(self) -> None:
+        super().__init__(1)
+        self.actor = nn.Sequential(nn.Linear(4, 32), nn.BatchNorm1d(32), nn.Dropout(0.5), nn.Linear(32, 3))
+
+
+def test_batch_norm_and_dropout_rest_in_rollouts_and_updates(pipeline: Pipeline) -> None:
+    torch.manual_seed(0)
+    policy = Dropping().train()
+    algorithm, buffer = PPO(policy, PPOConfig(value_iterations=0)), RolloutBuffer(12, 16, "cpu")
+    for iteration in range(2):
+        collect(PointEnv(16, horizon=6), algorithm.policy, pipeline, buffer, 16 * iteration)
+        assert algorithm.improve(buffer, pipeline).extra["first_ratio_error"] < 1e-3
+    assert not any(module.training for module in (*policy.modules(), *algorithm.reference.modules()))
+    assert (policy.actor[1].running_mean == 0).all()

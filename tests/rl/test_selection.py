@@ -1,0 +1,85 @@
+"""The checkpoint that is kept as the best, and when imagined and real success part."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lerobot_wmrl.envs.policy_success import Evaluated
+from lerobot_wmrl.rl.callbacks import Record
+from lerobot_wmrl.rl.policy_gradient import TrainingStopped
+from lerobot_wmrl.rl.selection import Measure, Selection, best_iteration, parted
+from lerobot_wmrl.statistics import Proportion
+
+N = 64
+
+
+def record(real: float | None, imagined: float | None, n: int = N) -> Record:
+    """Of these success rates."""
+    shares = {"real": real, "imagined": imagined}
+    return {
+        place: Proportion(round(share * n), n).as_json()
+        for place, share in shares.items()
+        if share is not None
+    }
+
+
+def measure(successes: int, n: int = 4, steps: int = 30) -> Measure:
+    return lambda: Evaluated([index < successes for index in range(n)], steps)
+
+
+def make_selection(tmp_path: Path, **measures: Measure) -> Selection:
+    for iteration in (0, 5, 10, 12):
+        (tmp_path / "checkpoints" / f"{iteration:06d}").mkdir(parents=True)
+    return Selection(5, 12, measures, tmp_path)
+
+
+def best(tmp_path: Path) -> str:
+    return (tmp_path / "checkpoints" / "best").resolve().name
+
+
+def test_it_measures_before_any_update_at_intervals_and_at_the_end(tmp_path: Path) -> None:
+    selection = make_selection(tmp_path, real=measure(1))
+    assert [iteration for iteration in range(13) if selection.due(iteration)] == [0, 5, 10, 12]
+
+
+def test_a_record_has_both_rates_and_the_steps_that_reality_took(tmp_path: Path) -> None:
+    selection = make_selection(tmp_path, real=measure(3), imagined=measure(4, steps=99))
+    found = selection.run(5, tmp_path, tmp_path)
+    assert (found["real"]["k"], found["imagined"]["k"], found["real_steps"]) == (3, 4, 30)
+    unreal = make_selection(tmp_path / "unreal", imagined=measure(4, steps=99)).run(5, tmp_path, tmp_path)
+    assert unreal["real_steps"] == 0
+    assert "real" not in unreal
+
+
+def test_real_success_decides_and_of_equals_the_earlier(tmp_path: Path) -> None:
+    records: dict[int, Any] = {0: record(0.5, 0.5), 5: record(0.75, 0.6), 10: record(0.75, 0.9)}
+    selection = make_selection(tmp_path, real=measure(0), imagined=measure(0))
+    selection.apply({0: records[0]})
+    assert best(tmp_path) == "000000"
+    selection.apply(records)
+    assert best(tmp_path) == "000005"
+    assert best_iteration(records, "imagined") == 10
+    make_selection(tmp_path / "unreal", imagined=measure(0)).apply(records)
+    assert best(tmp_path / "unreal") == "000010"
+
+
+@pytest.mark.parametrize(("latest", "expected"), [
+    (record(0.20, 0.80), True),  # as measured once: imagined 0.55 → 0.80, real 0.53 → 0.20
+    (record(0.20, 0.55), True),
+    (record(0.34, 0.80), False),  # the intervals touch
+    (record(0.20, 0.40), False),  # imagination sees it fail
+    (record(0.53, 0.80), False),
+    (record(0.02, 0.80, n=5), False),  # too few episodes to say
+    (record(None, 0.80), False),
+    (record(0.20, None), False),
+])  # fmt: skip
+def test_imagined_and_real_success_part(latest: Record, expected: bool) -> None:
+    assert parted(record(0.53, 0.55), latest) is expected
+
+
+def test_a_training_whose_imagination_parts_from_reality_is_stopped(tmp_path: Path) -> None:
+    selection = make_selection(tmp_path, real=measure(0), imagined=measure(0))
+    with pytest.raises(TrainingStopped, match=r"iteration 10: real success has fallen.*53 %.*at iteration 5"):
+        selection.apply({0: record(0.40, 0.5), 5: record(0.53, 0.55), 10: record(0.20, 0.80)})
+    assert best(tmp_path) == "000005", "the best checkpoint is pointed at nonetheless"

@@ -1,0 +1,198 @@
+"""lerobot-wmrl-train with gate, selection, Dyna rounds, wandb and --resume; and what it refuses."""
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import pytest
+import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.envs.configs import EnvConfig
+from safetensors.torch import load_file
+
+from lerobot_wmrl.constants import GATE_SEED
+from lerobot_wmrl.episodes import recorded_episodes
+from lerobot_wmrl.scripts.train import main
+from lerobot_wmrl.tracking import read_metrics
+from tests.rl.checkpoints import save_untrained_policy
+from tests.rl.point_env import PointEnv
+
+WEIGHTS = "pretrained_model/model.safetensors"
+SHORT = [
+    "--algorithm.type=ppo", "--num_envs=2", "--iterations=2", "--save_freq=2",
+    "--algorithm.value_iterations=0",
+]  # fmt: skip
+POINT = ["--policy.path={pointing}", "--env.type=test_evaluable_point"]
+IMAGINED = [
+    "--env.type=world_model", "--env.world_model_path={action_world_model}", "--env.reward.type=general",
+    "--env.reward.alpha=1", "--env.dataset.root={data}", "--env.episode_length=4", "--env.done_frames=1",
+    "--env.device=cpu",
+]  # fmt: skip
+PUSH = ["--policy.path={pushing}", *IMAGINED]
+SIMULATOR = [
+    "--real_env.type=wmrl_maniskill", "--real_env.image_size=32", "--real_env.episode_length=3",
+    "--real_env.scenes=[0]", "--real_num_envs=1",
+]  # fmt: skip
+
+
+class EvaluablePointEnv(PointEnv):
+    """As lerobot-eval asks for: a device, a batched action space, and one seed a sub-environment."""
+
+    def __init__(self, num_envs: int) -> None:
+        super().__init__(num_envs, horizon=4, image_size=32)
+        self.device = torch.device("cpu")
+        self.action_space = gym.vector.utils.batch_space(self.single_action_space, num_envs)
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
+        return super().reset(seed=seed[0] if isinstance(seed, list) else seed, options=options)
+
+
+@EnvConfig.register_subclass("test_evaluable_point")
+@dataclass
+class EvaluablePointConfig(EnvConfig):
+    """The point environment, drawn in 32x32 pixels: a world that is built at once."""
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        return {}
+
+    def create_tensor_env(self, n_envs: int, device: str) -> EvaluablePointEnv:
+        return EvaluablePointEnv(n_envs)
+
+
+@pytest.fixture
+def paths(trained_models: dict[str, Path], small_dataset: LeRobotDataset, tmp_path: Path) -> dict[str, Any]:
+    """What flags may name: models, data, two policies, an output folder."""
+    return {
+        **trained_models, "data": small_dataset.root, "out": tmp_path / "rl",
+        "pointing": save_untrained_policy(tmp_path / "pointing"),
+        "pushing": save_untrained_policy(tmp_path / "pushing", actions=7),
+    }  # fmt: skip
+
+
+@pytest.fixture
+def improve(paths: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> Any:
+    """The command in this process."""
+
+    def call(*flags: str) -> Path:
+        given = [flag.format(**paths) for flag in flags]
+        monkeypatch.setattr(sys, "argv", ["lerobot-wmrl-train", *given])
+        main()
+        return paths["out"]
+
+    return call
+
+
+def test_selection_keeps_the_best_checkpoint(improve: Any) -> None:
+    flags = [*POINT, *SHORT, "--output_dir={out}", "--selection.freq=1"]
+    out = improve(*flags, "--selection.n_episodes=3")
+    records = {
+        int(path.parent.name): json.loads(path.read_text()) for path in out.glob("selection/*/record.json")
+    }
+    assert sorted(records) == [0, 1, 2]
+    shares = {iteration: record["real"]["share"] for iteration, record in records.items()}
+    assert (
+        out / "checkpoints" / "best"
+    ).resolve().name == f"{max(shares, key=lambda at: (shares[at], -at)):06d}"
+    assert (out / "checkpoints" / "best" / WEIGHTS).is_file()
+    written = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
+    improve(*flags, "--selection.n_episodes=3")
+    assert {path: path.stat().st_mtime_ns for path in out.rglob("*")} == written
+
+
+def test_a_run_is_resumed_as_lerobot_train_resumes(improve: Any, paths: dict[str, Any]) -> None:
+    """By its configuration alone; what does not change the outcome may be another."""
+    out = improve(*POINT, *SHORT, "--save_freq=1", "--output_dir={out}")
+    last = out / "checkpoints" / "000002"
+    weights = load_file(last / WEIGHTS)
+    last.rename(out / "checkpoints" / ".000002.lost")
+    configuration = out / "checkpoints" / "000001" / "pretrained_model" / "train_config.json"
+    improve(f"--config_path={configuration}", "--resume=true", "--log_freq=2")
+    resumed = load_file(last / WEIGHTS)
+    assert all(torch.equal(resumed[name], value) for name, value in weights.items())
+    assert [line["step"] for line in read_metrics(out)] == [1, 2]
+
+
+def test_wandb_gets_what_the_metrics_file_gets(improve: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """LeRobot's logger, offline; a continued run goes on in the same one."""
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    flags = [*POINT, *SHORT, "--output_dir={out}", "--wandb.enable=true"]
+    out = improve(*flags, "--wandb.mode=offline", "--wandb.disable_artifact=true", "--selection.freq=2")
+    runs = list((out / "wandb").glob("offline-run-*/*.wandb"))
+    assert len(runs) == 1
+    logged = runs[0].read_bytes()
+    for name in (
+        b"train/success_rate",
+        b"train/kl",
+        b"eval/selection/real/share",
+        b"eval/real_steps/selection",
+    ):
+        assert name in logged, name
+
+
+def test_the_gate_is_asked_before_the_first_update(improve: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    flags = [*PUSH, *SHORT, "--output_dir={out}", "--gate.dataset.root={data}"]
+    with pytest.raises(SystemExit) as stopped:
+        improve(*flags, "--env.done_threshold=0.0001")
+    assert stopped.value.code == 1
+    assert "the world model calls real failures successes" in capsys.readouterr().err
+    out = improve(*flags, "--env.done_threshold=0.0001", "--gate.action=warn")
+    assert (out / "checkpoints" / "last").resolve().name == "000002"
+    assert [line["step"] for line in read_metrics(out)] == [0, 1, 2]
+    assert read_metrics(out)[0]["gate/labelled/false_success_rate/share"] == 1.0
+
+
+def test_gate_and_selection_in_the_simulator(improve: Any) -> None:
+    """Fresh rollouts are asked about, and real success stands beside imagined."""
+    out = improve(
+        *PUSH, *SHORT, *SIMULATOR, "--output_dir={out}", "--gate.action=warn", "--gate.freq=0",
+        "--gate.n_episodes=1", "--selection.freq=2", "--selection.n_episodes=1",
+    )  # fmt: skip
+    first, *_, last = read_metrics(out)
+    assert (last["real_steps/gate"], last["real_steps/selection"]) == (3, 6)
+    assert last["selection/real/n"] == last["selection/imagined/n"] == 1
+    assert first["gate/fresh/false_success_rate/n"] == 1
+    assert (out / "gate" / "000000" / "fresh_failure.png").is_file()
+    assert recorded_episodes(out / "gate" / "000000" / "rollouts")["seed"].tolist() == [GATE_SEED]
+
+
+@pytest.mark.parametrize(("flags", "message"), [
+    (PUSH, "--gate.action=stop: nothing says what is real"),
+    ([*PUSH, "--gate.action=halt"], "--gate.action=halt: choose one of stop"),
+    ([*PUSH, "--gate.limit=2"], "--gate.limit=2"),
+    ([*PUSH, "--env.done_frames=5"], "no episode could succeed"),
+    ([*PUSH, *SIMULATOR, "--real_env.image_size=1"], "--real_env.image_size=1: must be at least 16"),
+    ([*PUSH, *SIMULATOR, "--real_env.image_size=64"], "the environment has (3, 64, 64)"),
+    ([*PUSH, *SIMULATOR, "--real_env.cameras=[wrist]"], "which the environment does not have"),
+    ([*PUSH, *SIMULATOR, "--dyna.rounds=2"], "--dyna.rounds=2: there is room for 1"),
+    ([*PUSH, "--gate.action=off", "--dyna.rounds=1"], "give a simulator to record in"),
+    (["--policy.path={pointing}", *IMAGINED, "--gate.action=off"], "has 3 action components, the environ"),
+    ([*POINT, "--dyna.rounds=1"], "no world model to refresh"),
+    ([*POINT, "--selection.freq=-1"], "--selection.freq=-1: must be at least 0"),
+    ([*POINT, "--resume=true"], "--resume=true: there is no checkpoint in"),
+    ([*POINT, "--algorithm.clipp=0.3"], "there is no flag --algorithm.clipp: did you mean --algorithm.clip?"),
+    ([*POINT, "--num_envs=0"], "--num_envs=0: must be at least 1"),
+])  # fmt: skip
+def test_bad_input_is_named_and_nothing_is_written(
+    flags: list[str], message: str, improve: Any, paths: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        improve(*SHORT, "--output_dir={out}", *flags)
+    assert stopped.value.code == 1
+    assert message in capsys.readouterr().err
+    assert not paths["out"].exists()
+
+
+def test_other_settings_are_named_with_their_values(improve: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    flags = [*POINT, *SHORT, "--output_dir={out}"]
+    improve(*flags)
+    with pytest.raises(SystemExit):
+        improve(*flags, "--iterations=3", "--algorithm.clip=0.1")
+    said = capsys.readouterr().err
+    assert (
+        "(iterations 2 → 3; algorithm.clip 0.2 → 0.1)" in said
+        or "algorithm.clip 0.2 → 0.1; iterations 2 → 3" in said
+    )
