@@ -58,11 +58,12 @@ class Experiment:
     Args:
         episodes: planned ones; in each manner a tenth as many of the policy that is asked about, a sixteenth
             of the others.
+        depth: whether it is recorded too.
         model_flags: further flags of the action world model's training.
     """
 
-    def __init__(self, out: Path, episodes: int, model_flags: Sequence[str]) -> None:
-        self.out, self.episodes, self.model_flags = out, episodes, model_flags
+    def __init__(self, out: Path, episodes: int, depth: bool, model_flags: Sequence[str]) -> None:
+        self.out, self.episodes, self.depth, self.model_flags = out, episodes, depth, model_flags
 
     def stages(self) -> list[Stage]:
         """In order."""
@@ -105,7 +106,7 @@ class Experiment:
 
     def record(self, name: str, kinds: str, episodes: int, seed: int, cameras: str) -> list[str]:
         flags: Flags = {
-            "kinds": kinds, "num_episodes": episodes, "seed": seed, "depth": True,
+            "kinds": kinds, "num_episodes": episodes, "seed": seed, "depth": self.depth,
             "output_dir": self.path(name),
         }  # fmt: skip
         return ["lerobot-wmrl-record", *format_flags({**self.simulator(cameras), **flags})]
@@ -127,7 +128,7 @@ class Experiment:
         flags: Flags = {
             "policy.path": str(checkpoint(self.out / f"policy_{policy}")), "exploration": exploration,
             "num_episodes": max(2, self.episodes // share), "seed": seed, "output_dir": self.path(name),
-            "depth": True,
+            "depth": self.depth,
         }  # fmt: skip
         return ["lerobot-wmrl-record", *format_flags({**self.simulator(CAMERAS, scenes), **flags})]
 
@@ -174,8 +175,12 @@ def main() -> None:
     )
     parser.add_argument("--output_dir", type=Path, default=Path("outputs/gate"))
     parser.add_argument("--episodes", type=int, default=2400, help="planned episodes")
+    parser.add_argument(
+        "--depth", default="false", choices=("true", "false"), help="record it, for world_model_ablation.py"
+    )
     given, model_flags = parser.parse_known_args()
-    run_stages(Experiment(given.output_dir, given.episodes, model_flags).stages(), given.output_dir)
+    experiment = Experiment(given.output_dir, given.episodes, given.depth == "true", model_flags)
+    run_stages(experiment.stages(), given.output_dir)
 
 
 if __name__ == "__main__":
