@@ -35,6 +35,9 @@ IMAGE_SIZE = 64
 LONGEST_PUSH = 44
 """Frames: the horizon of push and what is recorded after success."""
 
+EPISODES = 2400
+"""Planned ones."""
+
 STEPS = 5500
 """Of the action world model: an hour on two cores with AVX2, by estimate."""
 
@@ -56,13 +59,16 @@ class Experiment:
     """The commands of the experiment, all paths below `out`.
 
     Args:
+        out: folder of all of it.
         episodes: planned ones; in each manner a tenth as many of the policy that is asked about, a sixteenth
             of the others.
         depth: whether it is recorded too.
         model_flags: further flags of the action world model's training.
     """
 
-    def __init__(self, out: Path, episodes: int, depth: bool, model_flags: Sequence[str]) -> None:
+    def __init__(
+        self, out: Path, episodes: int = EPISODES, depth: bool = False, model_flags: Sequence[str] = ()
+    ) -> None:
         self.out, self.episodes, self.depth, self.model_flags = out, episodes, depth, model_flags
 
     def stages(self) -> list[Stage]:
@@ -174,7 +180,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--output_dir", type=Path, default=Path("outputs/gate"))
-    parser.add_argument("--episodes", type=int, default=2400, help="planned episodes")
+    parser.add_argument("--episodes", type=int, default=EPISODES, help="planned episodes")
     parser.add_argument(
         "--depth", default="false", choices=("true", "false"), help="record it, for world_model_ablation.py"
     )

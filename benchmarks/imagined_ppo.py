@@ -81,7 +81,8 @@ class Experiment:
 
     def _measured(self, policy: str, kind: str, folder: Path) -> list[Stage]:
         names = {domain: f"eval_{kind}_{policy}_{domain}" for domain in DOMAINS}
-        return [self._stage(name, self.evaluate, name, folder, domain) for domain, name in names.items()]
+        policy = checkpoint(folder)
+        return [self._stage(name, self.evaluate, name, policy, domain) for domain, name in names.items()]
 
     def _stage(self, name: str, make: Callable[..., list[str]], *arguments: Any) -> Stage:
         return Stage(name, name.replace("_", " "), partial(make, *arguments))
@@ -114,10 +115,10 @@ class Experiment:
             "gate.dataset.root": str(self.gate / "rollouts"), **self.judgement(),
         }  # fmt: skip
 
-    def simulator(self, scenes: Flags = SCENES) -> Flags:
+    def simulator(self, processes: int = PROCESSES) -> Flags:
         return {
-            "num_envs": PROCESSES, "rollout_steps": ENVS * HORIZON // PROCESSES,
-            **self._maniskill(scenes), "env.episode_length": HORIZON,
+            "num_envs": processes, "rollout_steps": ENVS * HORIZON // processes,
+            **self._maniskill(SCENES), "env.episode_length": HORIZON,
         }  # fmt: skip
 
     def reinforce(self, policy: str, name: str, environment: Callable[[], Flags]) -> list[str]:
@@ -127,9 +128,9 @@ class Experiment:
         }  # fmt: skip
         return ["lerobot-wmrl-train", "--preset=demo", *format_flags(flags), *self.flags]
 
-    def evaluate(self, name: str, folder: Path, domain: str) -> list[str]:
+    def evaluate(self, name: str, policy: Path, domain: str) -> list[str]:
         flags: Flags = {
-            "policy.path": str(checkpoint(folder)), **self._maniskill(DOMAINS[domain]),
+            "policy.path": str(policy), **self._maniskill(DOMAINS[domain]),
             "eval.n_episodes": self.episodes, "seed": EVALUATION_SEED, "output_dir": str(self.out / name),
         }  # fmt: skip
         return ["lerobot-eval", *preset_flags("demo", "eval"), *format_flags(flags)]
