@@ -3,11 +3,12 @@
     python benchmarks/gate.py --output_dir=outputs/gate
     python benchmarks/rl_comparison.py --gate=outputs/gate --output_dir=outputs/rl_comparison
 
-Three seeds each, all with the same number of steps of their environment, on one thread. Checkpoints are
-measured on the same starts in ManiSkill, against steps and against the time that the training took; the last
-one also in scenes that are held out from all training. The same call again continues, and `--places` takes
-one kind of training alone, so that two calls can share a machine. Writes docs/results/rl_comparison.json and
-a picture beside it. Flags of lerobot-wmrl-train may follow.
+Three seeds each, on one thread: in ManiSkill for 20 iterations, in imagination for as many and then on, until
+about the same time has passed. Checkpoints are measured on the same starts in ManiSkill, against steps and
+against the time that the training took; the last one also in scenes that are held out from all training. The
+same call again continues, and `--places` takes one kind of training alone, so that two calls can share a
+machine. Writes docs/results/rl_comparison.json and a picture beside it. Flags of lerobot-wmrl-train may
+follow.
 """
 
 import argparse
@@ -32,6 +33,7 @@ from imagined_ppo import DOMAINS, ENVS, HORIZON, TITLES
 from lerobot_wmrl.demo.pipeline import run_stages
 from lerobot_wmrl.demo.stages import Stage, checkpoint
 from lerobot_wmrl.files import write_json
+from lerobot_wmrl.presets import Flags, format_flags
 from lerobot_wmrl.report.figures import COLOURS, tidy
 from lerobot_wmrl.report.sources import outcomes
 from lerobot_wmrl.statistics import MeanChange, Proportion
@@ -45,8 +47,18 @@ POLICY: Final = "few"
 DEMONSTRATIONS, CLONING_STEPS = range(60, 68), 250
 """So few that the policy fails often: there is something to learn. The world model has not seen it act."""
 
-MEASUREMENTS: Final = 2
-"""Checkpoints of a training that are measured, evenly spread; the last of them is its result."""
+COMPARED: Final = {
+    "imagined, as many steps": ("imagined", 20),
+    "imagined, as much time": ("imagined", 60),
+    "simulated": ("simulated", 20),
+}
+"""Training and iteration."""
+
+SEEDS_APART: Final = 100_000
+"""Trainings of neighbouring seeds would have starts and noise in common."""
+
+MEASURED: Final = {"imagined": (20, 40, 60), "simulated": (10, 20)}
+"""Iterations after which a training is measured, ENVS · HORIZON steps each; the last is its end."""
 
 SIMULATORS: Final = 1
 """A process more would be a core more than imagination has."""
@@ -58,14 +70,10 @@ class Comparison:
     Args:
         gate: of the world model and the demonstrations.
         ppo: how policies are trained and measured.
-        iterations: of each training, ENVS · HORIZON steps each.
     """
 
-    def __init__(
-        self, gate: gate.Experiment, ppo: imagined_ppo.Experiment, seeds: Sequence[int], iterations: int
-    ) -> None:
-        self.gate, self.ppo, self.seeds, self.iterations = gate, ppo, seeds, iterations
-        self.every = iterations // MEASUREMENTS
+    def __init__(self, gate: gate.Experiment, ppo: imagined_ppo.Experiment, seeds: Sequence[int]) -> None:
+        self.gate, self.ppo, self.seeds = gate, ppo, seeds
 
     def stages(self, places: Sequence[str]) -> list[Stage]:
         """In order: the cloned policy, then one training after the other, each with its measurements."""
@@ -80,18 +88,13 @@ class Comparison:
                 stages += self._training(place, seed)
         return stages
 
-    def measured(self) -> list[int]:
-        """Iterations after which there is a measurement."""
-        return [self.every * (number + 1) for number in range(MEASUREMENTS)]
-
     def _training(self, place: str, seed: int) -> list[Stage]:
-        name = run_name(place, seed)
+        name, end = run_name(place, seed), MEASURED[place][-1]
         stages = [Stage(name, f"PPO, {place}, seed {seed}", partial(self.reinforce, place, seed))]
-        for iteration in self.measured():
-            step = get_step_checkpoint_dir(self.ppo.out / name, self.iterations, iteration)
-            policy = step / PRETRAINED_MODEL_DIR
+        for iteration in MEASURED[place]:
+            policy = get_step_checkpoint_dir(self.ppo.out / name, end, iteration) / PRETRAINED_MODEL_DIR
             stages.append(self._measurement(f"{name}_{iteration}_ind", policy, "ind"))
-        return [*stages, self._measurement(f"{name}_{self.iterations}_ood", policy, "ood")]
+        return [*stages, self._measurement(f"{name}_{end}_ood", policy, "ood")]
 
     def _measurement(self, name: str, policy: Path, domain: str) -> Stage:
         make = partial(self.ppo.evaluate, f"eval_{name}", policy, domain)
@@ -99,8 +102,11 @@ class Comparison:
 
     def reinforce(self, place: str, seed: int) -> list[str]:
         environment = self.ppo.imagination if place == "imagined" else partial(self.ppo.simulator, SIMULATORS)
+        flags: Flags = {
+            "iterations": MEASURED[place][-1], "save_freq": MEASURED[place][0], "seed": seed * SEEDS_APART,
+        }  # fmt: skip
         command = self.ppo.reinforce(POLICY, run_name(place, seed), environment)
-        return [*command, f"--seed={seed}", f"--save_freq={self.every}"]
+        return [*command, *format_flags(flags)]
 
     def found(self, name: str) -> list[bool]:
         """Outcomes of a measurement, one a start."""
@@ -109,32 +115,24 @@ class Comparison:
     def results(self) -> dict[str, Any]:
         """Success of the cloned policy and of every training's checkpoints, and the mean changes."""
         cloned = {domain: self.found(f"cloned_{domain}") for domain in DOMAINS}
-        last = {
-            place: {
-                domain: [
-                    self.found(f"{run_name(place, seed)}_{self.iterations}_{domain}") for seed in self.seeds
-                ]
-                for domain in DOMAINS
-            }
-            for place in PLACES
-        }
-        changes = {
-            place: {
-                domain: asdict(MeanChange.over_runs([cloned[domain]] * len(runs), runs))
-                for domain, runs in last[place].items()
-            }
-            for place in PLACES
-        }
-        imagined, simulated = (last[place] for place in PLACES)
         return {
             "cloned": {domain: proportion(found) for domain, found in cloned.items()},
             "runs": {place: [self._run(place, seed) for seed in self.seeds] for place in PLACES},
-            "mean_change": changes,
-            "imagined_above_simulated": {
-                domain: asdict(MeanChange.over_runs(simulated[domain], imagined[domain]))
-                for domain in DOMAINS
+            "mean_change": {
+                name: {
+                    domain: self._change(place, iteration, domain)
+                    for domain in DOMAINS
+                    if domain == "ind" or iteration == MEASURED[place][-1]
+                }
+                for name, (place, iteration) in COMPARED.items()
             },
         }
+
+    def _change(self, place: str, iteration: int, domain: str) -> dict[str, Any]:
+        """From the cloned policy, on the same starts."""
+        cloned = self.found(f"cloned_{domain}")
+        after = [self.found(f"{run_name(place, seed)}_{iteration}_{domain}") for seed in self.seeds]
+        return asdict(MeanChange.over_runs([cloned] * len(after), after))
 
     def _run(self, place: str, seed: int) -> dict[str, Any]:
         """A training's curve, and its result in unseen scenes."""
@@ -147,12 +145,12 @@ class Comparison:
                 "seconds": seconds[iteration - 1],
                 **proportion(self.found(f"{name}_{iteration}_ind")),
             }
-            for iteration in self.measured()
+            for iteration in MEASURED[place]
         ]
         return {
             "seed": seed,
             "ind": curve,
-            "ood": proportion(self.found(f"{name}_{self.iterations}_ood")),
+            "ood": proportion(self.found(f"{name}_{MEASURED[place][-1]}_ood")),
             "success_rate_in_training": [row["success_rate"] for row in rows],
         }
 
@@ -169,24 +167,22 @@ def proportion(found: Sequence[bool]) -> dict[str, Any]:
 
 def results_table(results: Mapping[str, Any]) -> str:
     """A line a training and domain."""
-    lines = [_line(results, place, domain) for place in PLACES for domain in DOMAINS]
-    head = ["training", "scenes", "cloned", "each seed", "all seeds", "change on the same starts", "time"]
-    apart = [
-        f"imagined above simulated, {domain}: {MeanChange(**results['imagined_above_simulated'][domain])}"
-        for domain in DOMAINS
-    ]
-    return "\n".join([markdown_table(head, lines), "", *apart])
+    lines = [_line(results, name, domain) for name in COMPARED for domain in results["mean_change"][name]]
+    head = ["training", "scenes", "steps", "time", "cloned", "each seed", "all", "change on the same starts"]
+    return markdown_table(head, lines)
 
 
-def _line(results: Mapping[str, Any], place: str, domain: str) -> list[str]:
-    runs, before = results["runs"][place], results["cloned"][domain]
-    ends = [run["ind"][-1] if domain == "ind" else run["ood"] for run in runs]
-    together = Proportion(sum(end["k"] for end in ends), sum(end["n"] for end in ends))
-    minutes = np.mean([run["ind"][-1]["seconds"] for run in runs]) / 60
+def _line(results: Mapping[str, Any], name: str, domain: str) -> list[str]:
+    place, iteration = COMPARED[name]
+    index, runs = MEASURED[place].index(iteration), results["runs"][place]
+    found = [run["ind"][index] if domain == "ind" else run["ood"] for run in runs]
+    minutes = np.mean([run["ind"][index]["seconds"] for run in runs]) / 60
+    together = Proportion(sum(one["k"] for one in found), sum(one["n"] for one in found))
+    before = results["cloned"][domain]
     return [
-        TITLES[place], domain, str(Proportion(before["k"], before["n"])),
-        ", ".join(f"{100 * end['share']:.0f} %" for end in ends), str(together),
-        str(MeanChange(**results["mean_change"][place][domain])), f"{minutes:.0f} min",
+        name, domain, f"{iteration * ENVS * HORIZON:,}", f"{minutes:.0f} min",
+        str(Proportion(before["k"], before["n"])), ", ".join(f"{100 * one['share']:.0f} %" for one in found),
+        str(together), str(MeanChange(**results["mean_change"][name][domain])),
     ]  # fmt: skip
 
 
@@ -232,19 +228,17 @@ def main() -> None:
     parser.add_argument("--places", nargs="+", default=PLACES, choices=PLACES)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--episodes", type=int, default=200, help="of each success rate")
-    parser.add_argument("--iterations", type=int, default=20)
     parser.add_argument("--output", type=Path, default=RESULTS, help="JSON file")
     given, flags = parser.parse_known_args()
-    if given.iterations < MEASUREMENTS:
-        parser.error(f"--iterations={given.iterations}: at least {MEASUREMENTS}, one a measurement")
+    iterations = max(measured[-1] for measured in MEASURED.values())
     ppo = imagined_ppo.Experiment(
-        given.gate, given.output_dir, [POLICY], given.episodes, given.iterations, True, flags
+        given.gate, given.output_dir, [POLICY], given.episodes, iterations, True, flags
     )
-    comparison = Comparison(gate.Experiment(given.gate), ppo, given.seeds, given.iterations)
+    comparison = Comparison(gate.Experiment(given.gate), ppo, given.seeds)
     run_stages(comparison.stages(given.places), given.output_dir)
     if set(given.places) < set(PLACES):
         return
-    results = {"episodes": given.episodes, "iterations": given.iterations, **comparison.results()}
+    results = {"episodes": given.episodes, **comparison.results()}
     write_json(given.output, results)
     draw(results, given.output.with_suffix(".png"))
     print(results_table(results))
