@@ -7,9 +7,12 @@ import json
 import sys
 
 import draccus
+from accelerate import PartialState
 
 import lerobot_env_wmrl  # noqa: F401  (registers the models)
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig, train_world_model
+from tests.torchrun import PATIENCE
 
+PartialState(cpu=True, timeout=PATIENCE)
 for flags in sys.argv[1:]:
     train_world_model(draccus.parse(TrainWorldModelConfig, args=json.loads(flags)))

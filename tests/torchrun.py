@@ -1,0 +1,24 @@
+"""Scripts run by several processes at once, as users start them."""
+
+import os
+import subprocess
+import sys
+from datetime import timedelta
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+PATIENCE = timedelta(minutes=4)
+"""For a script's processes to wait for each other: then the one that waits says so, and where."""
+
+
+def torchrun(script: Path, *arguments: str) -> None:
+    """Two processes, which meet on this machine's loopback, whatever its name resolves to."""
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--local-addr=127.0.0.1",
+               "--nproc_per_node=2", str(script), *arguments]  # fmt: skip
+    folders = os.pathsep.join(str(ROOT / folder) for folder in ("", "policies", "datasets"))
+    own = {"PYTHONPATH": folders, "GLOO_SOCKET_IFNAME": "lo"}
+    result = subprocess.run(
+        command, env={**os.environ, **own}, capture_output=True, text=True, cwd=ROOT,
+        timeout=3 * PATIENCE.total_seconds(),
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr[-3000:]
