@@ -7,6 +7,7 @@ environment's episodes do not depend on which process it is in.
 import sys
 import time
 from collections.abc import Mapping
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,6 @@ from lerobot_wmrl.rl.factory import make_algorithm
 from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer
 from lerobot_wmrl.rl.trainer import Schedule, train
-from tests.torchrun import PATIENCE
 
 ENVS, STEPS, ITERATIONS = 24, 12, 3
 COMMON: dict[str, Any] = {"policy_lr": 1e-3, "minibatch_size": 50, "target_kl": 0.05}
@@ -88,7 +88,7 @@ def run(name: str, output_dir: Path) -> None:
 
 
 if __name__ == "__main__":
-    PartialState(cpu=True, timeout=PATIENCE)
+    PartialState(cpu=True, timeout=timedelta(minutes=4))  # for a process to wait for the other
     for each in RUNS:
         run(each, Path(sys.argv[1]) / each)
     PartialState().destroy_process_group()
