@@ -98,10 +98,10 @@ def wait_for_all() -> None:
 
 
 def mean_and_variance(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Of every process's `values` (N,) together, N may differ. → (), () the variance of a sample"""
+    """Of every process's `values` (N,) together, N may differ. → (), () the variance of a sample, of one 0"""
     count = sum_over_processes(torch.tensor(float(len(values)), device=values.device))
     mean = sum_over_processes(values.sum()) / count
-    return mean, sum_over_processes((values - mean).square().sum()) / (count - 1)
+    return mean, sum_over_processes((values - mean).square().sum()) / (count - 1).clamp_min(1)
 
 
 def sum_gradients(parameters: Iterable[nn.Parameter]) -> None:

@@ -56,16 +56,25 @@ class Callbacks:
     def resume(self, iteration: int) -> None:
         """Take up what was found up to here; what was found later belongs to iterations that are repeated."""
         for callback in self.callbacks:
+            self._take_up(callback.name, iteration)
+        for callback in self.callbacks:
             found = self.records[callback.name]
-            for folder in sorted((self.output_dir / callback.name).glob("[0-9]*")):
-                if int(folder.name) > iteration:
-                    shutil.rmtree(folder, ignore_errors=True)
-                elif (folder / RECORD_FILE).is_file():
-                    found[int(folder.name)] = json.loads((folder / RECORD_FILE).read_text())
             if iteration in found:
                 self._log(callback.name, iteration)
             if found:
-                callback.apply(found)
+                self._apply(callback)
+
+    def _take_up(self, name: str, iteration: int) -> None:
+        for folder in sorted((self.output_dir / name).glob("[0-9]*")):
+            if int(folder.name) > iteration:
+                shutil.rmtree(folder, ignore_errors=True)
+            elif (folder / RECORD_FILE).is_file():
+                self.records[name][int(folder.name)] = json.loads((folder / RECORD_FILE).read_text())
+
+    def _apply(self, callback: Callback) -> None:
+        """Also when resumed, which has the training's dice at the checkpoint: to make a model rolls some."""
+        with preserved_randomness():
+            callback.apply(self.records[callback.name])
 
     def due(self, iteration: int) -> bool:
         """Whether any of them has something to do that is not done yet."""
@@ -83,7 +92,7 @@ class Callbacks:
                 record = json.loads((folder / RECORD_FILE).read_text())
                 self.records[callback.name][iteration] = record
                 self._log(callback.name, iteration)
-                callback.apply(self.records[callback.name])
+                self._apply(callback)
 
     def real_steps(self) -> dict[str, float]:
         """Steps in reality so far, by what they were spent on: `real_steps/<name>`."""

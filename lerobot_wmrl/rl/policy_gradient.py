@@ -150,7 +150,7 @@ class PolicyGradient(RLAlgorithm):
             records.append(record)
             if record["kl"] > self.config.target_kl:
                 break
-            records[-1] |= self._descend()
+            record |= self._descend()
         return summary(records, self.optimization_step - first)
 
     def _accumulate(self, batch: Minibatch) -> dict[str, float]:
@@ -199,27 +199,33 @@ class PolicyGradient(RLAlgorithm):
         return list(self.parameter_groups())
 
     def _descend(self) -> dict[str, float]:
-        """One step along the gradients, those of each group clipped. → their norms"""
-        trained, norms = self.trained(), {}
+        """One step along the gradients, those of each group clipped. → their norms. TrainingStopped before it
+        if they are not finite."""
+        trained, clipped = self.trained(), {}
         for name, (parameters, _) in self.parameter_groups().items():
             if name not in trained:
                 for parameter in parameters:
                     parameter.grad = None
                 continue
             sum_gradients(parameters)
-            norms[name + NORM] = nn.utils.clip_grad_norm_(parameters, self.config.grad_clip_norm)
+            clipped[name + NORM] = nn.utils.clip_grad_norm_(parameters, self.config.grad_clip_norm)
+        norms = {name: norm.item() for name, norm in clipped.items()}
+        self._check_finite(norms)
         self.optimizer.step()
         self.optimization_step += 1
-        return {name: norm.item() for name, norm in norms.items()}
+        return norms
 
-    def _check(self, record: dict[str, float]) -> None:
-        """TrainingStopped before a step that would spoil the policy."""
+    def _check_finite(self, record: dict[str, float]) -> None:
         broken = [name for name, value in record.items() if not math.isfinite(value)]
         if broken:
             raise TrainingStopped(
                 f"iteration {self.iteration + 1}: {', '.join(broken)} is not finite; the last checkpoint is "
                 "kept: lower algorithm.policy_lr or algorithm.value_lr"
             )
+
+    def _check(self, record: dict[str, float]) -> None:
+        """TrainingStopped before a step that would spoil the policy."""
+        self._check_finite(record)
         if record["reference_kl"] > self.config.max_reference_kl:
             raise TrainingStopped(
                 f"iteration {self.iteration + 1}: the policy is {record['reference_kl']:.1f} nats "

@@ -58,7 +58,7 @@ class PPO(PolicyGradient):
         buffer.columns = {
             "advantage": normalised(advantages, decided),
             "target": self.returns.normalise(target),
-            "old_value": self.returns.normalise(value),
+            "old_value": buffer.value,
         }
         missed, spread = mean_and_variance(advantages[decided])[1], mean_and_variance(target[decided])[1]
         explained = 1 - (missed / spread.clamp_min(1e-12)).item()

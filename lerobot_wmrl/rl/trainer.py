@@ -65,6 +65,7 @@ def train(
     pauses = Callbacks(callbacks, output_dir, total, tracker)
     with progress_bar(algorithm, total) as progress:
         pauses.resume(algorithm.iteration)
+        wait_for_all()  # else a slow process would find what the first one has written since
         if pauses.due(algorithm.iteration):
             pauses.run(algorithm.iteration, checkpoint or save(algorithm, output_dir, total, save_pretrained))
         while algorithm.iteration < total:

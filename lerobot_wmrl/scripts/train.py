@@ -26,7 +26,7 @@ from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 
 from lerobot_wmrl.command import RunConfig, claim_output_dir, run_command
 from lerobot_wmrl.constants import ACTION_NAMES, EVALUATION_SEED
-from lerobot_wmrl.distributed import LONGEST_WAIT, rank_and_size
+from lerobot_wmrl.distributed import LONGEST_WAIT, rank_and_size, wait_for_all
 from lerobot_wmrl.malloc import keep_freed_memory
 from lerobot_wmrl.presets import expand_preset
 from lerobot_wmrl.rl.configuration_callbacks import CallbackSettings
@@ -146,7 +146,9 @@ def train_policy(cfg: TrainConfig) -> None:
     algorithm = check_config(cfg)
     config = load_config(cfg)
     PartialState(cpu=config.device == "cpu", timeout=LONGEST_WAIT)
-    if finished(cfg):
+    done = finished(cfg)
+    wait_for_all()  # no process has written anything before all have looked
+    if done:
         claim_output_dir(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER)
         print(f"{cfg.output_dir}: already trained for {cfg.iterations} iterations")
         return

@@ -79,14 +79,12 @@ def test_a_stage_ends_when_the_demo_is_stopped(sign: signal.Signals, tmp_path: P
         f"Path({str(pid_file)!r}).write_text(str(os.getpid())); time.sleep(60)"
     )
     runner = (
-        "import sys; from pathlib import Path; from lerobot_wmrl.demo import process; "
+        "import signal, sys; from pathlib import Path; from lerobot_wmrl.demo import process; "
+        "signal.signal(signal.SIGINT, signal.default_int_handler); "  # background jobs ignore it
         "process.entry_point = lambda program: lambda: exec(sys.argv[1], {}); "
         f"process.run_measured(['python', {stage!r}], Path({str(log)!r}), print)"
     )
-    process = subprocess.Popen(
-        [sys.executable, "-c", runner], stdout=subprocess.DEVNULL,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # background jobs ignore it
-    )  # fmt: skip
+    process = subprocess.Popen([sys.executable, "-c", runner], stdout=subprocess.DEVNULL)
     wait_until(lambda: pid_file.exists() and pid_file.read_text() != "")
     process.send_signal(sign)
     process.wait(30)

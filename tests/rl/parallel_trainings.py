@@ -5,6 +5,9 @@ environment's episodes do not depend on which process it is in.
 """
 
 import sys
+import time
+from collections.abc import Mapping
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +20,7 @@ from chunk_policy import ACTIONS, ChunkPolicy, Sample
 from point_env import PointEnv
 
 from lerobot_wmrl.distributed import rank_and_size
+from lerobot_wmrl.rl.callbacks import Record
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 from lerobot_wmrl.rl.configuration_policy_gradient import PolicyGradientConfig
 from lerobot_wmrl.rl.configuration_ppo import PPOConfig
@@ -48,8 +52,23 @@ class SeeingIsDeciding(ChunkPolicy):
         return Sample(raw_action, distribution.log_prob(raw_action), self.value(observation))
 
 
+class Pause:
+    """Before the first update."""
+
+    name = "pause"
+
+    def due(self, iteration: int) -> bool:
+        return iteration == 0
+
+    def run(self, iteration: int, checkpoint: Path, folder: Path) -> Record:
+        return {"checkpoint": int(checkpoint.name)}
+
+    def apply(self, records: Mapping[int, Record]) -> None:
+        """There is no conclusion."""
+
+
 def run(name: str, output_dir: Path) -> None:
-    """One training, of this process's environments."""
+    """One training, of this process's environments. The second process comes to it late."""
     config, chunk = RUNS[name]
     torch.manual_seed(0)
     policy = SeeingIsDeciding(chunk)
@@ -64,11 +83,12 @@ def run(name: str, output_dir: Path) -> None:
 
     output_dir.mkdir(parents=True, exist_ok=True)
     env, schedule = PointEnv(num_envs, horizon=6), Schedule(ITERATIONS, 1, seed=5)
-    train(env, algorithm, pipeline, buffer, schedule, output_dir, save_pretrained)
+    time.sleep(0.5 * rank_and_size()[0])
+    train(env, algorithm, pipeline, buffer, schedule, output_dir, save_pretrained, [Pause()])
 
 
 if __name__ == "__main__":
-    PartialState(cpu=True)
+    PartialState(cpu=True, timeout=timedelta(minutes=4))  # for a process to wait for the other
     for each in RUNS:
         run(each, Path(sys.argv[1]) / each)
     PartialState().destroy_process_group()

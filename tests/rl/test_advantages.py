@@ -67,6 +67,10 @@ def test_normalised_advantages() -> None:
     assert abs(advantages.std().item() - 1) < 1e-4
 
 
+def test_a_single_decision_is_as_good_as_the_average() -> None:
+    assert normalised(torch.tensor([[7.0]]), torch.tensor([[True]])).item() == 0.0
+
+
 def test_group_advantages_are_of_the_group_not_of_the_batch() -> None:
     """An easy start's worst episode is below 0, a hard start's best above, whatever the other group did."""
     returns = torch.tensor([[0.9, 1.0, 1.1, 1.0], [0.0, 0.2, 0.0, 0.0], [1.0, 1.0, 1.0, 1.0]])

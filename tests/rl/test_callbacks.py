@@ -51,30 +51,37 @@ class EvaluablePointEnv(PointEnv):
         return super().reset(seed=seed[0] if isinstance(seed, list) else seed, options=options)
 
 
+def roll() -> list[float]:
+    """All dice there are."""
+    return [torch.rand(1).item(), float(np.random.rand()), random.random()]  # noqa: NPY002
+
+
 class Gambler:
-    """Rolls all dice there are, at every second iteration; is killed, or stops the training, if told to."""
+    """Rolls all dice there are, at every second iteration up to the `last`; is killed, or stops the
+    training, if told to."""
 
     name = "gambler"
 
-    def __init__(self, killed_at: int | None = None, stops_at: int | None = None) -> None:
-        self.killed_at, self.stops_at = killed_at, stops_at
+    def __init__(self, killed_at: int | None = None, stops_at: int | None = None, last: int = 9) -> None:
+        self.killed_at, self.stops_at, self.last = killed_at, stops_at, last
         self.runs: list[int] = []
         self.applied: list[list[int]] = []
 
     def due(self, iteration: int) -> bool:
-        return iteration % 2 == 0
+        return iteration % 2 == 0 and iteration <= self.last
 
     def run(self, iteration: int, checkpoint: Path, folder: Path) -> Record:
         assert (checkpoint / "pretrained_model").is_dir()
         assert int(checkpoint.name) == iteration
         self.runs.append(iteration)
-        rolled = [torch.rand(1).item(), float(np.random.rand()), random.random()]  # noqa: NPY002
+        rolled = roll()
         if iteration == self.killed_at:
             raise Killed
         return {"sum": sum(rolled), "nested": {"iteration": iteration}, "fine": True, "real_steps": 10}
 
     def apply(self, records: Mapping[int, Record]) -> None:
         self.applied.append(sorted(records))
+        roll()
         if self.stops_at in records:
             raise TrainingStopped("enough")
 
@@ -183,6 +190,34 @@ def test_steps_in_reality_add_up_also_over_a_kill(
     assert [line.get("gambler/nested/iteration") for line in lines] == [0, None, 2, None, 4]
     assert [line.get("env_steps") for line in lines] == [None, 48, 96, 144, 192]
     assert "gambler/fine" not in lines[0]
+
+
+def test_conclusions_of_earlier_iterations_leave_a_resumed_training_s_dice_alone(
+    fresh: Callable[[], CnnPolicy], pipeline: Pipeline, tmp_path: Path
+) -> None:
+    """A world model that is loaded again rolls some."""
+    whole = run(fresh(), pipeline, tmp_path / "whole", lambda env: [Gambler(last=0), Sleeper()])
+    run(fresh(), pipeline, tmp_path / "cut", lambda env: [Gambler(last=0), Sleeper()])
+    (tmp_path / "cut" / "checkpoints" / "000004").rename(tmp_path / "lost")
+    assert same(whole, run(fresh(), pipeline, tmp_path / "cut", lambda env: [Gambler(last=0), Sleeper()]))
+
+
+class Sleeper(Gambler):
+    """Takes steps of its own."""
+
+    name = "sleeper"
+
+
+def test_a_resumed_callback_forgets_no_steps_of_another(
+    fresh: Callable[[], CnnPolicy], pipeline: Pipeline, tmp_path: Path
+) -> None:
+    """The first knows of iteration 2 when the second, which was killed there, has only been at 0."""
+    with pytest.raises(Killed):
+        run(fresh(), pipeline, tmp_path, lambda env: [Gambler(), Sleeper(killed_at=2)])
+    run(fresh(), pipeline, tmp_path, lambda env: [Gambler(), Sleeper(last=0)])
+    lines = read_metrics(tmp_path)
+    assert [line["real_steps/gambler"] for line in lines] == [10, 10, 20, 20, 30]
+    assert [line["real_steps/sleeper"] for line in lines] == [10] * 5
 
 
 def test_what_was_found_in_iterations_that_are_repeated_is_found_again(

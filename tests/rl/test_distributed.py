@@ -1,8 +1,5 @@
 """Two processes that each have half of the environments learn what one process learns from all of them."""
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -11,17 +8,9 @@ from safetensors.torch import load_file
 
 from lerobot_wmrl.tracking import read_metrics
 from tests.rl.parallel_trainings import ITERATIONS, RUNS, run
+from tests.torchrun import torchrun
 
-HERE = Path(__file__).parent
-ROOT = HERE.parents[1]
-
-
-def torchrun(script: list[str]) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2", *script]
-    folders = os.pathsep.join(str(ROOT / folder) for folder in ("", "policies", "datasets"))
-    return subprocess.run(
-        command, env={**os.environ, "PYTHONPATH": folders}, capture_output=True, text=True, cwd=ROOT
-    )
+SCRIPT = Path(__file__).with_name("parallel_trainings.py")
 
 
 @pytest.fixture(scope="module")
@@ -30,15 +19,15 @@ def trained_twice(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]
     one, two = tmp_path_factory.mktemp("one"), tmp_path_factory.mktemp("two")
     for name in RUNS:
         run(name, one / name)
-    result = torchrun([str(HERE / "parallel_trainings.py"), str(two)])
-    assert result.returncode == 0, result.stderr[-3000:]
+    torchrun(SCRIPT, str(two))
     return one, two
 
 
 @pytest.mark.parametrize("name", RUNS)
 def test_two_processes_log_what_one_does(name: str, trained_twice: tuple[Path, Path]) -> None:
     one, two = (read_metrics(folder / name) for folder in trained_twice)
-    assert [line["step"] for line in two] == list(range(1, ITERATIONS + 1))
+    assert [line["step"] for line in two] == list(range(ITERATIONS + 1))
+    assert two[0]["pause/checkpoint"] == 0
     for first, second in zip(one, two, strict=True):
         timeless = [
             {key: value for key, value in line.items() if key[-2:] != "_s"} for line in (first, second)

@@ -11,7 +11,7 @@ from torch import nn
 
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_wmrl.rl.configuration_ppo import PPOConfig
-from lerobot_wmrl.rl.policy_gradient import schedule_factor
+from lerobot_wmrl.rl.policy_gradient import TrainingStopped, schedule_factor
 from lerobot_wmrl.rl.ppo import PPO
 from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
@@ -153,3 +153,49 @@ def test_batch_norm_and_dropout_rest_in_rollouts_and_updates(pipeline: Pipeline)
         assert algorithm.improve(buffer, pipeline).extra["first_ratio_error"] < 1e-3
     assert not any(module.training for module in (*policy.modules(), *algorithm.reference.modules()))
     assert (policy.actor[1].running_mean == 0).all()
+
+
+class Root(torch.autograd.Function):
+    """Finite itself, with a slope that is not."""
+
+    @staticmethod
+    def forward(context: Any, value: torch.Tensor) -> torch.Tensor:
+        return value.clone()
+
+    @staticmethod
+    def backward(context: Any, gradient: torch.Tensor) -> torch.Tensor:
+        return gradient * torch.inf
+
+
+class Steep(ChunkPolicy):
+    """Its value is finite, the gradient of it is not."""
+
+    def value(self, observation: dict[str, Any]) -> torch.Tensor:
+        return Root.apply(super().value(observation))
+
+
+def test_a_gradient_that_is_not_finite_spoils_no_weights(pipeline: Pipeline) -> None:
+    """Else those of an iteration's last minibatch would be saved."""
+    torch.manual_seed(0)
+    policy = Steep(1)
+    before = copy.deepcopy(policy.state_dict())
+    algorithm, buffer = PPO(policy, PPOConfig(epochs=1, minibatch_size=192)), RolloutBuffer(12, 16, "cpu")
+    collect(PointEnv(16, horizon=6), policy, pipeline, buffer, 0)
+    with pytest.raises(TrainingStopped, match=r"iteration 1: value_grad_norm is not finite"):
+        algorithm.improve(buffer, pipeline)
+    assert all(torch.equal(value, before[name]) for name, value in policy.state_dict().items())
+
+
+def test_a_clipped_value_begins_where_it_was_whatever_the_scale_has_become(
+    make_policy: MakePolicy, pipeline: Pipeline
+) -> None:
+    """Else it could not move at all once the returns' scale has, being beyond the clip from the start."""
+    policy = make_policy()
+    config = PPOConfig(value_loss="clipped", value_normalisation=True, minibatch_size=9999, epochs=1)
+    algorithm, buffer = PPO(policy, config), RolloutBuffer(12, 16, "cpu")
+    collect(PointEnv(16, horizon=6), policy, pipeline, buffer, 0)
+    buffer.reward -= 1000
+    stats = algorithm.improve(buffer, pipeline)
+    missed = buffer.value - buffer.columns["target"]
+    assert stats.losses["value_loss"] == pytest.approx(missed.square().mean().item() / 2, rel=1e-4)
+    assert stats.grad_norms["value"] > 0

@@ -1,9 +1,6 @@
 """Two processes that each have half of the batch learn what one process learns from all of it."""
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import draccus
@@ -13,9 +10,9 @@ from safetensors.torch import load_file
 
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig, train_world_model
 from lerobot_wmrl.tracking import read_metrics
+from tests.torchrun import torchrun
 
-HERE = Path(__file__).parent
-ROOT = HERE.parents[1]
+SCRIPT = Path(__file__).with_name("trainings.py")
 TRAINED_WEIGHTS = "checkpoints/last/pretrained_model/model.safetensors"
 STEPS, BATCH = 6, 8
 SIZES = {
@@ -52,13 +49,7 @@ def trained_twice(small_dataset, trained_models, tmp_path_factory) -> tuple[Path
             draccus.parse(TrainWorldModelConfig, args=flags(model, root, tokenizer, one / model, 1))
         )
     runs = [json.dumps(flags(model, root, tokenizer, two / model, 2)) for model in SIZES]
-    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
-    folders = os.pathsep.join(str(ROOT / folder) for folder in ("", "policies", "datasets"))
-    result = subprocess.run(
-        [*torchrun, str(HERE / "trainings.py"), *runs], env={**os.environ, "PYTHONPATH": folders},
-        capture_output=True, text=True,
-    )  # fmt: skip
-    assert result.returncode == 0, result.stderr[-3000:]
+    torchrun(SCRIPT, *runs)
     return one, two
 
 
