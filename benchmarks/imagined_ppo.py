@@ -66,18 +66,26 @@ class Experiment:
     ) -> None:  # fmt: skip
         self.gate, self.out, self.policies, self.episodes = gate, out, policies, episodes
         self.iterations, self.flags = iterations, flags
+        self.text_model = out / "text_world_model"
         self.trainings = {"imagined": self.imagination, **({"simulated": self.simulator} if rival else {})}
 
     def stages(self) -> list[Stage]:
         """In order: whole policies one after the other, so that the first results come early."""
         stages = [self._stage("text_world_model", self.train_text_model)]
-        for policy in self.policies:
-            stages += self._measured(policy, "cloned", self.gate / f"policy_{policy}")
-            for place, environment in self.trainings.items():
-                name = f"{place}_{policy}"
-                stages.append(self._stage(name, self.reinforce, policy, name, environment))
-                stages += self._measured(policy, place, self.out / name)
+        return stages + [stage for policy in self.policies for stage in self.improvement(policy)]
+
+    def improvement(self, policy: str) -> list[Stage]:
+        """A cloned policy is measured, then trained and measured again."""
+        stages = self._measured(policy, "cloned", self.cloned(policy))
+        for place, environment in self.trainings.items():
+            name = f"{place}_{policy}"
+            stages.append(self._stage(name, self.reinforce, policy, name, environment))
+            stages += self._measured(policy, place, self.out / name)
         return stages
+
+    def cloned(self, policy: str) -> Path:
+        """The output folder of its training."""
+        return self.gate / f"policy_{policy}"
 
     def _measured(self, policy: str, kind: str, folder: Path) -> list[Stage]:
         names = {domain: f"eval_{kind}_{policy}_{domain}" for domain in DOMAINS}
@@ -91,7 +99,7 @@ class Experiment:
         """It is needed for the goal frames of the dense reward."""
         flags: Flags = {
             "model.type": "text_world_model", "model.tokenizer_path": str(self.gate / "frame_tokenizer"),
-            "dataset.root": str(self.gate / "dataset"), "output_dir": str(self.out / "text_world_model"),
+            "dataset.root": str(self.gate / "dataset"), "output_dir": str(self.text_model),
         }  # fmt: skip
         return ["lerobot-wmrl-train-world-model", "--preset=demo", *format_flags(flags)]
 
@@ -110,7 +118,7 @@ class Experiment:
         return {
             "num_envs": ENVS, "rollout_steps": HORIZON, "env.type": "world_model",
             "env.world_model_path": str(self.gate / "action_world_model"),
-            "env.text_world_model_path": str(self.out / "text_world_model"),
+            "env.text_world_model_path": str(self.text_model),
             "env.dataset.root": str(self.gate / "dataset"), "env.episode_length": HORIZON,
             "gate.dataset.root": str(self.gate / "rollouts"), **self.judgement(),
         }  # fmt: skip
@@ -123,7 +131,7 @@ class Experiment:
 
     def reinforce(self, policy: str, name: str, environment: Callable[[], Flags]) -> list[str]:
         flags: Flags = {
-            "policy.path": str(checkpoint(self.gate / f"policy_{policy}")), **environment(),
+            "policy.path": str(checkpoint(self.cloned(policy))), **environment(),
             "algorithm.type": "ppo", "iterations": self.iterations, "output_dir": str(self.out / name),
         }  # fmt: skip
         return ["lerobot-wmrl-train", "--preset=demo", *format_flags(flags), *self.flags]

@@ -25,16 +25,21 @@ def load_with_adapters(config: PreTrainedConfig, **options: Any) -> Any:
     path = str(config.pretrained_path)
     adapter = PeftConfig.from_pretrained(path)
     base = adapter.base_model_name_or_path
-    if Path(base).is_absolute() and not Path(base).is_dir():
+    if not may_be_on_hub(base) and not Path(base).is_dir():
         raise ValueError(
-            f"{path}: adapts the policy in {base}, which is not there; put it back, or write where it is now "
-            "into adapter_config.json, base_model_name_or_path"
+            f"{path}: adapts the policy in {base}, which is not there; put it back, start this where its "
+            "training was started, or write where it is now into adapter_config.json, base_model_name_or_path"
         )
     policy_class = get_policy_class(config.type)
     policy = policy_class.from_pretrained(
         base, config=config, revision=adapter.revision, strict=True, **options
     )
     return PeftModel.from_pretrained(policy, path, config=adapter, is_trainable=True)
+
+
+def may_be_on_hub(name: str) -> bool:
+    """Whether a name can be one of the hub's: `model` or `owner/model`. All others are paths."""
+    return len(Path(name).parts) <= 2 and not name.startswith((".", "/"))
 
 
 def unwrapped(policy: Any) -> Any:

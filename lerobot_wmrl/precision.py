@@ -4,9 +4,11 @@ Weights, losses and optimiser states stay in float32; autocast chooses by operat
 Micikevicius et al. 2018; bfloat16 needs no scaling of the loss).
 """
 
+from collections.abc import Iterable
 from typing import Final
 
 import torch
+from torch import Tensor
 
 SMALL_BATCH: Final = 16
 """In so few imaginations at once on the CPU, casts cost more than bfloat16 saves."""
@@ -35,6 +37,15 @@ def training_dtype(precision: str, device: torch.device | str) -> torch.dtype:
     if precision == "auto":
         return torch.bfloat16 if multiplies_bfloat16(device) else torch.float32
     return torch.float32 if precision == "float32" else torch.bfloat16
+
+
+def require_exact_updates(trained: Iterable[Tensor]) -> None:
+    """ValueError if weights that are to be trained are in bfloat16: its eight bits round small steps away."""
+    if any(weights.dtype == torch.bfloat16 for weights in trained):
+        raise ValueError(
+            "policy.dtype: weights in bfloat16 cannot be trained, most steps would be rounded away; use "
+            "--policy.dtype=float32, or train adapters, --peft.method_type=LORA"
+        )
 
 
 def compute_in(dtype: torch.dtype, device: torch.device | str) -> torch.autocast:

@@ -100,6 +100,25 @@ PAPER_WORLD_MODEL: Final[Flags] = {
 }
 """RoboScape's transformer and the paper's clips and window."""
 
+SMALL_OPENVLA: Final[Flags] = {
+    "policy.type": "openvla",
+    "policy.sizes.image_size": DEMO_IMAGE_SIZE,
+    "policy.sizes.patch_size": 8,
+    "policy.sizes.dino.width": 48,
+    "policy.sizes.dino.depth": 3,
+    "policy.sizes.dino.mlp_size": 192,
+    "policy.sizes.siglip.width": 48,
+    "policy.sizes.siglip.depth": 3,
+    "policy.sizes.siglip.mlp_size": 192,
+    "policy.sizes.llama.width": 96,
+    "policy.sizes.llama.depth": 3,
+    "policy.sizes.llama.mlp_size": 256,
+    "policy.optimizer_lr": 1e-3,
+    "steps": 4000,
+    "save_freq": 1000,
+}
+"""OpenVLA's parts at a size that one core can train from random weights; the rest is that of `sft`."""
+
 PRESETS: Final[dict[str, dict[str, Flags]]] = {
     "tiny": {
         "train-world-model:frame_tokenizer": {
@@ -180,6 +199,7 @@ PRESETS: Final[dict[str, dict[str, Flags]]] = {
             "save_freq": 100,
             "log_freq": 20,
         },
+        "sft:openvla": SMALL_OPENVLA,
         "train": {
             "num_envs": 64,
             "iterations": 20,

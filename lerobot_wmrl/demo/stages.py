@@ -1,7 +1,7 @@
 """The stages of the demo: which command each one runs, as a user would type it."""
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -142,26 +142,32 @@ def train_model(config: DemoConfig, model: str) -> list[str]:
 
 
 def clone(config: DemoConfig) -> list[str]:
+    dataset = config.output_dir / "planned"
+    flags: Flags = {"policy.type": "cnn", "dataset.repo_id": "local/demo", "seed": first_seed(config)}
+    return lerobot_train(
+        config.output_dir / "sft",
+        dataset,
+        optimal_episodes(dataset, config.sft_episodes),
+        [*preset_flags(config.stage_preset, "sft"), *format_flags(flags)],
+    )
+
+
+def lerobot_train(folder: Path, dataset: Path, episodes: Sequence[int], flags: Sequence[str]) -> list[str]:
     """LeRobot's own training. It continues by other flags, and refuses a folder without checkpoints, which
     is therefore removed. It points `last` at a checkpoint that is whole, but a kill can come in between."""
-    folder, dataset = config.output_dir / "sft", config.output_dir / "planned"
     last = folder / LAST_CHECKPOINT
     newest = last if last.exists() else latest_checkpoint(folder)
     if newest is not None:
         trained = newest / PRETRAINED_MODEL_DIR / "train_config.json"
         return ["lerobot-train", *format_flags({"config_path": str(trained), "resume": True})]
     shutil.rmtree(folder, ignore_errors=True)
-    episodes = ",".join(str(episode) for episode in optimal_episodes(dataset, config.sft_episodes))
-    flags: Flags = {
-        "policy.type": "cnn",
+    files: Flags = {
         "policy.push_to_hub": False,
-        "dataset.repo_id": "local/demo",
         "dataset.root": str(dataset),
-        "dataset.episodes": f"[{episodes}]",
+        "dataset.episodes": f"[{','.join(map(str, episodes))}]",
         "output_dir": str(folder),
-        "seed": first_seed(config),
     }
-    return ["lerobot-train", *preset_flags(config.stage_preset, "sft"), *format_flags(flags)]
+    return ["lerobot-train", *flags, *format_flags(files)]
 
 
 def imagination(config: DemoConfig) -> Flags:

@@ -23,6 +23,7 @@ from lerobot_wmrl.distributed import (
     sum_gradients,
     sum_over_processes,
 )
+from lerobot_wmrl.precision import require_exact_updates
 from lerobot_wmrl.rl.adapters import stochastic
 from lerobot_wmrl.rl.configuration_policy_gradient import PolicyGradientConfig
 from lerobot_wmrl.rl.minibatches import Minibatch, Steps, make_minibatches, read_steps
@@ -79,6 +80,7 @@ class PolicyGradient(RLAlgorithm):
         self.policy_parameters = [
             p for p in self.policy.parameters() if p.requires_grad and id(p) not in owned
         ]
+        require_exact_updates(self.policy_parameters)
         self.optimizer = self.make_optimizers_and_scheduler()[self.name]
 
     @property

@@ -28,8 +28,8 @@ class OpenVLAConfig(PreTrainedConfig):
         unnorm_key: the dataset whose statistics turn normalised actions into the robot's; set by the import
             and by fine-tuning, together with the processors.
         norm_stats: 1st and 99th percentile and mask of the actions of every dataset it knows.
-        dtype: what the network computes in: `auto` is bfloat16 on a GPU that multiplies in it, else float32.
-            Adapters and the value head stay in float32.
+        dtype: of the network: `auto` is bfloat16 for a checkpoint on a GPU that multiplies in it, else
+            float32. Adapters and the value head stay in float32; what is bfloat16 cannot be trained itself.
         temperature: by which logits are divided in sampling, and in the log-probabilities of samples.
         value_sizes: hidden layers of the value head (RL4VLA's, Liu et al. 2025).
         gradient_checkpointing: recompute activations instead of keeping them: less memory, a third more time.

@@ -18,17 +18,20 @@ NAMED = 5
 """Weights that an error names before it only counts them."""
 
 
-def compute_dtype(name: str, device: str) -> torch.dtype:
-    """What `policy.dtype` means on `device`. ValueError if a CPU is asked for a format it does not have."""
+def compute_dtype(name: str, device: str, random_start: bool = False) -> torch.dtype:
+    """What `policy.dtype` means on `device`. ValueError if a CPU is asked for a format it does not have.
+
+    `auto` is float32 for a random start, since all of its weights must be trained.
+    """
     kind = torch.device(device).type
     if name == "bfloat16" and kind == "cpu" and not multiplies_bfloat16(device):
         raise ValueError(
             "policy.dtype=bfloat16: this CPU has no instructions for it (AVX512-BF16 or AMX); use "
             "--policy.dtype=float32 or auto"
         )
-    if name == "bfloat16" or (name == "auto" and kind == "cuda" and multiplies_bfloat16(device)):
+    if name == "auto" and not random_start and kind == "cuda" and multiplies_bfloat16(device):
         return torch.bfloat16
-    return torch.float32
+    return torch.bfloat16 if name == "bfloat16" else torch.float32
 
 
 def openvla_config(

@@ -19,7 +19,7 @@ from lerobot_policy_openvla.adapters import VALUE_HEAD, adapter_targets
 from lerobot_policy_openvla.configuration_openvla import OpenVLAConfig
 from lerobot_policy_openvla.images import check_pixel_values, to_pixel_values
 from lerobot_policy_openvla.loading import check_key, compute_dtype, fill, openvla_config
-from lerobot_policy_openvla.memory import require_memory
+from lerobot_policy_openvla.memory import AS_STORED, CONVERTED, require_memory
 from lerobot_policy_openvla.network import OpenVLANetwork, Prefix, make_value_head
 from lerobot_policy_openvla.observations import look
 from lerobot_policy_openvla.openvla_checkpoint import (
@@ -29,10 +29,12 @@ from lerobot_policy_openvla.openvla_checkpoint import (
     read_companions,
     read_tensors,
     resolve_folder,
+    stored_bytes,
     weight_files,
 )
 from lerobot_policy_openvla.prompts import END_ID, PromptTokenizer, aligned_prompts, train_tokenizer
 from lerobot_policy_openvla.statistics import adopt_statistics
+from lerobot_wmrl.precision import require_exact_updates
 
 Observation = dict[str, Any]
 
@@ -76,9 +78,9 @@ class OpenVLAPolicy(PreTrainedPolicy):
         self.files = files
         self.prompts = PromptTokenizer(files[TOKENIZER_FILE].decode())
         self.action_tokens = ActionTokenizer(vocabulary)
-        self.dtype = compute_dtype(config.dtype, config.device or "cpu")
+        self.dtype = compute_dtype(config.dtype, config.device or "cpu", random_start=not empty)
         with init_empty_weights() if empty else nullcontext():
-            self.model = OpenVLANetwork(config.sizes).to(self.dtype)
+            self.model = OpenVLANetwork(config.sizes).in_format(self.dtype)
         if config.gradient_checkpointing:
             self.model.enable_checkpointing()
         self.value_head = make_value_head([config.sizes.llama.width, *config.value_sizes])
@@ -99,7 +101,8 @@ class OpenVLAPolicy(PreTrainedPolicy):
         checkpoint = OpenVLACheckpoint.open(source)
         config = openvla_config(checkpoint, unnorm_key, device, dtype)
         policy = cls(config, files=checkpoint.companions, empty=True)
-        policy._fill(policy.model, checkpoint.tensors(), as_stored, str(source))
+        stored = stored_bytes(checkpoint.locations) if as_stored else None
+        policy._fill(policy.model, checkpoint.tensors(), str(source), stored)
         return policy.to(device).eval()
 
     @classmethod
@@ -119,18 +122,28 @@ class OpenVLAPolicy(PreTrainedPolicy):
         if dataset_meta is None:
             check_key(config)
         policy = cls(config, files=files, dataset_meta=dataset_meta, empty=True)
-        policy._fill(policy, read_tensors(weight_files(folder)), as_stored, str(pretrained_name_or_path))
+        weights = weight_files(folder)
+        stored = stored_bytes(weights) if as_stored else None
+        policy._fill(policy, read_tensors(weights), str(pretrained_name_or_path), stored)
         return policy.to(config.device).eval()
 
     def _fill(
-        self, module: nn.Module, tensors: Iterable[tuple[str, Tensor]], as_stored: bool, source: str
+        self, module: nn.Module, tensors: Iterable[tuple[str, Tensor]], source: str, stored: int | None
     ) -> None:
-        """Weights into the network, converted to what it computes in; the value head's stay as they are."""
+        """Weights into the network, converted to what it computes in; the value head's stay as they are.
+
+        `stored`: bytes that all take as they are stored, if they shall keep that format.
+        """
         device = self.config.device or "cpu"
-        require_memory(sum(p.numel() for p in module.parameters()) * self.dtype.itemsize, device)
+        if stored is None:
+            count = sum(parameter.numel() for parameter in module.parameters())
+            require_memory(count * self.dtype.itemsize, device, CONVERTED)
+        else:
+            require_memory(stored, device, AS_STORED)
 
         def convert(name: str, tensor: Tensor) -> Tensor:
-            return tensor if as_stored or name.startswith(VALUE_HEAD) else tensor.to(self.dtype)
+            as_it_is = stored is not None or name.startswith(VALUE_HEAD)
+            return tensor if as_it_is else tensor.to(self.dtype)
 
         fill(module, ((name, convert(name, tensor)) for name, tensor in tensors), device, source)
 
@@ -143,9 +156,12 @@ class OpenVLAPolicy(PreTrainedPolicy):
         return adapter_targets(self.config.sizes)
 
     def get_optim_params(self) -> list[nn.Parameter]:
-        """What fine-tuning trains: everything that is not frozen, but for the value."""
+        """What fine-tuning trains: everything that is not frozen, but for the value. ValueError if that
+        includes weights in bfloat16."""
         own = {id(parameter) for parameter in self.value_parameters()}
-        return [p for p in self.parameters() if p.requires_grad and id(p) not in own]
+        trained = [p for p in self.parameters() if p.requires_grad and id(p) not in own]
+        require_exact_updates(trained)
+        return trained
 
     def value_parameters(self) -> Iterator[nn.Parameter]:
         """The value head's: the state that it looks at does not learn from it."""

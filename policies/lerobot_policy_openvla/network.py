@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Self
 
 import torch
 import torch.nn.functional as F
@@ -82,6 +83,13 @@ class OpenVLANetwork(nn.Module):
         self.vision_backbone = VisionBackbone(sizes)
         self.projector = Projector(sizes.dino.width + sizes.siglip.width, sizes.llama.width)
         self.language_model = LlamaForCausalLM(llama_config(sizes.llama))
+
+    def in_format(self, dtype: torch.dtype) -> Self:
+        """Itself, with all weights in `dtype`. The rotary embedding's frequencies are none and stay in
+        float32: rounded to bfloat16, they would turn position 280 by up to half a radian too far."""
+        for parameter in self.parameters():
+            parameter.data = parameter.data.to(dtype)
+        return self
 
     def enable_checkpointing(self) -> None:
         """Recompute activations in the backward pass instead of keeping them (Chen et al. 2016)."""

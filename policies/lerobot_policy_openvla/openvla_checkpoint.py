@@ -11,6 +11,7 @@ from huggingface_hub.constants import SAFETENSORS_INDEX_FILE, SAFETENSORS_SINGLE
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
+from lerobot_policy_openvla.action_tokens import BINS
 from lerobot_policy_openvla.sizes import DINO, SIGLIP, VIT_FILE, Shapes, Sizes, sizes_from_weights
 from lerobot_policy_openvla.statistics import NormStats
 
@@ -28,7 +29,9 @@ COMPANIONS: Final = (
 """Small files beside the weights, kept as they are."""
 
 VIT_IDS: Final = {DINO: "vit_large_patch14_reg4_dinov2.lvd142m", SIGLIP: "vit_so400m_patch14_siglip_224"}
-SUPPORTED: Final = {"image_resize_strategy": "resize-naive", "use_fused_vision_backbone": True}
+SUPPORTED: Final = {
+    "image_resize_strategy": "resize-naive", "use_fused_vision_backbone": True, "n_action_bins": BINS,
+}  # fmt: skip
 RENAMED: Final = (".gamma", ".scale_factor")
 """LayerScale's parameter: timm's name, which some fine-tuned checkpoints have, and OpenVLA's."""
 
@@ -76,8 +79,16 @@ class OpenVLACheckpoint:
 
     @property
     def sizes(self) -> Sizes:
-        """Of all parts, from the weights' shapes and the configuration."""
-        return sizes_from_weights(self.shapes(), self.config, self._heads())
+        """Of all parts, from the weights' shapes and the configuration. ValueError if patches do not cover
+        the pictures that the configuration tells of, as 27 patches of 14 pixels do not cover 384."""
+        sizes = sizes_from_weights(self.shapes(), self.config, self._heads())
+        told = self.config.get("image_sizes") or [sizes.image_size]
+        if set(told) != {sizes.image_size}:
+            raise ValueError(
+                f"{self.folder}: image_sizes={told}: the weights are for pictures of {sizes.image_size} "
+                f"pixels in patches of {sizes.patch_size}; only pictures that patches cover are supported"
+            )
+        return sizes
 
     def shapes(self) -> Shapes:
         """Of every weight, by the name that the network gives it; none is read."""
@@ -130,6 +141,11 @@ def weight_files(folder: Path) -> dict[str, Path]:
         return files
     path = folder / SAFETENSORS_SINGLE_FILE
     return dict.fromkeys(_require_names(path, []), path)
+
+
+def stored_bytes(locations: dict[str, Path]) -> int:
+    """What the files of weights take, and the weights in memory while they keep their number format."""
+    return sum(path.stat().st_size for path in set(locations.values()))
 
 
 def read_tensors(locations: dict[str, Path]) -> Iterator[tuple[str, Tensor]]:

@@ -8,7 +8,6 @@ from typing import Any, Final
 from huggingface_hub import save_torch_state_dict
 from torch import Tensor
 
-from lerobot_policy_openvla.action_tokens import BINS
 from lerobot_policy_openvla.openvla_checkpoint import (
     CONFIG_FILE,
     ORIGINAL_CONFIG_FILE,
@@ -18,7 +17,7 @@ from lerobot_policy_openvla.openvla_checkpoint import (
     Files,
 )
 from lerobot_policy_openvla.sizes import DINO, RELEASED_HEADS, SIGLIP, VIT_FILE, Sizes, ViTSizes
-from lerobot_policy_openvla.statistics import NormStats
+from lerobot_policy_openvla.statistics import NormStats, used_statistics
 
 MAX_SHARD: Final = "5GB"
 
@@ -33,21 +32,27 @@ def write_openvla(
         weights: by OpenVLA's names.
         sizes: of the model; needed where no original configuration is among `companions`.
         companions: written as they are, but for the statistics.
-        norm_stats: added to those that the checkpoint came with.
+        norm_stats: added to those that the checkpoint came with, and put in place of those that differ.
     """
     folder.mkdir(parents=True, exist_ok=True)
     files = dict(companions)
     config = json.loads(files.pop(ORIGINAL_CONFIG_FILE, b"null")) or original_config(sizes)
     stored = files.pop(STATISTICS_FILE, None)
-    known = json.loads(stored) if stored else config.get("norm_stats", {})
-    added = {key: entry for key, entry in norm_stats.items() if key not in known}
-    config["norm_stats"] = {**config.get("norm_stats", {}), **added}
+    known = json.loads(stored) if stored else config.get("norm_stats") or {}
+    changed = changed_statistics(norm_stats, known)
+    config["norm_stats"] = {**(config.get("norm_stats") or {}), **changed}
     if not {sizes.dino.width, sizes.siglip.width} <= RELEASED_HEADS.keys():
         files.setdefault(VIT_FILE, _json(vit_overrides(sizes)))
-    files |= {CONFIG_FILE: _json(config), STATISTICS_FILE: _json({**known, **added})}
+    files |= {CONFIG_FILE: _json(config), STATISTICS_FILE: _json({**known, **changed})}
     for name, content in files.items():
         (folder / name).write_bytes(content)
     save_torch_state_dict(dict(weights), folder, max_shard_size=MAX_SHARD)
+
+
+def changed_statistics(norm_stats: NormStats, known: NormStats) -> NormStats:
+    """Entries that `known` lacks, or has with other numbers, as of a dataset that has grown since."""
+    before, now = used_statistics(known), used_statistics(norm_stats)
+    return {key: entry for key, entry in norm_stats.items() if before.get(key) != now[key]}
 
 
 def original_config(sizes: Sizes) -> dict[str, Any]:
@@ -66,7 +71,7 @@ def original_config(sizes: Sizes) -> dict[str, Any]:
         "vision_backbone_id": "dinosiglip-vit-so-224px", "hf_llm_id": "meta-llama/Llama-2-7b-hf",
         "timm_model_ids": list(VIT_IDS.values()), "timm_override_act_layers": [None, None],
         "image_sizes": [sizes.image_size] * 2, "llm_max_length": llama.max_positions,
-        "n_action_bins": BINS, "pad_to_multiple_of": llama.extra_ids, "pad_token_id": llama.tokenizer_size,
+        "pad_to_multiple_of": llama.extra_ids, "pad_token_id": llama.tokenizer_size,
         "text_config": text, **SUPPORTED,
     }  # fmt: skip
 

@@ -37,7 +37,6 @@ class PromptTokenizer:
     """
 
     def __init__(self, definition: str) -> None:
-        self.definition = definition
         self.tokenizer = Tokenizer.from_str(definition)
         space_id = self.tokenizer.token_to_id(SPACE)
         if space_id is None:
@@ -105,7 +104,10 @@ def train_tokenizer(instructions: Sequence[str], vocabulary: int) -> Tokenizer:
     learnable = vocabulary - BINS
     fixed = [UNKNOWN, BEGIN, END, *BYTES, SPACE]
     if learnable < len(fixed):
-        raise ValueError(f"vocabulary of {vocabulary} ids: needs at least {len(fixed) + BINS}")
+        raise ValueError(
+            f"vocabulary of {vocabulary} ids: needs at least {len(fixed) + BINS}; raise "
+            "policy.sizes.llama.vocab_size, which is that and extra_ids"
+        )
     learnt = Tokenizer(models.BPE(unk_token=UNKNOWN))
     learnt.normalizer = _normalizer()
     learnt.pre_tokenizer = pre_tokenizers.Split(SPACE, behavior="merged_with_next")

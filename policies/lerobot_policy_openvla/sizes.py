@@ -49,6 +49,17 @@ class LlamaSizes:
     rope_theta: float = 10000.0
     max_positions: int = 2048
 
+    def __post_init__(self) -> None:
+        if self.width % (2 * self.heads):
+            raise ValueError(
+                f"sizes.llama.width={self.width}: must be a multiple of twice heads={self.heads}, since "
+                "positions turn pairs of channels"
+            )
+        if self.heads % self.kv_heads:
+            raise ValueError(
+                f"sizes.llama.heads={self.heads}: must be a multiple of kv_heads={self.kv_heads}"
+            )
+
     @property
     def tokenizer_size(self) -> int:
         """Ids that the tokenizer can produce; the id after them is `<PAD>`."""

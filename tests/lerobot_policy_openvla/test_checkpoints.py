@@ -82,6 +82,27 @@ def test_statistics_beside_the_weights_replace_the_configurations(checkpoint: Pa
     assert OpenVLAPolicy.from_openvla(checkpoint).config.unnorm_key == "three"
 
 
+def test_statistics_that_changed_replace_what_the_checkpoint_came_with(
+    checkpoint: Path, tmp_path: Path
+) -> None:
+    """A dataset of the same name that was recorded anew: the old range would move the robot wrongly."""
+    grown = {"action": {"q01": [-2.0] * 3, "q99": [2.0] * 3, "mask": [True] * 3}, "num_trajectories": 9}
+    policy = OpenVLAPolicy.from_openvla(checkpoint, unnorm_key="two", as_stored=True)
+    stats = {**policy.config.norm_stats, "two": grown}
+    write_openvla(tmp_path / "out", policy.model.state_dict(), policy.config.sizes, policy.files, stats)
+    beside = json.loads((tmp_path / "out" / "dataset_statistics.json").read_text())
+    inside = json.loads((tmp_path / "out" / "config.json").read_text())["norm_stats"]
+    assert beside == inside == {"one": STATISTICS["one"], "two": grown}
+
+
+def test_a_checkpoint_without_statistics_gets_them(checkpoint: Path, tmp_path: Path) -> None:
+    (checkpoint / "dataset_statistics.json").unlink()
+    set_config(norm_stats=None)(checkpoint)
+    policy = OpenVLAPolicy.from_openvla(checkpoint, as_stored=True)
+    write_openvla(tmp_path, policy.model.state_dict(), SMALL_SIZES, policy.files, STATISTICS)
+    assert json.loads((tmp_path / "config.json").read_text())["norm_stats"] == STATISTICS
+
+
 def drop_weight(folder: Path) -> None:
     weights = load_file(folder / "model.safetensors")
     del weights[WEIGHT]
@@ -137,6 +158,8 @@ def set_config(**changes: Any) -> Callable[[Path], None]:
     (lambda folder: (folder / "tokenizer.json").unlink(), r"tokenizer\.json is missing"),
     (set_config(image_resize_strategy="letterbox"), "image_resize_strategy=letterbox: only resize-naive"),
     (set_config(use_fused_vision_backbone=False), "use_fused_vision_backbone=False: only True"),
+    (set_config(n_action_bins=128), "n_action_bins=128: only 256"),
+    (set_config(image_sizes=[40, 40]), r"image_sizes=\[40, 40\]: the weights are for pictures of 32 pixels"),
 ])  # fmt: skip
 def test_a_damaged_checkpoint_is_refused(
     checkpoint: Path, damage: Callable[[Path], None], message: str
@@ -177,5 +200,21 @@ def test_too_little_memory_is_said_before_anything_is_read(
     checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(memory, "free_memory", lambda device: 20_000)
-    with pytest.raises(ValueError, match=r"weights take 0\.\d GB on cpu, 0\.0 GB are free"):
+    with pytest.raises(
+        ValueError, match=r"weights take 0\.\d GB on cpu, 0\.0 GB are free; use --policy\.dtype"
+    ):
         OpenVLAPolicy.from_openvla(checkpoint)
+
+
+def test_a_conversion_needs_room_for_the_weights_as_they_are_stored(
+    checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Half of what they take in float32, in which this machine would compute."""
+    stored = (checkpoint / "model.safetensors").stat().st_size
+    monkeypatch.setattr(memory, "free_memory", lambda device: stored)
+    OpenVLAPolicy.from_openvla(checkpoint, as_stored=True)
+    with pytest.raises(ValueError, match="are free"):
+        OpenVLAPolicy.from_openvla(checkpoint)
+    monkeypatch.setattr(memory, "free_memory", lambda device: stored - 1)
+    with pytest.raises(ValueError, match="are free; end other programs"):
+        OpenVLAPolicy.from_openvla(checkpoint, as_stored=True)

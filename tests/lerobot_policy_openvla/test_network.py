@@ -8,7 +8,7 @@ from accelerate import init_empty_weights
 
 from lerobot_policy_openvla.network import OpenVLANetwork
 from lerobot_policy_openvla.sizes import RELEASED as RELEASED_SIZES
-from lerobot_policy_openvla.sizes import Sizes, ViTSizes, sizes_from_weights
+from lerobot_policy_openvla.sizes import LlamaSizes, Sizes, ViTSizes, sizes_from_weights
 from tests.lerobot_policy_openvla.reference import RELEASED
 from tests.lerobot_policy_openvla.small import (
     ACTIONS,
@@ -55,6 +55,8 @@ def test_a_weight_without_which_nothing_is_known_is_named() -> None:
 @pytest.mark.parametrize(("sizes", "settings", "message"), [
     (ViTSizes, {"depth": 1}, "depth=1"), (ViTSizes, {"width": 30, "heads": 4}, "width=30"),
     (Sizes, {"image_size": 60, "patch_size": 8}, "image_size=60"),
+    (LlamaSizes, {"width": 36, "heads": 4}, r"sizes\.llama\.width=36: .* twice heads=4"),
+    (LlamaSizes, {"width": 48, "heads": 6, "kv_heads": 4}, r"sizes\.llama\.heads=6: .* kv_heads=4"),
 ])  # fmt: skip
 def test_impossible_sizes_are_named(sizes: Any, settings: dict[str, int], message: str) -> None:
     with pytest.raises(ValueError, match=message):

@@ -13,6 +13,8 @@ from lerobot.policies.factory import make_policy, make_pre_post_processors
 
 from lerobot_policy_openvla.loading import compute_dtype
 from lerobot_policy_openvla.modeling_openvla import OpenVLAPolicy
+from lerobot_wmrl.rl.configuration_ppo import PPOConfig
+from lerobot_wmrl.rl.ppo import PPO
 from tests.lerobot_policy_openvla.small import (
     ACTIONS,
     CAMERA,
@@ -134,6 +136,30 @@ def test_bfloat16_keeps_log_probs_and_value_in_float32(
     exact = small_policy().evaluate(observe(), sample.raw_action)[0]
     assert (log_prob - sample.log_prob).abs().max() < 0.15
     assert (log_prob - exact).abs().max() < 0.3
+
+
+def test_bfloat16_leaves_positions_exact(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rounded frequencies turn position 280, where the release's actions are, by up to half a radian."""
+    monkeypatch.setattr("lerobot_policy_openvla.loading.multiplies_bfloat16", lambda device: True)
+    rounded, exact = (small_policy(dtype=dtype).model for dtype in ("bfloat16", "float32"))
+    assert {parameter.dtype for parameter in rounded.parameters()} == {torch.bfloat16}
+    embeddings = [model.language_model.model.rotary_emb for model in (rounded, exact)]
+    state, position = torch.zeros(1, 1, 32), torch.tensor([[280]])
+    for found, expected in zip(*(each(state, position) for each in embeddings), strict=True):
+        assert torch.equal(found, expected)
+
+
+def test_what_is_bfloat16_is_not_trained(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By cloning or by PPO; a random start, which must be trained whole, is never so by itself."""
+    monkeypatch.setattr("lerobot_policy_openvla.loading.multiplies_bfloat16", lambda device: True)
+    policy = small_policy(dtype="bfloat16")
+    for train in (policy.get_optim_params, lambda: PPO(policy, PPOConfig())):
+        with pytest.raises(ValueError, match=r"policy\.dtype: weights in bfloat16.*=float32, or .*LORA"):
+            train()
+    policy.model.requires_grad_(False)
+    assert policy.get_optim_params() == []
+    assert compute_dtype("auto", "cuda") == torch.bfloat16
+    assert compute_dtype("auto", "cuda", random_start=True) == torch.float32
 
 
 def test_a_cpu_without_bfloat16_says_so(monkeypatch: pytest.MonkeyPatch) -> None:

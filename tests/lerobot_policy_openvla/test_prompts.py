@@ -41,7 +41,7 @@ def test_known_instructions_take_few_tokens(prompts: PromptTokenizer) -> None:
 
 
 def test_too_small_a_vocabulary_is_refused() -> None:
-    with pytest.raises(ValueError, match="vocabulary of 500 ids: needs at least 516"):
+    with pytest.raises(ValueError, match=r"500 ids: needs at least 516; raise policy\.sizes\.llama\.vocab"):
         train_tokenizer(TASKS, 500)
 
 
