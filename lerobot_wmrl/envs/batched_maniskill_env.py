@@ -35,6 +35,7 @@ class BatchedManiSkillEnv(gym.vector.VectorEnv):
         self.simulation = config.create_batched_simulation(n_envs, device)
         self.device, self.max_episode_steps = self.simulation.device, config.horizon
         self._elapsed = torch.zeros(n_envs, dtype=torch.long, device=self.device)
+        self._progress = torch.zeros(n_envs, device=self.device)
         self._rng = np.random.default_rng()
         self.single_action_space = gym.spaces.Box(
             np.array(ACTION_LOW, np.float32), np.array(ACTION_HIGH, np.float32)
@@ -63,7 +64,9 @@ class BatchedManiSkillEnv(gym.vector.VectorEnv):
         self._elapsed += 1
         terminated = frame.success
         truncated = (self._elapsed >= self.max_episode_steps) & ~terminated
-        observation, reward, info = self._observation(frame), frame.reward, {}
+        reward = self.config.reward.of_step(terminated.float(), frame.reward, self._progress)
+        self._progress = frame.reward
+        observation, info = self._observation(frame), {}
         ended = terminated | truncated
         if bool(ended.any()):
             info = {
@@ -89,7 +92,9 @@ class BatchedManiSkillEnv(gym.vector.VectorEnv):
         """New episodes in these rows."""
         self._elapsed[list(rows)] = 0
         scenes = [scene_for_seed(self.scenes, seed) for seed in seeds]
-        return self.simulation.reset(scenes, seeds, rows)
+        frame = self.simulation.reset(scenes, seeds, rows)
+        self._progress = frame.reward
+        return frame
 
     def _count(self, ended: Tensor, succeeded: Tensor) -> None:
         episodes = self.simulation.episodes

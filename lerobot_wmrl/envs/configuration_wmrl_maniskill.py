@@ -13,6 +13,7 @@ from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
 from lerobot_wmrl.constants import ACTION_NAMES, CAMERAS, FPS, IMAGE_SIZE, ROBOT_MESH_DETAIL, STATE_NAMES
 from lerobot_wmrl.maniskill.scenes import Scene, scenes_of
+from lerobot_wmrl.rewards.rule_based import RuleBasedReward
 
 if TYPE_CHECKING:
     import gymnasium as gym
@@ -33,6 +34,7 @@ class WmrlManiSkillEnv(EnvConfig):
         cameras: which cameras the policy sees.
         image_size: pixels of each side of a picture.
         episode_length: steps after which an episode is truncated; the task's own horizon by default.
+        reward: what a step pays for success and for progress.
         assets: YAML file with meshes to use in place of objects (`lemon: {mesh: lemon.obj, scale: 0.001}`).
         robot_mesh_detail: share of the robot's triangles that are drawn; 1 draws all, three times slower.
         batched: whether episodes share one simulation on CUDA, instead of having a process each.
@@ -46,6 +48,7 @@ class WmrlManiSkillEnv(EnvConfig):
     cameras: list[str] = field(default_factory=lambda: ["third_view"])
     image_size: int = IMAGE_SIZE
     episode_length: int | None = None
+    reward: RuleBasedReward = field(default_factory=RuleBasedReward)
     assets: Path | None = None
     robot_mesh_detail: float = ROBOT_MESH_DETAIL
     batched: bool = False

@@ -61,12 +61,12 @@ class ManiSkillEnv(gym.Env):
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         self._steps += 1
-        self._frame = self._simulation.step(action)
+        before, self._frame = self._frame, self._simulation.step(action)
         terminated = self._frame.success
         truncated = not terminated and self._steps >= self._max_episode_steps
         return (
             self._observation(self._frame),
-            self._frame.reward,
+            self.config.reward.of_step(float(terminated), self._frame.reward, before.reward),
             terminated,
             truncated,
             self._info(self._frame),

@@ -5,6 +5,8 @@ from typing import Final
 
 from lerobot.configs.rewards import RewardModelConfig
 
+from lerobot_wmrl.rewards.general import check_shape
+
 LPIPS_BACKBONES: Final = {"lpips_alex": "alex", "lpips_vgg": "vgg"}
 SIMILARITIES: Final = ("tokenizer", *LPIPS_BACKBONES, "mse")
 
@@ -29,12 +31,9 @@ class GeneralConfig(RewardModelConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.form not in ("absolute", "potential"):
-            raise ValueError(f"--reward.form={self.form}: choose absolute or potential")
+        check_shape(self.alpha, self.form)
         if self.similarity not in SIMILARITIES:
             raise ValueError(f"--reward.similarity={self.similarity}: choose {', '.join(SIMILARITIES)}")
-        if not 0 <= self.alpha <= 1:
-            raise ValueError(f"--reward.alpha={self.alpha}: choose a weight in [0, 1]")
 
     @property
     def needs_goal(self) -> bool:

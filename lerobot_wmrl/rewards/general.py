@@ -9,7 +9,9 @@ def sparse_reward(done_logit: Tensor, threshold: float) -> Tensor:
     return (done_logit.sigmoid() >= threshold).float()
 
 
-def dense_reward(similarity: Tensor, previous: Tensor, form: str, gamma: float) -> Tensor:
+def dense_reward[Number: (float, Tensor)](
+    similarity: Number, previous: Number, form: str, gamma: float
+) -> Number:
     """Eq. 5, as it stands (`absolute`) or as the potential difference γ·s_t − s_{t−1}. (B,), (B,) → (B,)
 
     The potential form telescopes: an episode earns γ^T·s_T − s_0 in all, so lingering near the goal costs a
@@ -19,11 +21,19 @@ def dense_reward(similarity: Tensor, previous: Tensor, form: str, gamma: float) 
     return similarity if form == "absolute" else gamma * similarity - previous
 
 
-def general_reward(
-    sparse: Tensor, similarity: Tensor, previous: Tensor, *, alpha: float, form: str, gamma: float
-) -> Tensor:
-    """Algorithm 1: α·R_sps + (1 − α)·R_den. All (B,)."""
+def general_reward[Number: (float, Tensor)](
+    sparse: Number, similarity: Number, previous: Number, *, alpha: float, form: str, gamma: float
+) -> Number:
+    """Algorithm 1: α·R_sps + (1 − α)·R_den. All (B,), or numbers."""
     return alpha * sparse + (1 - alpha) * dense_reward(similarity, previous, form, gamma)
+
+
+def check_shape(alpha: float, form: str) -> None:
+    """ValueError unless there is such a reward."""
+    if form not in ("absolute", "potential"):
+        raise ValueError(f"--reward.form={form}: choose absolute or potential")
+    if not 0 <= alpha <= 1:
+        raise ValueError(f"--reward.alpha={alpha}: choose a weight in [0, 1]")
 
 
 def consecutive_count(count: Tensor, fired: Tensor) -> Tensor:

@@ -1,6 +1,7 @@
 """ManiSkill through LeRobot's and through the trainer's eyes."""
 
 from collections.abc import Iterator
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from lerobot_wmrl.constants import EVALUATION_SEED
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.maniskill_env import ManiSkillEnv
 from lerobot_wmrl.envs.maniskill_tensor_env import ManiSkillTensorEnv
+from lerobot_wmrl.rewards.rule_based import RuleBasedReward
 
 HORIZON = 3
 STAY = np.array([0, 0, 0, 0, 0, 0, -1], np.float32)
@@ -45,6 +47,20 @@ def test_an_episode_is_truncated_at_the_horizon_not_terminated(env: ManiSkillEnv
     env.reset(seed=1)
     ends = [env.step(STAY)[2:4] for _ in range(HORIZON)]
     assert ends == [(False, False)] * (HORIZON - 1) + [(False, True)]
+
+
+def test_a_step_pays_for_the_progress_that_it_made() -> None:
+    down = np.array([0.0, 0, -1, 0, 0, 0, -1], np.float32)
+    earned = []
+    for reward in (RuleBasedReward(alpha=0.0, form="absolute"), RuleBasedReward()):
+        env = ManiSkillEnv(WmrlManiSkillEnv(image_size=32, reward=reward))
+        env.reset(seed=0)
+        earned.append([env.step(down)[1] for _ in range(3)])
+        env.close()
+    progress, paid = earned
+    expected = [0.1 * (0.97 * now - before) for before, now in pairwise(progress)]
+    assert progress[0] != progress[-1]
+    assert paid[1:] == pytest.approx(expected, abs=1e-5)
 
 
 def test_a_reset_without_a_seed_draws_a_training_seed(env: ManiSkillEnv) -> None:
