@@ -35,6 +35,9 @@ Observation = dict[str, Any]
 class WorldModelVectorEnv(gym.vector.VectorEnv):
     """Tensors in, tensors out, SAME_STEP autoreset with `final_obs` and `final_info`.
 
+    A step asks the device one thing, whether an episode has ended: `final_obs` is there only then, and to
+    begin again costs too much to do it for nobody. Only then the instructions of new episodes are fetched.
+
     Observations: `observation.images.<camera>` (B, 3, H, W) in [0, 1], `observation.state` (B, P) if the
     model predicts it, `task` (B strings). Actions (B, A) in metres, radians and gripper, clipped to the box.
     """
@@ -59,7 +62,6 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         self.single_observation_space = self._observation_space()
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, n_envs)
         self.generator = torch.Generator(self.device)
-        self._start_index = torch.zeros(n_envs, dtype=torch.long, device=self.device)
 
     def _observation_space(self) -> gym.spaces.Dict:
         size, config = self.model.config.image_size, self.model.config
@@ -81,8 +83,8 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         if isinstance(seed, list):
             self.generator.manual_seed(seed[0])
             drawn = torch.tensor(seed, device=self.device) % len(self.starts)
-        self._start_index, starts = drawn, self.starts
-        now = starts.now[drawn]
+        self._begin_at(drawn)
+        starts, now = self.starts, self.starts.now[drawn]
         self._imagination = start_after(self.model, starts.past[drawn], now, starts.context[drawn])
         self._elapsed = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
         self._done_streak = torch.zeros_like(self._elapsed)
@@ -129,7 +131,7 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
 
     def _restart(self, mask: Tensor, observation: Observation) -> Observation:
         """New starts where `mask` (B,) is True; other rows of the observation stay."""
-        self._start_index = torch.where(mask, self._draw_starts(), self._start_index)
+        self._begin_at(torch.where(mask, self._draw_starts(), self._start_index))
         index, starts = self._start_index, self.starts
         past, now, context = starts.past[index], starts.now[index], starts.context[index]
         restart_after(self.model, self._imagination, mask, past, now, context)
@@ -143,6 +145,11 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
             if isinstance(value, Tensor):
                 fresh[key] = torch.where(mask.reshape(-1, *[1] * (value.ndim - 1)), fresh[key], value)
         return fresh
+
+    def _begin_at(self, index: Tensor) -> None:
+        """Which start every environment's episode has, (B,); the instructions are then known to the host."""
+        self._start_index = index
+        self._instructions = [self.starts.instructions[row] for row in index.tolist()]
 
     def _draw_starts(self) -> Tensor:
         return torch.randint(len(self.starts), (self.num_envs,), generator=self.generator, device=self.device)
@@ -167,7 +174,7 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         }
         if self.model.config.state_size:
             observation[OBS_STATE] = state
-        observation["task"] = [self.starts.instructions[index] for index in self._start_index.tolist()]
+        observation["task"] = list(self._instructions)
         return observation
 
 

@@ -25,14 +25,15 @@ class ObservationBuffer:
                 self.tensors[name] = value.new_empty((self.steps, self.num_envs, *value.shape[1:]))
             self.tensors[name][step] = value
 
+    def read_step(self, step: int) -> Observation:
+        """The observations (B, …) of `step`, where they are."""
+        return decode({name: value[step] for name, value in self.tensors.items()}, self.instructions)
+
     def read(self, rows: Tensor) -> Observation:
         """Observations of flat rows step * B + environment. `rows` lies in the CPU's memory, as instructions
         do: so that none is fetched from the device."""
-        moved: dict[torch.device, Tensor] = {}
-        taken = {}
-        for name, value in self.tensors.items():
-            index = moved.setdefault(value.device, rows.to(value.device))
-            taken[name] = value.flatten(0, 1)[index]
+        moved = {device: rows.to(device) for device in {value.device for value in self.tensors.values()}}
+        taken = {name: value.flatten(0, 1)[moved[value.device]] for name, value in self.tensors.items()}
         return decode(taken, self.instructions)
 
 

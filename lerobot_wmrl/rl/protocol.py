@@ -5,10 +5,11 @@ are (B, n, K) for it, and it is asked again after n steps, or when an episode ha
 """
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, runtime_checkable
 
 from lerobot.configs import PreTrainedConfig
+from lerobot.processor import DeviceProcessorStep
 from torch import Tensor, nn
 
 Observation = dict[str, Any]
@@ -57,13 +58,19 @@ class Pipeline:
 
 
 def make_pipeline(config: PreTrainedConfig, preprocessor: Any, postprocessor: Any) -> Pipeline:
-    """The processors as functions; observations the policy does not know are left out."""
+    """The processors as functions; observations the policy does not know are left out, and actions stay on
+    the policy's device, where LeRobot's postprocessors would fetch them."""
     known = {*(config.input_features or {}), "task"}
+    steps = [
+        replace(step, device=config.device) if isinstance(step, DeviceProcessorStep) else step
+        for step in postprocessor.steps
+    ]
+    staying = replace(postprocessor, steps=steps)
 
     def prepare(observation: Observation) -> Observation:
         return preprocessor({name: value for name, value in observation.items() if name in known})
 
     def to_action(raw_action: Tensor) -> Tensor:
-        return postprocessor(raw_action)
+        return staying(raw_action)
 
     return Pipeline(prepare, to_action)

@@ -13,7 +13,7 @@ from torch import Tensor
 from lerobot_wmrl.constants import EVALUATION_SEED
 from lerobot_wmrl.distributed import mean_over_processes, rank_and_size
 from lerobot_wmrl.rl.observations import ObservationBuffer, as_bytes_see_it
-from lerobot_wmrl.rl.protocol import Pipeline, Sample, StochasticPolicy
+from lerobot_wmrl.rl.protocol import Observation, Pipeline, Sample, StochasticPolicy
 
 NOISE_SEED = 2**31
 """Added to a rollout's seed: the policy's noise must not be that with which the environment draws."""
@@ -126,32 +126,39 @@ class RolloutBuffer:
 
 
 class Actor:
-    """Asks the policy where a decision is due, and otherwise goes on with the last one."""
+    """Asks the policy where a decision is due, and otherwise goes on with the last one.
+
+    Ages of decisions are counted on the host too, and fetched only when an episode has ended.
+    """
 
     def __init__(self, policy: StochasticPolicy, pipeline: Pipeline, buffer: RolloutBuffer) -> None:
         self.policy, self.pipeline, self.buffer = policy, pipeline, buffer
-        self.everyone = torch.arange(buffer.num_envs)
-        self.here = self.everyone.to(buffer.device)
+        self.here = torch.arange(buffer.num_envs, device=buffer.device)
         self.age = torch.zeros_like(self.here)
+        self.known_age = [0] * buffer.num_envs
         self.plan = torch.empty(0, 1, 0)
         """The decisions that are acted on, (B, n, K)."""
 
     def act(self, step: int) -> Tensor:
         """The raw action of every environment at `step`. → (B, K)"""
-        if self.plan.shape[1] == 1:
-            self._decide(step, self.here, self.everyone)
-        else:
-            rows = (self.age == 0).nonzero()[:, 0]
-            if len(rows):
-                self._decide(step, rows, rows.cpu())
+        due, count = [row for row, age in enumerate(self.known_age) if not age], self.buffer.num_envs
+        if len(due) == count:
+            self._decide(step, self.here, self.buffer.observations.read_step(step))
+        elif due:
+            rows = torch.tensor(due)
+            observed = self.buffer.observations.read(step * count + rows)
+            self._decide(step, rows.to(self.here.device), observed)
         return self.plan[self.here, self.age]
 
-    def advance(self, finished: Tensor) -> None:
+    def advance(self, finished: Tensor, any_finished: bool) -> None:
         """A new decision is due after n steps, and where an episode has ended. (B,)"""
-        self.age = torch.where(finished, 0, (self.age + 1) % self.plan.shape[1])
+        length = self.plan.shape[1]
+        self.age = torch.where(finished, 0, (self.age + 1) % length)
+        if length > 1:
+            following = [(age + 1) % length for age in self.known_age]
+            self.known_age = self.age.tolist() if any_finished else following
 
-    def _decide(self, step: int, rows: Tensor, rows_on_cpu: Tensor) -> None:
-        observed = self.buffer.observations.read(step * self.buffer.num_envs + rows_on_cpu)
+    def _decide(self, step: int, rows: Tensor, observed: Observation) -> None:
         sample = self.policy.sample(self.pipeline.prepare(observed))
         self.buffer.write_decision(step, rows, sample)
         raw = sample.raw_action if sample.raw_action.ndim == 3 else sample.raw_action[:, None]
@@ -200,7 +207,7 @@ def collect(
             action = pipeline.to_action(raw_action).to(buffer.device)
             observation, reward, terminated, truncated, info = env.step(action)
             buffer.write(step, age, reward, terminated, truncated)
-            actor.advance(terminated | truncated)
+            actor.advance(terminated | truncated, any_finished="final_obs" in info)
             for name, part in info.get("reward_parts", {}).items():
                 logged.setdefault(name, []).append(part.float().mean())
             if "final_obs" in info:

@@ -1,6 +1,6 @@
 """What the anchored network keeps of a first frame, and what it knows of the past since."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch
@@ -31,11 +31,15 @@ class AnchoredCache:
     """Imaginations that each began at a frame of their own: its scene, the path since, a ring of the past.
 
     Whoever has imagined as many frames as the ring holds begins anew at the frame that was imagined last.
+    `frame` is the ring's position, known to the host, and `beginnings` are the frames, modulo the ring's
+    window, at which somebody may have begun: at any other the device need not be asked who is due.
     """
 
     ring: TemporalCache
     scene: Scene | None = None
     path: Path | None = None
+    frame: int = 0
+    beginnings: set[int] = field(default_factory=lambda: {0})
 
     @property
     def dtype(self) -> torch.dtype:
@@ -50,11 +54,14 @@ class AnchoredCache:
 
     def restart(self, mask: Tensor) -> None:
         """The next frame of the environments in `mask` (B,) is their first."""
+        self.beginnings.add(self._phase)
         self.ring.restart(mask)
 
     def begin_before(self, other: "AnchoredCache", frames: int) -> None:
         """Be empty, and so many frames behind the other cache."""
         self.ring.begin_before(other.ring, frames)
+        self.frame = other.frame - frames
+        self.beginnings = {self._phase}
 
     def put(self, rows: Tensor, other: "AnchoredCache") -> None:
         """Remember in `rows` (R,) what the other cache does."""
@@ -62,11 +69,18 @@ class AnchoredCache:
         assert other.path is not None
         self.begin(rows, other.scene, other.path)
         self.ring.put(rows, other.ring)
+        self.beginnings |= other.beginnings
 
     def due(self) -> Tensor:
-        """Environments that have to begin now: rows (R,). Waits for the device to say which."""
+        """Environments that have to begin now: rows (R,). Waits for the device to say which, if there may be
+        any."""
+        if self._phase not in self.beginnings:
+            return self.ring.started.new_empty(0)
         age = self.ring.position - self.ring.started
-        return (age % self.ring.window == 0).nonzero().squeeze(1)
+        rows = (age % self.ring.window == 0).nonzero().squeeze(1)
+        if not len(rows):
+            self.beginnings.remove(self._phase)
+        return rows
 
     def begin(self, rows: Tensor, scene: Scene, path: Path) -> None:
         """Rows (R,) begin at scenes and paths of R rows."""
@@ -79,4 +93,9 @@ class AnchoredCache:
 
     def advance(self) -> RingMemory:
         """Begin a frame in the ring."""
+        self.frame += 1
         return self.ring.advance()
+
+    @property
+    def _phase(self) -> int:
+        return self.frame % self.ring.window

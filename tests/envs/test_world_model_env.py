@@ -13,9 +13,13 @@ from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelE
 from lerobot_wmrl.envs.doubt import Doubt
 from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
 from lerobot_wmrl.rewards.configuration_general import GeneralConfig
+from lerobot_wmrl.rewards.configuration_learned import EmbeddingConfig, ProxyConfig
+from lerobot_wmrl.rewards.modeling_learned import EmbeddingRewardModel, ProxyRewardModel
 from lerobot_wmrl.rewards.similarity import TokenizerSimilarity
 from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
 from lerobot_wmrl.world_models.frame_tokenizer import Decoded
+from tests.read_backs import fetched
+from tests.trained import action_config, run_training
 
 B = 4
 IMAGE, STATE = "observation.images.third_view", "observation.state"
@@ -239,7 +243,7 @@ def test_lerobot_eval_gets_an_environment_for_each_task(config, make_synthetic_d
 
 
 def test_models_that_do_not_fit_together_are_refused(config, small_dataset, trained_models, tmp_path):
-    from tests.trained import run_training, text_config, train_tokenizer
+    from tests.trained import text_config, train_tokenizer
 
     root = Path(small_dataset.root)
     other = train_tokenizer(root, tmp_path / "tokenizer", steps=1, seed=9)
@@ -277,6 +281,79 @@ def test_episodes_can_begin_after_a_past_that_is_looked_at(config, small_dataset
         replace(config, dataset=replace(config.dataset, past=500)).create_tensor_env(1)
     with pytest.raises(ValueError, match=r"--env\.dataset\.past=1: the frames before a start are those of"):
         replace(config, dataset=StartFrames(resets=1, past=1)).create_tensor_env(1)
+
+
+def fetched_by_steps(env, steps: int) -> list[int]:
+    """What the device is asked in each step of episodes that do not end."""
+    always_done(env, torch.zeros(B, dtype=torch.bool))
+    env.reset(seed=0)
+    action = torch.zeros(B, 7)
+    return [fetched(lambda: env.step(action)) for _ in range(steps)]
+
+
+REWARDS = {
+    "tokenizer": GeneralConfig(device="cpu"),
+    "mse": GeneralConfig(device="cpu", similarity="mse"),
+    "sparse": GeneralConfig(device="cpu", alpha=1.0),
+}
+
+
+@pytest.mark.parametrize("doubt", [Doubt(), Doubt(limit=1.0), Doubt(limit=0.1, effect="weight")])
+@pytest.mark.parametrize("reward", list(REWARDS))
+def test_a_step_asks_the_device_only_whether_an_episode_has_ended(config, reward, doubt):
+    """Anchored dynamics ask once more in the first step, who begins."""
+    env = replace(config, reward=REWARDS[reward], doubt=doubt).create_tensor_env(B)
+    assert fetched_by_steps(env, 4) == [2, 1, 1, 1]
+
+
+def test_learned_rewards_ask_nothing_more(env):
+    width = env.model.config.width
+    for reward in (
+        ProxyRewardModel(ProxyConfig(device="cpu", cameras=env.model.config.cameras, image_size=32)),
+        EmbeddingRewardModel(EmbeddingConfig(device="cpu", world_model="untrained", hidden_size=width)),
+    ):
+        env.reward = reward.eval()
+        assert fetched_by_steps(env, 4) == [2, 1, 1, 1]
+
+
+def test_autoregressive_dynamics_never_ask_who_begins(config, small_dataset, trained_models, tmp_path):
+    model = action_config(trained_models["frame_tokenizer"], dynamics="autoregressive")
+    output = run_training(model, Path(small_dataset.root), tmp_path / "model", steps=1)
+    env = replace(config, world_model_path=str(output)).create_tensor_env(B)
+    assert fetched_by_steps(env, 4) == [1] * 4
+
+
+def test_anchored_dynamics_ask_who_begins_only_where_somebody_may(config):
+    """Whenever a clip is full, and after the restart of somebody: that once, and when that clip is full."""
+    env = replace(config, episode_length=50).create_tensor_env(B)
+    clip, still = env.model.config.clip_length, torch.zeros(B, 7)
+    quiet = [1] * (clip - 1)
+    assert fetched_by_steps(env, 2 * clip + 1) == [2, *quiet, 2, *quiet, 2]
+    step = env.model.step
+    always_done(env, torch.tensor([True, False, False, False]))
+    for _ in range(3):
+        env.step(still)
+    env.model.step = step
+    assert env._elapsed.tolist() == [0] + [2 * clip + 4] * 3
+    asked = [fetched(lambda: env.step(still)) for _ in range(clip + 1)]
+    assert asked == [2 if row in (0, clip - 4, clip) else 1 for row in range(clip + 1)]
+
+
+def test_instructions_are_those_of_the_starts(env):
+    """Of an episode that ended, and of the one after it."""
+    env.starts.instructions[:] = [f"task {row}" for row in range(len(env.starts))]
+
+    def expected() -> list[str]:
+        return [f"task {row}" for row in env._start_index.tolist()]
+
+    observation, _ = env.reset(seed=list(range(B)))
+    assert observation["task"] == expected()
+    always_done(env, torch.tensor([True, False, False, True]))
+    for _ in range(3):
+        before = expected()
+        observation, *_, info = env.step(torch.zeros(B, 7))
+    assert info["final_obs"]["task"] == before
+    assert observation["task"] == expected() != before
 
 
 def doubtful(config, **doubt):

@@ -77,6 +77,18 @@ def test_a_rotation_turns_the_gripper_about_that_base_axis(
     assert np.abs(np.delete(rotation, axis)).max() < 0.3 * abs(rotation[axis])
 
 
+def test_a_rotation_goes_on_beyond_half_a_turn(simulation: Simulation) -> None:
+    """Actions say how far to turn, not where to: an angle that wraps would send the gripper back."""
+    before, turned = simulation.reset(SCENES[0], 0).state, []
+    for _ in range(52):
+        after = simulation.step(command(5, 0.2)).state
+        axis, angle = quat2axangle(qmult(after[3:7], qconjugate(before[3:7])))
+        turned.append((axis[2] * angle + np.pi) % (2 * np.pi) - np.pi)
+        before = after
+    assert min(turned) > 0.02
+    assert sum(turned) > np.pi + 0.1
+
+
 def test_actions_are_clipped_to_the_box(simulation: Simulation) -> None:
     states = []
     for size in (ACTION_HIGH[0], 10.0):

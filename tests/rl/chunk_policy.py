@@ -28,7 +28,7 @@ class ChunkPolicy(nn.Module):
 
     def _distribution(self, observation: dict[str, Any]) -> Normal:
         mean = self.actor(observation["observation.state"]).view(-1, self.chunk, ACTIONS)
-        return Normal(mean, self.log_std.exp())
+        return Normal(mean, self.log_std.exp(), validate_args=False)
 
     def sample(self, observation: dict[str, Any]) -> Sample:
         distribution = self._distribution(observation)

@@ -25,3 +25,13 @@ def test_the_pipeline_gives_the_policy_what_it_knows(tmp_path: Path) -> None:
     assert prepared["task"] == ["a", "b"]
     raw = torch.randn(2, 3)
     assert torch.equal(pipeline.to_action(raw), raw)
+
+
+def test_actions_stay_on_the_policys_device(tmp_path: Path) -> None:
+    """Here PyTorch's device without memory, from which nothing can be fetched."""
+    config = read_policy_config(str(save_untrained_policy(tmp_path)), [])
+    processors = load_processors(config)
+    config.device = "meta"
+    raw = torch.zeros(2, 3, device="meta")
+    assert make_pipeline(config, *processors).to_action(raw).device.type == "meta"
+    assert processors[1].steps[-1].device == "cpu"

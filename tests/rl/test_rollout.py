@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import pytest
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -11,7 +12,9 @@ from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_wmrl.rl.minibatches import make_minibatches, read_steps
 from lerobot_wmrl.rl.observations import ObservationBuffer
 from lerobot_wmrl.rl.protocol import Pipeline
-from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
+from lerobot_wmrl.rl.rollout import Actor, RolloutBuffer, collect
+from tests.read_backs import ReadBacks
+from tests.rl.chunk_policy import ChunkPolicy
 from tests.rl.point_env import PointEnv
 
 HORIZON = 6
@@ -138,25 +141,45 @@ class StillEnv(PointEnv):
         return self._observe(), action.sum(dim=1), never, never, {"reward_parts": {"success": never}}
 
 
-class ReadBacks(TorchDispatchMode):
-    """Counts how often a number is fetched from a tensor, for which a device would have to be waited for."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.count = 0
-
-    def __torch_dispatch__(self, function: Any, types: Any, arguments: Any = (), named: Any = None) -> Any:
-        self.count += function in (torch.ops.aten._local_scalar_dense.default, torch.ops.aten.nonzero.default)
-        return function(*arguments, **(named or {}))
-
-
+@pytest.mark.parametrize("chunk", [1, 3])
 def test_no_step_of_a_rollout_waits_for_the_device(
-    make_policy: Callable[..., CnnPolicy], pipeline: Pipeline
+    chunk: int, make_policy: Callable[..., CnnPolicy], pipeline: Pipeline
 ) -> None:
-    policy, counts = make_policy(), []
+    policy: Any = make_policy() if chunk == 1 else ChunkPolicy(chunk)
+    counts = []
     for steps in (3, 30):
         buffer = RolloutBuffer(steps, 4, "cpu")
         with ReadBacks() as found:
             collect(StillEnv(4), policy, pipeline, buffer, 0)
         counts.append(found.count)
     assert counts[0] == counts[1] > 0
+
+
+class Moves(TorchDispatchMode):
+    """Counts copies from one device to another."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = 0
+
+    def __torch_dispatch__(self, function: Any, types: Any, arguments: Any = (), named: Any = None) -> Any:
+        result = function(*arguments, **(named or {}))
+        moves = function is torch.ops.aten._to_copy.default and result.device != arguments[0].device
+        self.count += moves
+        return result
+
+
+@pytest.mark.parametrize("chunk", [1, 3])
+def test_to_ask_the_policy_nothing_is_moved_to_the_device_or_from_it(chunk: int, pipeline: Pipeline) -> None:
+    """On PyTorch's device without memory, from which nothing can be fetched."""
+    policy, buffer = ChunkPolicy(chunk).to("meta"), RolloutBuffer(7, 4, "meta")
+    never = torch.zeros(4, dtype=torch.bool, device="meta")
+    actor = Actor(policy, pipeline, buffer)
+    observation = {"observation.state": torch.zeros(4, 4, device="meta"), "task": ["reach"] * 4}
+    with Moves() as found:
+        for step in range(7):
+            buffer.observations.write(step, observation)
+            assert actor.act(step).shape == (4, 3)
+            actor.advance(never, any_finished=False)
+    assert found.count == 0
+    assert policy.asked == [4] * len(range(0, 7, chunk))

@@ -52,9 +52,9 @@ def test_who_begins_anew_among_others_is_as_if_all_began(model, before):
         model.step(running, first.action[:, row])
     past, now = past_of(second, 0), frames_of(second, AGO)
     restart_after(model, running, mask, past, now, second.context)
-    together = [model.step(running, second.action[:, AGO + row]) for row in range(3)]
+    together = [model.step(running, second.action[:, AGO + row]) for row in range(5)]
     fresh = begun(model, second)
-    alone = [model.step(fresh, second.action[:, AGO + row]) for row in range(3)]
+    alone = [model.step(fresh, second.action[:, AGO + row]) for row in range(5)]
     for one, other in zip(together, alone, strict=True):
         torch.testing.assert_close(one.done_logit[1], other.done_logit[1], atol=1e-4, rtol=1e-4)
         torch.testing.assert_close(one.proprioception[1], other.proprioception[1], atol=1e-4, rtol=1e-4)
