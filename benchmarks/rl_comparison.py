@@ -112,12 +112,21 @@ class Comparison:
         """Outcomes of a measurement, one a start."""
         return outcomes(self.ppo.out / f"eval_{name}")
 
+    def finished(self, place: str) -> list[int]:
+        """Seeds whose trainings are measured to the end."""
+        end = MEASURED[place][-1]
+        return [
+            seed
+            for seed in self.seeds
+            if (self.ppo.out / f"eval_{run_name(place, seed)}_{end}_ood" / "eval_info.json").exists()
+        ]
+
     def results(self) -> dict[str, Any]:
-        """Success of the cloned policy and of every training's checkpoints, and the mean changes."""
+        """Of what is finished: success of the cloned policy and of checkpoints, and the mean changes."""
         cloned = {domain: self.found(f"cloned_{domain}") for domain in DOMAINS}
         return {
             "cloned": {domain: proportion(found) for domain, found in cloned.items()},
-            "runs": {place: [self._run(place, seed) for seed in self.seeds] for place in PLACES},
+            "runs": {place: [self._run(place, seed) for seed in self.finished(place)] for place in PLACES},
             "mean_change": {
                 name: {
                     domain: self._change(place, iteration, domain)
@@ -131,7 +140,7 @@ class Comparison:
     def _change(self, place: str, iteration: int, domain: str) -> dict[str, Any]:
         """From the cloned policy, on the same starts."""
         cloned = self.found(f"cloned_{domain}")
-        after = [self.found(f"{run_name(place, seed)}_{iteration}_{domain}") for seed in self.seeds]
+        after = [self.found(f"{run_name(place, seed)}_{iteration}_{domain}") for seed in self.finished(place)]
         return asdict(MeanChange.over_runs([cloned] * len(after), after))
 
     def _run(self, place: str, seed: int) -> dict[str, Any]:
@@ -236,7 +245,7 @@ def main() -> None:
     )
     comparison = Comparison(gate.Experiment(given.gate), ppo, given.seeds)
     run_stages(comparison.stages(given.places), given.output_dir)
-    if set(given.places) < set(PLACES):
+    if not all(comparison.finished(place) for place in PLACES):
         return
     results = {"episodes": given.episodes, **comparison.results()}
     write_json(given.output, results)
