@@ -21,8 +21,9 @@ from lerobot.rewards.pretrained import PreTrainedRewardModel
 from lerobot.utils.import_utils import register_third_party_plugins
 from torch import Tensor
 
+from imagined_env import add_world_models, world_model_env
 from lerobot_wmrl.constants import ACTION_LOW
-from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
+from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.envs.first_frames import read_first_frames
 from lerobot_wmrl.envs.world_model_env import WorldModels, WorldModelVectorEnv, begin_in, load_world_models
 from lerobot_wmrl.files import write_json
@@ -107,16 +108,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--world_model", required=True, help="action world model")
-    parser.add_argument("--text_world_model", required=True, help="text world model on the same tokens")
-    parser.add_argument("--dataset.root", dest="root", required=True, help="start frames")
+    add_world_models(parser)
     parser.add_argument("--numbers", type=int, nargs="+", default=NUMBERS, help="of environments")
     parser.add_argument("--output", type=Path, default=RESULTS, help="JSON file")
     given = parser.parse_args()
-    config = WorldModelEnv(
-        world_model_path=given.world_model, text_world_model_path=given.text_world_model,
-        dataset=StartFrames(root=given.root), device="cpu",
-    )  # fmt: skip
+    config = world_model_env(given, device="cpu")
     models = load_world_models(config, config.device)
     figures: Mapping[str, Any] = {
         "threads": torch.get_num_threads(),

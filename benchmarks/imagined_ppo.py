@@ -89,8 +89,8 @@ class Experiment:
 
     def _measured(self, policy: str, kind: str, folder: Path) -> list[Stage]:
         names = {domain: f"eval_{kind}_{policy}_{domain}" for domain in DOMAINS}
-        policy = checkpoint(folder)
-        return [self._stage(name, self.evaluate, name, policy, domain) for domain, name in names.items()]
+        trained = checkpoint(folder)
+        return [self._stage(name, self.evaluate, name, trained, domain) for domain, name in names.items()]
 
     def _stage(self, name: str, make: Callable[..., list[str]], *arguments: Any) -> Stage:
         return Stage(name, name.replace("_", " "), partial(make, *arguments))

@@ -25,11 +25,11 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.utils.constants import ACTION, OBS_STATE
 from lerobot.utils.import_utils import register_third_party_plugins
 
+from imagined_env import add_world_models, world_model_env
 from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_policy_cnn.processor_cnn import make_cnn_pre_post_processors
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
-from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.files import write_json
 from lerobot_wmrl.rl.configuration_ppo import PPOConfig
 from lerobot_wmrl.rl.ppo import PPO
@@ -134,9 +134,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--world_model", required=True, help="action world model")
-    parser.add_argument("--text_world_model", required=True, help="text world model on the same tokens")
-    parser.add_argument("--dataset.root", dest="root", required=True, help="start frames")
+    add_world_models(parser)
     parser.add_argument("--num_envs", type=int, default=64, help="imaginations at once")
     parser.add_argument("--steps", type=int, default=40, help="frames of each an iteration")
     parser.add_argument("--simulators", type=int, default=2, help="processes of ManiSkill; 0 leaves it out")
@@ -144,10 +142,7 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--output", type=Path, default=RESULTS, help="JSON file")
     given = parser.parse_args()
-    imagination = WorldModelEnv(
-        world_model_path=given.world_model, text_world_model_path=given.text_world_model,
-        dataset=StartFrames(root=given.root), episode_length=given.steps, device=given.device,
-    )  # fmt: skip
+    imagination = world_model_env(given, episode_length=given.steps, device=given.device)
     worlds: dict[str, tuple[Any, int]] = {"world_model": (imagination, given.num_envs)}
     if given.simulators:
         model: Any = read_config(given.world_model, "action_world_model")

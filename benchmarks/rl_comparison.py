@@ -79,7 +79,7 @@ class Comparison:
         """In order: the cloned policy, then one training after the other, each with its measurements."""
         clone = partial(self.gate.clone, POLICY, DEMONSTRATIONS, CLONING_STEPS)
         stages = [Stage("clone", "clone a policy from few demonstrations", clone)]
-        cloned = checkpoint(self.gate.out / f"policy_{POLICY}")
+        cloned = checkpoint(self.ppo.cloned(POLICY))
         stages += [self._measurement(f"cloned_{domain}", cloned, domain) for domain in DOMAINS]
         if "imagined" in places:
             stages.append(Stage("text_world_model", "text world model", self.ppo.train_text_model))
@@ -114,18 +114,13 @@ class Comparison:
 
     def finished(self, place: str) -> list[int]:
         """Seeds whose trainings are measured to the end."""
-        end = MEASURED[place][-1]
-        return [
-            seed
-            for seed in self.seeds
-            if (self.ppo.out / f"eval_{run_name(place, seed)}_{end}_ood" / "eval_info.json").exists()
-        ]
+        last = [(seed, f"eval_{run_name(place, seed)}_{MEASURED[place][-1]}_ood") for seed in self.seeds]
+        return [seed for seed, name in last if (self.ppo.out / name / "eval_info.json").exists()]
 
     def results(self) -> dict[str, Any]:
         """Of what is finished: success of the cloned policy and of checkpoints, and the mean changes."""
-        cloned = {domain: self.found(f"cloned_{domain}") for domain in DOMAINS}
         return {
-            "cloned": {domain: proportion(found) for domain, found in cloned.items()},
+            "cloned": {domain: proportion(self.found(f"cloned_{domain}")) for domain in DOMAINS},
             "runs": {place: [self._run(place, seed) for seed in self.finished(place)] for place in PLACES},
             "mean_change": {
                 name: {

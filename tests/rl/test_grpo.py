@@ -13,6 +13,7 @@ from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 from lerobot_wmrl.rl.grpo import GRPO
 from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer, collect, start_seeds
+from tests.rl.learning import assert_it_learns
 from tests.rl.point_env import PointEnv
 
 MakePolicy = Callable[..., CnnPolicy]
@@ -114,12 +115,7 @@ def test_grpo_learns_to_reach(make_policy: MakePolicy, pipeline: Pipeline) -> No
     env, buffer = PointEnv(ENVS), RolloutBuffer(STEPS, ENVS, "cpu")
     settings = {"policy_lr": 3e-3, "target_kl": 0.05, "minibatch_size": 240, "max_reference_kl": 1e9}
     algorithm = GRPO(policy, GRPOConfig(group_size=GROUP, **settings))
-    rates = []
-    for iteration in range(30):
-        rates.append(collect(env, policy, pipeline, buffer, ENVS * iteration, GROUP)["success_rate"])
-        algorithm.improve(buffer, pipeline)
-    assert max(rates[:2]) < 0.3
-    assert sum(rates[-3:]) / 3 > 0.6, rates
+    assert_it_learns(algorithm, env, buffer, pipeline, 30)
 
 
 @pytest.mark.parametrize(("settings", "message"), [

@@ -16,6 +16,7 @@ from lerobot_wmrl.rl.policy_gradient import TrainingStopped
 from lerobot_wmrl.rl.ppo import PPO
 from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
+from tests.rl.learning import assert_it_learns
 from tests.rl.point_env import PointEnv
 
 FAST = {"policy_lr": 3e-3, "value_lr": 3e-3, "target_kl": 0.05, "minibatch_size": 240, "value_iterations": 1}
@@ -131,12 +132,7 @@ def test_ppo_learns_to_reach(make_policy: MakePolicy, pipeline: Pipeline) -> Non
     policy = make_policy()
     env, buffer = PointEnv(64), RolloutBuffer(15, 64, "cpu")
     algorithm = PPO(policy, PPOConfig(**FAST, reference_coefficient=0.0))
-    rates = []
-    for iteration in range(26):
-        rates.append(collect(env, policy, pipeline, buffer, 64 * iteration)["success_rate"])
-        algorithm.improve(buffer, pipeline)
-    assert max(rates[:2]) < 0.3
-    assert sum(rates[-3:]) / 3 > 0.6, rates
+    assert_it_learns(algorithm, env, buffer, pipeline, 26)
 
 
 def test_the_reference_holds_the_policy(make_policy: MakePolicy, pipeline: Pipeline) -> None:

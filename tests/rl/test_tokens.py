@@ -13,6 +13,7 @@ from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
 from tests.rl.chunk_policy import ChunkPolicy
 from tests.rl.conformance import check_samples_and_log_probs_agree
 from tests.rl.conftest import point_policy
+from tests.rl.learning import assert_it_learns
 from tests.rl.point_env import PointEnv
 from tests.rl.token_policy import BINS, FIRST_ID, TOKENS, TokenPolicy, to_metres
 
@@ -52,12 +53,7 @@ def test_ppo_learns_to_reach_by_tokens(ratio: str) -> None:
     policy, buffer = TokenPolicy(), RolloutBuffer(15, 64, "cpu")
     settings: dict[str, Any] = {"policy_lr": 3e-3, "value_lr": 3e-3, "target_kl": 0.05, "minibatch_size": 240}
     algorithm = PPO(policy, PPOConfig(**settings, ratio=ratio, value_iterations=1, reference_coefficient=0.0))
-    env, rates = PointEnv(64), []
-    for iteration in range(30):
-        rates.append(collect(env, policy, PIPELINE, buffer, 64 * iteration)["success_rate"])
-        algorithm.improve(buffer, PIPELINE)
-    assert max(rates[:2]) < 0.3
-    assert sum(rates[-3:]) / 3 > 0.6, rates
+    assert_it_learns(algorithm, PointEnv(64), buffer, PIPELINE, 30)
 
 
 @pytest.mark.parametrize("policy", [TokenPolicy(), ChunkPolicy(3), point_policy()])
