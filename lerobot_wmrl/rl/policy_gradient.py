@@ -24,7 +24,7 @@ from lerobot_wmrl.distributed import (
     sum_over_processes,
 )
 from lerobot_wmrl.precision import require_exact_updates
-from lerobot_wmrl.rl.adapters import stochastic
+from lerobot_wmrl.rl.stochastic_policies import stochastic
 from lerobot_wmrl.rl.configuration_policy_gradient import PolicyGradientConfig
 from lerobot_wmrl.rl.minibatches import Minibatch, Steps, make_minibatches, read_steps
 from lerobot_wmrl.rl.objectives import (
