@@ -24,7 +24,6 @@ from lerobot_wmrl.distributed import (
     sum_over_processes,
 )
 from lerobot_wmrl.precision import require_exact_updates
-from lerobot_wmrl.rl.stochastic_policies import stochastic
 from lerobot_wmrl.rl.configuration_policy_gradient import PolicyGradientConfig
 from lerobot_wmrl.rl.minibatches import Minibatch, Steps, make_minibatches, read_steps
 from lerobot_wmrl.rl.objectives import (
@@ -36,6 +35,7 @@ from lerobot_wmrl.rl.objectives import (
 )
 from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer
+from lerobot_wmrl.rl.stochastic_policies import stochastic
 
 REFERENCE, EXECUTED = "reference_log_prob", "executed"
 LOSS, NORM = "_loss", "_grad_norm"
