@@ -183,16 +183,19 @@ def record_in_parallel(
 
 
 def follow_workers(open_parts: set[int], results: Any, workers: list[Any], report: Report) -> None:
-    """Until every open part is whole. A worker's error is raised here."""
+    """Until every open part is whole. A worker's error is raised here.
+
+    So is its death, as soon as the others are silent: it may have held a lock that they wait for.
+    """
     while open_parts:
         try:
             result = results.get(timeout=POLL_SECONDS)
         except queue.Empty:
-            if not any(worker.is_alive() for worker in workers):
-                ends = ", ".join(str(worker.exitcode) for worker in workers)
+            ends = [worker.exitcode for worker in workers]
+            if any(ends) or None not in ends:
                 raise ValueError(
-                    f"the recording processes died (exit statuses {ends}; -9 is what a lack of memory looks "
-                    "like); run the same command to continue"
+                    f"recording processes died (exit statuses {', '.join(map(str, ends))}; -9 is what a lack "
+                    "of memory looks like, None still runs); run the same command to continue"
                 ) from None
             continue
         if isinstance(result, Exception):

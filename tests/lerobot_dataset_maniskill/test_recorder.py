@@ -1,6 +1,7 @@
 """A recording that is killed, continued, finished and refused: one small dataset, real simulator."""
 
 import json
+import multiprocessing
 import os
 import shutil
 import signal
@@ -17,7 +18,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.integrity import whole_dataset
 from lerobot_dataset_maniskill.manifest import planned_parts
-from lerobot_dataset_maniskill.recorder import missing_parts, record
+from lerobot_dataset_maniskill.recorder import follow_workers, missing_parts, record
 from lerobot_dataset_maniskill.writer import HOLD_FRAMES
 from lerobot_wmrl.constants import KINDS, STATE_NAMES
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
@@ -156,3 +157,18 @@ def test_a_corrupted_finished_dataset_is_reported(recorded: Path, tmp_path: Path
     os.truncate(data, data.stat().st_size // 2)
     with pytest.raises(ValueError, match=r"corrupted.*record again"):
         record(config(tmp_path))
+
+
+def test_a_worker_that_is_killed_does_not_leave_the_command_waiting() -> None:
+    """It may die with a lock that the others wait for."""
+    context = multiprocessing.get_context("spawn")
+    killed = context.Process(target=signal.raise_signal, args=(signal.SIGKILL,))
+    waiting = context.Process(target=time.sleep, args=(PATIENCE_S,), daemon=True)
+    for worker in (killed, waiting):
+        worker.start()
+    try:
+        with pytest.raises(ValueError, match="exit statuses -9, None.*run the same command"):
+            follow_workers({0}, context.Queue(), [killed, waiting], print)
+    finally:
+        waiting.kill()
+        waiting.join()
