@@ -167,7 +167,7 @@ def test_a_worker_that_is_killed_does_not_leave_the_command_waiting() -> None:
     for worker in (killed, waiting):
         worker.start()
     try:
-        with pytest.raises(ValueError, match="exit statuses -9, None.*run the same command"):
+        with pytest.raises(ValueError, match=r"exit statuses -9, None.*run the same command"):
             follow_workers({0}, context.Queue(), [killed, waiting], print)
     finally:
         waiting.kill()
