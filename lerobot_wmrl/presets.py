@@ -209,6 +209,7 @@ PRESETS: Final[dict[str, dict[str, Flags]]] = {
             "algorithm.epochs": 2,
             "algorithm.initial_std": 0.3,
             "algorithm.value_iterations": 2,
+            "algorithm.reference_coefficient": 0.1,
         },
         "eval": {"eval.batch_size": 2, "eval.use_async_envs": True},
         "eval-imagined": {"eval.batch_size": 50},

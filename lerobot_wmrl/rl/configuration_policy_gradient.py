@@ -30,7 +30,7 @@ class PolicyGradientConfig(RLAlgorithmConfig):
     """Largest norm of a gradient, of the policy's and of the value's separately."""
     ratio: str = "action"
     """What the objective clips: the ratio of a whole action, or that of each token, its components."""
-    reference_coefficient: float = 0.1
+    reference_coefficient: float = 0.02
     """Weight of KL(policy || cloned policy)."""
     entropy_coefficient: float = 0.0
     """Weight of the entropy bonus."""
