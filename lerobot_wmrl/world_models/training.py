@@ -46,6 +46,7 @@ from lerobot_wmrl.world_models.episode_table import (
     golden_episodes,
     open_dataset,
     read_episodes,
+    success_column,
 )
 from lerobot_wmrl.world_models.frame_cache import cached_context, cached_frames, cached_tokens
 
@@ -86,10 +87,10 @@ def make_sampler(
             raise ValueError(
                 "the text world model learns from successful optimal episodes; the dataset has none"
             )
-    elif "next.done" not in table.dataset.features:
+    elif success_column(table.dataset.features) is None:
         logging.warning(
-            "the dataset has no next.done: the model cannot learn what success is, and nothing that is "
-            "imagined in it will succeed"
+            "the dataset has neither next.success nor next.done: the model cannot learn what success is, and "
+            "nothing that is imagined in it will succeed"
         )
     tokenizer: Any = model.tokenizer
     tokens = cached_tokens(table.dataset, config.camera_keys, tokenizer)

@@ -12,6 +12,8 @@ from lerobot.scripts import lerobot_train
 from safetensors.torch import load_file
 
 from lerobot_wmrl.world_models.checkpoint import load_model
+from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig
+from lerobot_wmrl.world_models.processor_world_model import make_pass_through_processors
 from lerobot_wmrl.world_models.windows import clip_from_windows
 
 SIZE, ACTIONS, LENGTHS = 32, 3, (9, 14, 2)
@@ -132,6 +134,17 @@ def test_only_windows_that_hold_their_episodes_start_have_a_done_label_and_it_is
         batch["action"].long(), {**batch, "next.done": False}, "camera", state_size=0
     )
     assert not unlabelled.done_known.any()
+
+
+@pytest.mark.parametrize(("labels", "expected"), [
+    ({"next.done": [[True], [True]], "next.success": [[False], [True]]}, [[False], [True]]),
+    ({"next.done": [[True], [False]]}, [[True], [False]]), ({}, False),
+])  # fmt: skip
+def test_done_is_success_where_a_dataset_tells_them_apart(labels, expected):
+    preprocess, _ = make_pass_through_processors(ActionWorldModelConfig(device="cpu"))
+    batch = {name: torch.tensor(values) for name, values in labels.items()}
+    done = preprocess({"action": torch.zeros(2, 4, 3), **batch})["next.done"]
+    assert (done.tolist() if labels else done) == expected
 
 
 def test_the_reward_of_a_window_does_not_depend_on_what_pads_it(small_dataset, trained_models):

@@ -2,10 +2,13 @@
 
 import json
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import torch
 
@@ -14,7 +17,7 @@ from lerobot_wmrl.dataset_source import DatasetSource
 from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.context import NO_CONTEXT
-from lerobot_wmrl.world_models.episode_table import choose_episodes, read_episodes
+from lerobot_wmrl.world_models.episode_table import choose_episodes, open_dataset, read_episodes
 from lerobot_wmrl.world_models.evaluation import replay as replay_module
 from lerobot_wmrl.world_models.evaluation.accuracy import EpisodeAccuracy, by_step, episode_numbers, measure
 from lerobot_wmrl.world_models.evaluation.evaluate import evaluate
@@ -145,6 +148,39 @@ def test_episodes_of_one_frame_are_named(source, model):
 def test_the_gate_is_one_call(small_dataset, model):
     gate = success_gate(model, Path(small_dataset.root), threshold=1e-9, frames=1)
     assert (gate.false_success.share, gate.recognised.share) == (1, 1)
+
+
+def with_columns(source: Path, root: Path, columns: dict[str, list[bool] | None]) -> Path:
+    """A copy of a dataset with other columns of truth values, (N,) each; without those that are None."""
+    shutil.copytree(source, root)
+    path, info = next((root / "data").rglob("*.parquet")), root / "meta" / "info.json"
+    table, described = pq.read_table(path), json.loads(info.read_text())
+    for name, values in columns.items():
+        kind = table.schema.field(name).type
+        table = table.drop_columns(name)
+        if values is None:
+            del described["features"][name]
+        else:
+            table = table.append_column(name, pa.array(values, kind))
+    pq.write_table(table, path)
+    info.write_text(json.dumps(described))
+    return root
+
+
+def test_an_episode_that_ends_without_success_is_a_failure(small_dataset, model, tmp_path):
+    """As in LeRobot's own datasets, where `next.done` is the last row's whatever the outcome."""
+    table = read_episodes(small_dataset)
+    ends = np.isin(np.arange(len(table.done)), table.start + table.length - 1)
+    root = with_columns(Path(small_dataset.root), tmp_path / "ends", {"next.done": ends.tolist()})
+    assert read_episodes(open_dataset(root)).done.tolist() == table.done.tolist()
+    gate = success_gate(model, root)
+    assert (gate.false_success.n, gate.recognised.n) == (2, 4)
+    root = with_columns(Path(small_dataset.root), tmp_path / "old", {"next.success": None})
+    assert read_episodes(open_dataset(root)).done.tolist() == table.done.tolist()
+    unlabelled = {"next.success": None, "next.done": None}
+    root = with_columns(Path(small_dataset.root), tmp_path / "unlabelled", unlabelled)
+    with pytest.raises(ValueError, match=r"neither next\.success nor next\.done"):
+        success_gate(model, root)
 
 
 def test_the_command_writes_figures_and_pictures(small_dataset, trained_models, tmp_path, capsys):
