@@ -186,12 +186,18 @@ def log(output_dir: Path, step: int, metrics: dict[str, float], progress: tqdm) 
 def descend(
     model: torch.nn.Module, loss: Tensor, optimizer: Optimizer, grad_clip_norm: float
 ) -> dict[str, float]:
-    """One optimiser step. → the loss and the norm of its gradient. ValueError, and no step, on a NaN."""
+    """One optimiser step. → the loss and the norm of its gradient. ValueError, and no step, if one is NaN."""
     value = mean_over_processes({"loss": loss.item()}, loss.device)["loss"]
-    if not math.isfinite(value):
-        raise ValueError(f"the loss is {value}; the last checkpoint is kept: lower --model.learning_rate")
+    require_finite("loss", value)
     optimizer.zero_grad()
     loss.backward()
-    grad_norm = torch.nn.utils.clip_grad_norm_(model.parameters(), grad_clip_norm)
+    grad_norm = torch.nn.utils.clip_grad_norm_(model.parameters(), grad_clip_norm).item()
+    require_finite("gradient's norm", grad_norm)
     optimizer.step()
-    return {"loss": value, "grad_norm": grad_norm.item()}
+    return {"loss": value, "grad_norm": grad_norm}
+
+
+def require_finite(name: str, value: float) -> None:
+    """ValueError on a NaN or infinity."""
+    if not math.isfinite(value):
+        raise ValueError(f"the {name} is {value}; the last checkpoint is kept: lower --model.learning_rate")

@@ -21,7 +21,7 @@ from lerobot_wmrl.world_models.clips import ClipSampler, InTurn
 from lerobot_wmrl.world_models.episode_table import golden_episodes, read_episodes
 from lerobot_wmrl.world_models.frame_cache import cached_frames, cached_tokens
 from lerobot_wmrl.world_models.temporal_memory import ClipMemory
-from lerobot_wmrl.world_models.training import make_joint_sampler, make_sampler
+from lerobot_wmrl.world_models.training import descend, make_joint_sampler, make_sampler
 from tests.trained import action_config, run_training, text_config, tokenizer_config, train_tokenizer
 
 WEIGHTS = "checkpoints/last/pretrained_model/model.safetensors"
@@ -204,3 +204,13 @@ def test_other_settings_do_not_continue_a_run(small_dataset, trained_models, tmp
     folder = train_tokenizer(root, tmp_path / "run", steps=1)
     with pytest.raises(ValueError, match="other settings"):
         train_tokenizer(root, folder, steps=1, batch_size=3)
+
+
+def test_weights_are_left_as_they_are_where_the_loss_has_no_gradient():
+    """The loss of a step is finite and its gradient is not: a step would write NaN into a checkpoint."""
+    model = torch.nn.Linear(1, 1, bias=False)
+    torch.nn.init.zeros_(model.weight)
+    optimizer = torch.optim.AdamW(model.parameters(), lr=0.1)
+    with pytest.raises(ValueError, match=r"gradient's norm is inf; the last checkpoint is kept"):
+        descend(model, model.weight.sqrt().sum(), optimizer, 1.0)
+    assert model.weight.item() == 0
