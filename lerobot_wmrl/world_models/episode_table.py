@@ -46,6 +46,11 @@ class EpisodeTable:
     instructions: list[str]
 
     @property
+    def done_known(self) -> bool:
+        """Whether the dataset says where success holds; else done is False everywhere."""
+        return success_column(self.dataset.features) is not None
+
+    @property
     def success(self) -> np.ndarray:
         """Whether success was ever reached. (E,)"""
         return np.array([self.done[a : a + n].any() for a, n in zip(self.start, self.length, strict=True)])

@@ -17,7 +17,7 @@ from torch import Tensor
 from lerobot_wmrl.constants import KINDS, PLAY, TASKS
 from lerobot_wmrl.statistics import Proportion
 from lerobot_wmrl.world_models.compatibility import check_dataset
-from lerobot_wmrl.world_models.episode_table import EpisodeTable, open_dataset, read_episodes, success_column
+from lerobot_wmrl.world_models.episode_table import EpisodeTable, open_dataset, read_episodes
 from lerobot_wmrl.world_models.evaluation.replay import LONGEST, EpisodeReplay, Source, in_batches
 from lerobot_wmrl.world_models.frame_cache import cached_frames
 from lerobot_wmrl.world_models.look_ahead import look_ahead
@@ -138,7 +138,7 @@ def rollouts_for(model: ActionWorldModelRewardModel, dataset_root: str | Path) -
     which of them succeeded."""
     table = read_episodes(open_dataset(dataset_root))
     check_dataset(model.config, table.dataset.features)
-    if success_column(table.dataset.features) is None:
+    if not table.done_known:
         raise ValueError(
             f"dataset.root={dataset_root}: has neither next.success nor next.done, which say whether success "
             "holds; use rollouts with labels"

@@ -2,13 +2,10 @@
 
 import json
 import math
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 import torch
 
@@ -25,6 +22,7 @@ from lerobot_wmrl.world_models.evaluation.extreme_actions import extreme_actions
 from lerobot_wmrl.world_models.evaluation.gate import Outcomes, gate_at, success_gate
 from lerobot_wmrl.world_models.evaluation.replay import EpisodeReplay, Source, replay_episodes
 from lerobot_wmrl.world_models.frame_cache import cached_frames
+from tests.relabelled import UNLABELLED, relabelled
 
 
 @pytest.fixture(scope="module")
@@ -150,37 +148,32 @@ def test_the_gate_is_one_call(small_dataset, model):
     assert (gate.false_success.share, gate.recognised.share) == (1, 1)
 
 
-def with_columns(source: Path, root: Path, columns: dict[str, list[bool] | None]) -> Path:
-    """A copy of a dataset with other columns of truth values, (N,) each; without those that are None."""
-    shutil.copytree(source, root)
-    path, info = next((root / "data").rglob("*.parquet")), root / "meta" / "info.json"
-    table, described = pq.read_table(path), json.loads(info.read_text())
-    for name, values in columns.items():
-        kind = table.schema.field(name).type
-        table = table.drop_columns(name)
-        if values is None:
-            del described["features"][name]
-        else:
-            table = table.append_column(name, pa.array(values, kind))
-    pq.write_table(table, path)
-    info.write_text(json.dumps(described))
-    return root
-
-
 def test_an_episode_that_ends_without_success_is_a_failure(small_dataset, model, tmp_path):
     """As in LeRobot's own datasets, where `next.done` is the last row's whatever the outcome."""
     table = read_episodes(small_dataset)
     ends = np.isin(np.arange(len(table.done)), table.start + table.length - 1)
-    root = with_columns(Path(small_dataset.root), tmp_path / "ends", {"next.done": ends.tolist()})
+    root = relabelled(Path(small_dataset.root), tmp_path / "ends", {"next.done": ends.tolist()})
     assert read_episodes(open_dataset(root)).done.tolist() == table.done.tolist()
     gate = success_gate(model, root)
     assert (gate.false_success.n, gate.recognised.n) == (2, 4)
-    root = with_columns(Path(small_dataset.root), tmp_path / "old", {"next.success": None})
+    root = relabelled(Path(small_dataset.root), tmp_path / "old", {"next.success": None})
     assert read_episodes(open_dataset(root)).done.tolist() == table.done.tolist()
-    unlabelled = {"next.success": None, "next.done": None}
-    root = with_columns(Path(small_dataset.root), tmp_path / "unlabelled", unlabelled)
+    root = relabelled(Path(small_dataset.root), tmp_path / "unlabelled", UNLABELLED)
     with pytest.raises(ValueError, match=r"neither next\.success nor next\.done"):
         success_gate(model, root)
+
+
+def test_episodes_of_which_nobody_knows_the_outcome_are_no_failures(small_dataset, trained_models, tmp_path):
+    root = relabelled(Path(small_dataset.root), tmp_path / "unlabelled", UNLABELLED)
+    config = EvalWorldModelConfig(
+        model=Checkpoint(str(trained_models["action_world_model"])), dataset=DatasetSource(str(root)),
+        output_dir=tmp_path / "check",
+    )  # fmt: skip
+    eval_world_model(config)
+    metrics = json.loads((tmp_path / "check" / "metrics.json").read_text(), parse_constant=pytest.fail)
+    assert (metrics["real_failures"], metrics["real_successes"], metrics["passed"]) == (0, 0, False)
+    assert metrics["headline"]["done_f1"]["value"] is None
+    assert (metrics["headline"]["psnr"]["episodes"], metrics["extreme_actions"]["episodes"]) == (6, 6)
 
 
 def test_the_command_writes_figures_and_pictures(small_dataset, trained_models, tmp_path, capsys):
