@@ -13,6 +13,7 @@ from safetensors.torch import load_file
 
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig
+from lerobot_wmrl.world_models.look_ahead import look_ahead
 from lerobot_wmrl.world_models.processor_world_model import make_pass_through_processors
 from lerobot_wmrl.world_models.windows import clip_from_windows
 
@@ -74,10 +75,10 @@ def test_a_world_model_of_any_dataset_goes_on_bit_for_bit(
     foreign_dataset, foreign_tokenizer, monkeypatch, tmp_path
 ):
     """As `lerobot-train --resume=true` continues it: with its samples, but not with its random numbers."""
-    model = ["--reward_model.type=action_world_model", f"--reward_model.tokenizer_path={foreign_tokenizer}",
+    flags = ["--reward_model.type=action_world_model", f"--reward_model.tokenizer_path={foreign_tokenizer}",
              "--reward_model.dynamics=autoregressive", "--reward_model.token_noise=0",
              "--reward_model.self_forcing=0"]  # fmt: skip
-    whole = lerobot_trained(monkeypatch, tmp_path / "run", *on(foreign_dataset, 4), *model, *SMALL)
+    whole = lerobot_trained(monkeypatch, tmp_path / "run", *on(foreign_dataset, 4), *flags, *SMALL)
     expected = load_file(whole / LAST / "model.safetensors")
     (whole / "checkpoints" / "000004").rename(tmp_path / "lost")
     link = whole / "checkpoints" / "last"
@@ -89,8 +90,12 @@ def test_a_world_model_of_any_dataset_goes_on_bit_for_bit(
     resumed = load_file(whole / LAST / "model.safetensors")
     assert (link.resolve().name, expected.keys()) == ("000004", resumed.keys())
     assert all(torch.equal(expected[name], resumed[name]) for name in expected)
-    config = load_model(whole, "action_world_model").config
-    assert (config.cameras, config.action_size, config.state_size) == (["top", "left.fisheye"], ACTIONS, 0)
+    model = load_model(whole, "action_world_model")
+    assert model.config.cameras == ["top", "left.fisheye"]
+    assert (model.config.action_size, model.config.state_size) == (ACTIONS, 0)
+    first = torch.zeros(2, model.tokenizer.tokens_per_frame, dtype=torch.long)
+    ahead = look_ahead(model, first, torch.empty(2, 0), torch.randn(2, 5, ACTIONS))
+    assert (ahead.done_logit.sigmoid() < 0.01).all(), "the dataset does not say what success is"
 
 
 def test_a_text_world_model_of_a_dataset_with_videos_states_and_labels(
