@@ -8,6 +8,7 @@ import numpy as np
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import ACTION, DONE, OBS_STATE
+from numpy.typing import ArrayLike
 
 from lerobot_wmrl.constants import KINDS
 
@@ -126,14 +127,20 @@ def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
         for name in ("start.kind", "start.scene", "start.task")
     )
     done = np.asarray(rows[success]).reshape(-1) if success else np.zeros(frames, bool)
-    state = (
-        np.asarray(rows[OBS_STATE], np.float32) if OBS_STATE in rows else np.zeros((frames, 0), np.float32)
-    )
+    state = np.zeros((frames, 0), np.float32)
+    if OBS_STATE in rows:
+        state = as_columns(rows[OBS_STATE])
     instructions = [episode["tasks"][0] for episode in dataset.meta.episodes]
-    action = np.asarray(rows[ACTION], np.float32)
+    action = as_columns(rows[ACTION])
     return EpisodeTable(
         dataset, state, action, done.astype(bool), start, length, kind, scene, task, instructions
     )
+
+
+def as_columns(values: ArrayLike) -> np.ndarray:
+    """Float32 (N, K) of N rows; LeRobot stores vectors of one component as scalars, (N,)."""
+    columns = np.asarray(values, np.float32)
+    return columns.reshape(len(columns), -1)
 
 
 def check_finite(dataset: LeRobotDataset, column: str, values: np.ndarray, episode: np.ndarray) -> None:

@@ -13,6 +13,7 @@ from safetensors.torch import load_file
 
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig
+from lerobot_wmrl.world_models.episode_table import open_dataset, read_episodes
 from lerobot_wmrl.world_models.look_ahead import look_ahead
 from lerobot_wmrl.world_models.processor_world_model import make_pass_through_processors
 from lerobot_wmrl.world_models.windows import clip_from_windows
@@ -150,6 +151,25 @@ def test_done_is_success_where_a_dataset_tells_them_apart(labels, expected):
     batch = {name: torch.tensor(values) for name, values in labels.items()}
     done = preprocess({"action": torch.zeros(2, 4, 3), **batch})["next.done"]
     assert (done.tolist() if labels else done) == expected
+
+
+def test_vectors_of_one_component_are_vectors(tmp_path):
+    """LeRobot stores them as scalars."""
+    one = {"dtype": "float32", "shape": (1,), "names": None}
+    dataset = LeRobotDataset.create(
+        "somebody/slider", 10, {"action": one, "observation.state": one}, root=tmp_path / "dataset",
+        use_videos=False,
+    )  # fmt: skip
+    for row in np.arange(4, dtype=np.float32):
+        dataset.add_frame({"action": row[None], "observation.state": row[None] + 100, "task": "slide"})
+    dataset.save_episode()
+    dataset.finalize()
+    table = read_episodes(open_dataset(tmp_path / "dataset"))
+    assert table.action.tolist() == [[0], [1], [2], [3]]
+    assert (table.state == table.action + 100).all()
+    batch = {"action": torch.arange(6.0).view(2, 3), "observation.state": torch.arange(6.0).view(2, 3)}
+    clip = clip_from_windows(torch.zeros(2, 3, 4), batch, "camera", state_size=1)
+    assert clip.action.tolist() == clip.state.tolist() == [[[0], [1], [2]], [[3], [4], [5]]]
 
 
 def test_the_reward_of_a_window_does_not_depend_on_what_pads_it(small_dataset, trained_models):
