@@ -28,6 +28,7 @@ class ClipSampler:
 
     tokens (rows, S) is the memory map; `episodes` the indices of the episodes to draw from. For models that
     look at them: depth (rows, S), metres of each token; context (E, N, C, g, g), of episodes' first frames.
+    done_known: whether the table's done is what happened, or nobody knows.
     """
 
     table: EpisodeTable
@@ -39,6 +40,7 @@ class ClipSampler:
     device: str
     depth: np.ndarray | None = None
     context: np.ndarray | None = None
+    done_known: bool = True
 
     def __call__(self, step: int) -> Clip:
         """This process's share of the batch of one training step."""
@@ -56,7 +58,8 @@ class ClipSampler:
         rows = self.table.start[episodes][:, None] + np.minimum(
             rows, self.table.length[episodes][:, None] - 1
         )
-        known = valid if self.context is not None else valid & (offsets == 0)[:, None]
+        whole = self.context is not None
+        known = valid & self.done_known & (whole | (offsets == 0))[:, None]
         context = NO_CONTEXT if self.context is None else Context((self._tensor(self.context[episodes]),))
         return Clip(
             self._tensor(self.tokens[rows]).long(),

@@ -1,13 +1,14 @@
 """A LeRobotDataset's numbers, without its pictures: what training and evaluation index episodes by."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Container, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.utils.constants import ACTION, OBS_STATE
+from lerobot.utils.constants import ACTION, DONE, OBS_STATE
+from numpy.typing import ArrayLike
 
 from lerobot_wmrl.constants import KINDS
 
@@ -17,10 +18,18 @@ VIDEO_BACKEND = "pyav"
 VALIDATION_EVERY = 20
 """Every twentieth episode is held out from the training of tokenizers and world models."""
 
+SUCCESS_COLUMNS = ("next.success", DONE)
+"""Where success is looked for. Beside the first, LeRobot's `next.done` may be the mere end of an episode."""
+
+
+def success_column(columns: Container[str]) -> str | None:
+    """The one of a dataset that says whether success holds; None if it does not say."""
+    return next((name for name in SUCCESS_COLUMNS if name in columns), None)
+
 
 @dataclass
 class EpisodeTable:
-    """Per frame (N rows): state (N, P), action (N, A), done (N,). Per episode (E): start, length, ….
+    """Per frame (N rows): state (N, P), action (N, A), done (N,): success. Per episode (E): start, length, ….
 
     `kind` and `task` hold indices into `constants.KINDS` and `TASKS`, `scene` those of the recorded scenes,
     −1 where the dataset does not say.
@@ -36,6 +45,11 @@ class EpisodeTable:
     scene: np.ndarray
     task: np.ndarray
     instructions: list[str]
+
+    @property
+    def done_known(self) -> bool:
+        """Whether the dataset says where success holds; else done is False everywhere."""
+        return success_column(self.dataset.features) is not None
 
     @property
     def success(self) -> np.ndarray:
@@ -98,10 +112,12 @@ def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
             f"{', '.join(dataset.features)}); world models need what was done beside what was seen"
         )
     columns = [ACTION, "episode_index"]
-    optional = (OBS_STATE, "next.done", "start.kind", "start.scene", "start.task")
+    success = success_column(dataset.features)
+    labels = [] if success is None else [success]
+    optional = (OBS_STATE, *labels, "start.kind", "start.scene", "start.task")
     columns += [name for name in optional if name in dataset.features]
     rows = dataset.hf_dataset.with_format("numpy", columns=columns)[:]
-    for column in (ACTION, OBS_STATE, "next.done"):
+    for column in (ACTION, OBS_STATE, *labels):
         if column in rows:
             check_finite(dataset, column, np.asarray(rows[column]), rows["episode_index"])
     frames = len(rows["episode_index"])
@@ -110,15 +126,21 @@ def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
         np.asarray(rows[name]).reshape(-1)[start] if name in rows else np.full(len(start), -1)
         for name in ("start.kind", "start.scene", "start.task")
     )
-    done = np.asarray(rows["next.done"]).reshape(-1) if "next.done" in rows else np.zeros(frames, bool)
-    state = (
-        np.asarray(rows[OBS_STATE], np.float32) if OBS_STATE in rows else np.zeros((frames, 0), np.float32)
-    )
+    done = np.asarray(rows[success]).reshape(-1) if success else np.zeros(frames, bool)
+    state = np.zeros((frames, 0), np.float32)
+    if OBS_STATE in rows:
+        state = as_columns(rows[OBS_STATE])
     instructions = [episode["tasks"][0] for episode in dataset.meta.episodes]
-    action = np.asarray(rows[ACTION], np.float32)
+    action = as_columns(rows[ACTION])
     return EpisodeTable(
         dataset, state, action, done.astype(bool), start, length, kind, scene, task, instructions
     )
+
+
+def as_columns(values: ArrayLike) -> np.ndarray:
+    """Float32 (N, K) of N rows; LeRobot stores vectors of one component as scalars, (N,)."""
+    columns = np.asarray(values, np.float32)
+    return columns.reshape(len(columns), -1)
 
 
 def check_finite(dataset: LeRobotDataset, column: str, values: np.ndarray, episode: np.ndarray) -> None:

@@ -1,4 +1,4 @@
-"""Processors of the world models: batches pass through, moved to the device.
+"""Processors of the world models: batches pass through, moved to the device, with success as what done means.
 
 Statistics live in the models' buffers, because LeRobot does not reload reward processors on resume.
 """
@@ -9,11 +9,25 @@ from lerobot.configs.rewards import RewardModelConfig
 from lerobot.processor import (
     AddBatchDimensionProcessorStep,
     DeviceProcessorStep,
+    EnvTransition,
     PolicyProcessorPipeline,
+    batch_to_transition,
     policy_action_to_transition,
     transition_to_policy_action,
 )
-from lerobot.utils.constants import POLICY_POSTPROCESSOR_DEFAULT_NAME, POLICY_PREPROCESSOR_DEFAULT_NAME
+from lerobot.utils.constants import (
+    DONE,
+    POLICY_POSTPROCESSOR_DEFAULT_NAME,
+    POLICY_PREPROCESSOR_DEFAULT_NAME,
+)
+
+from lerobot_wmrl.world_models.episode_table import success_column
+
+
+def labelled_transition(batch: dict[str, Any]) -> EnvTransition:
+    """LeRobot's, which has no place for `next.success`: it takes that of `next.done` where there is one."""
+    column = success_column(batch)
+    return batch_to_transition(batch if column is None else {**batch, DONE: batch[column]})
 
 
 def make_pass_through_processors(
@@ -23,6 +37,7 @@ def make_pass_through_processors(
     preprocessor: PolicyProcessorPipeline = PolicyProcessorPipeline(
         steps=[AddBatchDimensionProcessorStep(), DeviceProcessorStep(device=config.device or "cpu")],
         name=POLICY_PREPROCESSOR_DEFAULT_NAME,
+        to_transition=labelled_transition,
     )
     postprocessor: PolicyProcessorPipeline = PolicyProcessorPipeline(
         steps=[DeviceProcessorStep(device="cpu")],

@@ -66,8 +66,12 @@ def make_sampler(
     chosen: Sequence[int] | None,
     batch_size: int,
     seed: int,
+    done_known: bool = True,
 ) -> ClipSampler | FrameSampler:
-    """Batches for this kind of model from the episodes that are not held out, and `chosen` if some are."""
+    """Batches for this kind of model from the episodes that are not held out, and `chosen` if some are.
+
+    `done_known`: as in `ClipSampler`.
+    """
     config: Any = model.config
     episodes = ~table.validation & table.among(chosen)
     if not episodes.any():
@@ -86,10 +90,11 @@ def make_sampler(
             raise ValueError(
                 "the text world model learns from successful optimal episodes; the dataset has none"
             )
-    elif "next.done" not in table.dataset.features:
+    elif not table.done_known:
         logging.warning(
-            "the dataset has no next.done: the model cannot learn what success is, and nothing that is "
-            "imagined in it will succeed"
+            "dataset.root=%s: has neither next.success nor next.done: the model cannot learn from it what "
+            "success is, and from it alone learns that nothing succeeds",
+            table.dataset.root,
         )
     tokenizer: Any = model.tokenizer
     tokens = cached_tokens(table.dataset, config.camera_keys, tokenizer)
@@ -99,20 +104,25 @@ def make_sampler(
         context = cached_context(table.dataset, config.camera_keys, tokenizer)
     return ClipSampler(
         table, tokens, episodes.nonzero()[0], config.clip_length, batch_size, seed, config.device, depth,
-        context,
+        context, done_known,
     )  # fmt: skip
 
 
 def make_joint_sampler(
     model: PreTrainedRewardModel, table: EpisodeTable, data: TrainingData, batch_size: int, seed: int
 ) -> ClipSampler | FrameSampler | InTurn:
-    """Batches from the episodes of `data`, which are in `table`, and from its further datasets."""
-    first = make_sampler(model, table, data.episodes, batch_size, seed)
-    others = []
-    for root in data.more:
-        other = read_episodes(open_dataset(root))
+    """Batches from the episodes of `data`, which are in `table`, and from its further datasets.
+
+    Where some of them say what success is, those that do not leave done alone.
+    """
+    more = [read_episodes(open_dataset(root)) for root in data.more]
+    for other in more:
         check_dataset(model.config, other.dataset.features)
-        others.append(make_sampler(model, other, None, batch_size, seed))
+    unlabelled = not any(each.done_known for each in (table, *more))
+    first, *others = (
+        make_sampler(model, each, chosen, batch_size, seed, unlabelled or each.done_known)
+        for each, chosen in zip((table, *more), (data.episodes, *[None] * len(more)), strict=True)
+    )
     return InTurn(first, others) if others else first
 
 
@@ -185,12 +195,18 @@ def log(output_dir: Path, step: int, metrics: dict[str, float], progress: tqdm) 
 def descend(
     model: torch.nn.Module, loss: Tensor, optimizer: Optimizer, grad_clip_norm: float
 ) -> dict[str, float]:
-    """One optimiser step. → the loss and the norm of its gradient. ValueError, and no step, on a NaN."""
+    """One optimiser step. → the loss and the norm of its gradient. ValueError, and no step, if one is NaN."""
     value = mean_over_processes({"loss": loss.item()}, loss.device)["loss"]
-    if not math.isfinite(value):
-        raise ValueError(f"the loss is {value}; the last checkpoint is kept: lower --model.learning_rate")
+    require_finite("loss", value)
     optimizer.zero_grad()
     loss.backward()
-    grad_norm = torch.nn.utils.clip_grad_norm_(model.parameters(), grad_clip_norm)
+    grad_norm = torch.nn.utils.clip_grad_norm_(model.parameters(), grad_clip_norm).item()
+    require_finite("gradient's norm", grad_norm)
     optimizer.step()
-    return {"loss": value, "grad_norm": grad_norm.item()}
+    return {"loss": value, "grad_norm": grad_norm}
+
+
+def require_finite(name: str, value: float) -> None:
+    """ValueError on a NaN or infinity."""
+    if not math.isfinite(value):
+        raise ValueError(f"the {name} is {value}; the last checkpoint is kept: lower --model.learning_rate")

@@ -22,8 +22,8 @@ def clip_from_windows(
 
     Args:
         tokens: (B, T, S), of the window's frames.
-        batch: action (B, T, A), observation.state (B, T, P), next.done (B,) or (B, 1), task, `*_is_pad`
-            (B, T); all but the action may be missing.
+        batch: action (B, T, A), observation.state (B, T, P), either (B, T) where it has one component;
+            next.done (B,) or (B, 1), task, `*_is_pad` (B, T); all but the action may be missing.
         depth: (B, T, S) metres, of the window's frames.
 
     Raises:
@@ -31,10 +31,14 @@ def clip_from_windows(
     """
     (rows, length), device = tokens.shape[:2], tokens.device
     action = batch.get(ACTION)
+    if action is not None and action.shape == (rows, length):
+        action = action[..., None]
     if action is None or action.ndim != 3 or action.shape[1] != length:
         found = "none" if action is None else f"shape {tuple(action.shape)}"
         raise ValueError(f"action: {found}, but the batch has windows of {length} frames; give one a frame")
-    state = batch[OBS_STATE] if state_size else action.new_zeros(rows, length, 0)
+    state = action.new_zeros(rows, length, 0)
+    if state_size:
+        state = batch[OBS_STATE].reshape(rows, length, -1)
     for name, values in ((ACTION, action), (OBS_STATE, state)):
         if not torch.isfinite(values).all():
             raise ValueError(f"{name}: holds NaN or infinity; remove the episodes that do from the dataset")

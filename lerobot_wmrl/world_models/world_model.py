@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from lerobot.rewards.pretrained import PreTrainedRewardModel
 from lerobot.utils.constants import OBS_STATE
-from torch import Tensor
+from torch import Tensor, nn
 
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.clip import Clip
@@ -23,6 +23,7 @@ from lerobot_wmrl.world_models.configuration_world_model import WorldModelConfig
 from lerobot_wmrl.world_models.decoding import Condition, make_decoding
 from lerobot_wmrl.world_models.depth_maps import depth_of_windows
 from lerobot_wmrl.world_models.dynamics import make_dynamics
+from lerobot_wmrl.world_models.episode_table import success_column
 from lerobot_wmrl.world_models.frame_network import Prediction
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
 from lerobot_wmrl.world_models.hub_card import HubCard
@@ -39,6 +40,10 @@ upright) is scaled as if it varied so much, lest its noise weigh as much as cent
 
 STATE_LIMIT = 5.0
 """In standard deviations."""
+
+NEVER = -5.0
+"""Logit of done with which a model begins whose dataset does not say what success is: else it would stay at
+chance, and every second imagination would succeed."""
 
 
 class WorldModelRewardModel(HubCard, Imagination, PreTrainedRewardModel):
@@ -77,6 +82,9 @@ class WorldModelRewardModel(HubCard, Imagination, PreTrainedRewardModel):
             state_size=config.state_size, patch=config.patch, width=config.width,
             code_width=config.code_width, quantizer=config.quantizer,
         )  # fmt: skip
+        if dataset_meta is not None and success_column(dataset_meta.features) is None:
+            last: Any = self.network.done[-1]
+            nn.init.constant_(last.bias, NEVER)
         self.tokenizer.eval()
         self.decoding = make_decoding(config, self.network.embedding.local.in_channels)
         self._register_statistics("state", OBS_STATE, config.state_size, dataset_stats, STATE_SPREAD)

@@ -12,6 +12,10 @@ from lerobot.scripts import lerobot_train
 from safetensors.torch import load_file
 
 from lerobot_wmrl.world_models.checkpoint import load_model
+from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig
+from lerobot_wmrl.world_models.episode_table import open_dataset, read_episodes
+from lerobot_wmrl.world_models.look_ahead import look_ahead
+from lerobot_wmrl.world_models.processor_world_model import make_pass_through_processors
 from lerobot_wmrl.world_models.windows import clip_from_windows
 
 SIZE, ACTIONS, LENGTHS = 32, 3, (9, 14, 2)
@@ -72,10 +76,10 @@ def test_a_world_model_of_any_dataset_goes_on_bit_for_bit(
     foreign_dataset, foreign_tokenizer, monkeypatch, tmp_path
 ):
     """As `lerobot-train --resume=true` continues it: with its samples, but not with its random numbers."""
-    model = ["--reward_model.type=action_world_model", f"--reward_model.tokenizer_path={foreign_tokenizer}",
+    flags = ["--reward_model.type=action_world_model", f"--reward_model.tokenizer_path={foreign_tokenizer}",
              "--reward_model.dynamics=autoregressive", "--reward_model.token_noise=0",
              "--reward_model.self_forcing=0"]  # fmt: skip
-    whole = lerobot_trained(monkeypatch, tmp_path / "run", *on(foreign_dataset, 4), *model, *SMALL)
+    whole = lerobot_trained(monkeypatch, tmp_path / "run", *on(foreign_dataset, 4), *flags, *SMALL)
     expected = load_file(whole / LAST / "model.safetensors")
     (whole / "checkpoints" / "000004").rename(tmp_path / "lost")
     link = whole / "checkpoints" / "last"
@@ -87,8 +91,12 @@ def test_a_world_model_of_any_dataset_goes_on_bit_for_bit(
     resumed = load_file(whole / LAST / "model.safetensors")
     assert (link.resolve().name, expected.keys()) == ("000004", resumed.keys())
     assert all(torch.equal(expected[name], resumed[name]) for name in expected)
-    config = load_model(whole, "action_world_model").config
-    assert (config.cameras, config.action_size, config.state_size) == (["top", "left.fisheye"], ACTIONS, 0)
+    model = load_model(whole, "action_world_model")
+    assert model.config.cameras == ["top", "left.fisheye"]
+    assert (model.config.action_size, model.config.state_size) == (ACTIONS, 0)
+    first = torch.zeros(2, model.tokenizer.tokens_per_frame, dtype=torch.long)
+    ahead = look_ahead(model, first, torch.empty(2, 0), torch.randn(2, 5, ACTIONS))
+    assert (ahead.done_logit.sigmoid() < 0.01).all(), "the dataset does not say what success is"
 
 
 def test_a_text_world_model_of_a_dataset_with_videos_states_and_labels(
@@ -132,6 +140,36 @@ def test_only_windows_that_hold_their_episodes_start_have_a_done_label_and_it_is
         batch["action"].long(), {**batch, "next.done": False}, "camera", state_size=0
     )
     assert not unlabelled.done_known.any()
+
+
+@pytest.mark.parametrize(("labels", "expected"), [
+    ({"next.done": [[True], [True]], "next.success": [[False], [True]]}, [[False], [True]]),
+    ({"next.done": [[True], [False]]}, [[True], [False]]), ({}, False),
+])  # fmt: skip
+def test_done_is_success_where_a_dataset_tells_them_apart(labels, expected):
+    preprocess, _ = make_pass_through_processors(ActionWorldModelConfig(device="cpu"))
+    batch = {name: torch.tensor(values) for name, values in labels.items()}
+    done = preprocess({"action": torch.zeros(2, 4, 3), **batch})["next.done"]
+    assert (done.tolist() if labels else done) == expected
+
+
+def test_vectors_of_one_component_are_vectors(tmp_path):
+    """LeRobot stores them as scalars."""
+    one = {"dtype": "float32", "shape": (1,), "names": None}
+    dataset = LeRobotDataset.create(
+        "somebody/slider", 10, {"action": one, "observation.state": one}, root=tmp_path / "dataset",
+        use_videos=False,
+    )  # fmt: skip
+    for row in np.arange(4, dtype=np.float32):
+        dataset.add_frame({"action": row[None], "observation.state": row[None] + 100, "task": "slide"})
+    dataset.save_episode()
+    dataset.finalize()
+    table = read_episodes(open_dataset(tmp_path / "dataset"))
+    assert table.action.tolist() == [[0], [1], [2], [3]]
+    assert (table.state == table.action + 100).all()
+    batch = {"action": torch.arange(6.0).view(2, 3), "observation.state": torch.arange(6.0).view(2, 3)}
+    clip = clip_from_windows(torch.zeros(2, 3, 4), batch, "camera", state_size=1)
+    assert clip.action.tolist() == clip.state.tolist() == [[[0], [1], [2]], [[3], [4], [5]]]
 
 
 def test_the_reward_of_a_window_does_not_depend_on_what_pads_it(small_dataset, trained_models):

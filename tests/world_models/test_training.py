@@ -18,10 +18,11 @@ from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig
 from lerobot_wmrl.tracking import read_metrics
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.clips import ClipSampler, InTurn
-from lerobot_wmrl.world_models.episode_table import golden_episodes, read_episodes
+from lerobot_wmrl.world_models.episode_table import golden_episodes, open_dataset, read_episodes
 from lerobot_wmrl.world_models.frame_cache import cached_frames, cached_tokens
 from lerobot_wmrl.world_models.temporal_memory import ClipMemory
-from lerobot_wmrl.world_models.training import make_joint_sampler, make_sampler
+from lerobot_wmrl.world_models.training import descend, make_joint_sampler, make_sampler
+from tests.relabelled import UNLABELLED, relabelled
 from tests.trained import action_config, run_training, text_config, tokenizer_config, train_tokenizer
 
 WEIGHTS = "checkpoints/last/pretrained_model/model.safetensors"
@@ -94,6 +95,19 @@ def test_every_second_batch_is_of_a_further_dataset(small_dataset, trained_model
         assert torch.equal(joint(step).action, every(step).action)
     data = TrainingData(root, episodes=[1, 3])
     assert not isinstance(make_joint_sampler(model, table, data, batch_size=2, seed=0), InTurn)
+
+
+def test_done_is_left_alone_where_a_further_dataset_does_not_say_it(small_dataset, trained_models, tmp_path):
+    model = load_model(trained_models["action_world_model"], "action_world_model")
+    silent = str(relabelled(Path(small_dataset.root), tmp_path / "unlabelled", UNLABELLED))
+    for root, more, known in (
+        (str(small_dataset.root), [silent], (True, False)),
+        (silent, [str(small_dataset.root)], (False, True)),
+        (silent, [silent], (True, True)),  # of which it learns that nothing succeeds
+    ):
+        table = read_episodes(open_dataset(root))
+        joint = make_joint_sampler(model, table, TrainingData(root, more=more), batch_size=8, seed=0)
+        assert tuple(bool(joint(step).done_known.any()) for step in (0, 1)) == known
 
 
 def test_cached_frames_are_those_of_the_dataset(small_dataset):
@@ -204,3 +218,13 @@ def test_other_settings_do_not_continue_a_run(small_dataset, trained_models, tmp
     folder = train_tokenizer(root, tmp_path / "run", steps=1)
     with pytest.raises(ValueError, match="other settings"):
         train_tokenizer(root, folder, steps=1, batch_size=3)
+
+
+def test_weights_are_left_as_they_are_where_the_loss_has_no_gradient():
+    """The loss of a step is finite and its gradient is not: a step would write NaN into a checkpoint."""
+    model = torch.nn.Linear(1, 1, bias=False)
+    torch.nn.init.zeros_(model.weight)
+    optimizer = torch.optim.AdamW(model.parameters(), lr=0.1)
+    with pytest.raises(ValueError, match=r"gradient's norm is inf; the last checkpoint is kept"):
+        descend(model, model.weight.sqrt().sum(), optimizer, 1.0)
+    assert model.weight.item() == 0

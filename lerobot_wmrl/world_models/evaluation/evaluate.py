@@ -15,10 +15,11 @@ from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewar
 
 @dataclass(frozen=True)
 class Evaluation:
-    """accuracy of every episode, in order; outcomes of those that attempt the task; shown: the replays of the
-    shortest success and the shortest failure, by name."""
+    """accuracy of every episode, in order; attempts: those that attempt the task; outcomes: of these, none if
+    the dataset does not say; shown: the replays of the shortest success and the shortest failure, by name."""
 
     accuracy: list[EpisodeAccuracy]
+    attempts: np.ndarray
     outcomes: Outcomes
     shown: dict[str, EpisodeReplay]
 
@@ -39,4 +40,6 @@ def evaluate(model: ActionWorldModelRewardModel, source: Source, episodes: np.nd
         if source.table.kind[run.episode] != KINDS.index(PLAY) and len(run.done) > 1:
             shown.setdefault("success" if run.done.any() else "failure", run)
     accuracy.sort(key=lambda episode: episode.episode)
-    return Evaluation(accuracy, Outcomes.of(runs).attempts(source.table), shown)
+    outcomes = Outcomes.of(runs).attempts(source.table)
+    known = outcomes.where(np.full(len(outcomes.episodes), source.table.done_known))
+    return Evaluation(accuracy, outcomes.episodes, known, shown)

@@ -138,10 +138,10 @@ def rollouts_for(model: ActionWorldModelRewardModel, dataset_root: str | Path) -
     which of them succeeded."""
     table = read_episodes(open_dataset(dataset_root))
     check_dataset(model.config, table.dataset.features)
-    if "next.done" not in table.dataset.features:
+    if not table.done_known:
         raise ValueError(
-            f"dataset.root={dataset_root}: has no next.done, which says whether success holds; use rollouts "
-            "with labels"
+            f"dataset.root={dataset_root}: has neither next.success nor next.done, which say whether success "
+            "holds; use rollouts with labels"
         )
     return Source(table, cached_frames(table.dataset, model.config.camera_keys))
 

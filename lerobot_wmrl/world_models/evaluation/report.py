@@ -46,7 +46,7 @@ def report_action_model(
     steps, gates = by_step(evaluation.accuracy, HORIZON), sweep(outcomes)
     best = best_operating_point(gates)
     by_task = gates_by_task(outcomes, source.table, threshold, frames)
-    extremes = robustness(model, source, outcomes.episodes, threshold, frames)
+    extremes = robustness(model, source, evaluation.attempts, threshold, frames)
     numbers = {
         **success_agreement(outcomes, threshold, frames),
         **{name: estimates[name].as_json()["value"] if name in estimates else None for name in TOP_LEVEL},
@@ -81,7 +81,7 @@ def report_goals(
     text_model: TextWorldModelRewardModel, source: Source, evaluation: Evaluation, folder: Path
 ) -> Report:
     """Goal frames from the starts of the evaluated episodes; goal_frames.png in `folder`."""
-    goals = imagine_goals(text_model, source, evaluation.outcomes.episodes)
+    goals = imagine_goals(text_model, source, evaluation.attempts)
     quality = goal_quality(goals, train_probe(text_model.tokenizer, source))
     pictures.save_goals(goals, folder / "goal_frames.png")
     return Report({"goal_frames": quality}, tables.goal_table(quality))

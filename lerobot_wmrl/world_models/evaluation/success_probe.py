@@ -1,6 +1,6 @@
 """A probe that says whether the simulator's success condition holds in a picture.
 
-It is a small CNN trained on real frames, labelled by the dataset's own `next.done`. It sees them as the
+It is a small CNN trained on real frames, labelled by the dataset's own `next.success`. It sees them as the
 tokenizer draws them, since it is asked about frames that only exist so, and each beside its episode's first
 frame, since success can depend on where things were.
 """
@@ -125,7 +125,7 @@ def labelled_frames(
 ) -> LabelledFrames | None:
     """As many frames with success as without from the episodes in `chosen` (E,); None if a class is empty.
 
-    `next.done` of a row speaks of the frame its action led to, which is the next row's.
+    `next.success` of a row speaks of the frame its action led to, which is the next row's.
     """
     table = source.table
     episodes = np.repeat(np.arange(len(table.start)), table.length - 1)

@@ -14,7 +14,7 @@ from lerobot_wmrl.dataset_source import DatasetSource
 from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.context import NO_CONTEXT
-from lerobot_wmrl.world_models.episode_table import choose_episodes, read_episodes
+from lerobot_wmrl.world_models.episode_table import choose_episodes, open_dataset, read_episodes
 from lerobot_wmrl.world_models.evaluation import replay as replay_module
 from lerobot_wmrl.world_models.evaluation.accuracy import EpisodeAccuracy, by_step, episode_numbers, measure
 from lerobot_wmrl.world_models.evaluation.evaluate import evaluate
@@ -22,6 +22,7 @@ from lerobot_wmrl.world_models.evaluation.extreme_actions import extreme_actions
 from lerobot_wmrl.world_models.evaluation.gate import Outcomes, gate_at, success_gate
 from lerobot_wmrl.world_models.evaluation.replay import EpisodeReplay, Source, replay_episodes
 from lerobot_wmrl.world_models.frame_cache import cached_frames
+from tests.relabelled import UNLABELLED, relabelled
 
 
 @pytest.fixture(scope="module")
@@ -145,6 +146,34 @@ def test_episodes_of_one_frame_are_named(source, model):
 def test_the_gate_is_one_call(small_dataset, model):
     gate = success_gate(model, Path(small_dataset.root), threshold=1e-9, frames=1)
     assert (gate.false_success.share, gate.recognised.share) == (1, 1)
+
+
+def test_an_episode_that_ends_without_success_is_a_failure(small_dataset, model, tmp_path):
+    """As in LeRobot's own datasets, where `next.done` is the last row's whatever the outcome."""
+    table = read_episodes(small_dataset)
+    ends = np.isin(np.arange(len(table.done)), table.start + table.length - 1)
+    root = relabelled(Path(small_dataset.root), tmp_path / "ends", {"next.done": ends.tolist()})
+    assert read_episodes(open_dataset(root)).done.tolist() == table.done.tolist()
+    gate = success_gate(model, root)
+    assert (gate.false_success.n, gate.recognised.n) == (2, 4)
+    root = relabelled(Path(small_dataset.root), tmp_path / "old", {"next.success": None})
+    assert read_episodes(open_dataset(root)).done.tolist() == table.done.tolist()
+    root = relabelled(Path(small_dataset.root), tmp_path / "unlabelled", UNLABELLED)
+    with pytest.raises(ValueError, match=r"neither next\.success nor next\.done"):
+        success_gate(model, root)
+
+
+def test_episodes_of_which_nobody_knows_the_outcome_are_no_failures(small_dataset, trained_models, tmp_path):
+    root = relabelled(Path(small_dataset.root), tmp_path / "unlabelled", UNLABELLED)
+    config = EvalWorldModelConfig(
+        model=Checkpoint(str(trained_models["action_world_model"])), dataset=DatasetSource(str(root)),
+        output_dir=tmp_path / "check",
+    )  # fmt: skip
+    eval_world_model(config)
+    metrics = json.loads((tmp_path / "check" / "metrics.json").read_text(), parse_constant=pytest.fail)
+    assert (metrics["real_failures"], metrics["real_successes"], metrics["passed"]) == (0, 0, False)
+    assert metrics["headline"]["done_f1"]["value"] is None
+    assert (metrics["headline"]["psnr"]["episodes"], metrics["extreme_actions"]["episodes"]) == (6, 6)
 
 
 def test_the_command_writes_figures_and_pictures(small_dataset, trained_models, tmp_path, capsys):
