@@ -29,8 +29,10 @@ def done_quality(outcomes: Outcomes, threshold: float, frames: int) -> dict[str,
     called = outcomes.called(threshold, frames) >= 0
     per_frame = precision_recall_f1(fired, outcomes.done)
     per_episode = precision_recall_f1(called, outcomes.success)
+    delay = done_delay(outcomes, threshold, frames)
     return {
         **{f"done_{name}": estimate for name, estimate in per_frame.items()},
         **{f"episode_{name}": estimate for name, estimate in per_episode.items()},
-        "done_delay_frames": Estimate.mean(done_delay(outcomes, threshold, frames)),
+        "done_delay_frames": Estimate.mean(delay),
+        "done_distance_frames": Estimate.mean(np.abs(delay)),
     }

@@ -34,6 +34,7 @@ NAMES = {
     "episode_recall": "success recall, by episode",
     "episode_f1": "success F1, by episode",
     "done_delay_frames": "delay of done (frames)",
+    "done_distance_frames": "delay of done, early or late (frames)",
 }
 """What the table calls each number of metrics.json."""
 

@@ -90,6 +90,13 @@ def test_done_by_frame_by_episode_and_how_late(outcomes):
     assert np.isnan(done_delay(outcomes, 0.5, 3)[2:]).all()
 
 
+def test_early_and_late_calls_do_not_cancel(outcomes):
+    outcomes.done[0, 1] = False
+    quality = {name: estimate.value for name, estimate in done_quality(outcomes, 0.5, 3).items()}
+    assert quality["done_delay_frames"] == pytest.approx((-1 + 2) / 2)
+    assert quality["done_distance_frames"] == pytest.approx((1 + 2) / 2)
+
+
 def test_without_any_success_rates_are_no_numbers():
     never = Outcomes(np.arange(3), np.zeros((3, 4)), np.zeros((3, 4), bool))
     assert math.isnan(done_quality(never, 0.5, 3)["done_f1"].value)
