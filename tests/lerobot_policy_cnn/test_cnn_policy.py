@@ -15,7 +15,7 @@ from torch.distributions import Normal
 
 from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_policy_cnn.modeling_cnn import SUMMARY, UNKNOWN_POLICY, CnnPolicy
-from lerobot_policy_cnn.networks import ImageEncoder, InstructionEncoder, random_shift
+from lerobot_policy_cnn.networks import ImageEncoder, InstructionEncoder, random_shift, standardised
 from lerobot_policy_cnn.processor_cnn import make_cnn_pre_post_processors
 from tests.hub_server import Hub
 
@@ -46,6 +46,12 @@ def observe(policy: CnnPolicy, batch: int = 6) -> dict[str, Any]:
         name: torch.rand(batch, *feature.shape) for name, feature in inputs.items()
     }
     return {**observation, "task": ["push the red cube forward"] * batch}
+
+
+@pytest.mark.parametrize("layout", [torch.contiguous_format, torch.channels_last])
+def test_channels_are_standardised_as_by_instance_normalisation(layout: torch.memory_format) -> None:
+    maps = (3 + 5 * torch.randn(4, 6, 8, 12)).contiguous(memory_format=layout)
+    assert torch.allclose(standardised(maps), nn.functional.instance_norm(maps), atol=1e-5)
 
 
 @pytest.fixture(scope="module")
