@@ -64,6 +64,17 @@ CPU_TEXT_MODEL: Final[Flags] = {
 }
 """An hour too. Where a clip costs so much, many steps of two teach more than few of six."""
 
+CPU_REINFORCEMENT: Final[Flags] = {
+    "num_envs": 64,
+    "iterations": 60,
+    "save_freq": 10,
+    "algorithm.type": "ppo",
+    "algorithm.epochs": 2,
+    "algorithm.initial_std": 0.3,
+    "algorithm.value_iterations": 2,
+}
+"""A quarter of an hour in imagination on one core, for a policy that is cloned from few episodes."""
+
 GPU_WORLD_MODEL: Final[Flags] = {
     "model.dynamics": "autoregressive",
     "model.layers": 12,
@@ -218,6 +229,7 @@ PRESETS: Final[dict[str, dict[str, Flags]]] = {
         "train-world-model:frame_tokenizer": CPU_TOKENIZER,
         "train-world-model:action_world_model": CPU_ACTION_MODEL,
         "train-world-model:text_world_model": CPU_TEXT_MODEL,
+        "train": CPU_REINFORCEMENT,
     },
     "gpu": {
         "train-world-model:frame_tokenizer": LFQ_TOKENIZER,
