@@ -166,7 +166,9 @@ class Experiment:
                 "trained": Proportion(sum(other), len(other)).as_json(),
                 **PairedChange.between(one, other).as_json(),
                 "success_rate_in_training": [
-                    row["success_rate"] for row in read_metrics(self.out / f"{place}_{policy}")
+                    row["success_rate"]
+                    for row in read_metrics(self.out / f"{place}_{policy}")
+                    if "success_rate" in row
                 ],
             }
             for policy, one, other in zip(self.policies, before, after, strict=True)

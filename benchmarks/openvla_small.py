@@ -15,7 +15,7 @@ and a picture beside it. Flags of lerobot-wmrl-train may follow.
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from lerobot.utils.import_utils import register_third_party_plugins
 
@@ -125,11 +125,9 @@ def main() -> None:
         given.episodes, given.iterations, flags,
     )  # fmt: skip
     run_stages(experiment.stages(), given.output_dir)
-    results: dict[str, Any] = {
-        "episodes": given.episodes, "iterations": given.iterations, "steps": given.steps,
-        "demonstrations": given.demonstrations, **experiment.results(),
-    }  # fmt: skip
-    write_json(given.output, results)
+    results = experiment.results()
+    settings = {name: getattr(given, name) for name in ("episodes", "iterations", "steps", "demonstrations")}
+    write_json(given.output, {**settings, **results})
     draw(results, given.output.with_suffix(".png"))
     print(results_table(results))
 
