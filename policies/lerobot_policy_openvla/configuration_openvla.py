@@ -31,6 +31,7 @@ class OpenVLAConfig(PreTrainedConfig):
         dtype: of the network: `auto` is bfloat16 for a checkpoint on a GPU that multiplies in it, else
             float32. Adapters and the value head stay in float32; what is bfloat16 cannot be trained itself.
         temperature: by which logits are divided in sampling, and in the log-probabilities of samples.
+        sampling: act by drawing tokens, as in reinforcement learning; else by the likeliest, as OpenVLA does.
         value_sizes: hidden layers of the value head (RL4VLA's, Liu et al. 2025).
         gradient_checkpointing: recompute activations instead of keeping them: less memory, a third more time.
         optimizer_lr, optimizer_weight_decay, optimizer_grad_clip_norm: of fine-tuning by lerobot-train.
@@ -42,6 +43,7 @@ class OpenVLAConfig(PreTrainedConfig):
     norm_stats: dict[str, Any] = field(default_factory=dict)
     dtype: str = "auto"
     temperature: float = 1.0
+    sampling: bool = False
     value_sizes: list[int] = field(default_factory=lambda: [512, 128])
     gradient_checkpointing: bool = False
     optimizer_lr: float = 5e-4

@@ -206,8 +206,10 @@ class OpenVLAPolicy(PreTrainedPolicy):
 
     @torch.no_grad()
     def select_action(self, batch: Observation, **_: Any) -> Tensor:
-        """The greedy token ids, for the postprocessor. → int64 (B, A)"""
+        """Token ids, for the postprocessor: the likeliest, or with `sampling` drawn ones. → int64 (B, A)"""
         self.eval()
+        if self.config.sampling:
+            return self.sample(batch).raw_action
         return self._greedy(self._observed(batch), self.config.action_size)
 
     @torch.no_grad()

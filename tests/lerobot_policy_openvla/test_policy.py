@@ -64,6 +64,16 @@ def test_samples_are_as_frequent_as_their_log_probs_say() -> None:
     assert (counts - probabilities).abs().max() < 0.03
 
 
+def test_it_acts_by_the_likeliest_tokens_or_by_drawn_ones() -> None:
+    observation, greedy, drawing = observe(), small_policy(), small_policy(sampling=True)
+    assert torch.equal(greedy.select_action(observation), greedy.select_action(observation))
+    torch.manual_seed(3)
+    actions = drawing.select_action(observation)
+    torch.manual_seed(3)
+    assert torch.equal(actions, drawing.sample(observation).raw_action)
+    assert not torch.equal(actions, greedy.select_action(observation))
+
+
 def test_an_id_that_is_no_action_is_no_label() -> None:
     policy, ids = small_policy(), random_ids(small_policy(), 4)
     ids[2, 1] = 576
