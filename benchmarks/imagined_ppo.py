@@ -126,7 +126,7 @@ class Experiment:
     def simulator(self, processes: int = PROCESSES) -> Flags:
         return {
             "num_envs": processes, "rollout_steps": ENVS * HORIZON // processes,
-            **self._maniskill(SCENES), "env.episode_length": HORIZON,
+            **self.maniskill(SCENES), "env.episode_length": HORIZON,
         }  # fmt: skip
 
     def reinforce(self, policy: str, name: str, environment: Callable[[], Flags]) -> list[str]:
@@ -138,12 +138,13 @@ class Experiment:
 
     def evaluate(self, name: str, policy: Path, domain: str) -> list[str]:
         flags: Flags = {
-            "policy.path": str(policy), **self._maniskill(DOMAINS[domain]),
+            "policy.path": str(policy), **self.maniskill(DOMAINS[domain]),
             "eval.n_episodes": self.episodes, "seed": EVALUATION_SEED, "output_dir": str(self.out / name),
         }  # fmt: skip
         return ["lerobot-eval", *preset_flags("demo", "eval"), *format_flags(flags)]
 
-    def _maniskill(self, scenes: Flags) -> Flags:
+    def maniskill(self, scenes: Flags) -> Flags:
+        """The simulator, as gate.py's policies see it."""
         return {
             "env.type": "wmrl_maniskill", "env.task": "push", **scenes, "env.image_size": IMAGE_SIZE,
             "env.cameras": POLICY_CAMERA,
