@@ -26,9 +26,7 @@ class EvaluationAdapter(gym.vector.VectorEnv):
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """Thaw and restart all; `seed` may be an int or one a sub-environment."""
-        self._last, info = self.env.reset(
-            seed=list(seed) if seed is not None and not isinstance(seed, int) else seed
-        )
+        self._last, info = self.env.reset(seed=seed)
         self._frozen = torch.zeros(self.num_envs, dtype=torch.bool, device=self.env.device)
         self._success = torch.zeros_like(self._frozen)
         return self._to_numpy(self._last), info

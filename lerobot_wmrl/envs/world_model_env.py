@@ -1,5 +1,6 @@
 """The world model as a natively batched environment: many imagined episodes, one forward pass a step."""
 
+from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import gymnasium as gym
@@ -35,11 +36,13 @@ Observation = dict[str, Any]
 class WorldModelVectorEnv(gym.vector.VectorEnv):
     """Tensors in, tensors out, SAME_STEP autoreset with `final_obs` and `final_info`.
 
-    A step asks the device one thing, whether an episode has ended: `final_obs` is there only then, and to
-    begin again costs too much to do it for nobody. Only then the instructions of new episodes are fetched.
+    A step asks the device one thing, whether an episode has ended and every action was a number: `final_obs`
+    is there only where one has, and to begin again costs too much to do it for nobody. Only then the
+    instructions of new episodes are fetched.
 
     Observations: `observation.images.<camera>` (B, 3, H, W) in [0, 1], `observation.state` (B, P) if the
-    model predicts it, `task` (B strings). Actions (B, A) in metres, radians and gripper, clipped to the box.
+    model predicts it, `task` (B strings). Actions (B, A) in metres, radians and gripper, clipped to the box;
+    NaN is refused.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_fps": FPS, "autoreset_mode": AutoresetMode.SAME_STEP}
@@ -62,6 +65,7 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         self.single_observation_space = self._observation_space()
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, n_envs)
         self.generator = torch.Generator(self.device)
+        self.generator.seed()
 
     def _observation_space(self) -> gym.spaces.Dict:
         size, config = self.model.config.image_size, self.model.config
@@ -74,15 +78,13 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         return gym.spaces.Dict(spaces)
 
     def reset(
-        self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
+        self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin B episodes. An int seeds the draw of starts; a list names each environment's start."""
-        if isinstance(seed, int):
-            self.generator.manual_seed(seed)
-        drawn = self._draw_starts()
-        if isinstance(seed, list):
-            self.generator.manual_seed(seed[0])
-            drawn = torch.tensor(seed, device=self.device) % len(self.starts)
+        """Begin B episodes. An int seeds the draw of starts; B of them name each environment's start.
+
+        ValueError for another number of seeds.
+        """
+        drawn = self._seeded_starts(seed)
         self._begin_at(drawn)
         starts, now = self.starts, self.starts.now[drawn]
         self._imagination = start_after(self.model, starts.past[drawn], now, starts.context[drawn])
@@ -94,8 +96,11 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
 
     @torch.no_grad()
     def step(self, actions: Tensor) -> tuple[Observation, Tensor, Tensor, Tensor, dict[str, Any]]:
-        """Imagine one frame in every environment; finished ones restart at once."""
-        clipped = actions.to(self.device).clamp(self.action_low, self.action_high)
+        """Imagine one frame in every environment; finished ones restart at once.
+
+        ValueError unless there is an action for each, without NaN; a reset comes next then.
+        """
+        clipped = self._clip(actions)
         imagined = self.model.step(self._imagination, clipped, self.generator)
         doubt = entropies(imagined)
         terminated, truncated = self._advance(imagined, doubt)
@@ -107,7 +112,11 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         parts |= {**doubt, "done_probability": imagined.done_logit.sigmoid()}
         info: dict[str, Any] = {"reward_parts": parts}
         finished = terminated | truncated
-        if bool(finished.any()):
+        any_finished, any_nan = torch.stack([finished.any(), clipped.isnan().any()]).tolist()
+        if any_nan:
+            rows = clipped.isnan().any(1).nonzero().flatten().tolist()
+            raise ValueError(f"action: NaN in environments {rows}; nothing can be imagined after it")
+        if any_finished:
             info["final_obs"] = observation
             info["final_info"] = {"is_success": terminated, "episode_length": self._elapsed.clone()}
             observation = self._restart(finished, observation)
@@ -150,6 +159,29 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         """Which start every environment's episode has, (B,); the instructions are then known to the host."""
         self._start_index = index
         self._instructions = [self.starts.instructions[row] for row in index.tolist()]
+
+    def _clip(self, actions: Tensor) -> Tensor:
+        """To the action box, float32 on the device. ValueError for another shape than (B, A)."""
+        if tuple(actions.shape) != self.action_space.shape:
+            raise ValueError(
+                f"action: shape {tuple(actions.shape)}, but {self.num_envs} environments take "
+                f"{self.action_space.shape}"
+            )
+        given = torch.as_tensor(actions, dtype=torch.float32, device=self.device)
+        return given.clamp(self.action_low, self.action_high)
+
+    def _seeded_starts(self, seed: int | Sequence[int] | None) -> Tensor:
+        """Seed the generator, by the first of several seeds. → (B,)"""
+        if seed is None:
+            return self._draw_starts()
+        if isinstance(seed, int | np.integer):
+            self.generator.manual_seed(int(seed))
+            return self._draw_starts()
+        seeds = [int(each) for each in seed]
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"seed: {len(seeds)} seeds for {self.num_envs} environments; give one each")
+        self.generator.manual_seed(seeds[0])
+        return torch.tensor(seeds, device=self.device) % len(self.starts)
 
     def _draw_starts(self) -> Tensor:
         return torch.randint(len(self.starts), (self.num_envs,), generator=self.generator, device=self.device)

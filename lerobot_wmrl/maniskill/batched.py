@@ -128,8 +128,14 @@ class BatchedSimulation:
         return self._frame()
 
     def step(self, actions: Tensor) -> BatchedFrame:
-        """Apply actions (B, 7), clipped to the action box and to the workspace, for one control step."""
+        """Apply actions (B, 7), clipped to the action box and to the workspace, for one control step.
+
+        ValueError if one is NaN: on CUDA nobody else looks, and the physics of all would be lost.
+        """
         clipped = actions.to(self.device).clamp(self._low, self._high)
+        if bool(clipped.isnan().any()):
+            rows = clipped.isnan().any(1).nonzero().flatten().tolist()
+            raise ValueError(f"action: NaN in environments {rows}; nothing can be simulated after it")
         floor = WORKSPACE_FLOOR - self.tcp_poses()[:, 2]
         clipped[:, 2] = torch.maximum(clipped[:, 2], floor)
         for episode, position in zip(self.episodes, self.object_positions().cpu().numpy(), strict=True):

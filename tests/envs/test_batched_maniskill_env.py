@@ -128,3 +128,10 @@ def test_one_row_ends_and_the_others_go_on(monkeypatch: pytest.MonkeyPatch) -> N
 def test_batched_without_cuda_is_refused() -> None:
     with pytest.raises(ValueError, match=r"--env.batched=true: .* leave the flag out"):
         WmrlManiSkillEnv(batched=True).create_tensor_env(1, "cpu")
+
+
+@pytest.mark.parametrize("env", [True], indirect=True)
+def test_an_action_that_is_no_number_is_refused(env: BatchedManiSkillEnv) -> None:
+    env.reset(seed=[EVALUATION_SEED])
+    with pytest.raises(ValueError, match=r"action: NaN in environments \[0\]"):
+        env.step(STAY * torch.nan)

@@ -183,6 +183,43 @@ def test_actions_are_clipped_to_the_box(env):
     assert torch.equal(far, edge)
 
 
+def test_actions_that_are_none_are_refused(env):
+    """NaN would stay in an environment's state until its episode ends; one column would be taken for all."""
+    env.reset(seed=1)
+    actions = torch.zeros(B, 7)
+    actions[2, 0] = torch.nan
+    with pytest.raises(ValueError, match=r"action: NaN in environments \[2\]"):
+        env.step(actions)
+    for shape in ((7,), (1, 7), (B, 1), (B, 6)):
+        with pytest.raises(ValueError, match=r"action: shape .*but 4 environments take \(4, 7\)"):
+            env.step(torch.zeros(shape))
+
+
+def test_actions_of_any_number_format_are_taken(env):
+    """NumPy's own is float64; gymnasium samples arrays."""
+    env.reset(seed=1)
+    expected = env.step(torch.full((B, 7), 0.25))[0][STATE]
+    for actions in (torch.full((B, 7), 0.25, dtype=torch.float64), np.full((B, 7), 0.25, np.float32)):
+        env.reset(seed=1)
+        assert torch.equal(env.step(actions)[0][STATE], expected)
+
+
+def test_seeds_of_every_kind_of_integer_and_sequence_count(env):
+    def begun(seed) -> list[int]:
+        env.reset(seed=seed)
+        return [*env._start_index.tolist(), *env._draw_starts().tolist()]
+
+    assert begun(np.int64(3)) == begun(3)
+    assert begun((5, 4, 3, 2)) == begun(range(5, 1, -1)) == begun(np.arange(5, 1, -1)) == begun([5, 4, 3, 2])
+    with pytest.raises(ValueError, match="seed: 2 seeds for 4 environments"):
+        env.reset(seed=[1, 2])
+
+
+def test_environments_without_a_seed_do_not_all_begin_alike(config):
+    first, second = (config.create_tensor_env(1).generator.initial_seed() for _ in range(2))
+    assert first != second
+
+
 def test_lerobot_eval_gets_numpy_and_frozen_episodes(config):
     adapter = config.create_envs(B)["world_model"][0]
     assert isinstance(adapter, EvaluationAdapter)
