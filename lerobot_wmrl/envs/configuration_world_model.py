@@ -25,11 +25,11 @@ class StartFrames(DatasetSource):
         frames: a file by numpy.savez, in place of a dataset: `observation.images.<camera>` (K, H, W, 3)
             uint8, `observation.state` (K, P) and `task` (K,), the instructions.
         resets: start frames to take from ManiSkill, in place of a dataset, of `tasks` (push by default),
-            `scenes` and the split `ind` or `ood`.
+            `scenes` and the split `ind` (by default) or `ood`.
         split: `train` (what the world model was trained on), `validation` (held out) or `all`; `ind` or
             `ood`, scenes that training may see and those held out. Joined by a comma: what is in both.
         tasks, scenes: only episodes of these tasks (by name) and scenes (by index).
-        max_starts: at most so many episodes, drawn evenly; each needs a goal frame.
+        max_starts: at most so many episodes or saved frames, drawn evenly; each needs a goal frame.
         past: frames of each episode of the dataset that the world model is shown, with what was done in
             them, before it imagines on from the next one.
     """
@@ -43,7 +43,7 @@ class StartFrames(DatasetSource):
     resets: int = 0
 
     def check(self) -> None:
-        """ValueError unless there is exactly one place to begin in."""
+        """ValueError unless there is exactly one place to begin in, and what is chosen of it can be."""
         given = [name for name in ("root", "frames", "resets") if getattr(self, name)]
         if len(given) != 1:
             raise ValueError(
@@ -55,6 +55,18 @@ class StartFrames(DatasetSource):
                 f"--env.dataset.past={self.past}: the frames before a start are those of --env.dataset.root, "
                 "at least 0; saved frames and resets have none"
             )
+        if self.frames and (self.tasks or self.scenes or self.split != "all"):
+            raise ValueError(
+                "--env.dataset.frames: saved frames do not say their task, scene or split; leave out "
+                "--env.dataset.tasks, --env.dataset.scenes and --env.dataset.split"
+            )
+        if self.resets and self.split not in ("all", "ind", "ood"):
+            raise ValueError(
+                f"--env.dataset.split={self.split}: ManiSkill's resets are of ind or ood, which none was "
+                "trained on; choose one"
+            )
+        if self.resets < 0:
+            raise ValueError(f"--env.dataset.resets={self.resets}: must be at least 1")
 
 
 @EnvConfig.register_subclass("world_model")

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -19,6 +20,7 @@ from lerobot_wmrl.world_models.depth_maps import depth_at
 from lerobot_wmrl.world_models.episode_table import (
     EpisodeTable,
     choose_episodes,
+    evenly_spread,
     open_dataset,
     read_episodes,
 )
@@ -91,6 +93,11 @@ def dataset_frames(source: StartFrames, config: Any) -> FirstFrames:
     table = read_episodes(open_dataset(source.root, source.repo_id))
     check_dataset(config, table.dataset.features)
     episodes = chosen_episodes(table, source)
+    if source.past >= config.memory:
+        raise ValueError(
+            f"--env.dataset.past={source.past}: the world model remembers {config.memory} frames, so give "
+            f"at most {config.memory - 1}"
+        )
     rows = table.start[episodes, None] + np.arange(source.past + 1)
 
     def depth(model: Any) -> Tensor | None:
@@ -110,25 +117,37 @@ def dataset_frames(source: StartFrames, config: Any) -> FirstFrames:
 
 def saved_frames(path: Path, at_most: int, config: Any) -> FirstFrames:
     """Of a file by `numpy.savez`: `observation.images.<camera>` (K, H, W, 3) uint8, `observation.state`
-    (K, P) and `task` (K,), the instructions."""
-    try:
-        with np.load(path) as file:
-            found = {name: file[name][:at_most] for name in file.files}
-    except (OSError, ValueError) as error:
-        raise ValueError(
-            f"--env.dataset.frames={path}: cannot be read ({error}); write it with numpy.savez"
-        ) from error
+    (K, P) and `task` (K,), the instructions. ValueError if it lacks one, or has it otherwise."""
+    found = read_arrays(path)
     shape = (config.image_size, config.image_size, 3)
     wanted = {**dict.fromkeys(config.camera_keys, shape), OBS_STATE: (config.state_size,), INSTRUCTION: ()}
+    count = max((len(found[name]) for name in wanted if name in found and found[name].ndim), default=0)
     for name, size in wanted.items():
-        if name not in found or found[name].shape[1:] != size:
+        if name not in found or not count or found[name].shape != (count, *size):
             has = found[name].shape if name in found else "nothing of that name"
-            raise ValueError(f"--env.dataset.frames={path}: needs {name} of shape {('K', *size)}, has {has}")
+            raise ValueError(
+                f"--env.dataset.frames={path}: needs {name} of shape {(count or 'K', *size)}, has {has}"
+            )
     images = np.stack([found[name] for name in config.camera_keys], 1)
     if images.dtype != np.uint8:
         raise ValueError(f"--env.dataset.frames={path}: pictures are {images.dtype}, they must be uint8")
-    instructions = [str(text) for text in found[INSTRUCTION]]
-    return _without_past(images, found[OBS_STATE].astype(np.float32), instructions, np.full(len(images), -1))
+    if not np.isfinite(found[OBS_STATE]).all():
+        raise ValueError(f"--env.dataset.frames={path}: {OBS_STATE} holds NaN or infinity")
+    rows = evenly_spread(count, at_most)
+    instructions = [str(text) for text in found[INSTRUCTION][rows]]
+    state = found[OBS_STATE][rows].astype(np.float32)
+    return _without_past(images[rows], state, instructions, np.full(len(rows), -1))
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """What `numpy.savez` wrote. ValueError if it did not."""
+    try:
+        with np.load(path) as file:
+            return {name: file[name] for name in file.files}
+    except (OSError, ValueError, TypeError, EOFError, BadZipFile) as error:
+        raise ValueError(
+            f"--env.dataset.frames={path}: cannot be read ({error}); write it with numpy.savez"
+        ) from error
 
 
 def simulated_frames(source: StartFrames, config: Any) -> FirstFrames:

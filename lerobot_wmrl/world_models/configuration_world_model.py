@@ -138,6 +138,11 @@ class WorldModelConfig(RewardModelConfig):
         return [f"observation.images.{camera}" for camera in self.cameras]
 
     @property
+    def memory(self) -> int:
+        """Frames that imagination remembers at most."""
+        return self.clip_length if self.dynamics == "anchored" else self.window
+
+    @property
     def context_channels(self) -> int:
         """Of the tokenizer's context, as far as the dynamics look at it; 0 if they do not."""
         return self.tokenizer_widths[-1] if self.tokenizer_context and self.dynamics == "anchored" else 0

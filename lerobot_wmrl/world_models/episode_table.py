@@ -190,4 +190,9 @@ def choose_episodes(
     if not len(episodes):
         those = "" if wanted is None else " of those that are asked for"
         raise ValueError(f"dataset {table.dataset.root}: no episode{those} in its {split} split")
-    return episodes[np.linspace(0, len(episodes) - 1, min(len(episodes), at_most)).astype(int)]
+    return episodes[evenly_spread(len(episodes), at_most)]
+
+
+def evenly_spread(count: int, at_most: int) -> np.ndarray:
+    """At most `at_most` of the indices below `count`, the first and the last among them."""
+    return np.linspace(0, count - 1, min(count, at_most)).astype(int)

@@ -251,17 +251,31 @@ def test_episodes_begin_in_saved_frames_as_in_those_of_the_dataset(config, env, 
     path = tmp_path / "starts.npz"
     saved = replace(config, dataset=StartFrames(frames=path, max_starts=4))
     np.savez(path, **whole)
-    found = saved.create_tensor_env(2).starts
-    assert torch.equal(found.now.tokens, env.starts.now.tokens[:4])
-    assert torch.equal(found.now.proprioception, env.starts.now.proprioception[:4])
-    assert found.instructions == env.starts.instructions[:4]
-    for name, value in ((IMAGE, whole[IMAGE][:, :16]), (STATE, whole[STATE][:, :3])):
+    found, spread = saved.create_tensor_env(2).starts, [0, 1, 3, 5]
+    assert torch.equal(found.now.tokens, env.starts.now.tokens[spread])
+    assert torch.equal(found.now.proprioception, env.starts.now.proprioception[spread])
+    assert found.instructions == [env.starts.instructions[row] for row in spread]
+    for name, value in (
+        (IMAGE, whole[IMAGE][:, :16]), (STATE, whole[STATE][:, :3]), ("task", whole["task"][:3]),
+        ("task", np.array("push")), (STATE, whole[STATE][:5]),
+    ):  # fmt: skip
         np.savez(path, **{**whole, name: value})
-        with pytest.raises(ValueError, match=rf"--env\.dataset\.frames=.*needs {name} of shape"):
+        with pytest.raises(ValueError, match=rf"--env\.dataset\.frames=.*needs {name} of shape \(6,"):
             saved.create_tensor_env(2)
-    path.write_text("no frames")
-    with pytest.raises(ValueError, match=r"cannot be read.*numpy\.savez"):
+    np.savez(path, **{name: value[:0] for name, value in whole.items()})
+    with pytest.raises(ValueError, match=rf"needs {IMAGE} of shape \('K', 32, 32, 3\), has \(0,"):
         saved.create_tensor_env(2)
+    np.savez(path, **{**whole, STATE: whole[STATE] * np.nan})
+    with pytest.raises(ValueError, match=rf"--env\.dataset\.frames=.*{STATE} holds NaN"):
+        saved.create_tensor_env(2)
+    np.savez(path, **whole)
+    cut = path.read_bytes()[: path.stat().st_size // 2]
+    with (tmp_path / "one.npy").open("wb") as file:
+        np.save(file, np.zeros(3))
+    for content in (b"no frames", b"", cut, (tmp_path / "one.npy").read_bytes()):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=r"cannot be read.*numpy\.savez"):
+            saved.create_tensor_env(2)
     with pytest.raises(ValueError, match="starts are given by root and frames; give one"):
         replace(config, dataset=replace(config.dataset, frames=path)).create_tensor_env(2)
 
@@ -318,6 +332,23 @@ def test_episodes_can_begin_after_a_past_that_is_looked_at(config, small_dataset
         replace(config, dataset=replace(config.dataset, past=500)).create_tensor_env(1)
     with pytest.raises(ValueError, match=r"--env\.dataset\.past=1: the frames before a start are those of"):
         replace(config, dataset=StartFrames(resets=1, past=1)).create_tensor_env(1)
+    remembered = env.model.config.clip_length
+    with pytest.raises(
+        ValueError, match=rf"past={remembered}: the world model remembers {remembered} frames"
+    ):
+        replace(config, dataset=replace(config.dataset, past=remembered)).create_tensor_env(1)
+
+
+@pytest.mark.parametrize(("given", "message"), [
+    ({"frames": Path("starts.npz"), "tasks": [TASKS[0]]}, "saved frames do not say their task"),
+    ({"frames": Path("starts.npz"), "split": "ood"}, "saved frames do not say their task, scene or split"),
+    ({"resets": 2, "split": "validation,ood"}, r"split=validation,ood: ManiSkill's resets are of ind or ood"),
+    ({"resets": -1}, r"--env\.dataset\.resets=-1: must be at least 1"),
+])  # fmt: skip
+def test_what_starts_cannot_be_chosen_by_is_refused(config, given, message):
+    """Rather than ignored."""
+    with pytest.raises(ValueError, match=message):
+        replace(config, dataset=StartFrames(**given)).create_tensor_env(1)
 
 
 def fetched_by_steps(env, steps: int) -> list[int]:
