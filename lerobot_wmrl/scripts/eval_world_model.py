@@ -62,7 +62,8 @@ class EvalWorldModelConfig(RunConfig):
         done_threshold, done_frames: when an imagined episode counts as a success; as in the environment.
         reward: the general reward of the curves (--reward.alpha …); as in the environment.
         policies: checkpoints, or output folders of trainings, of which every checkpoint counts: their success
-            in the world model, from the dataset's start frames, beside that in `real_env`.
+            in the world model, from the dataset's start frames, beside that in `real_env`, in episodes of
+            the same length.
         policy_episodes: of each of them, in either place.
         real_env: `--real_env.type=wmrl_maniskill` and its settings.
         device: where the models run; the best there is by default.
@@ -157,8 +158,11 @@ def policy_agreement(cfg: EvalWorldModelConfig) -> "Agreement":
     from lerobot_wmrl.envs.policy_success import policy_checkpoints, policy_outcomes
     from lerobot_wmrl.world_models.evaluation.agreement import Agreement
 
+    real: Any = cfg.real_env
+    longest = getattr(real, "horizon", None) or getattr(real, "episode_length", None)
     imagination = WorldModelEnv(
         world_model_path=cfg.model.path, reward=GeneralConfig(alpha=1.0), device=cfg.device,
+        episode_length=longest or WorldModelEnv.episode_length,
         dataset=StartFrames(cfg.dataset.root, cfg.dataset.repo_id, split=cfg.split),
         done_threshold=cfg.done_threshold, done_frames=cfg.done_frames,
     )  # fmt: skip

@@ -8,10 +8,17 @@ import pytest
 
 from lerobot_wmrl.constants import EVALUATION_SEED
 from lerobot_wmrl.dataset_source import DatasetSource
+from lerobot_wmrl.envs import policy_success
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.policy_success import policy_checkpoints, policy_outcomes
 from lerobot_wmrl.rewards.configuration_general import GeneralConfig
-from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
+from lerobot_wmrl.scripts.eval_world_model import (
+    Checkpoint,
+    EvalWorldModelConfig,
+    eval_world_model,
+    policy_agreement,
+)
 from lerobot_wmrl.statistics import Proportion
 from lerobot_wmrl.world_models.evaluation.agreement import Agreement
 from tests.rl.checkpoints import save_untrained_policy
@@ -62,6 +69,19 @@ def test_the_evaluation_reports_policies_beside_reality(imagination, small_datas
     assert found["pearson"]["value"] is None
     assert "real success" in (cfg.output_dir / "metrics.md").read_text()
     assert (cfg.output_dir / "policies.png").is_file()
+
+
+def test_imagined_episodes_are_as_long_as_real_ones(imagination, monkeypatch):
+    """Those of a simulator's task, or of another environment."""
+    asked = []
+    monkeypatch.setattr(policy_success, "policy_outcomes", lambda env, *_: asked.append(env) or [True, False])
+    for real in (WmrlManiSkillEnv(task="pick_place"), imagination):
+        policy_agreement(EvalWorldModelConfig(
+            model=Checkpoint(imagination.world_model_path), policies=["policy"], real_env=real, device="cpu"
+        ))  # fmt: skip
+    imagined, of_pick_place, again, of_imagination = asked
+    assert imagined.episode_length == of_pick_place.horizon > 100
+    assert again.episode_length == of_imagination.episode_length == 4
 
 
 def test_agreement_is_pearsons_correlation_with_fishers_interval():
