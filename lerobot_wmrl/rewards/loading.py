@@ -4,12 +4,11 @@ from typing import Any, Protocol
 
 from lerobot.configs.rewards import RewardModelConfig
 from lerobot.rewards.factory import make_reward_model
-from lerobot.rewards.pretrained import PreTrainedRewardModel
 from torch import Tensor
 
 from lerobot_wmrl.rewards.configuration_general import GeneralConfig
 from lerobot_wmrl.rewards.configuration_learned import LearnedRewardConfig
-from lerobot_wmrl.rewards.modeling_learned import EmbeddingRewardModel
+from lerobot_wmrl.rewards.modeling_learned import EmbeddingRewardModel, ProxyRewardModel
 from lerobot_wmrl.rewards.prepared import load_prepared
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
@@ -34,7 +33,6 @@ def load_reward(config: RewardModelConfig, model: ActionWorldModelRewardModel) -
             f"--env.reward.pretrained_path is missing: --env.reward.type={config.type} is learnt; train it "
             f"with lerobot-train --reward_model.type={config.type} and give its output folder"
         )
-    reward: PreTrainedRewardModel = load_model(config.pretrained_path, config.type, device)
-    if isinstance(reward, EmbeddingRewardModel):
-        reward.check_world_model(model)
+    reward: EmbeddingRewardModel | ProxyRewardModel = load_model(config.pretrained_path, config.type, device)
+    reward.check_world_model(model)
     return reward

@@ -46,6 +46,16 @@ class ProxyRewardModel(HubCard, PreTrainedRewardModel):
             self.config.image_size = frame_size(features[first])[0]
         check_cameras(self.config, features)
 
+    def check_world_model(self, model: ActionWorldModelRewardModel) -> None:
+        """ValueError unless the model imagines such frames as the network was trained on."""
+        size, cameras = model.config.image_size, model.config.cameras
+        if self.config.image_size != size or not {*self.config.cameras} <= {*cameras}:
+            raise ValueError(
+                f"--env.reward.pretrained_path: this proxy reward looks at {', '.join(self.config.cameras)} "
+                f"of {self.config.image_size} pixels, the world model imagines {', '.join(cameras)} of "
+                f"{size}; train it again on frames like those, with --reward_model.cameras=[…]"
+            )
+
     def forward(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, float]]:
         """On the frames that actions led to: images (B, 1, 3, H, W), `next.reward` (B,) or (B, 1)."""
         first = self.config.camera_keys[0]

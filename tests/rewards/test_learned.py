@@ -130,6 +130,18 @@ def test_a_reward_of_another_world_model_is_refused(embedding, trained_models, s
         config.create_tensor_env(1)
 
 
+@pytest.mark.parametrize(("sees", "message"), [
+    ({"cameras": ["wrist"], "image_size": 32}, "looks at wrist of 32 pixels, .* imagines third_view of 32"),
+    ({"image_size": 64}, "looks at third_view of 64 pixels, the world model imagines third_view of 32"),
+])  # fmt: skip
+def test_a_reward_for_other_frames_is_refused(sees, message, trained_models, small_dataset, tmp_path):
+    """Before an episode begins."""
+    ProxyRewardModel(ProxyConfig(device="cpu", **sees)).save_pretrained(tmp_path)
+    config = environment(trained_models, small_dataset, "proxy", tmp_path)
+    with pytest.raises(ValueError, match=message):
+        config.create_tensor_env(1)
+
+
 def test_bad_settings_name_the_field_and_the_remedy(trained_models, small_dataset, proxy):
     with pytest.raises(ValueError, match=r"--env\.reward\.pretrained_path is missing.*lerobot-train"):
         environment(trained_models, small_dataset, "proxy", None).create_tensor_env(1)
