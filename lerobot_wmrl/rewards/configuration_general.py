@@ -31,7 +31,7 @@ class GeneralConfig(RewardModelConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_shape(self.alpha, self.form)
+        check_shape(self.alpha, self.form, self.gamma)
         if self.similarity not in SIMILARITIES:
             raise ValueError(f"--reward.similarity={self.similarity}: choose {', '.join(SIMILARITIES)}")
 

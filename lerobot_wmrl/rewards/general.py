@@ -28,12 +28,14 @@ def general_reward[Number: (float, Tensor)](
     return alpha * sparse + (1 - alpha) * dense_reward(similarity, previous, form, gamma)
 
 
-def check_shape(alpha: float, form: str) -> None:
+def check_shape(alpha: float, form: str, gamma: float) -> None:
     """ValueError unless there is such a reward."""
     if form not in ("absolute", "potential"):
         raise ValueError(f"--reward.form={form}: choose absolute or potential")
     if not 0 <= alpha <= 1:
         raise ValueError(f"--reward.alpha={alpha}: choose a weight in [0, 1]")
+    if not 0 < gamma <= 1:
+        raise ValueError(f"--reward.gamma={gamma}: choose a discount above 0, at most 1")
 
 
 def consecutive_count(count: Tensor, fired: Tensor) -> Tensor:

@@ -23,7 +23,7 @@ class RuleBasedReward:
     gamma: float = 0.97
 
     def __post_init__(self) -> None:
-        check_shape(self.alpha, self.form)
+        check_shape(self.alpha, self.form, self.gamma)
 
     def of_step[Number: (float, Tensor)](self, success: Number, progress: Number, previous: Number) -> Number:
         """Of a step that led to `progress` in [0, 1] from `previous`. Numbers, or (B,) each."""

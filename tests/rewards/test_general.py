@@ -46,3 +46,5 @@ def test_bad_settings_name_the_field():
         GeneralConfig(device="cpu", form="relative")
     with pytest.raises(ValueError, match=r"alpha=1\.5"):
         GeneralConfig(device="cpu", alpha=1.5)
+    with pytest.raises(ValueError, match=r"gamma=97: choose a discount"):
+        GeneralConfig(device="cpu", gamma=97)

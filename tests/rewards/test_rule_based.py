@@ -35,7 +35,8 @@ def test_the_potential_form_pays_for_the_way_not_for_its_length() -> None:
 
 
 @pytest.mark.parametrize(
-    ("fields", "message"), [({"form": "sum"}, "form=sum"), ({"alpha": 2.0}, "alpha=2.0")]
+    ("fields", "message"),
+    [({"form": "sum"}, "form=sum"), ({"alpha": 2.0}, "alpha=2.0"), ({"gamma": -1.0}, "gamma=-1.0")],
 )
 def test_there_is_no_other_reward(fields: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
