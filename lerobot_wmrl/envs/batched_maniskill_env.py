@@ -7,12 +7,12 @@ import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode
-from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
+from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, EVALUATION_SEED, FPS, STATE_NAMES
+from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, EVALUATION_SEED, FPS
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
-from lerobot_wmrl.envs.maniskill_tensor_env import image_observations
+from lerobot_wmrl.envs.maniskill_tensor_env import image_observations, observation_space
 from lerobot_wmrl.envs.scene_results import SceneResults
 from lerobot_wmrl.maniskill.batched import BatchedFrame
 from lerobot_wmrl.maniskill.scenes import scene_for_seed
@@ -40,10 +40,7 @@ class BatchedManiSkillEnv(gym.vector.VectorEnv):
         self.single_action_space = gym.spaces.Box(
             np.array(ACTION_LOW, np.float32), np.array(ACTION_HIGH, np.float32)
         )
-        picture = gym.spaces.Box(0.0, 1.0, (3, config.image_size, config.image_size), np.float32)
-        images = {f"{OBS_IMAGES}.{camera}": picture for camera in config.cameras}
-        state = gym.spaces.Box(-np.inf, np.inf, (len(STATE_NAMES),), np.float32)
-        self.single_observation_space = gym.spaces.Dict({**images, OBS_STATE: state})
+        self.single_observation_space = observation_space(config)
         self.action_space = gym.vector.utils.batch_space(self.single_action_space, n_envs)
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, n_envs)
 

@@ -20,6 +20,8 @@ class EvaluationAdapter(gym.vector.VectorEnv):
         self.num_envs = env.num_envs
         self.metadata = env.metadata
         self.single_action_space, self.action_space = env.single_action_space, env.action_space
+        self.single_observation_space = shown_space(env.single_observation_space)
+        self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, env.num_envs)
         self._max_episode_steps = self.env.max_episode_steps
 
     def reset(
@@ -92,3 +94,14 @@ def pictures(observation: Observation) -> dict[str, np.ndarray]:
         for key, value in observation.items()
         if key.startswith(prefix)
     }
+
+
+def shown_space(space: Any) -> gym.spaces.Dict:
+    """That of the same observation as `_to_numpy` shows it."""
+    cameras = {
+        key.removeprefix(f"{OBS_IMAGES}."): gym.spaces.Box(0, 255, (*box.shape[1:], 3), np.uint8)
+        for key, box in space.items()
+        if key.startswith(OBS_IMAGES)
+    }
+    state = {"agent_pos": space[OBS_STATE]} if OBS_STATE in space.spaces else {}
+    return gym.spaces.Dict({"pixels": gym.spaces.Dict(cameras), **state})

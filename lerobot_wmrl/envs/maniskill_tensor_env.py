@@ -7,10 +7,10 @@ import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode
-from lerobot.utils.constants import OBS_IMAGES
+from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
-from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, FPS
+from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, FPS, STATE_NAMES
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.maniskill_env import make_vector_env
 
@@ -30,8 +30,8 @@ class ManiSkillTensorEnv(gym.vector.VectorEnv):
         self.envs = make_vector_env(config, n_envs, use_async_envs=n_envs > 1, freeze=False)
         self.config, self.num_envs, self.device = config, n_envs, torch.device(device)
         self.single_action_space, self.action_space = self.envs.single_action_space, self.envs.action_space
-        self.single_observation_space = self.envs.single_observation_space
-        self.observation_space = self.envs.observation_space
+        self.single_observation_space = observation_space(config)
+        self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, n_envs)
         self.max_episode_steps = config.horizon
         self._low, self._high = np.array(ACTION_LOW, np.float32), np.array(ACTION_HIGH, np.float32)
 
@@ -72,9 +72,17 @@ class ManiSkillTensorEnv(gym.vector.VectorEnv):
         pictures = {camera: self._vector(image) for camera, image in observation["pixels"].items()}
         return {
             **image_observations(pictures),
-            "observation.state": self._vector(observation["agent_pos"]),
+            OBS_STATE: self._vector(observation["agent_pos"]),
             "task": list(instructions),
         }
+
+
+def observation_space(config: WmrlManiSkillEnv) -> gym.spaces.Dict:
+    """Of one simulator: camera images (3, H, W) in [0, 1], and the state."""
+    picture = gym.spaces.Box(0.0, 1.0, (3, config.image_size, config.image_size), np.float32)
+    images = {f"{OBS_IMAGES}.{camera}": picture for camera in config.cameras}
+    state = gym.spaces.Box(-np.inf, np.inf, (len(STATE_NAMES),), np.float32)
+    return gym.spaces.Dict({**images, OBS_STATE: state})
 
 
 def image_observations(pictures: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -103,6 +103,8 @@ def test_the_tensor_environment_keeps_the_last_observation_of_an_episode() -> No
     env = ManiSkillTensorEnv(WmrlManiSkillEnv(episode_length=HORIZON, image_size=64), 1, "cpu")
     try:
         observation, _ = env.reset(seed=[0])
+        arrays = {name: value.numpy() for name, value in observation.items() if name != "task"}
+        assert env.observation_space.contains(arrays)
         assert observation["observation.images.third_view"].shape == (1, 3, 64, 64)
         assert observation["observation.images.third_view"].min() >= 0.0
         assert observation["observation.images.third_view"].max() <= 1.0

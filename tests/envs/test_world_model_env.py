@@ -52,6 +52,8 @@ def test_the_observation_is_what_the_config_announces(config, env):
     assert observation[IMAGE].shape == (B, 3, 32, 32)
     assert observation[STATE].shape == (B, 8)
     assert len(observation["task"]) == B
+    arrays = {name: value.numpy() for name, value in observation.items() if name != "task"}
+    assert env.observation_space.contains(arrays)
     assert config.features["pixels/third_view"].shape == (32, 32, 3)
     assert config.features["agent_pos"].shape == (8,)
 
@@ -226,6 +228,7 @@ def test_lerobot_eval_gets_numpy_and_frozen_episodes(config):
     observation, _ = adapter.reset(seed=[3, 4, 5, 6], options={"lerobot_new_rollout": True})
     assert observation["pixels"]["third_view"].dtype == np.uint8
     assert observation["pixels"]["third_view"].shape == (B, 32, 32, 3)
+    assert adapter.observation_space.contains(observation)
     assert adapter.call("_max_episode_steps") == (5,) * B
     assert len(adapter.call("task_description")) == B
     always_done(adapter.env, torch.tensor([True, False, False, False]))
