@@ -24,6 +24,12 @@ class PointEnv(gym.vector.VectorEnv):
     def __init__(self, num_envs: int, horizon: int = 15, image_size: int = 0) -> None:
         self.num_envs, self.max_episode_steps, self.image_size = num_envs, horizon, image_size
         self.single_action_space = gym.spaces.Box(-0.1, 0.1, (3,), np.float32)
+        seen = {"observation.state": gym.spaces.Box(-np.inf, np.inf, (4,), np.float32)}
+        if image_size:
+            seen["observation.images.third_view"] = gym.spaces.Box(
+                0, 1, (3, image_size, image_size), np.float32
+            )
+        self.single_observation_space = gym.spaces.Dict(seen)
         self.generators = [torch.Generator() for _ in range(num_envs)]
 
     def reset(

@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 import pytest
 import torch
+import wandb
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import EnvConfig
 from safetensors.torch import load_file
@@ -121,6 +122,7 @@ def test_wandb_gets_what_the_metrics_file_gets(improve: Any, monkeypatch: pytest
     monkeypatch.setenv("WANDB_SILENT", "true")
     flags = [*POINT, *SHORT, "--output_dir={out}", "--wandb.enable=true"]
     out = improve(*flags, "--wandb.mode=offline", "--wandb.disable_artifact=true", "--selection.freq=2")
+    wandb.finish()  # which waits until all is written
     runs = list((out / "wandb").glob("offline-run-*/*.wandb"))
     assert len(runs) == 1
     logged = runs[0].read_bytes()
