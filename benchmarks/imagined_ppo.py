@@ -46,6 +46,9 @@ PROCESSES: Final = 2
 
 DOMAINS: Final[dict[str, Flags]] = {"ind": SCENES, "ood": UNSEEN_SCENES}
 SHOWN: Final = {"unseen": "new policy"}
+PANELS: Final = {
+    "ind": "scenes the world model knows", "ood": "unseen scenes", "drawn": "known scenes, tokens drawn",
+}  # fmt: skip
 TITLES: Final = {"cloned": "cloned", "imagined": "PPO in imagination", "simulated": "PPO in ManiSkill"}
 
 
@@ -59,6 +62,8 @@ class Experiment:
         rival: whether there is PPO in ManiSkill too.
         flags: further ones of lerobot-wmrl-train.
     """
+
+    domains: Mapping[str, Flags] = DOMAINS
 
     def __init__(
         self, gate: Path, out: Path, policies: Sequence[str], episodes: int, iterations: int, rival: bool,
@@ -88,7 +93,7 @@ class Experiment:
         return self.gate / f"policy_{policy}"
 
     def _measured(self, policy: str, kind: str, folder: Path) -> list[Stage]:
-        names = {domain: f"eval_{kind}_{policy}_{domain}" for domain in DOMAINS}
+        names = {domain: f"eval_{kind}_{policy}_{domain}" for domain in self.domains}
         trained = checkpoint(folder)
         return [self._stage(name, self.evaluate, name, trained, domain) for domain, name in names.items()]
 
@@ -138,7 +143,7 @@ class Experiment:
 
     def evaluate(self, name: str, policy: Path, domain: str) -> list[str]:
         flags: Flags = {
-            "policy.path": str(policy), **self.maniskill(DOMAINS[domain]),
+            "policy.path": str(policy), **self.maniskill(self.domains[domain]),
             "eval.n_episodes": self.episodes, "seed": EVALUATION_SEED, "output_dir": str(self.out / name),
         }  # fmt: skip
         return ["lerobot-eval", *preset_flags("demo", "eval"), *format_flags(flags)]
@@ -153,7 +158,8 @@ class Experiment:
     def results(self) -> dict[str, Any]:
         """Of each training and domain every policy's rates and paired change, and the mean change."""
         return {
-            place: {domain: self._change(place, domain) for domain in DOMAINS} for place in self.trainings
+            place: {domain: self._change(place, domain) for domain in self.domains}
+            for place in self.trainings
         }
 
     def _change(self, place: str, domain: str) -> dict[str, Any]:
@@ -194,14 +200,15 @@ def results_table(results: Mapping[str, Any]) -> str:
 
 
 def _changes(results: Mapping[str, Any]) -> list[tuple[tuple[str, str], Any]]:
-    return [((place, domain), results[place][domain]) for place in results for domain in DOMAINS]
+    return [((place, domain), results[place][domain]) for place in results for domain in results[place]]
 
 
 def draw(results: Mapping[str, Any], path: Path) -> None:
     """A panel a domain: every policy's success before and after, with Wilson intervals."""
-    figure = Figure(figsize=(8, 3.2), layout="constrained")
-    panels = figure.subplots(1, len(DOMAINS), sharey=True)
-    for axes, domain in zip(panels, DOMAINS, strict=True):
+    domains = list(results["imagined"])
+    figure = Figure(figsize=(4 * len(domains), 3.2), layout="constrained")
+    panels = figure.subplots(1, len(domains), sharey=True)
+    for axes, domain in zip(panels, domains, strict=True):
         shown = {"cloned": results["imagined"][domain], **{p: results[p][domain] for p in results}}
         for offset, (kind, found) in enumerate(shown.items()):
             column = "cloned" if kind == "cloned" else "trained"
@@ -214,7 +221,7 @@ def draw(results: Mapping[str, Any], path: Path) -> None:
             )  # fmt: skip
         names = [SHOWN.get(name, f"policy {name}") for name in shown["cloned"]["policies"]]
         axes.set_xticks([place + 0.125 * (len(shown) - 1) for place in range(len(names))], names)
-        axes.set_title({"ind": "scenes the world model knows", "ood": "unseen scenes"}[domain])
+        axes.set_title(PANELS[domain])
         axes.set_ylim(0, 1.2)
     panels[0].set_ylabel("success in ManiSkill")
     tidy(figure).savefig(path, dpi=130)

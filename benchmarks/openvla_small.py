@@ -7,9 +7,10 @@
 lerobot-train fits all weights to the optimal episodes among gate.py's planned ones, then adapters to other
 demonstrations. PPO trains these adapters further in the imagination of gate.py's action world model.
 Success is measured before and after, on the same starts in ManiSkill: in the three scenes that the world
-model knows, and in those held out from all training. The same call again continues. Without --imagined, the
-text world model, which imagined_ppo.py leaves behind, is trained here. Writes docs/results/openvla_small.json
-and a picture beside it. Flags of lerobot-wmrl-train may follow.
+model knows, by the likeliest tokens and by drawn ones, and in those held out from all training. The same
+call again continues. Without --imagined, the text world model, which imagined_ppo.py leaves behind, is
+trained here. Writes docs/results/openvla_small.json and a picture beside it. Flags of lerobot-wmrl-train
+may follow.
 """
 
 import argparse
@@ -20,7 +21,8 @@ from typing import Final
 from lerobot.utils.import_utils import register_third_party_plugins
 
 import imagined_ppo
-from imagined_ppo import HORIZON, draw, results_table
+from gate import SCENES
+from imagined_ppo import DOMAINS, HORIZON, draw, results_table
 from lerobot_wmrl.checkpoints import LAST_CHECKPOINT
 from lerobot_wmrl.demo.episodes import optimal_episodes
 from lerobot_wmrl.demo.pipeline import run_stages
@@ -55,6 +57,8 @@ class Experiment(imagined_ppo.Experiment):
         episodes: of each success rate.
         flags: further ones of lerobot-wmrl-train.
     """
+
+    domains = {**DOMAINS, "drawn": {**SCENES, "policy.sampling": True}}  # noqa: RUF012
 
     def __init__(
         self, gate: Path, out: Path, imagined: Path | None, demonstrations: tuple[int, int],

@@ -10,7 +10,9 @@ every reward says what each frame is worth: `rule_based` (recorded in the simula
 each: the mean curve of successes and of failures with its band, Spearman's correlation with the rule-based
 reward within an episode, and the AUC of its highest run of three frames, success against failure. The same
 starts are also given to hands that move at random, not at all, and to one corner: they should earn less than
-the planner's actions. Writes docs/results/reward_curves.json and a picture beside it.
+the planner's actions. And does the environment's doubt warn? Of the episodes that the world model calls
+successes, how often is the greatest doubt in a false one above that in a true one. Writes
+docs/results/reward_curves.json and a picture beside it.
 """
 
 import argparse
@@ -28,6 +30,7 @@ from torch import Tensor
 
 from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
+from lerobot_wmrl.envs.doubt import SIGNALS
 from lerobot_wmrl.envs.first_frames import chosen_episodes
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv, make_world_model_env
 from lerobot_wmrl.files import write_json
@@ -42,6 +45,9 @@ from lerobot_wmrl.world_models.evaluation.tables import markdown_table
 RESULTS: Final = Path(__file__).parents[1] / "docs" / "results" / "reward_curves.json"
 FRAMES = 3
 """In a row that count together, as in the environment."""
+
+THRESHOLD = 0.5
+"""Of success."""
 
 FEWEST = 5
 """Episodes that a mean is drawn of."""
@@ -68,15 +74,17 @@ class EveryReward:
 
 
 def judged(env: WorldModelVectorEnv, actions: Tensor, config: GeneralConfig) -> dict[str, np.ndarray]:
-    """What every reward says of the frames after actions (B, T, A) from the first B starts. → (B, T) each"""
+    """What every reward says of the frames after actions (B, T, A) from the first B starts, and both signals
+    of doubt. → (B, T) each"""
     env.reward.said.clear()
     env.reset(seed=list(range(env.num_envs)))
     parts = [env.step(action)[-1]["reward_parts"] for action in actions.unbind(1)]
     success = torch.stack([part["done_probability"] for part in parts], 1)
     similarity = torch.stack([part["similarity"] for part in parts], 1)
-    level = config.alpha * (success >= 0.5).float() + (1 - config.alpha) * similarity
+    level = config.alpha * (success >= THRESHOLD).float() + (1 - config.alpha) * similarity
     learned = {name: torch.stack(values, 1) for name, values in env.reward.said.items()}
-    every = {"general": level, "success": success, "similarity": similarity, **learned}
+    doubt = {signal: torch.stack([part[signal] for part in parts], 1) for signal in SIGNALS}
+    every = {"general": level, "success": success, "similarity": similarity, **learned, **doubt}
     return {name: values.cpu().numpy() for name, values in every.items()}
 
 
@@ -116,9 +124,10 @@ def measure(
 ) -> dict[str, Any]:
     """Of every reward the numbers above; done (E, T) real success; `alone`: what other hands earn."""
     truth, success = curves["rule_based"], done.any(1)
+    lasted = {name: np.where(np.isfinite(truth), values, np.nan) for name, values in curves.items()}
+    doubt = {signal: lasted.pop(signal) for signal in SIGNALS}
     found = {}
-    for name, values in curves.items():
-        cut = np.where(np.isfinite(truth), values, np.nan)
+    for name, cut in lasted.items():
         outcomes = Outcomes(np.arange(len(cut)), cut, done)
         earned = np.nanmean(cut[success], 1)
         found[name] = {
@@ -129,7 +138,21 @@ def measure(
             "earned_by_successes": float(earned.mean()),
             "earned_by": {hand: float(said[name].mean()) for hand, said in alone.items() if name in said},
         }
-    return {"successes": int(success.sum()), "failures": int((~success).sum()), "rewards": found}
+    return {
+        "successes": int(success.sum()), "failures": int((~success).sum()), "rewards": found,
+        "doubt": warnings(doubt, Outcomes(np.arange(len(done)), lasted["success"], done)),
+    }  # fmt: skip
+
+
+def warnings(doubt: Mapping[str, np.ndarray], outcomes: Outcomes) -> dict[str, Any]:
+    """Among the episodes that are called successes: how well a signal's maximum tells the false ones."""
+    called = outcomes.where(outcomes.called(THRESHOLD, FRAMES) >= 0)
+    false = np.repeat(~called.success[:, None], called.done.shape[1], 1)
+    auc = {
+        signal: Outcomes(called.episodes, values[called.episodes], false).auc(1)
+        for signal, values in doubt.items()
+    }
+    return {"called_successes": len(false), "false": int((~called.success).sum()), "auc": auc}
 
 
 def other_hands(shape: tuple[int, int]) -> dict[str, Tensor]:
@@ -220,6 +243,7 @@ def main() -> None:
     write_json(given.output, found)
     draw(found, given.output.with_suffix(".png"))
     print(results_table(found))
+    print(*(f"{name}: {numbers['doubt']}" for name, numbers in found.items()), sep="\n")
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ from lerobot_wmrl.scripts.train import TrainConfig
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 VIEWS = ("third_view", "side_view")
+MEASURED = ("ind", "ood", "drawn")
 RATES = {"recognised_rate": {"share": 0.9}, "false_success_rate": {"share": 0.1}}
 
 
@@ -53,7 +54,7 @@ def test_the_stages_go_from_nothing_to_a_policy_that_is_measured_twice(
     make_experiment: Callable[..., Any], tmp_path: Path
 ) -> None:
     measured = {
-        kind: [f"eval_{kind}_openvla_{where}" for where in ("ind", "ood")] for kind in ("cloned", "imagined")
+        kind: [f"eval_{kind}_openvla_{where}" for where in MEASURED] for kind in ("cloned", "imagined")
     }
     rest = [*measured["cloned"], "imagined_openvla", *measured["imagined"]]
     first = ["pretrained", "adapted"]
@@ -68,6 +69,7 @@ def test_the_stages_go_from_nothing_to_a_policy_that_is_measured_twice(
         found = [stages[name] for name in measured[kind]]
         assert {each["policy.path"] for each in found} == {str(checkpoint(out / folder))}
         assert {each["eval.n_episodes"] for each in found} == {"6"}
+        assert [each.get("policy.sampling") for each in found] == [None, None, "true"]
 
 
 def test_the_preset_is_a_policy_that_sees_one_of_two_views(make_experiment: Callable[..., Any]) -> None:
@@ -114,7 +116,7 @@ def test_results_are_paired_by_start(make_experiment: Callable[..., Any], tmp_pa
     """And drawn."""
     before, after = np.array([1, 0, 0, 0]), np.array([1, 1, 1, 0])
     for kind, found in (("cloned", before), ("imagined", after)):
-        for domain in ("ind", "ood"):
+        for domain in MEASURED:
             folder = tmp_path / "out" / f"eval_{kind}_openvla_{domain}"
             folder.mkdir(parents=True)
             tasks = [{"metrics": {"successes": found.tolist()}}]
