@@ -4,13 +4,14 @@ from dataclasses import dataclass, field
 
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.types import FeatureType, NormalizationMode, PolicyFeature
-from lerobot.optim import AdamWConfig, LRSchedulerConfig
 from lerobot.utils.constants import ACTION, OBS_STATE
+
+from lerobot_wmrl.policy_configuration import ClonedConfig
 
 
 @PreTrainedConfig.register_subclass("cnn")
 @dataclass
-class CnnConfig(PreTrainedConfig):
+class CnnConfig(ClonedConfig):
     """One action from one observation: images, `observation.state` if there is one, and the instruction.
 
     Args:
@@ -25,7 +26,6 @@ class CnnConfig(PreTrainedConfig):
         std_lr_factor: learning rate of the standard deviation relative to the rest, during cloning.
         min_state_std, min_action_std: floors of the dataset's standard deviations, in the dataset's units,
             so that a component that hardly varies is not blown up by normalisation.
-        optimizer_lr, optimizer_weight_decay, optimizer_grad_clip_norm: of cloning by lerobot-train.
     """
 
     use_state: bool = True
@@ -41,9 +41,6 @@ class CnnConfig(PreTrainedConfig):
     std_lr_factor: float = 20.0
     min_state_std: float = 1e-2
     min_action_std: float = 1e-4
-    optimizer_lr: float = 1e-3
-    optimizer_weight_decay: float = 1e-4
-    optimizer_grad_clip_norm: float = 1.0
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {
             "VISUAL": NormalizationMode.IDENTITY,
@@ -59,8 +56,6 @@ class CnnConfig(PreTrainedConfig):
                 f"initial_std={self.initial_std}: must lie between min_std={self.min_std} (above 0) "
                 f"and max_std={self.max_std}"
             )
-        if self.n_obs_steps != 1:
-            raise ValueError(f"n_obs_steps={self.n_obs_steps}: this policy sees one observation, set it to 1")
 
     @property
     def state_feature(self) -> PolicyFeature | None:
@@ -83,28 +78,6 @@ class CnnConfig(PreTrainedConfig):
         for key, feature in self.image_features.items():
             if feature.type is FeatureType.VISUAL and (len(feature.shape) != 3 or feature.shape[0] != 3):
                 raise ValueError(f"input_features[{key}].shape={feature.shape}: needs (3, height, width)")
-
-    def get_optimizer_preset(self) -> AdamWConfig:
-        return AdamWConfig(
-            lr=self.optimizer_lr,
-            weight_decay=self.optimizer_weight_decay,
-            grad_clip_norm=self.optimizer_grad_clip_norm,
-        )
-
-    def get_scheduler_preset(self) -> LRSchedulerConfig | None:
-        return None
-
-    @property
-    def observation_delta_indices(self) -> None:
-        return None
-
-    @property
-    def action_delta_indices(self) -> None:
-        return None
-
-    @property
-    def reward_delta_indices(self) -> None:
-        return None
 
 
 def _is_depth(feature: PolicyFeature) -> bool:

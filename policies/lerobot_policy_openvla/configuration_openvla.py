@@ -5,17 +5,17 @@ from typing import Any
 
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.types import FeatureType, NormalizationMode, PolicyFeature
-from lerobot.optim import AdamWConfig, LRSchedulerConfig
 from lerobot.utils.constants import ACTION
 
 from lerobot_policy_openvla.sizes import Sizes
+from lerobot_wmrl.policy_configuration import ClonedConfig
 
 DTYPES = ("auto", "float32", "bfloat16")
 
 
 @PreTrainedConfig.register_subclass("openvla")
 @dataclass
-class OpenVLAConfig(PreTrainedConfig):
+class OpenVLAConfig(ClonedConfig):
     """One action, as tokens, from one picture and the instruction.
 
     A checkpoint of OpenVLA brings its sizes and statistics along (`lerobot-wmrl-convert-openvla`); without
@@ -34,7 +34,6 @@ class OpenVLAConfig(PreTrainedConfig):
         sampling: act by drawing tokens, as in reinforcement learning; else by the likeliest, as OpenVLA does.
         value_sizes: hidden layers of the value head (RL4VLA's, Liu et al. 2025).
         gradient_checkpointing: recompute activations instead of keeping them: less memory, a third more time.
-        optimizer_lr, optimizer_weight_decay, optimizer_grad_clip_norm: of fine-tuning by lerobot-train.
     """
 
     sizes: Sizes = field(default_factory=Sizes)
@@ -48,7 +47,6 @@ class OpenVLAConfig(PreTrainedConfig):
     gradient_checkpointing: bool = False
     optimizer_lr: float = 5e-4
     optimizer_weight_decay: float = 0.0
-    optimizer_grad_clip_norm: float = 1.0
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {
             "VISUAL": NormalizationMode.IDENTITY,
@@ -63,8 +61,6 @@ class OpenVLAConfig(PreTrainedConfig):
             raise ValueError(f"policy.dtype={self.dtype}: choose one of {', '.join(DTYPES)}")
         if self.temperature <= 0:
             raise ValueError(f"policy.temperature={self.temperature}: must be above 0")
-        if self.n_obs_steps != 1:
-            raise ValueError(f"n_obs_steps={self.n_obs_steps}: this policy sees one observation, set it to 1")
 
     @property
     def action_size(self) -> int:
@@ -100,25 +96,3 @@ class OpenVLAConfig(PreTrainedConfig):
         action: PolicyFeature | None = self.action_feature
         if action is not None and (action.type is not FeatureType.ACTION or len(action.shape) != 1):
             raise ValueError(f"output_features={self.output_features}: needs `{ACTION}` with one dimension")
-
-    def get_optimizer_preset(self) -> AdamWConfig:
-        return AdamWConfig(
-            lr=self.optimizer_lr,
-            weight_decay=self.optimizer_weight_decay,
-            grad_clip_norm=self.optimizer_grad_clip_norm,
-        )
-
-    def get_scheduler_preset(self) -> LRSchedulerConfig | None:
-        return None
-
-    @property
-    def observation_delta_indices(self) -> None:
-        return None
-
-    @property
-    def action_delta_indices(self) -> None:
-        return None
-
-    @property
-    def reward_delta_indices(self) -> None:
-        return None

@@ -6,12 +6,14 @@ from typing import Final
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.types import NormalizationMode
 
+from lerobot_wmrl.policy_configuration import SingleStepConfig
+
 OBJECTIVES: Final = ("success", "goal")
 
 
 @PreTrainedConfig.register_subclass("wm_mpc")
 @dataclass
-class WmMpcConfig(PreTrainedConfig):
+class WmMpcConfig(SingleStepConfig):
     """Nothing is learnt: action sequences are imagined, and the best one's beginning is carried out.
 
     The sequences are those of the cross-entropy method (Rubinstein 1999): drawn around a mean, which moves to
@@ -78,18 +80,3 @@ class WmMpcConfig(PreTrainedConfig):
 
     def get_optimizer_preset(self) -> None:
         """Nothing is trained."""
-
-    def get_scheduler_preset(self) -> None:
-        """Nothing is trained."""
-
-    @property
-    def observation_delta_indices(self) -> None:
-        return None
-
-    @property
-    def action_delta_indices(self) -> None:
-        return None
-
-    @property
-    def reward_delta_indices(self) -> None:
-        return None
