@@ -11,7 +11,7 @@ each: the mean curve of successes and of failures with its band, Spearman's corr
 reward within an episode, and the AUC of its highest run of three frames, success against failure. The same
 starts are also given to hands that move at random, not at all, and to one corner: they should earn less than
 the planner's actions. And does the environment's doubt warn? Of the episodes that the world model calls
-successes, how often is the greatest doubt in a false one above that in a true one. Writes
+successes, how often is the greatest doubt until then in a false one above that in a true one. Writes
 docs/results/reward_curves.json and a picture beside it.
 """
 
@@ -145,11 +145,14 @@ def measure(
 
 
 def warnings(doubt: Mapping[str, np.ndarray], outcomes: Outcomes) -> dict[str, Any]:
-    """Among the episodes that are called successes: how well a signal's maximum tells the false ones."""
-    called = outcomes.where(outcomes.called(THRESHOLD, FRAMES) >= 0)
+    """Among the episodes that are called successes: how well a signal's maximum up to that call, which is
+    what the environment's guard would have seen, tells the false ones."""
+    first = outcomes.called(THRESHOLD, FRAMES)
+    called, end = outcomes.where(first >= 0), first[first >= 0] + FRAMES
+    seen = np.arange(called.done.shape[1]) < end[:, None]
     false = np.repeat(~called.success[:, None], called.done.shape[1], 1)
     auc = {
-        signal: Outcomes(called.episodes, values[called.episodes], false).auc(1)
+        signal: Outcomes(called.episodes, np.where(seen, values[called.episodes], np.nan), false).auc(1)
         for signal, values in doubt.items()
     }
     return {"called_successes": len(false), "false": int((~called.success).sum()), "auc": auc}
@@ -213,11 +216,11 @@ def draw(found: Mapping[str, Mapping[str, Any]], path: Path) -> None:
         for axes, name in zip(row, names, strict=True):
             for colour, kind in zip(COLOURS, ("successes", "failures"), strict=False):
                 shown = numbers["rewards"][name][f"curve_of_{kind}"]
-                axes.plot(shown["mean"], color=colour, label=kind)
+                axes.plot(shown["mean"], color=colour, label=kind if axes is grid[0, 0] else None)
                 frames = range(len(shown["mean"]))
                 axes.fill_between(frames, shown["low"], shown["high"], color=colour, alpha=0.25)
             axes.set_title(f"{name}, {dataset}", fontsize=9)
-    grid[0, 0].legend(fontsize=8)
+            axes.set_xlabel("frame" if dataset == list(found)[-1] else "")
     tidy(figure).savefig(path, dpi=130)
 
 

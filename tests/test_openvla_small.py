@@ -101,7 +101,7 @@ def test_ppo_samples_from_the_categorical_alone(
     given = [flag for flag in expand_preset(command[1:], "train") if not flag.startswith("--policy.path")]
     config = draccus.parse(TrainConfig, args=given)
     assert config.algorithm.initial_std is None
-    assert (config.num_envs, config.rollout_steps, config.iterations, config.seed) == (32, 40, 7, 8)
+    assert (config.num_envs, config.rollout_steps, config.iterations, config.seed) == (64, 40, 7, 8)
     assert config.env.done_frames == 2
 
 

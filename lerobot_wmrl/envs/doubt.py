@@ -17,7 +17,7 @@ def entropies(imagined: Imagined) -> dict[str, Tensor]:
     return {"token_entropy": imagined.entropy, "done_entropy": done.entropy()}
 
 
-SIGNALS: Final = ("done_entropy", "token_entropy")
+SIGNALS: Final = ("token_entropy", "done_entropy")
 EFFECTS: Final = ("end", "weight")
 
 
@@ -27,14 +27,14 @@ class Doubt:
 
     Args:
         limit: nats above which a frame is doubtful.
-        signal: `done_entropy`, of its being a success (at most 0.69), or `token_entropy`, of what it looks
-            like, the mean over its codes.
+        signal: `token_entropy`, of what it looks like, the mean over its codes, or `done_entropy`, of its
+            being a success (at most 0.69).
         effect: `end` truncates the episode there, without success; `weight` multiplies the reward of the
             frame by limit / doubt.
     """
 
     limit: float | None = None
-    signal: str = "done_entropy"
+    signal: str = "token_entropy"
     effect: str = "end"
 
     def check(self) -> None:

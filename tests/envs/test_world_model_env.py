@@ -369,7 +369,7 @@ REWARDS = {
 }
 
 
-@pytest.mark.parametrize("doubt", [Doubt(), Doubt(limit=1.0), Doubt(limit=0.1, effect="weight")])
+@pytest.mark.parametrize("doubt", [Doubt(), Doubt(limit=100.0), Doubt(limit=0.1, effect="weight")])
 @pytest.mark.parametrize("reward", list(REWARDS))
 def test_a_step_asks_the_device_only_whether_an_episode_has_ended(config, reward, doubt):
     """Anchored dynamics ask once more in the first step, who begins."""
@@ -444,7 +444,7 @@ def test_what_the_world_model_doubts_ends_or_pays_less(config):
     assert terminated.tolist() == [True, True, False, False]
     assert not truncated.any()
     torch.testing.assert_close(parts["done_entropy"], torch.tensor([0, 0.6931, 0.3653, 0]), atol=1e-3, rtol=0)
-    _, terminated, truncated, _ = doubtful(surely, limit=0.5)
+    _, terminated, truncated, _ = doubtful(surely, limit=0.5, signal="done_entropy")
     assert terminated.tolist() == [True, False, False, False]
     assert truncated.tolist() == [False, True, False, False]
     less, terminated, truncated, parts = doubtful(surely, limit=0.5, signal="token_entropy", effect="weight")
