@@ -44,7 +44,7 @@ REINFORCEMENT: Final[Flags] = {
     "algorithm.value_lr": 3e-3, "algorithm.value_iterations": 3, "algorithm.reference_coefficient": 0.02,
     "env.dataset.max_starts": 1024,
 }  # fmt: skip
-"""A categorical explores by itself, and few large minibatches make more of what `target_kl` allows."""
+"""A categorical explores by itself; at this rate small minibatches reach `target_kl` too soon."""
 
 
 class Experiment(imagined_ppo.Experiment):
