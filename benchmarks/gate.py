@@ -2,10 +2,10 @@
 
     python benchmarks/gate.py --output_dir=outputs/gate
 
-One task (push) in the demo's three scenes. Planners and three cloned policies, as they are and disturbed,
-give the data; a fourth policy, too, is rolled out in ManiSkill, in these scenes and in those held out from
-all training, and replayed in the world model. Every stage is one of the package's commands; the same call
-again continues. Two to three hours on two cores, by estimate; the results are metrics.json in
+One task (push), by default in the demo's three scenes. Planners and three cloned policies, as they are and
+disturbed, give the data; a fourth policy, too, is rolled out in ManiSkill, in these scenes and in those held
+out from all training, and replayed in the world model. Every stage is one of the package's commands; the same
+call again continues. Two to three hours on two cores, by estimate; the results are metrics.json in
 outputs/gate/check and outputs/gate/check_ood. Flags of the action world model's training may follow.
 """
 
@@ -64,12 +64,15 @@ class Experiment:
             of the others.
         depth: whether it is recorded too.
         model_flags: further flags of the action world model's training.
+        scenes: those that the model learns.
     """
 
     def __init__(
-        self, out: Path, episodes: int = EPISODES, depth: bool = False, model_flags: Sequence[str] = ()
-    ) -> None:
+        self, out: Path, episodes: int = EPISODES, depth: bool = False, model_flags: Sequence[str] = (),
+        scenes: Flags = SCENES,
+    ) -> None:  # fmt: skip
         self.out, self.episodes, self.depth, self.model_flags = out, episodes, depth, model_flags
+        self.scenes = scenes
 
     def stages(self) -> list[Stage]:
         """In order."""
@@ -104,10 +107,10 @@ class Experiment:
     def path(self, name: str) -> str:
         return str(self.out / name)
 
-    def simulator(self, cameras: str, scenes: Flags = SCENES) -> Flags:
+    def simulator(self, cameras: str, scenes: Flags | None = None) -> Flags:
         return {
-            "env.type": "wmrl_maniskill", "env.task": "push", **scenes, "env.image_size": IMAGE_SIZE,
-            "env.cameras": cameras,
+            "env.type": "wmrl_maniskill", "env.task": "push", **(scenes or self.scenes),
+            "env.image_size": IMAGE_SIZE, "env.cameras": cameras,
         }  # fmt: skip
 
     def record(self, name: str, kinds: str, episodes: int, seed: int, cameras: str) -> list[str]:
@@ -128,7 +131,7 @@ class Experiment:
         return ["lerobot-train", *preset_flags("demo", "sft"), *format_flags(flags)]
 
     def roll_out(
-        self, name: str, policy: str, exploration: float, seed: int, scenes: Flags = SCENES
+        self, name: str, policy: str, exploration: float, seed: int, scenes: Flags | None = None
     ) -> list[str]:
         share = 10 if policy == "unseen" else 16
         flags: Flags = {
@@ -184,8 +187,11 @@ def main() -> None:
     parser.add_argument(
         "--depth", default="false", choices=("true", "false"), help="record it, for world_model_ablation.py"
     )
+    parser.add_argument("--scenes", default=DEMO_SCENES, help="indices of scenes, as in [0,1,2]")
     given, model_flags = parser.parse_known_args()
-    experiment = Experiment(given.output_dir, given.episodes, given.depth == "true", model_flags)
+    depth = given.depth == "true"
+    scenes: Flags = {"env.scenes": given.scenes}
+    experiment = Experiment(given.output_dir, given.episodes, depth, model_flags, scenes)
     run_stages(experiment.stages(), given.output_dir)
 
 

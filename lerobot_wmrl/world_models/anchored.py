@@ -7,7 +7,8 @@ again, so errors in pictures do not add up, training meets what imagination meet
 frame that it learns from.
 """
 
-from typing import Any
+from collections.abc import Iterable
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -103,8 +104,10 @@ class AnchoredNetwork(FrameNetwork):
         for block in self.scene:
             x = block(x, nothing)
         tokens = self.scene_norm(x)
-        scene = Scene(digits, tokens, self.places(tokens), local.unflatten(0, (len(digits), -1)))
-        return scene, self.path.begin(state)
+        blocks = cast(Iterable[TrajectoryBlock], self.trajectory)
+        offered = torch.stack([block.offered(tokens) for block in blocks], 2)
+        local = local.unflatten(0, (len(digits), -1))
+        return Scene(digits, tokens, offered, self.places(tokens), local), self.path.begin(state)
 
     def make_cache(self, batch: int, device: torch.device, dtype: torch.dtype) -> AnchoredCache:
         """Imaginations of which none has begun."""
@@ -117,9 +120,8 @@ class AnchoredNetwork(FrameNetwork):
         """The trajectory under the conditions' means (B, T, D), and what is read from it."""
         path = self.path(begin, scene.places, mean)
         x = (self.register + mean + self.motion(path.hidden) + self.state_in(path.state))[:, None]
-        given = ConditionTokens(scene.tokens, None, scene.tokens[:, :, 0])
         for layer, block in enumerate(self.trajectory):
-            x = block(x, given, layer, memory)
+            x = block(x, scene.offered[:, :, layer], layer, memory)
         hidden = self.norm(x)[:, 0]
         logits = self._draw(scene, hidden if frames is None else take_rows(hidden, frames))
         with compute_in(torch.float32, x.device):

@@ -11,11 +11,13 @@ from lerobot_wmrl.world_models.temporal_memory import RingMemory, TemporalCache
 
 
 class Scene(NamedTuple):
-    """First frames of B clips, seen once: digits (B, 1, S, C), transformer tokens (B, 1, 1 + S', D), places
-    (B, 1, D), local features (B, N, code_width, g, g)."""
+    """First frames of B clips, seen once: digits (B, 1, S, C), transformer tokens (B, 1, 1 + S', D), what
+    these offer each of the trajectory's L layers (B, 1, L, 2, h, 1 + S', d), places (B, 1, D), local features
+    (B, N, code_width, g, g)."""
 
     digits: Tensor
     tokens: Tensor
+    offered: Tensor
     places: Tensor
     local: Tensor
 

@@ -86,11 +86,15 @@ class TrajectoryBlock(nn.Module):
         self.scene = CrossAttention(width, heads)
         self.mlp = make_mlp(width)
 
-    def forward(self, x: Tensor, scene: ConditionTokens, layer: int, memory: TemporalMemory) -> Tensor:
-        """x (B, 1, T, D) → same; the scene has tokens (B, 1, M, D)."""
+    def offered(self, scene: Tensor) -> Tensor:
+        """What the scene's tokens (B, 1, M, D) offer this block. → (B, 1, 2, h, M, d)"""
+        return self.scene.offer(scene)
+
+    def forward(self, x: Tensor, offered: Tensor, layer: int, memory: TemporalMemory) -> Tensor:
+        """x (B, 1, T, D) → same, given what `offered` makes of the scene."""
         heads = self.time.split_heads(self.time.norm(x))
         x = x + self.time.merge_heads(memory.attend(layer, *heads))
-        x = self.scene(x, scene)
+        x = self.scene.ask(x, offered)
         return x + self.mlp(x)
 
 
