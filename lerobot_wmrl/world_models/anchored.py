@@ -32,12 +32,14 @@ class AnchoredNetwork(FrameNetwork):
     Args:
         layers: of the trajectory and of the renderer; the scene's encoder has half as many.
         context_channels: of the coarsest features of the tokenizer's context, 0 without.
+        dropout: in the trajectory, in training.
         heads, window: of the attention; `window` is the longest trajectory. Others as in `FrameNetwork`.
     """
 
     def __init__(
-        self, *, layers: int, heads: int, window: int, context_channels: int = 0, **sizes: Any
-    ) -> None:
+        self, *, layers: int, heads: int, window: int, context_channels: int = 0, dropout: float = 0.0,
+        **sizes: Any,
+    ) -> None:  # fmt: skip
         super().__init__(**sizes)
         width = sizes["width"]
         self.window, self.heads, self.head_width = window, heads, width // heads
@@ -46,7 +48,7 @@ class AnchoredNetwork(FrameNetwork):
         self.scene = nn.ModuleList(
             SpatialBlock(width, heads, Conditioning(width, heads)) for _ in range(max(1, layers // 2))
         )
-        self.trajectory = nn.ModuleList(TrajectoryBlock(width, heads) for _ in range(layers))
+        self.trajectory = nn.ModuleList(TrajectoryBlock(width, heads, dropout) for _ in range(layers))
         self.motion = nn.Linear(width, width)
         self.renderer = nn.ModuleList(
             SpatialBlock(width, heads, AddedCondition(width, heads)) for _ in range(layers)

@@ -17,24 +17,23 @@ from lerobot_wmrl.world_models.context import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.episode_table import EpisodeTable
 from lerobot_wmrl.world_models.frame_cache import frames_to_tensor
 
-FROM_START = 0.75
-"""Share of training clips that begin with their episode. Success can depend on where the episode began
-(an object pushed 10 cm), so only these carry done labels, unless the context shows it to all."""
-
 
 @dataclass
 class ClipSampler:
     """Clips of tokens for the world models.
 
-    tokens (rows, S) is the memory map; `episodes` the indices of the episodes to draw from. For models that
-    look at them: depth (rows, S), metres of each token; context (E, N, C, g, g), of episodes' first frames.
-    done_known: whether the table's done is what happened, or nobody knows.
+    tokens (rows, S) is the memory map; `episodes` the indices of the episodes to draw from; `from_start` the
+    share of clips that begin with their episode. Success can depend on where the episode began (an object
+    pushed 10 cm), so only these carry done labels, unless the context shows it to all.
+    For models that look at them: depth (rows, S), metres of each token; context (E, N, C, g, g), of episodes'
+    first frames. done_known: whether the table's done is what happened, or nobody knows.
     """
 
     table: EpisodeTable
     tokens: np.ndarray
     episodes: np.ndarray
     clip_length: int
+    from_start: float
     batch_size: int
     seed: int
     device: str
@@ -47,7 +46,7 @@ class ClipSampler:
         rng, size = np.random.default_rng([self.seed, step]), self.batch_size * rank_and_size()[1]
         episodes = rng.choice(self.episodes, size)
         room = np.maximum(self.table.length[episodes] - 2, 1)
-        offsets = np.where(rng.random(size) < FROM_START, 0, rng.integers(0, room))
+        offsets = np.where(rng.random(size) < self.from_start, 0, rng.integers(0, room))
         rows = own_rows(self.batch_size)
         return self.clips(episodes[rows], offsets[rows])
 

@@ -80,17 +80,17 @@ class CrossAttention(Conditioning):
         nn.init.zeros_(self.out.bias)
 
     def forward(self, x: Tensor, condition: ConditionTokens) -> Tensor:
-        return self.ask(x, self.offer(condition.tokens), condition.mask)
+        return x + self.ask(x, self.offer(condition.tokens), condition.mask)
 
     def offer(self, tokens: Tensor) -> Tensor:
         """Keys and values of the condition's tokens (B, T or 1, M, D). → (B, T or 1, 2, h, M, d)"""
         return self.key_value(tokens).unflatten(-1, (2, self.heads, -1)).movedim(-4, -2)
 
     def ask(self, x: Tensor, offered: Tensor, mask: Tensor | None = None) -> Tensor:
-        """Tokens (B, T, S, D), given what is offered to them. → same"""
+        """What tokens (B, T, S, D) take from what is offered to them. → same"""
         query = self.query(self.norm(x)).unflatten(-1, (self.heads, -1)).transpose(-2, -3)
         key, value = offered.unbind(-4)
-        return x + self.out(attention(query, key, value, mask).transpose(-2, -3).flatten(-2))
+        return self.out(attention(query, key, value, mask).transpose(-2, -3).flatten(-2))
 
 
 class AdaptiveLayerNorm(Conditioning):

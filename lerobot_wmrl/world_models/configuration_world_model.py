@@ -29,6 +29,7 @@ class WorldModelConfig(RewardModelConfig):
         window: frames the model remembers; with anchored dynamics `clip_length` says that.
         clip_length: frames of a training clip. Success is learnt only that far from an episode's start, so
             give it the number of frames that episodes are imagined for.
+        from_start: share of training clips that begin with their episode; the others begin anywhere in it.
         patch: side of the square of tokens that forms one transformer token.
         code_width: channels of the convolutions on the token grid.
         conditioning: how blocks take in the condition: cross_attention (the paper's), adaln or additive.
@@ -37,6 +38,8 @@ class WorldModelConfig(RewardModelConfig):
         maskgit_steps: passes a frame of maskgit; 1 is as fast as shifted, and decodes the same way.
         depth: see and predict each camera's depth beside its tokens (RoboScape's depth branch). The dataset
             must have `observation.images.<camera>_depth`, which `lerobot-wmrl-record --depth=true` writes.
+        dropout: share of what each layer adds to the trajectory of anchored dynamics that training leaves
+            out, so that episodes are not learnt by heart.
         motion_weight: how much more a token counts in the loss when it moves. A high weight makes the model
             believe in motion: it then pushes objects that the hand misses.
         done_weight, done_positive_weight, state_weight, depth_weight: of the losses beside the tokens' one.
@@ -67,6 +70,7 @@ class WorldModelConfig(RewardModelConfig):
     heads: int = 4
     window: int = 48
     clip_length: int = 28
+    from_start: float = 0.75
     patch: int = 2
     code_width: int = 48
     conditioning: str = "cross_attention"
@@ -80,6 +84,7 @@ class WorldModelConfig(RewardModelConfig):
     state_weight: float = 4.0
     depth_weight: float = 1.0
     drawn_frames: int = 4
+    dropout: float = 0.0
     self_forcing: float = 0.5
     self_rollout: float = 0.0
     keypoint_weight: float = 0.0
@@ -98,6 +103,12 @@ class WorldModelConfig(RewardModelConfig):
             raise ValueError(
                 f"--model.self_rollout={self.self_rollout}: must be a share of the clips, between 0 and 1"
             )
+        if not 0 <= self.from_start <= 1:
+            raise ValueError(
+                f"--model.from_start={self.from_start}: must be a share of the clips, between 0 and 1"
+            )
+        if not 0 <= self.dropout < 1:
+            raise ValueError(f"--model.dropout={self.dropout}: must be a share, from 0 to below 1")
         if self.keypoint_weight < 0:
             raise ValueError(
                 f"--model.keypoint_weight={self.keypoint_weight}: must be 0 (off) or a positive weight"

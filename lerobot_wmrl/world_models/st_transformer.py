@@ -11,6 +11,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
+from lerobot_wmrl.distributed import draw_own_rows
 from lerobot_wmrl.world_models.attention import SelfAttention, attention
 from lerobot_wmrl.world_models.conditioning import (
     Conditioning,
@@ -77,11 +78,28 @@ class SpatialBlock(nn.Module):
         return x + self.mlp(x)
 
 
-class TrajectoryBlock(nn.Module):
-    """Time, scene, MLP for one token a frame."""
+class Dropout(nn.Module):
+    """Leaves out a share of what it is given, in training (Srivastava et al. 2014): of each row of the batch
+    the same, however many processes share it."""
 
-    def __init__(self, width: int, heads: int) -> None:
+    def __init__(self, share: float) -> None:
         super().__init__()
+        self.share = share
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, …) → same."""
+        if not self.training or not self.share:
+            return x
+        kept = draw_own_rows(torch.rand, x.shape, x.device) >= self.share
+        return x * kept / (1 - self.share)
+
+
+class TrajectoryBlock(nn.Module):
+    """Time, scene, MLP for one token a frame; training drops a share of what each adds (`dropout`)."""
+
+    def __init__(self, width: int, heads: int, dropout: float) -> None:
+        super().__init__()
+        self.dropout = Dropout(dropout)
         self.time = SelfAttention(width, heads)
         self.scene = CrossAttention(width, heads)
         self.mlp = make_mlp(width)
@@ -93,9 +111,9 @@ class TrajectoryBlock(nn.Module):
     def forward(self, x: Tensor, offered: Tensor, layer: int, memory: TemporalMemory) -> Tensor:
         """x (B, 1, T, D) → same, given what `offered` makes of the scene."""
         heads = self.time.split_heads(self.time.norm(x))
-        x = x + self.time.merge_heads(memory.attend(layer, *heads))
-        x = self.scene.ask(x, offered)
-        return x + self.mlp(x)
+        x = x + self.dropout(self.time.merge_heads(memory.attend(layer, *heads)))
+        x = x + self.dropout(self.scene.ask(x, offered))
+        return x + self.dropout(self.mlp(x))
 
 
 class SpatialTemporalTransformer(nn.Module):

@@ -103,8 +103,8 @@ def make_sampler(
     if config.context_channels:
         context = cached_context(table.dataset, config.camera_keys, tokenizer)
     return ClipSampler(
-        table, tokens, episodes.nonzero()[0], config.clip_length, batch_size, seed, config.device, depth,
-        context, done_known,
+        table, tokens, episodes.nonzero()[0], config.clip_length, config.from_start, batch_size, seed,
+        config.device, depth, context, done_known,
     )  # fmt: skip
 
 

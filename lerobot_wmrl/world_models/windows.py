@@ -18,7 +18,7 @@ def clip_from_windows(
     LeRobot fills a window that would begin before its episode with copies of the first row. They are moved
     behind the window's end, where they count for nothing: else the model would learn that actions at the
     start of an episode do nothing. Only the last row's `next.done` is in the batch, and like the token path
-    (`clips.FROM_START`) only windows that hold their episode's start have it as a label.
+    (`--model.from_start`) only windows that hold their episode's start have it as a label.
 
     Args:
         tokens: (B, T, S), of the window's frames.

@@ -20,6 +20,7 @@ from lerobot_wmrl.world_models.modeling_world_model import (
     ActionWorldModelRewardModel,
     TextWorldModelRewardModel,
 )
+from lerobot_wmrl.world_models.st_transformer import Dropout
 from lerobot_wmrl.world_models.world_model import STATE_SPREAD
 
 BATCH, LENGTH, TOKENS, CODES = 3, 6, 32, 20
@@ -183,6 +184,18 @@ def test_frames_done_and_state_are_learnt_though_few_frames_are_drawn():
     assert (over_time(steps, "proprioception")[:, :-1] - clip.state[:, 1:]).abs().mean() < 0.03
 
 
+def test_training_leaves_out_a_share_of_what_layers_add_and_imagination_nothing():
+    model, clip = world_model(dropout=0.5), random_clip()
+    plain, again = world_model().predict(clip), model.predict(clip)
+    assert torch.equal(plain.done_logit, again.done_logit)
+    model.train()
+    ways = torch.stack([model.predict(clip).done_logit for _ in range(2)])
+    assert not torch.equal(ways[0], ways[1])
+    left = Dropout(0.5).train()(torch.ones(4, 1000))
+    assert set(left.unique().tolist()) == {0.0, 2.0}
+    assert left.mean(1).sub(1).abs().max() < 0.15
+
+
 def test_rows_are_drawn_among_those_with_a_valid_next_one():
     valid = torch.tensor([[True] * 6, [True] * 3 + [False] * 3, [True] + [False] * 5])
     rows = torch.stack([draw_rows(valid, 5) for _ in range(200)])
@@ -215,6 +228,13 @@ def test_tokens_that_are_not_as_at_the_start_count_more_and_padding_nothing():
 def test_what_anchored_dynamics_do_not_have_is_named(setting, value):
     with pytest.raises(ValueError, match=rf"--model.{setting}={value}: anchored dynamics do not have it"):
         ActionWorldModelConfig(**SIZES | {setting: value})
+
+
+@pytest.mark.parametrize("setting", [{"dropout": 1.0}, {"dropout": -0.1}, {"from_start": 1.5}])
+def test_shares_that_are_none_are_named(setting):
+    name, value = next(iter(setting.items()))
+    with pytest.raises(ValueError, match=rf"--model.{name}={value}: must be a share"):
+        ActionWorldModelConfig(**setting)
 
 
 def test_unknown_dynamics_are_named():

@@ -25,6 +25,7 @@ SIZES = {
     "text_world_model": [
         "--model.layers=1", "--model.width=32", "--model.heads=2", "--model.clip_length=14",
         "--model.code_width=8", "--model.state_size=0", "--model.dynamics=anchored",
+        "--model.dropout=0.1",
     ],
 }  # fmt: skip
 

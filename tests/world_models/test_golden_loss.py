@@ -57,9 +57,7 @@ def made_up_sampler(model: str) -> ClipSampler | FrameSampler:
         )
         return FrameSampler(table, frames, episodes, ["third_view"], batch_size=4, seed=0, device="cpu")
     tokens = rng.integers(0, CODES, TOKENS) + (rng.random((EPISODES * ROWS, TOKENS)) < 0.1).cumsum(0)
-    return ClipSampler(
-        table, tokens % CODES, episodes, TINY["clip_length"], batch_size=4, seed=0, device="cpu"
-    )
+    return ClipSampler(table, tokens % CODES, episodes, TINY["clip_length"], 0.75, 4, seed=0, device="cpu")
 
 
 @pytest.mark.parametrize("model", GOLDEN)

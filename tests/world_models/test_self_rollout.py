@@ -33,7 +33,9 @@ def model_and_clip(name: str, trained_models, dataset, **settings) -> tuple[Worl
         torch.nn.init.normal_(parameter, std=0.2)
     shape = dataset.num_frames, model.tokenizer.tokens_per_frame
     tokens = np.random.default_rng(0).integers(0, 20, shape)
-    sampler = ClipSampler(read_episodes(dataset), tokens, np.arange(6), 9, batch_size=6, seed=3, device="cpu")
+    sampler = ClipSampler(
+        read_episodes(dataset), tokens, np.arange(6), 9, 0.75, batch_size=6, seed=3, device="cpu"
+    )
     return model, sampler(0)
 
 

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -33,7 +34,7 @@ def sampler(small_dataset, trained_models) -> ClipSampler:
     table = read_episodes(small_dataset)
     model = load_model(trained_models["action_world_model"], "action_world_model")
     tokens = cached_tokens(small_dataset, model.config.camera_keys, model.tokenizer)
-    return ClipSampler(table, tokens, np.arange(6), 12, batch_size=8, seed=3, device="cpu")
+    return ClipSampler(table, tokens, np.arange(6), 12, 0.75, batch_size=8, seed=3, device="cpu")
 
 
 def test_batches_are_a_function_of_seed_and_step(sampler):
@@ -57,8 +58,10 @@ def test_training_meets_every_length_of_history(sampler):
     """From one frame on, at the start of episodes and amid them: windows of random length add nothing."""
     memory = ClipMemory(sampler.clip_length, window=24, head_width=8, device=torch.device("cpu"))
     assert memory.mask.sum(1).tolist() == list(range(1, sampler.clip_length + 1))
-    amid = torch.cat([~sampler(step).done_known[:, 0] for step in range(50)])
-    assert 0.15 < amid.float().mean() < 0.35
+    for from_start in (0.75, 0.3):
+        drawing = replace(sampler, from_start=from_start)
+        amid = torch.cat([~drawing(step).done_known[:, 0] for step in range(50)])
+        assert 0.75 < amid.float().mean() / (1 - from_start) < 1.2
 
 
 @pytest.mark.parametrize("preset", PRESETS)

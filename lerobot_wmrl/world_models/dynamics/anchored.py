@@ -29,7 +29,7 @@ class AnchoredDynamics:
         config = self.config
         return AnchoredNetwork(
             layers=config.layers, heads=config.heads, window=config.clip_length,
-            context_channels=config.context_channels, **sizes,
+            context_channels=config.context_channels, dropout=config.dropout, **sizes,
         )  # fmt: skip
 
     def loss(self, model: Any, clip: Clip) -> tuple[Tensor, dict[str, float]]:
