@@ -24,7 +24,7 @@ CANDIDATES = {
     "side_low": View((-0.02, 0.62, 0.28), (0.0, -0.03, 0.05), 0.6),
 }
 FIRST_SEED = 3_000_000
-EVERY = 3
+EVERY = 5
 """Steps between two frames."""
 
 PROCESSES = 2
@@ -68,7 +68,7 @@ def _meet(contact: Any, thing: Any) -> bool:
 
 
 def frames_of(views: list[str], episodes: int, size: int, folder: Path) -> Frames:
-    """Every third frame of the first `episodes` planned episodes, rounded up to whole parts.
+    """Every fifth frame of the first `episodes` planned episodes, rounded up to whole parts.
 
     A part that `folder` holds is not recorded again.
     """

@@ -3,31 +3,26 @@
     python benchmarks/camera_probe.py --episodes=3200 --cameras front_steep+wrist side_mid+wrist
 
 Frames of planned episodes of all tasks and kinds, in all training scenes, are recorded once and kept.
-CNNs are trained on three quarters of the episodes and tested on the others. One, with a spatial soft-argmax,
-reads places (errors in mm) and the gripper's opening (in %). Another says whether finger and object touch; it
-sees pictures that are shifted and differently lit, which moves places but not contact.
+A CNN with a spatial soft-argmax is trained on three quarters of the episodes and tested on the others:
+errors of places in mm, of the gripper's opening in %, and whether finger and object touch.
 Adds to docs/results/cameras.json.
 """
 
 import argparse
 import json
-from collections.abc import Callable
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from tqdm import tqdm, trange
 
 from camera_frames import CANDIDATES, Frames, frames_of
 from lerobot_wmrl.files import write_json
 from lerobot_wmrl.maniskill.tasks import TASKS
-from lerobot_wmrl.precision import compute_in, training_dtype
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
 NAMES = ("object_x", "object_y", "object_z", "tcp_x", "tcp_y", "tcp_z")
@@ -46,18 +41,6 @@ WIDTHS = {64: (3, 24, 48), 128: (3, 24, 40, 56)}
 """Channels of the strided convolutions, by size of the picture."""
 
 MAPS, POOLED = 32, 24
-
-FASTEST = torch.channels_last
-"""Of the formats of pictures, for convolutions in bfloat16 on a CPU."""
-
-SHIFT = 4
-"""Pixels that a picture is moved by at most, in training to see contact."""
-
-CONTACT_STEPS = 2
-"""Times as many steps as for places."""
-
-AVERAGED = 0.999
-"""Of the average of weights that stays from one step to the next."""
 
 
 class CameraEncoder(nn.Module):
@@ -89,10 +72,8 @@ class CameraEncoder(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         maps = self.maps(images - 0.5)
-        with compute_in(torch.float32, images.device):
-            attention = (maps.float().flatten(2) * self.sharpness).softmax(-1)
-            places = attention @ self.places
-        return torch.cat([places.flatten(1), self.pool(maps)], 1)
+        attention = (maps.flatten(2) * self.sharpness).softmax(-1)
+        return torch.cat([(attention @ self.places).flatten(1), self.pool(maps)], 1)
 
 
 class Probe(nn.Module):
@@ -115,88 +96,37 @@ def held_out(episode: np.ndarray) -> np.ndarray:
     return episode // len(TASKS) % round(1 / TEST_SHARE) == 0
 
 
-@dataclass(frozen=True)
-class Pictures:
-    """What cameras saw, (N, 3, H, W) uint8 each, and the rows for training and for the test."""
-
-    cameras: list[Tensor]
-    train: Tensor
-    test: Tensor
-
-    @classmethod
-    def of(cls, frames: Frames, cameras: list[str]) -> Self:
-        pictures = [torch.from_numpy(frames.images[camera]).permute(0, 3, 1, 2) for camera in cameras]
-        test = torch.from_numpy(held_out(frames.episode))
-        return cls(pictures, *(mask.nonzero().squeeze(1) for mask in (~test, test)))
-
-    def rows(self, rows: Tensor) -> list[Tensor]:
-        """As the networks see them, [(B, 3, H, W), …] in [0, 1]."""
-        return [camera[rows].to(torch.float32, memory_format=FASTEST) / 255 for camera in self.cameras]
-
-    def augmented(self, rows: Tensor) -> list[Tensor]:
-        """Every camera's pictures shifted by up to `SHIFT` pixels, every picture lit in its own way."""
-        return [relit(shifted(picture)) for picture in self.rows(rows)]
-
-
-def shifted(pictures: Tensor) -> Tensor:
-    """(B, 3, H, W), all by the same random number of pixels."""
-    height, width = pictures.shape[-2:]
-    top, left = torch.randint(2 * SHIFT + 1, (2,)).tolist()
-    return F.pad(pictures, (SHIFT,) * 4, mode="replicate")[..., top : top + height, left : left + width]
-
-
-def relit(pictures: Tensor) -> Tensor:
-    """(B, 3, H, W), each with its own contrast and brightness."""
-    contrast, brightness = 0.1 * torch.randn(2, len(pictures), 1, 1, 1)
-    return (pictures - 0.5) * (1 + contrast) + 0.5 + brightness
-
-
-def fit(
-    outputs: int, pictures: Pictures, look: Callable[[Tensor], list[Tensor]],
-    loss: Callable[[Tensor, Tensor], Tensor], steps: int, name: str,
-) -> Tensor:  # fmt: skip
-    """Train a probe on what `look` gives of rows, by a loss of outputs and rows. → outputs for the test rows
-
-    The test asks the moving average of the weights.
-    """
-    torch.manual_seed(0)
-    model = Probe(pictures.cameras[0].shape[-1], len(pictures.cameras), outputs).to(memory_format=FASTEST)
-    average = AveragedModel(model, multi_avg_fn=get_ema_multi_avg_fn(AVERAGED))
-    optimizer = torch.optim.AdamW(model.parameters(), 2e-3, weight_decay=1e-2)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 2e-3, steps)
-    dtype = training_dtype("auto", "cpu")
-    for _ in trange(steps, desc=f"Probing {name}", unit="step", leave=False):
-        batch = pictures.train[torch.randint(len(pictures.train), (BATCH,))]
-        with compute_in(dtype, torch.device("cpu")):
-            output = model(look(batch))
-        optimizer.zero_grad()
-        loss(output.float(), batch).backward()
-        optimizer.step()
-        schedule.step()
-        average.update_parameters(model)
-    with torch.no_grad():
-        return torch.cat([average(pictures.rows(part)) for part in pictures.test.split(256)])
-
-
 def probe(cameras: list[str], frames: Frames, steps: int) -> dict[str, Any]:
     """Train on three quarters of the episodes, test on the others. → errors by name"""
-    pictures = Pictures.of(frames, cameras)
+    torch.manual_seed(0)
+    pictures = [torch.from_numpy(frames.images[camera]).permute(0, 3, 1, 2) for camera in cameras]
     targets = np.column_stack([frames.places, 100 * frames.opening])
-    mean, std = targets[pictures.train].mean(0), targets[pictures.train].std(0)
+    train = ~held_out(frames.episode)
+    mean, std = targets[train].mean(0), targets[train].std(0)
     scaled = torch.from_numpy((targets - mean) / std).float()
-    touches = torch.from_numpy(frames.gap < TOUCHING).float()
+    contact = torch.from_numpy(frames.gap < TOUCHING).float()
+    model = Probe(pictures[0].shape[-1], len(cameras), targets.shape[1] + 1)
+    optimizer = torch.optim.AdamW(model.parameters(), 2e-3, weight_decay=1e-2)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 2e-3, steps)
 
-    def place_loss(output: Tensor, rows: Tensor) -> Tensor:
-        return F.smooth_l1_loss(output, scaled[rows], beta=0.1)
+    def read(rows: Tensor) -> Tensor:
+        return model([picture[rows].float() / 255 for picture in pictures])
 
-    def contact_loss(output: Tensor, rows: Tensor) -> Tensor:
-        return F.binary_cross_entropy_with_logits(output[:, 0], touches[rows])
-
-    contact = fit(1, pictures, pictures.augmented, contact_loss, CONTACT_STEPS * steps, "contact")
-    places = fit(targets.shape[1], pictures, pictures.rows, place_loss, steps, "places")
-    error = (places - scaled[pictures.test]).abs().numpy() * std
-    right = ((contact[:, 0] > 0) == (touches[pictures.test] > 0)).numpy()
-    return summary(error, right, frames.gap[pictures.test], frames.episode[pictures.test] % len(TASKS))
+    train_rows, test_rows = (torch.from_numpy(mask.nonzero()[0]) for mask in (train, ~train))
+    for _ in trange(steps, desc="Probing", unit="step", leave=False):
+        batch = train_rows[torch.randint(len(train_rows), (BATCH,))]
+        output = read(batch)
+        loss = F.smooth_l1_loss(output[:, :-1], scaled[batch], beta=0.1)
+        loss = loss + 0.3 * F.binary_cross_entropy_with_logits(output[:, -1], contact[batch])
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+    with torch.no_grad():
+        output = torch.cat([read(part) for part in test_rows.split(256)])
+    error = (output[:, :-1] - scaled[test_rows]).abs().numpy() * std
+    right = ((output[:, -1] > 0) == (contact[test_rows] > 0)).numpy()
+    return summary(error, right, frames.gap[~train], frames.episode[~train] % len(TASKS))
 
 
 def summary(error: np.ndarray, right: np.ndarray, gaps: np.ndarray, task: np.ndarray) -> dict[str, Any]:

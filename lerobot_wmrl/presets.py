@@ -46,6 +46,8 @@ CPU_ACTION_MODEL: Final[Flags] = {
     "model.width": 192,
     "model.patch": 2,
     "model.clip_length": 64,
+    "model.from_start": 0.4,
+    "model.dropout": 0.1,
     "steps": 7000,
     "batch_size": 16,
     "save_freq": 250,

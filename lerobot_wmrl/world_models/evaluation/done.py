@@ -1,9 +1,14 @@
 """How well the done signal is predicted: frame by frame, episode by episode, and how late."""
 
+from typing import Final
+
 import numpy as np
 
 from lerobot_wmrl.statistics import Estimate
 from lerobot_wmrl.world_models.evaluation.gate import Outcomes
+
+SMALLEST: Final = 1e-6
+"""Probability that counts for what was thought impossible and happened."""
 
 
 def precision_recall_f1(called: np.ndarray, real: np.ndarray) -> dict[str, Estimate]:
@@ -23,8 +28,16 @@ def done_delay(outcomes: Outcomes, threshold: float, frames: int) -> np.ndarray:
     return np.where((begin >= 0) & outcomes.success, begin - outcomes.done.argmax(1), np.nan)
 
 
+def done_log_loss(outcomes: Outcomes) -> Estimate:
+    """Mean negative log-likelihood of what happened, in nats a frame, without any threshold."""
+    frames = ~np.isnan(outcomes.probability)
+    likelihood = np.where(outcomes.done, outcomes.probability, 1 - outcomes.probability)
+    losses = np.where(frames, -np.log(np.clip(likelihood, SMALLEST, 1)), 0)
+    return Estimate.ratio(losses.sum(1), frames.sum(1))
+
+
 def done_quality(outcomes: Outcomes, threshold: float, frames: int) -> dict[str, Estimate]:
-    """`done_*` over frames at `threshold`, `episode_*` as the environment ends episodes, and the delay."""
+    """`done_*` over frames at `threshold`, `episode_*` as the environment ends episodes, log loss, delay."""
     fired = outcomes.probability >= threshold
     called = outcomes.called(threshold, frames) >= 0
     per_frame = precision_recall_f1(fired, outcomes.done)
@@ -33,6 +46,7 @@ def done_quality(outcomes: Outcomes, threshold: float, frames: int) -> dict[str,
     return {
         **{f"done_{name}": estimate for name, estimate in per_frame.items()},
         **{f"episode_{name}": estimate for name, estimate in per_episode.items()},
+        "done_log_loss": done_log_loss(outcomes),
         "done_delay_frames": Estimate.mean(delay),
         "done_distance_frames": Estimate.mean(np.abs(delay)),
     }

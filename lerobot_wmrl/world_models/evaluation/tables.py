@@ -30,6 +30,7 @@ NAMES = {
     "done_precision": "done precision, by frame",
     "done_recall": "done recall, by frame",
     "done_f1": "done F1, by frame",
+    "done_log_loss": "done log loss (nats a frame)",
     "episode_precision": "success precision, by episode",
     "episode_recall": "success recall, by episode",
     "episode_f1": "success F1, by episode",

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lerobot_wmrl.world_models.evaluation.done import done_delay, done_quality
+from lerobot_wmrl.world_models.evaluation.done import done_delay, done_log_loss, done_quality
 from lerobot_wmrl.world_models.evaluation.gate import (
     Outcomes,
     best_operating_point,
@@ -88,6 +88,16 @@ def test_done_by_frame_by_episode_and_how_late(outcomes):
     assert quality["episode_recall"] == pytest.approx(2 / 3)
     assert quality["done_delay_frames"] == pytest.approx((0 + 2) / 2)
     assert np.isnan(done_delay(outcomes, 0.5, 3)[2:]).all()
+
+
+def test_done_is_scored_without_a_threshold_too():
+    """What happened was thought likely with 0.8, 0.5 and 1; frames after an episode's end do not count."""
+    probability = np.array([[0.8, 0.5, np.nan], [0.0, np.nan, np.nan]])
+    done = np.array([[True, False, False], [False, False, False]])
+    loss = done_log_loss(Outcomes(np.arange(2), probability, done))
+    assert loss.value == pytest.approx(-(math.log(0.8) + math.log(0.5) + math.log(1)) / 3)
+    surprised = done_log_loss(Outcomes(np.arange(1), np.ones((1, 1)), np.zeros((1, 1), bool)))
+    assert surprised.value == pytest.approx(6 * math.log(10), rel=1e-3)
 
 
 def test_early_and_late_calls_do_not_cancel(outcomes):
