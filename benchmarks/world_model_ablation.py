@@ -49,7 +49,7 @@ VARIANTS: Final[dict[str, Flags]] = {
     "both": {**NONE, "model.depth": True, "model.keypoint_weight": 1.0},
     "self_rollout": {**NONE, "model.self_rollout": 0.4},
     "no_self_forcing": {**NONE, "model.self_forcing": 0.0},
-    "adaln": {**NONE, "model.conditioning": "adaln"},
+    "cross_attention": {**NONE, "model.conditioning": "cross_attention"},
     "additive": {**NONE, "model.conditioning": "additive"},
     "no_state": {**NONE, "model.state_size": 0},
     "maskgit": {**NONE, "model.decoding": "maskgit"},

@@ -102,6 +102,7 @@ LFQ_TOKENIZER: Final[Flags] = {
 PAPER_WORLD_MODEL: Final[Flags] = {
     "model.dynamics": "autoregressive",
     "model.layers": 32,
+    "model.conditioning": "cross_attention",
     "model.width": 256,
     "model.heads": 8,
     "model.patch": 1,

@@ -8,10 +8,9 @@ from lerobot.optim.optimizers import AdamWConfig
 from lerobot.optim.schedulers import LRSchedulerConfig
 
 AUTOREGRESSIVE_ONLY: Final = {
-    "conditioning": "cross_attention", "decoding": "shifted", "depth": False, "self_rollout": 0.0,
-    "keypoint_weight": 0.0,
+    "decoding": "shifted", "depth": False, "self_rollout": 0.0, "keypoint_weight": 0.0,
 }  # fmt: skip
-"""Options that anchored dynamics do not have, and their defaults."""
+"""Options that anchored dynamics do not have, and their defaults; `conditioning` is one more."""
 
 
 @dataclass
@@ -130,8 +129,10 @@ class WorldModelConfig(RewardModelConfig):
 
     def _check_anchored(self) -> None:
         """ValueError if something is asked for that only predictions from the frame before have."""
-        for name, off in AUTOREGRESSIVE_ONLY.items():
-            if (value := getattr(self, name)) != off:
+        allowed: dict[str, tuple[object, ...]] = {name: (off,) for name, off in AUTOREGRESSIVE_ONLY.items()}
+        allowed["conditioning"] = (type(self).conditioning, WorldModelConfig.conditioning)
+        for name, values in allowed.items():
+            if (value := getattr(self, name)) not in values:
                 raise ValueError(
                     f"--model.{name}={value}: anchored dynamics do not have it; leave it out, or choose "
                     "--model.dynamics=autoregressive"
@@ -173,12 +174,13 @@ class ActionWorldModelConfig(WorldModelConfig):
     """Answers a policy: c = a in eq. 1. Its reward is the probability that success holds.
 
     Args:
-        dynamics: as of both models, but `anchored` by default.
+        dynamics, conditioning: as of both models, but `anchored` and `adaln` by default.
         action_size: width of `action`, filled in from the dataset.
         condition_tokens: tokens the action is embedded into for cross-attention.
     """
 
     dynamics: str = "anchored"
+    conditioning: str = "adaln"
     action_size: int = 7
     condition_tokens: int = 4
 
