@@ -38,7 +38,9 @@ class RecordConfig(RunConfig):
     Planned trajectories by default; with --policy.path=… the real rollouts of that policy, or, with
     --env.type=world_model, its imagined ones. The same command again continues an interrupted recording, or
     reports that it is complete.
-    `--preset=tiny` or `--preset=demo` stands for the flags of that size; flags further right override it.
+    `--recipe=FILE` stands for the flags in a YAML file, `--preset=tiny|demo|cpu|gpu|paper` for one of the
+    recipes that come with the package; flags further right override them. `--env.type=wmrl_maniskill --help`
+    lists the simulator's own flags.
     """
 
     path_fields: ClassVar[list[str]] = ["policy"]

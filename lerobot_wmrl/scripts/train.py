@@ -42,7 +42,7 @@ MAY_DIFFER = ("resume", "job_name", "log_freq", "wandb", "gate.action", "dyna.da
 class TrainConfig(CallbackSettings, RunConfig):
     """Improve a policy by reinforcement learning.
 
-    `--preset=tiny` or `--preset=demo` stands for the flags of that size; flags further right override it.
+    `--preset=tiny|demo|cpu` stands for the flags of that size; flags further right override it.
 
     Args:
         policy: `--policy.path=`, a checkpoint of lerobot-train or the folder it was written to.

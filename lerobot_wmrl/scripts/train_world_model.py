@@ -34,7 +34,7 @@ TRAINED = ("frame_tokenizer", "action_world_model", "text_world_model")
 class TrainWorldModelConfig(RunConfig):
     """Train a tokenizer or world model.
 
-    `--preset=tiny` or `--preset=demo` stands for the flags of that size; flags further right override it.
+    `--preset=tiny|demo|cpu|gpu|paper` stands for the flags of that size; flags further right override it.
 
     Args:
         model: `--model.type=frame_tokenizer|action_world_model|text_world_model` and its settings; or

@@ -171,7 +171,7 @@ class WorldModelConfig(RewardModelConfig):
 @RewardModelConfig.register_subclass("action_world_model")
 @dataclass
 class ActionWorldModelConfig(WorldModelConfig):
-    """Answers a policy: c = a in eq. 1. Its reward is the probability that success holds.
+    """Predicts the next frame, the robot's state and success from an action (RoboScape-R, eq. 1 with c = a).
 
     Args:
         dynamics, conditioning: as of both models, but `anchored` and `adaln` by default.
@@ -188,7 +188,7 @@ class ActionWorldModelConfig(WorldModelConfig):
 @RewardModelConfig.register_subclass("text_world_model")
 @dataclass
 class TextWorldModelConfig(WorldModelConfig):
-    """Imagines the golden trajectory of an instruction: c = i in eq. 1. Learns from optimal successes.
+    """Imagines the golden trajectory of an instruction (eq. 1 with c = i). Learns from optimal successes.
 
     Args:
         text_encoder: id or folder of a pretrained T5 (T5, flan-T5, ByT5, mT5, umT5) that reads the
@@ -210,3 +210,7 @@ class TextWorldModelConfig(WorldModelConfig):
             )
         if self.goal_horizon < 1:
             raise ValueError(f"--model.goal_horizon={self.goal_horizon}: must be at least 1 frame")
+
+
+for _kind in (ActionWorldModelConfig, TextWorldModelConfig):  # --help shows a class's own docstring alone
+    _kind.__doc__ = f"{_kind.__doc__}\n    {WorldModelConfig.__doc__}"
