@@ -2,19 +2,22 @@
 
     python benchmarks/world_model.py --world_model=outputs/demo/action_world_model
     python benchmarks/world_model.py --sizes=gpu --no_maniskill
+    python benchmarks/world_model.py --sizes=cpu --model.dynamics=autoregressive --output=autoregressive.json
 
-All in one run. `--sizes` takes a preset's sizes with random weights. At each batch size, measured in turns:
-imagining (with as much remembered as in the long run), imagining and decoding to pictures, imagining in
-float32, imagining without memory (what is remembered computed anew for each frame), and training on clips,
-the optimiser included. The floor of a frame is the larger of two times: its arithmetic at the measured rate
-of matrix products, and its bytes (weights and memory) at the measured rate of memory. ManiSkill, one process,
-steps and renders the same picture, with this package's light robot meshes and with its own. On CUDA a step of
-an autoregressive model is captured in a CUDA graph. Writes docs/results/world_model_speed.json.
+All in one run. `--sizes` takes a preset's sizes with random weights, and flags of the model may follow. At
+each batch size, measured in turns: imagining (with as much remembered as in the long run), imagining and
+decoding to pictures, imagining in float32, imagining without memory (what is remembered computed anew for
+each frame), and training on clips, the optimiser included. The floor of a frame is the larger of two times:
+its arithmetic at the measured rate of matrix products, and its bytes (weights and memory) at the measured
+rate of memory. ManiSkill, one process, steps and renders the same pictures, with this package's light robot
+meshes and with its own. On CUDA a step of an autoregressive model is captured in a CUDA graph. Writes
+docs/results/world_model_speed.json.
 """
 
 import argparse
 import json
 import platform
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +28,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.files import write_json
+from lerobot_wmrl.malloc import keep_freed_memory
 from lerobot_wmrl.precision import imagination_dtype
 from lerobot_wmrl.presets import PRESETS, preset_flags
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig
@@ -85,11 +89,11 @@ def measure_batch(
     }
 
 
-def maniskill_rates(image_size: int) -> dict[str, float]:
+def maniskill_rates(image_size: int, cameras: list[str]) -> dict[str, float]:
     """Rendered steps a second of one ManiSkill process, with light and with ManiSkill's robot meshes."""
     works, open_envs = {}, []
     for name, detail in (("light meshes", WmrlManiSkillEnv().robot_mesh_detail), ("stock meshes", 1.0)):
-        config = WmrlManiSkillEnv(image_size=image_size, robot_mesh_detail=detail)
+        config = WmrlManiSkillEnv(image_size=image_size, cameras=cameras, robot_mesh_detail=detail)
         env = config.create_envs(1)[config.type][0]
         env.reset(seed=[1_000_000])
         simulation, still = env.unwrapped.envs[0].unwrapped, env.single_action_space.sample() * 0
@@ -103,28 +107,32 @@ def maniskill_rates(image_size: int) -> dict[str, float]:
     return {name: round(rate, 1) for name, rate in found.items()}
 
 
-def make_model(given: argparse.Namespace) -> ActionWorldModelRewardModel:
-    """The checkpoint, or random weights of a preset's sizes."""
+def make_model(given: argparse.Namespace, flags: Sequence[str]) -> ActionWorldModelRewardModel:
+    """The checkpoint, or random weights of a preset's sizes, changed by `flags`."""
     device = given.device or ("cuda" if torch.cuda.is_available() else "cpu")
     if given.world_model:
         model: ActionWorldModelRewardModel = load_model(given.world_model, "action_world_model", device)
         return model
     tokenizer, config = (
-        preset_config(given.sizes, kind) for kind in ("frame_tokenizer", "action_world_model")
+        preset_config(given.sizes, kind, flags if kind == "action_world_model" else ())
+        for kind in ("frame_tokenizer", "action_world_model")
     )
     config.device, config.image_size, config.tokenizer_widths = device, tokenizer.image_size, tokenizer.widths
     config.levels, config.quantizer = tokenizer.levels, tokenizer.quantizer
+    config.cameras, config.tokenizer_context = tokenizer.cameras, tokenizer.context
     return ActionWorldModelRewardModel(config).to(device).eval()
 
 
-def preset_config(preset: str, kind: str) -> Any:
-    """The model's configuration that the training command has with `--preset`."""
-    flags = [*preset_flags(preset, "train-world-model", [kind]), f"--model.type={kind}", "--model.device=cpu"]
-    return draccus.parse(TrainWorldModelConfig, args=flags).model
+def preset_config(preset: str, kind: str, flags: Sequence[str]) -> Any:
+    """The model's configuration that the training command has with `--preset` and `flags`."""
+    sizes = preset_flags(preset, "train-world-model", [kind])
+    given = [*sizes, f"--model.type={kind}", "--model.device=cpu", *flags]
+    return draccus.parse(TrainWorldModelConfig, args=given).model
 
 
 def main() -> None:
     """Measure everything, print it, write it."""
+    keep_freed_memory()
     register_third_party_plugins()
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -137,8 +145,10 @@ def main() -> None:
     parser.add_argument("--device", help="cpu or cuda; by default CUDA if there is any")
     parser.add_argument("--no_maniskill", action="store_true", help="leave the simulator out")
     parser.add_argument("--output", type=Path, default=RESULTS / "world_model_speed.json", help="JSON file")
-    given = parser.parse_args()
-    model = make_model(given)
+    given, flags = parser.parse_known_args()
+    if flags and given.world_model:
+        parser.error(f"{' '.join(flags)}: a checkpoint's model is as it was trained; flags need --sizes")
+    model = make_model(given, flags)
     device = model.state_mean.device
     dtype = imagination_dtype(device)
     matmul, stream = matmul_rate(dtype, device), stream_rate(device)
@@ -150,7 +160,7 @@ def main() -> None:
         "image_size": config.image_size,
         "network": {
             name: getattr(config, name)
-            for name in ("dynamics", "layers", "width", "heads", "patch", "window", "clip_length")
+            for name in ("dynamics", "layers", "width", "heads", "patch", "window", "clip_length", "cameras")
         },
         "transformer_tokens": model.network.transformer_tokens,
         "matmul_gflop_per_s": round(matmul / 1e9, 1),
@@ -158,14 +168,14 @@ def main() -> None:
         "by_batch": [measure_batch(model, batch, matmul, stream) for batch in given.batches],
     }
     if not given.no_maniskill:
-        figures["maniskill_frames_per_s"] = maniskill_rates(config.image_size)
+        simulated = figures["maniskill_frames_per_s"] = maniskill_rates(config.image_size, config.cameras)
         figures["times_faster_than_maniskill"] = {
-            str(row["batch"]): round(
-                row["frames_per_s"]["imagined_and_decoded"]
-                / figures["maniskill_frames_per_s"]["light meshes"], 2,
-            )
-            for row in figures["by_batch"]
-        }  # fmt: skip
+            meshes: {
+                str(row["batch"]): round(row["frames_per_s"]["imagined_and_decoded"] / rate, 2)
+                for row in figures["by_batch"]
+            }
+            for meshes, rate in simulated.items()
+        }
     print(json.dumps(figures, indent=2))
     write_json(given.output, figures)
 

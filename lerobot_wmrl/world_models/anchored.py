@@ -101,7 +101,7 @@ class AnchoredNetwork(FrameNetwork):
                     f"the context of {len(context)} first frames for {len(digits)} imaginations: this world "
                     "model needs one each; give what its tokenizer's `context` returns"
                 )
-            x = torch.cat([x[:, :, :1], x[:, :, 1:] + self.context(context.scales[0])[:, None]], 2)
+            x = torch.cat([x[:, :, :1], x[:, :, 1:] + self.context(context.features)[:, None]], 2)
         nothing = ConditionTokens(x[:, :, :1], None, x[:, :, 0])
         for block in self.scene:
             x = block(x, nothing)

@@ -16,36 +16,46 @@ from torch.nn import functional as F
 
 @dataclass(frozen=True)
 class Context:
-    """Features of B first frames, a map (B, N, C, h, w) a scale, coarse to fine; without the option none."""
+    """Of B first frames, maps (B, N, C, h, w); without the option none.
 
-    scales: tuple[Tensor, ...] = ()
+    The first map are their features at the coarsest scale. The others are what each fusion of the tokenizer
+    adds to its features, which is the same for every frame of an episode: the encoder's, then the decoder's
+    from coarse to fine. Who only asks the dynamics can leave these out.
+    """
+
+    maps: tuple[Tensor, ...] = ()
 
     def __getitem__(self, rows: Any) -> "Context":
         """The context of some of the B frames: an index, mask or slice of the first dimension."""
-        return Context(tuple(scale[rows] for scale in self.scales))
+        return Context(tuple(each[rows] for each in self.maps))
 
     def __len__(self) -> int:
-        return len(self.scales[0]) if self.scales else 0
+        return len(self.maps[0]) if self.maps else 0
+
+    @property
+    def features(self) -> Tensor:
+        """(B, N, C, h, w)."""
+        return self.maps[0]
 
     def replaced(self, mask: Tensor, new: "Context") -> "Context":
         """The rows of `new` where `mask` (B,) is True, else one's own."""
         return Context(
             tuple(
                 torch.where(mask[:, None, None, None, None], b, a)
-                for a, b in zip(self.scales, new.scales, strict=True)
+                for a, b in zip(self.maps, new.maps, strict=True)
             )
         )
 
-    def flat(self) -> list[Tensor]:
-        """[(B·N, C, h, w), …], cameras as rows of the batch."""
-        return [scale.flatten(0, 1) for scale in self.scales]
+    def offers(self) -> list[Tensor]:
+        """What the fusions add, [(B·N, C, h, w), …], cameras as rows of the batch."""
+        return [each.flatten(0, 1) for each in self.maps[1:]]
 
 
 NO_CONTEXT: Final = Context()
 
 
 class ContextEncoder(nn.Module):
-    """First frames to features at every scale of the decoder."""
+    """First frames (F, 3, H, W) in [−1, 1] to features [(F, C, h, w), …], coarse to fine."""
 
     def __init__(self, widths: Sequence[int], patch: int) -> None:
         super().__init__()
@@ -53,20 +63,28 @@ class ContextEncoder(nn.Module):
         self.stem = nn.Conv2d(3 * patch**2, widths[0], 3, padding=1)
         self.downs = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in itertools.pairwise(widths))
 
-    def forward(self, images: Tensor) -> Context:
-        """Images (B, N, 3, H, W) in [0, 1] → their context."""
-        scales = [self.stem(F.pixel_unshuffle(images.flatten(0, 1) * 2 - 1, self.patch))]
+    def forward(self, images: Tensor) -> list[Tensor]:
+        scales = [self.stem(F.pixel_unshuffle(images, self.patch))]
         for down in self.downs:
             scales.append(down(F.silu(scales[-1])))
-        return Context(tuple(scale.unflatten(0, images.shape[:2]) for scale in reversed(scales)))
+        return scales[::-1]
 
 
 class Fusion(nn.Module):
-    """Adds to features (F, C, h, w) what a 1x1 convolution makes of them and the context's (F, C, h, w)."""
+    """Adds to features what a 1x1 convolution makes of them and the context's, all (F, C, h, w).
+
+    The convolution of both side by side is the sum of one of each: the context's is computed once an episode.
+    """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.mix = nn.Conv2d(2 * channels, channels, 1)
 
-    def forward(self, x: Tensor, context: Tensor) -> Tensor:
-        return x + self.mix(F.silu(torch.cat([x, context], 1)))
+    def offer(self, context: Tensor) -> Tensor:
+        """What is added on behalf of the context."""
+        return F.conv2d(F.silu(context), self.mix.weight[:, context.shape[1] :], self.mix.bias)
+
+    def forward(self, x: Tensor, offered: Tensor) -> Tensor:
+        """`offered` is what `offer` returned."""
+        mixed = F.conv2d(F.silu(x), self.mix.weight[:, : x.shape[1]])
+        return x + mixed + offered.to(mixed.dtype)

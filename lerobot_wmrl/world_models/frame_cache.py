@@ -81,7 +81,7 @@ def cached_context(
     def features(rows: np.ndarray) -> np.ndarray:
         with torch.no_grad():
             context = tokenizer.context(frames_to_tensor(frames[rows]).to(device))
-        return context.scales[0].cpu().numpy()
+        return context.features.cpu().numpy()
 
     def fill(target: np.ndarray) -> None:
         for begin in range(0, len(starts), ENCODE_BATCH):

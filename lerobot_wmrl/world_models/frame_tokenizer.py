@@ -81,20 +81,24 @@ class FrameTokenizer(nn.Module):
     def context(self, images: Tensor) -> Context:
         """First frames (B, N, 3, H, W) in [0, 1] → their context, empty without the option."""
         self._check_images(images)
-        return NO_CONTEXT if self.context_encoder is None else self.context_encoder(images)
+        if self.context_encoder is None:
+            return NO_CONTEXT
+        scales = self.context_encoder(images.flatten(0, 1) * 2 - 1)
+        maps = (scales[0], *self.encoder.offers(scales), *self.decoder.offers(scales))
+        return Context(tuple(each.unflatten(0, images.shape[:2]) for each in maps))
 
     def encode(self, images: Tensor, context: Context = NO_CONTEXT) -> Tensor:
         """Images (B, N, 3, H, W) in [0, 1] → tokens (B, S) int64. ValueError for other cameras or sizes."""
         self._check_images(images)
         self._check_context(context, len(images))
-        vectors = self.encoder(images.flatten(0, 1) * 2 - 1, context.flat())
+        vectors = self.encoder(images.flatten(0, 1) * 2 - 1, context.offers()[:1])
         return self.quantizer(vectors).tokens.reshape(len(images), -1)
 
     def decode_with_features(self, tokens: Tensor, context: Context = NO_CONTEXT) -> Decoded:
         """Tokens (B, S) → images and the whitened feature maps from which similarity is measured."""
         self._check_context(context, len(tokens))
         codes = self.quantizer.codes(tokens.reshape(-1, self.grid, self.grid))
-        pixels, features = self.decoder(codes, context.flat())
+        pixels, features = self.decoder(codes, context.offers()[1:])
         images = ((pixels + 1) / 2).clamp(0, 1).unflatten(0, (len(tokens), self.num_cameras))
         return Decoded(images, self._whitened(features))
 
@@ -136,9 +140,9 @@ class FrameTokenizer(nn.Module):
         """
         self._check_images(images)
         self._check_context(context, len(images))
-        flat, seen = images.flatten(0, 1) * 2 - 1, context.flat()
-        quantized = self.quantizer(self.encoder(flat, seen))
-        pixels, features = self.decoder(quantized.codes, seen)
+        flat, offers = images.flatten(0, 1) * 2 - 1, context.offers()
+        quantized = self.quantizer(self.encoder(flat, offers[:1]))
+        pixels, features = self.decoder(quantized.codes, offers[1:])
         if self.training:
             self._whitened([feature.detach() for feature in features])
         error = pixels - flat

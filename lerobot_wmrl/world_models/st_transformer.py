@@ -34,7 +34,7 @@ def unchanged(layer: int, x: Tensor) -> Tensor:
 def make_mlp(width: int) -> nn.Sequential:
     """Pre-norm and the MLP of a block."""
     return nn.Sequential(
-        nn.LayerNorm(width), nn.Linear(width, 4 * width), nn.GELU("tanh"), nn.Linear(4 * width, width)
+        nn.LayerNorm(width), nn.Linear(width, 4 * width), nn.GELU(), nn.Linear(4 * width, width)
     )
 
 

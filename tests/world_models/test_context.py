@@ -11,7 +11,7 @@ from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelE
 from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
-from lerobot_wmrl.world_models.context import NO_CONTEXT
+from lerobot_wmrl.world_models.context import NO_CONTEXT, Fusion
 from lerobot_wmrl.world_models.episode_table import read_episodes
 from lerobot_wmrl.world_models.evaluation.pictures import side_by_side, to_uint8
 from lerobot_wmrl.world_models.evaluation.replay import Source, replay_episodes
@@ -55,6 +55,14 @@ def scenes() -> tuple[torch.Tensor, torch.Tensor]:
         row, column = 8 * (index // 4), 8 * (index % 4)
         frames[index, :, :, row : row + 8, column : column + 8] = 1.0
     return start, frames
+
+
+@torch.no_grad()
+def test_a_fusion_convolves_features_and_context_side_by_side() -> None:
+    """What it computes beforehand on behalf of the context changes nothing of that."""
+    fusion, (x, context) = Fusion(8), torch.randn(2, 3, 8, 4, 4, generator=torch.Generator().manual_seed(0))
+    expected = x + fusion.mix(torch.nn.functional.silu(torch.cat([x, context], 1)))
+    torch.testing.assert_close(fusion(x, fusion.offer(context)), expected)
 
 
 @torch.no_grad()
@@ -125,8 +133,8 @@ def test_clips_carry_what_the_tokenizer_sees_in_their_episodes_first_frame(
     model = load_model(models["action_world_model"], "action_world_model")
     sampler = make_sampler(model, table, None, batch_size=4, seed=0)
     clip = sampler.clips(np.array([2, 0]), np.array([3, 0]))
-    expected = model.tokenizer.context(frames_to_tensor(frames[table.start[[2, 0]]])).scales[0]
-    torch.testing.assert_close(clip.context.scales[0], expected)
+    expected = model.tokenizer.context(frames_to_tensor(frames[table.start[[2, 0]]])).features
+    torch.testing.assert_close(clip.context.features, expected)
     assert torch.equal(clip.done_known, clip.valid)
     model.config.tokenizer_context = False
     plain = make_sampler(model, table, None, batch_size=4, seed=0)
