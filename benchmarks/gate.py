@@ -19,7 +19,7 @@ from typing import Any
 
 from lerobot.utils.import_utils import register_third_party_plugins
 
-from lerobot_wmrl.demo.pipeline import run_stages
+from lerobot_wmrl.demo.pipeline import claimed, run_stages
 from lerobot_wmrl.demo.stages import Stage, checkpoint
 from lerobot_wmrl.presets import DEMO_SCENES, Flags, format_flags, preset_flags
 
@@ -195,7 +195,12 @@ def main() -> None:
     depth = given.depth == "true"
     scenes: Flags = {"env.scenes": given.scenes}
     experiment = Experiment(given.output_dir, given.episodes, depth, model_flags, scenes)
-    run_stages(experiment.stages(), given.output_dir)
+    settings = {**vars(given), "output_dir": str(given.output_dir), "model flags": model_flags}
+    try:
+        with claimed(given.output_dir, settings):
+            run_stages(experiment.stages(), given.output_dir)
+    except ValueError as error:
+        parser.error(str(error))
 
 
 if __name__ == "__main__":

@@ -3,17 +3,16 @@
 import fcntl
 import json
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from lerobot_wmrl.demo.process import preload, run_measured
-from lerobot_wmrl.demo.stages import DemoConfig, Stage
+from lerobot_wmrl.demo.stages import Stage
 from lerobot_wmrl.files import foreign_files, write_json
 
-MARKER = "demo.json"
+MARKER = "settings.json"
 
 
 class StageError(RuntimeError):
@@ -21,32 +20,34 @@ class StageError(RuntimeError):
 
 
 @contextmanager
-def claimed(config: DemoConfig) -> Iterator[None]:
-    """Hold the output folder: it must be new, empty, or made by this very demo, and in nobody else's use."""
-    marker = config.output_dir / MARKER
-    settings = {**asdict(config), "output_dir": str(config.output_dir)}
+def claimed(output_dir: Path, settings: Mapping[str, Any]) -> Iterator[None]:
+    """Hold a folder for stages that are made from `settings` (name → text or number).
+
+    ValueError unless it is new, empty, or was claimed with these very settings, and is in nobody else's use.
+    """
+    marker = output_dir / MARKER
     if marker.exists():
-        check_settings(json.loads(marker.read_text()), settings)
-    elif foreign_files(config.output_dir, MARKER):
+        check_settings(output_dir, json.loads(marker.read_text()), settings)
+    elif foreign_files(output_dir, MARKER):
         raise ValueError(
-            f"--output_dir={config.output_dir}: holds something that is not a demo; choose another folder"
+            f"--output_dir={output_dir}: holds what this command did not make; choose another folder"
         )
     else:
-        write_json(marker, settings)
+        write_json(marker, dict(settings))
     with marker.open() as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise ValueError(f"--output_dir={config.output_dir}: another demo is running there") from None
+            raise ValueError(f"--output_dir={output_dir}: another run of this command is there") from None
         yield
 
 
-def check_settings(found: dict[str, Any], wanted: dict[str, Any]) -> None:
-    """ValueError unless the demo goes on as it began, also under the same path: its commands contain it."""
+def check_settings(output_dir: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+    """ValueError names a setting that is not what the folder was begun with."""
     for name, value in wanted.items():
         if found.get(name) != value:
             raise ValueError(
-                f"--{name}={value}: {wanted['output_dir']} was started with {found.get(name)}; "
+                f"--{name}={value}: {output_dir} was started with {found.get(name)}; "
                 "give that value to continue, or another --output_dir"
             )
 

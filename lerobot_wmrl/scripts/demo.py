@@ -7,6 +7,7 @@ Running the same command again continues after the last finished piece of work.
 
 import signal
 import sys
+from dataclasses import asdict
 from typing import NoReturn
 
 import draccus
@@ -21,7 +22,7 @@ def run_demo(cfg: DemoConfig) -> None:
     """Every stage, then the report."""
     cfg.check()
     stages = demo_stages(cfg)
-    with claimed(cfg):
+    with claimed(cfg.output_dir, {**asdict(cfg), "output_dir": str(cfg.output_dir)}):
         run_stages(stages, cfg.output_dir)
         from lerobot_wmrl.report.build import write_report
 

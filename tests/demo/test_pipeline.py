@@ -100,27 +100,23 @@ def wait_until(condition: Callable[[], bool], seconds: float = 20.0) -> None:
 
 def test_a_foreign_folder_is_refused_and_left_alone(tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").write_text("mine")
-    with pytest.raises(ValueError, match="holds something that is not a demo"), claimed(DemoConfig(tmp_path)):
+    with pytest.raises(ValueError, match="holds what this command did not make"), claimed(tmp_path, {}):
         pass
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
 
 
 def test_other_settings_are_refused_by_name(tmp_path: Path) -> None:
-    with claimed(DemoConfig(tmp_path, seed=1)):
+    with claimed(tmp_path, {"seed": 1}):
         pass
     with (
         pytest.raises(ValueError, match=r"--seed=2: .* was started with 1"),
-        claimed(DemoConfig(tmp_path, seed=2)),
+        claimed(tmp_path, {"seed": 2}),
     ):
         pass
 
 
-def test_two_demos_do_not_share_a_folder(tmp_path: Path) -> None:
-    with (
-        claimed(DemoConfig(tmp_path)),
-        pytest.raises(ValueError, match="another demo is running"),
-        claimed(DemoConfig(tmp_path)),
-    ):
+def test_two_runs_do_not_share_a_folder(tmp_path: Path) -> None:
+    with claimed(tmp_path, {}), pytest.raises(ValueError, match="another run"), claimed(tmp_path, {}):
         pass
 
 
