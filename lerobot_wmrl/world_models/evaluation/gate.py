@@ -102,12 +102,14 @@ class Outcomes:
 @dataclass(frozen=True)
 class Gate:
     """False successes among the failures, and successes that were recognised, at one operating point; and
-    how well the two are told apart at any threshold, `Outcomes.auc`."""
+    how well the two are told apart at any threshold, `Outcomes.auc`. Successes cut short were recorded for
+    fewer than `frames` frames: nobody can recognise them here."""
 
     threshold: float
     frames: int
     false_success: Proportion
     recognised: Proportion
+    cut_short: int
     auc: float
 
     @property
@@ -121,6 +123,7 @@ class Gate:
             "done_frames": self.frames,
             "false_success_rate": self.false_success.as_json(),
             "recognised_rate": self.recognised.as_json(),
+            "successes_cut_short": self.cut_short,
             "auc": None if math.isnan(self.auc) else self.auc,
             "passed": self.passed,
         }
@@ -172,6 +175,7 @@ def gate_at(outcomes: Outcomes, threshold: float, frames: int) -> Gate:
         frames,
         Proportion(int((called & ~real).sum()), int((~real).sum())),
         Proportion(int((called & real).sum()), int(real.sum())),
+        int((real & (first_run(outcomes.done, frames) < 0)).sum()),
         outcomes.auc(frames),
     )
 

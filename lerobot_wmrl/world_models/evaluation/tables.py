@@ -60,6 +60,11 @@ def gate_lines(gate: Gate, best: Gate | None) -> str:
         f"Failures called successes: {gate.false_success}. Successes recognised: {gate.recognised}.",
         f"AUC of successes against failures, whatever the threshold: {gate.auc:.2f} (0.5 by chance).",
     ]
+    if gate.cut_short:
+        lines.append(
+            f"{gate.cut_short} of the successes were recorded for fewer than {gate.frames} frames of success "
+            "and cannot be recognised; lower --done_frames, or record on after success."
+        )
     if best is None:
         lines.append("No operating point keeps false successes at 5 % or less and recognises anything.")
     else:

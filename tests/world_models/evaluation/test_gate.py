@@ -18,6 +18,7 @@ from lerobot_wmrl.world_models.evaluation.gate import (
     success_agreement,
     sweep,
 )
+from lerobot_wmrl.world_models.evaluation.tables import gate_lines
 
 
 @pytest.fixture
@@ -51,6 +52,15 @@ def test_the_gate_counts_as_the_environment_ends_episodes(outcomes, threshold, f
     assert (gate.false_success.k, gate.false_success.n) == (false, 2)
     assert (gate.recognised.k, gate.recognised.n) == (recognised, 3)
     assert not gate.passed
+
+
+def test_successes_that_end_too_early_for_anyone_are_counted(outcomes):
+    """The third success holds for the last two of its four frames."""
+    assert [gate_at(outcomes, 0.5, frames).cut_short for frames in (1, 2, 3, 4)] == [0, 0, 1, 1]
+    assert "1 of the successes were recorded for fewer than 3 frames" in gate_lines(
+        gate_at(outcomes, 0.5, 3), None
+    )
+    assert "recorded for fewer" not in gate_lines(gate_at(outcomes, 0.5, 2), None)
 
 
 def test_auc_is_the_share_of_pairs_in_the_right_order(outcomes):
