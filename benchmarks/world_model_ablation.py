@@ -39,7 +39,10 @@ from lerobot_wmrl.world_models.frame_cache import cached_frames
 
 RESULTS: Final = Path(__file__).parents[1] / "docs" / "results" / "world_model_ablation.json"
 
-NONE: Final[Flags] = {"model.dynamics": "autoregressive", "batch_size": 2}
+NONE: Final[Flags] = {
+    "model.dynamics": "autoregressive", "model.width": 128, "model.clip_length": 40, "model.from_start": 0.75,
+    "batch_size": 2,
+}  # fmt: skip
 """RoboScape's network without its options. Sixteen clips a step would take it eight times as long."""
 
 VARIANTS: Final[dict[str, Flags]] = {

@@ -45,8 +45,8 @@ class DemoConfig:
     output_dir: Path = Path("outputs/demo")
     seed: int = 0
     stage_preset: str = "demo"
-    sft_episodes: int = 12
-    explore_episodes: int = 240
+    sft_episodes: int = 8
+    explore_episodes: int = 300
     eval_episodes: int = 100
     rollout_episodes: int = 60  # real episodes of each policy that are replayed in the world model
 
