@@ -45,7 +45,7 @@ PROCESSES: Final = 2
 """Simulators at once, for PPO in ManiSkill."""
 
 NEARNESS: Final[Flags] = {"algorithm.reference_coefficient": 0.1, "env.dataset.max_starts": 256}
-"""Of all that docs/ says of this experiment; a weaker penalty and more starts gain more (rl_comparison.py)."""
+"""As docs/ has this experiment; rl_comparison.py gains more with a weaker penalty and more starts."""
 
 DOMAINS: Final[dict[str, Flags]] = {"ind": SCENES, "ood": UNSEEN_SCENES}
 SHOWN: Final = {"unseen": "new policy"}
