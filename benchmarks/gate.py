@@ -63,8 +63,8 @@ class Experiment:
 
     Args:
         out: folder of all of it.
-        episodes: planned ones; in each manner a tenth as many of the policy that is asked about, a sixteenth
-            of the others.
+        episodes: planned ones; in each manner a tenth as many of the policy that is asked about.
+        attempts: of each other policy in each manner; by default a sixteenth of `episodes`.
         depth: whether it is recorded too.
         model_flags: further flags of the action world model's training.
         scenes: those that the model learns.
@@ -72,10 +72,11 @@ class Experiment:
 
     def __init__(
         self, out: Path, episodes: int = EPISODES, depth: bool = False, model_flags: Sequence[str] = (),
-        scenes: Flags = SCENES,
+        scenes: Flags = SCENES, attempts: int | None = None,
     ) -> None:  # fmt: skip
         self.out, self.episodes, self.depth, self.model_flags = out, episodes, depth, model_flags
         self.scenes = scenes
+        self.attempts = {"learnt": attempts or max(2, episodes // 16), "asked": max(2, episodes // 10)}
 
     def stages(self) -> list[Stage]:
         """In order."""
@@ -91,8 +92,9 @@ class Experiment:
             role, name = "asked" if policy == "unseen" else "learnt", f"{manner}_{policy}"
             first = FIRST_SEEDS[role] + SEEDS_EACH * len(attempts[role])
             attempts[role].append(name)
-            stages.append(self._stage(name, self.roll_out, name, policy, exploration, first))
-        unseen_scenes = ("rollouts_ood", "unseen", 0.0, OOD_SEED, UNSEEN_SCENES)
+            rolled_out = (name, policy, self.attempts[role], exploration, first)
+            stages.append(self._stage(name, self.roll_out, *rolled_out))
+        unseen_scenes = ("rollouts_ood", "unseen", self.attempts["asked"], 0.0, OOD_SEED, UNSEEN_SCENES)
         return [
             *stages,
             self._stage("rollouts_ood", self.roll_out, *unseen_scenes),
@@ -134,12 +136,12 @@ class Experiment:
         return ["lerobot-train", *preset_flags("demo", "sft"), *format_flags(flags)]
 
     def roll_out(
-        self, name: str, policy: str, exploration: float, seed: int, scenes: Flags | None = None
-    ) -> list[str]:
-        share = 10 if policy == "unseen" else 16
+        self, name: str, policy: str, attempts: int, exploration: float, seed: int,
+        scenes: Flags | None = None,
+    ) -> list[str]:  # fmt: skip
         flags: Flags = {
             "policy.path": str(checkpoint(self.out / f"policy_{policy}")), "exploration": exploration,
-            "num_episodes": max(2, self.episodes // share), "seed": seed, "output_dir": self.path(name),
+            "num_episodes": attempts, "seed": seed, "output_dir": self.path(name),
             "depth": self.depth,
         }  # fmt: skip
         return ["lerobot-wmrl-record", *format_flags({**self.simulator(CAMERAS, scenes), **flags})]
@@ -188,13 +190,18 @@ def main() -> None:
     parser.add_argument("--output_dir", type=Path, default=Path("outputs/gate"))
     parser.add_argument("--episodes", type=int, default=EPISODES, help="planned episodes")
     parser.add_argument(
+        "--attempts",
+        type=int,
+        help="of each policy that is learnt from, calm and disturbed; by default a sixteenth of that",
+    )
+    parser.add_argument(
         "--depth", default="false", choices=("true", "false"), help="record it, for world_model_ablation.py"
     )
     parser.add_argument("--scenes", default=DEMO_SCENES, help="indices of scenes, as in [0,1,2]")
     given, model_flags = parser.parse_known_args()
     depth = given.depth == "true"
     scenes: Flags = {"env.scenes": given.scenes}
-    experiment = Experiment(given.output_dir, given.episodes, depth, model_flags, scenes)
+    experiment = Experiment(given.output_dir, given.episodes, depth, model_flags, scenes, given.attempts)
     settings = {**vars(given), "output_dir": str(given.output_dir), "model flags": model_flags}
     try:
         with claimed(given.output_dir, settings):
