@@ -49,7 +49,7 @@ ROLL_OUT = ["--policy.path={policy}", *SIMULATOR, "--num_episodes=1"]
     (convert_openvla, ["--direction=export", "--source={policy}", NEW], "of type cnn"),
     (demo, ["--preset=huge"], "--preset=huge: unknown preset"),
     (demo, ["--stage_preset=huge"], "--preset=huge: unknown preset"),
-    (demo, ["--output_dir={foreign}"], "holds something that is not a demo"),
+    (demo, ["--output_dir={foreign}"], "holds what this command did not make"),
     (demo, ["--sead=1"], "--sead"),
 ])  # fmt: skip
 def test_bad_input_is_one_line_and_changes_nothing(
