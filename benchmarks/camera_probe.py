@@ -21,7 +21,7 @@ from torch.nn import functional as F
 from tqdm import tqdm, trange
 
 from camera_frames import CANDIDATES, Frames, frames_of
-from lerobot_wmrl.files import write_json
+from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.maniskill.tasks import TASKS
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"

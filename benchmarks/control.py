@@ -24,8 +24,8 @@ from gymnasium.vector import AutoresetMode
 from torch import Tensor, nn
 from torch.distributions import Categorical, Distribution, Normal
 
-from lerobot_wmrl.constants import EVALUATION_SEED
-from lerobot_wmrl.files import write_json
+from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 from lerobot_wmrl.rl.configuration_policy_gradient import PolicyGradientConfig
 from lerobot_wmrl.rl.configuration_ppo import PPOConfig

@@ -13,9 +13,9 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from lerobot_wmrl.files import write_json
-from lerobot_wmrl.report.figures import IMAGINED, REAL, tidy
-from lerobot_wmrl.report.runs import Summary, mean_change, rate, run_rows
+from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.demo.report.figures import IMAGINED, REAL, tidy
+from lerobot_wmrl.demo.report.runs import Summary, mean_change, rate, run_rows
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
 

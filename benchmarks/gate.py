@@ -3,7 +3,7 @@
     python benchmarks/gate.py --output_dir=outputs/gate
 
 One task (push), by default in the demo's three scenes. Planners and three cloned policies, as they are and
-disturbed, give the data; a fourth policy, too, is rolled out in ManiSkill, in these scenes and in those held
+noisy, give the data; a fourth policy, too, is rolled out in ManiSkill, in these scenes and in those held
 out from all training, and replayed in the world model. Every stage is one of the package's commands; the same
 call again continues. Two to three hours on two cores, by estimate; the results are metrics.json in
 outputs/gate/check and outputs/gate/check_ood. Flags of the action world model's training may follow.
@@ -19,9 +19,9 @@ from typing import Any
 
 from lerobot.utils.import_utils import register_third_party_plugins
 
+from lerobot_wmrl.common.presets import DEMO_SCENES, Flags, format_flags, preset_flags
 from lerobot_wmrl.demo.pipeline import claimed, run_stages
 from lerobot_wmrl.demo.stages import Stage, checkpoint
-from lerobot_wmrl.presets import DEMO_SCENES, Flags, format_flags, preset_flags
 
 SCENES: Flags = {"env.scenes": DEMO_SCENES}
 UNSEEN_SCENES: Flags = {"env.split": "ood"}
@@ -29,7 +29,7 @@ UNSEEN_SCENES: Flags = {"env.split": "ood"}
 CAMERAS = "[third_view,side_view]"
 """Both stand still: what moves in them is what happens."""
 
-KINDS = "{optimal: 0.22, waypoint: 0.06, interpolated: 0.08, disturbed: 0.16, near_miss: 0.48}"
+KINDS = "{optimal: 0.22, waypoint: 0.06, interpolated: 0.08, noisy: 0.16, near_miss: 0.48}"
 IMAGE_SIZE = 64
 
 LONGEST_PUSH = 44
@@ -54,8 +54,8 @@ FIRST_SEEDS = {"learnt": 50_000, "asked": 1_200_000}
 SEEDS_EACH = 10_000
 OOD_SEED = 1_300_000
 
-MANNERS = {"calm": 0.0, "disturbed": 0.4}
-"""How a policy acts: exploration. One that is only ever seen disturbed is believed when it fails calmly."""
+MANNERS = {"calm": 0.0, "noisy": 0.4}
+"""How a policy acts: exploration. One that is only ever seen noisy is believed when it fails calmly."""
 
 
 class Experiment:
@@ -192,7 +192,7 @@ def main() -> None:
     parser.add_argument(
         "--attempts",
         type=int,
-        help="of each policy that is learnt from, calm and disturbed; by default a sixteenth of that",
+        help="of each policy that is learnt from, calm and noisy; by default a sixteenth of that",
     )
     parser.add_argument(
         "--depth", default="false", choices=("true", "false"), help="record it, for world_model_ablation.py"

@@ -19,16 +19,16 @@ import numpy as np
 from lerobot.utils.import_utils import register_third_party_plugins
 from tqdm import tqdm
 
-from lerobot_wmrl.constants import TASKS
-from lerobot_wmrl.episodes import recorded_episodes
-from lerobot_wmrl.files import write_json
+from lerobot_wmrl.common.constants import TASKS
+from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.common.statistics import Proportion
+from lerobot_wmrl.data.episode_table import EpisodeTable, open_dataset, read_episodes
+from lerobot_wmrl.data.recorded_episodes import recorded_episodes
+from lerobot_wmrl.evaluation.tables import markdown_table
 from lerobot_wmrl.maniskill.rendering import Rendering
 from lerobot_wmrl.maniskill.scenes import SCENES
 from lerobot_wmrl.maniskill.simulation import Simulation
 from lerobot_wmrl.maniskill.tasks import task_of
-from lerobot_wmrl.statistics import Proportion
-from lerobot_wmrl.world_models.episode_table import EpisodeTable, open_dataset, read_episodes
-from lerobot_wmrl.world_models.evaluation.tables import markdown_table
 
 RESULTS: Final = Path(__file__).parents[1] / "docs" / "results" / "gate_sensitivity.json"
 ERRORS_MM: Final = (0.0, 0.5, 1.0, 2.0, 3.0, 5.0)

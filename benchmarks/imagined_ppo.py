@@ -22,16 +22,16 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from matplotlib.figure import Figure
 
 from gate import IMAGE_SIZE, SCENES, UNSEEN_SCENES
-from lerobot_wmrl.constants import EVALUATION_SEED
+from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.common.presets import Flags, format_flags, preset_flags
+from lerobot_wmrl.common.statistics import MeanChange, PairedChange, Proportion
+from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.demo.pipeline import run_stages
+from lerobot_wmrl.demo.report.figures import COLOURS, tidy
+from lerobot_wmrl.demo.report.sources import outcomes
 from lerobot_wmrl.demo.stages import Stage, checkpoint
-from lerobot_wmrl.files import write_json
-from lerobot_wmrl.presets import Flags, format_flags, preset_flags
-from lerobot_wmrl.report.figures import COLOURS, tidy
-from lerobot_wmrl.report.sources import outcomes
-from lerobot_wmrl.statistics import MeanChange, PairedChange, Proportion
-from lerobot_wmrl.tracking import read_metrics
-from lerobot_wmrl.world_models.evaluation.tables import markdown_table
+from lerobot_wmrl.evaluation.tables import markdown_table
 
 RESULTS: Final = Path(__file__).parents[1] / "docs" / "results" / "imagined_ppo.json"
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from tqdm import trange
 
 from lerobot_dataset_maniskill.integrity import whole_dataset
-from lerobot_wmrl.episodes import recorded_episodes
+from lerobot_wmrl.data.recorded_episodes import recorded_episodes
 
 
 def main() -> None:

@@ -16,9 +16,9 @@ from typing import Any, Final
 
 from matplotlib.figure import Figure
 
-from lerobot_wmrl.presets import PRESETS, Flags
-from lerobot_wmrl.report.figures import COLOURS, tidy
-from lerobot_wmrl.world_models.episode_table import open_dataset
+from lerobot_wmrl.common.presets import PRESETS, Flags
+from lerobot_wmrl.data.episode_table import open_dataset
+from lerobot_wmrl.demo.report.figures import COLOURS, tidy
 from world_model_ablation import add_arguments, compare, results_table
 
 RESULTS: Final = Path(__file__).parents[1] / "docs" / "results" / "learning_curve.json"

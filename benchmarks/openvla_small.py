@@ -23,12 +23,12 @@ from lerobot.utils.import_utils import register_third_party_plugins
 import imagined_ppo
 from gate import SCENES
 from imagined_ppo import DOMAINS, HORIZON, draw, results_table
-from lerobot_wmrl.checkpoints import LAST_CHECKPOINT
+from lerobot_wmrl.common.checkpoints import LAST_CHECKPOINT
+from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.common.presets import Flags, format_flags, preset_flags
 from lerobot_wmrl.demo.episodes import optimal_episodes
 from lerobot_wmrl.demo.pipeline import run_stages
 from lerobot_wmrl.demo.stages import Stage, checkpoint, lerobot_train
-from lerobot_wmrl.files import write_json
-from lerobot_wmrl.presets import Flags, format_flags, preset_flags
 
 RESULTS: Final = Path(__file__).parents[1] / "docs" / "results" / "openvla_small.json"
 POLICY: Final = "openvla"

@@ -19,12 +19,12 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from lerobot_dataset_maniskill.planners import MOTIONS, TASK_KINDS, Motion, follow_plan
-from lerobot_wmrl.files import write_json
+from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.maniskill.rendering import Rendering
 from lerobot_wmrl.maniskill.scenes import SCENES
 from lerobot_wmrl.maniskill.simulation import Simulation
 from lerobot_wmrl.maniskill.tasks import TASKS
-from lerobot_wmrl.statistics import Proportion
 
 DOCS = Path(__file__).parents[1] / "docs"
 FIRST_SEED = 2_000_000

@@ -29,8 +29,8 @@ from imagined_env import add_world_models, world_model_env
 from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_policy_cnn.processor_cnn import make_cnn_pre_post_processors
+from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
-from lerobot_wmrl.files import write_json
 from lerobot_wmrl.rl.configuration_ppo import PPOConfig
 from lerobot_wmrl.rl.ppo import PPO
 from lerobot_wmrl.rl.protocol import make_pipeline

@@ -21,9 +21,9 @@ from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.manifest import planned_parts
 from lerobot_dataset_maniskill.quiet import silence_libraries
 from lerobot_dataset_maniskill.worker import PartRecorder
-from lerobot_wmrl.constants import KINDS, PLAY, TASKS
+from lerobot_wmrl.common.constants import KINDS, PLAY, TASKS
+from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
-from lerobot_wmrl.files import write_json
 
 CAMERAS = ("third_view", "side_view", "wrist")
 RESULTS = Path(__file__).parents[1] / "docs" / "results"

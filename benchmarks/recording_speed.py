@@ -17,8 +17,8 @@ import gymnasium as gym
 import mani_skill.envs  # noqa: F401 (registers PushCube)
 import numpy as np
 
-from lerobot_wmrl.constants import ROBOT_MESH_DETAIL
-from lerobot_wmrl.files import write_json
+from lerobot_wmrl.common.constants import ROBOT_MESH_DETAIL
+from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.maniskill.renderer import render_backend
 from lerobot_wmrl.maniskill.rendering import Rendering
 from lerobot_wmrl.maniskill.scenes import scenes_of

@@ -25,8 +25,8 @@ on similarity to the goal, absolute), its two parts, `embedding` and `proxy`. Of
 successes and of failures with its band, Spearman's correlation with the rule-based reward within an episode,
 and the AUC of its highest run of three frames, success against failure. The same starts are also given to
 hands that move at random, not at all, and to one corner: they should earn less than the planner's actions.
-And does the environment's doubt warn? Of the episodes that the world model calls successes, how often is the
-greatest doubt until then in a false one above that in a true one. Writes
+Does the environment's uncertainty warn? Of the episodes that the world model calls successes, how often is the
+greatest uncertainty until then in a false one above that in a true one. Writes
 docs/results/reward_curves.json and a picture beside it.
 """
 
@@ -43,19 +43,19 @@ from matplotlib.figure import Figure
 from scipy.stats import spearmanr
 from torch import Tensor
 
-from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW
+from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW
+from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.common.statistics import Estimate
+from lerobot_wmrl.data.episode_table import EpisodeTable, open_dataset, read_episodes
+from lerobot_wmrl.demo.report.figures import COLOURS, tidy
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
-from lerobot_wmrl.envs.doubt import SIGNALS
 from lerobot_wmrl.envs.first_frames import chosen_episodes
+from lerobot_wmrl.envs.uncertainty import SIGNALS
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv, make_world_model_env
-from lerobot_wmrl.files import write_json
-from lerobot_wmrl.report.figures import COLOURS, tidy
+from lerobot_wmrl.evaluation.gate import Outcomes
+from lerobot_wmrl.evaluation.tables import markdown_table
 from lerobot_wmrl.rewards.configuration_general import GeneralConfig
-from lerobot_wmrl.statistics import Estimate
 from lerobot_wmrl.world_models.checkpoint import load_model
-from lerobot_wmrl.world_models.episode_table import EpisodeTable, open_dataset, read_episodes
-from lerobot_wmrl.world_models.evaluation.gate import Outcomes
-from lerobot_wmrl.world_models.evaluation.tables import markdown_table
 
 RESULTS: Final = Path(__file__).parents[1] / "docs" / "results" / "reward_curves.json"
 FRAMES = 3
@@ -90,7 +90,7 @@ class EveryReward:
 
 def judged(env: WorldModelVectorEnv, actions: Tensor, config: GeneralConfig) -> dict[str, np.ndarray]:
     """What every reward says of the frames after actions (B, T, A) from the first B starts, and both signals
-    of doubt. → (B, T) each"""
+    of uncertainty. → (B, T) each"""
     env.reward.said.clear()
     env.reset(seed=list(range(env.num_envs)))
     parts = [env.step(action)[-1]["reward_parts"] for action in actions.unbind(1)]
@@ -98,8 +98,8 @@ def judged(env: WorldModelVectorEnv, actions: Tensor, config: GeneralConfig) -> 
     similarity = torch.stack([part["similarity"] for part in parts], 1)
     level = config.alpha * (success >= THRESHOLD).float() + (1 - config.alpha) * similarity
     learned = {name: torch.stack(values, 1) for name, values in env.reward.said.items()}
-    doubt = {signal: torch.stack([part[signal] for part in parts], 1) for signal in SIGNALS}
-    every = {"general": level, "success": success, "similarity": similarity, **learned, **doubt}
+    uncertainty = {signal: torch.stack([part[signal] for part in parts], 1) for signal in SIGNALS}
+    every = {"general": level, "success": success, "similarity": similarity, **learned, **uncertainty}
     return {name: values.cpu().numpy() for name, values in every.items()}
 
 
@@ -140,7 +140,7 @@ def measure(
     """Of every reward the numbers above; done (E, T) real success; `alone`: what other hands earn."""
     truth, success = curves["rule_based"], done.any(1)
     lasted = {name: np.where(np.isfinite(truth), values, np.nan) for name, values in curves.items()}
-    doubt = {signal: lasted.pop(signal) for signal in SIGNALS}
+    uncertainty = {signal: lasted.pop(signal) for signal in SIGNALS}
     found = {}
     for name, cut in lasted.items():
         outcomes = Outcomes(np.arange(len(cut)), cut, done)
@@ -155,11 +155,11 @@ def measure(
         }
     return {
         "successes": int(success.sum()), "failures": int((~success).sum()), "rewards": found,
-        "doubt": warnings(doubt, Outcomes(np.arange(len(done)), lasted["success"], done)),
+        "uncertainty": warnings(uncertainty, Outcomes(np.arange(len(done)), lasted["success"], done)),
     }  # fmt: skip
 
 
-def warnings(doubt: Mapping[str, np.ndarray], outcomes: Outcomes) -> dict[str, Any]:
+def warnings(uncertainty: Mapping[str, np.ndarray], outcomes: Outcomes) -> dict[str, Any]:
     """Among the episodes that are called successes: how well a signal's maximum up to that call, which is
     what the environment's guard would have seen, tells the false ones."""
     first = outcomes.called(THRESHOLD, FRAMES)
@@ -168,7 +168,7 @@ def warnings(doubt: Mapping[str, np.ndarray], outcomes: Outcomes) -> dict[str, A
     false = np.repeat(~called.success[:, None], called.done.shape[1], 1)
     auc = {
         signal: Outcomes(called.episodes, np.where(seen, values[called.episodes], np.nan), false).auc(1)
-        for signal, values in doubt.items()
+        for signal, values in uncertainty.items()
     }
     return {"called_successes": len(false), "false": int((~called.success).sum()), "auc": auc}
 
@@ -261,7 +261,7 @@ def main() -> None:
     write_json(given.output, found)
     draw(found, given.output.with_suffix(".png"))
     print(results_table(found))
-    print(*(f"{name}: {numbers['doubt']}" for name, numbers in found.items()), sep="\n")
+    print(*(f"{name}: {numbers['uncertainty']}" for name, numbers in found.items()), sep="\n")
 
 
 if __name__ == "__main__":

@@ -29,15 +29,15 @@ from matplotlib.figure import Figure
 import gate
 import imagined_ppo
 from imagined_ppo import DOMAINS, ENVS, HORIZON, TITLES
+from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.common.presets import Flags, format_flags
+from lerobot_wmrl.common.statistics import MeanChange, Proportion
+from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.demo.pipeline import run_stages
+from lerobot_wmrl.demo.report.figures import COLOURS, tidy
+from lerobot_wmrl.demo.report.sources import outcomes
 from lerobot_wmrl.demo.stages import Stage, checkpoint
-from lerobot_wmrl.files import write_json
-from lerobot_wmrl.presets import Flags, format_flags
-from lerobot_wmrl.report.figures import COLOURS, tidy
-from lerobot_wmrl.report.sources import outcomes
-from lerobot_wmrl.statistics import MeanChange, Proportion
-from lerobot_wmrl.tracking import read_metrics
-from lerobot_wmrl.world_models.evaluation.tables import markdown_table
+from lerobot_wmrl.evaluation.tables import markdown_table
 
 RESULTS: Final = Path(__file__).parents[1] / "docs" / "results" / "rl_comparison.json"
 PLACES: Final = ("imagined", "simulated")

@@ -4,7 +4,7 @@
     python benchmarks/rl_comparison.py --gate=outputs/gate --output_dir=outputs/rl_comparison
     python benchmarks/synthetic_data.py --gate=outputs/gate --output_dir=outputs/synthetic_data
 
-The policy that rl_comparison.py clones from eight demonstrations acts, disturbed, in imagination, which is
+The policy that rl_comparison.py clones from eight demonstrations acts, noisy, in imagination, which is
 written as a dataset, and in the simulator. A new policy is cloned from as many successes of either. All three
 are measured on the same starts in ManiSkill. The same call again continues. Writes
 docs/results/synthetic_data.json.
@@ -21,16 +21,16 @@ from lerobot.utils.import_utils import register_third_party_plugins
 import gate
 import imagined_ppo
 from imagined_ppo import DOMAINS, HORIZON
-from lerobot_wmrl.checkpoints import LAST_CHECKPOINT
-from lerobot_wmrl.constants import STATE_NAMES
+from lerobot_wmrl.common.checkpoints import LAST_CHECKPOINT
+from lerobot_wmrl.common.constants import STATE_NAMES
+from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.common.presets import Flags, format_flags, preset_flags
+from lerobot_wmrl.common.statistics import PairedChange, Proportion
+from lerobot_wmrl.data.recorded_episodes import recorded_episodes
 from lerobot_wmrl.demo.pipeline import run_stages
+from lerobot_wmrl.demo.report.sources import outcomes
 from lerobot_wmrl.demo.stages import Stage, checkpoint, lerobot_train
-from lerobot_wmrl.episodes import recorded_episodes
-from lerobot_wmrl.files import write_json
-from lerobot_wmrl.presets import Flags, format_flags, preset_flags
-from lerobot_wmrl.report.sources import outcomes
-from lerobot_wmrl.statistics import PairedChange, Proportion
-from lerobot_wmrl.world_models.evaluation.tables import markdown_table
+from lerobot_wmrl.evaluation.tables import markdown_table
 from rl_comparison import POLICY
 
 RESULTS: Final = Path(__file__).parents[1] / "docs" / "results" / "synthetic_data.json"

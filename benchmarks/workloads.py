@@ -7,9 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lerobot_wmrl.precision import compute_in
-from lerobot_wmrl.world_models.clip import Clip
-from lerobot_wmrl.world_models.context import Context
+from lerobot_wmrl.common.precision import compute_in
+from lerobot_wmrl.data.clip import Clip
+from lerobot_wmrl.data.frames import Context
 from lerobot_wmrl.world_models.imagination import ImaginationState
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 

@@ -26,11 +26,11 @@ import torch
 from lerobot.utils.import_utils import register_third_party_plugins
 from torch.utils.flop_counter import FlopCounterMode
 
+from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.common.malloc import keep_freed_memory
+from lerobot_wmrl.common.precision import imagination_dtype
+from lerobot_wmrl.common.presets import PRESETS, preset_flags
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
-from lerobot_wmrl.files import write_json
-from lerobot_wmrl.malloc import keep_freed_memory
-from lerobot_wmrl.precision import imagination_dtype
-from lerobot_wmrl.presets import PRESETS, preset_flags
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel

@@ -19,23 +19,23 @@ import draccus
 import numpy as np
 from lerobot.utils.import_utils import register_third_party_plugins
 
-from lerobot_wmrl.command import CONFIG_FILE
-from lerobot_wmrl.files import write_json
-from lerobot_wmrl.malloc import keep_freed_memory
+from lerobot_wmrl.common.command_line import CONFIG_FILE
+from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.common.malloc import keep_freed_memory
+from lerobot_wmrl.common.presets import Flags, format_flags, preset_flags
+from lerobot_wmrl.common.statistics import Estimate
+from lerobot_wmrl.common.tracking import read_metrics
+from lerobot_wmrl.data.episode_table import choose_episodes, open_dataset, read_episodes
+from lerobot_wmrl.data.frame_cache import cached_frames
+from lerobot_wmrl.evaluation.accuracy import EpisodeAccuracy, headline
+from lerobot_wmrl.evaluation.done import done_quality
+from lerobot_wmrl.evaluation.evaluate import evaluate
+from lerobot_wmrl.evaluation.gate import success_gate
+from lerobot_wmrl.evaluation.replay import Source
+from lerobot_wmrl.evaluation.tables import NAMES, markdown_table
 from lerobot_wmrl.maniskill.scenes import scenes_of
-from lerobot_wmrl.presets import Flags, format_flags, preset_flags
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig, train_world_model
-from lerobot_wmrl.statistics import Estimate
-from lerobot_wmrl.tracking import read_metrics
 from lerobot_wmrl.world_models.checkpoint import load_model
-from lerobot_wmrl.world_models.episode_table import choose_episodes, open_dataset, read_episodes
-from lerobot_wmrl.world_models.evaluation.accuracy import EpisodeAccuracy, headline
-from lerobot_wmrl.world_models.evaluation.done import done_quality
-from lerobot_wmrl.world_models.evaluation.evaluate import evaluate
-from lerobot_wmrl.world_models.evaluation.gate import success_gate
-from lerobot_wmrl.world_models.evaluation.replay import Source
-from lerobot_wmrl.world_models.evaluation.tables import NAMES, markdown_table
-from lerobot_wmrl.world_models.frame_cache import cached_frames
 
 RESULTS: Final = Path(__file__).parents[1] / "docs" / "results" / "world_model_ablation.json"
 

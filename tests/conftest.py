@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, ACTION_NAMES, FPS, KINDS, STATE_NAMES, TASKS
+from lerobot_wmrl.common.constants import (
+    ACTION_HIGH,
+    ACTION_LOW,
+    ACTION_NAMES,
+    FPS,
+    KINDS,
+    STATE_NAMES,
+    TASKS,
+)
 from tests.hub_client import hub as hub
 
 HOLD_FRAMES = 5

@@ -15,8 +15,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_policy_openvla.configuration_openvla import OpenVLAConfig
 from lerobot_policy_openvla.modeling_openvla import OpenVLAPolicy
+from lerobot_wmrl.common.presets import expand_preset
 from lerobot_wmrl.demo.stages import checkpoint
-from lerobot_wmrl.presets import expand_preset
 from lerobot_wmrl.scripts.train import TrainConfig
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"

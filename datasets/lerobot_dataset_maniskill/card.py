@@ -12,10 +12,10 @@ import numpy as np
 
 from lerobot_dataset_maniskill.examples import chosen_examples, write_pictures
 from lerobot_dataset_maniskill.writer import VOCABULARY_FILE
-from lerobot_wmrl.constants import FPS, KINDS, TASKS
-from lerobot_wmrl.episodes import recorded_episodes
-from lerobot_wmrl.files import write_text
-from lerobot_wmrl.statistics import Proportion
+from lerobot_wmrl.common.constants import FPS, KINDS, TASKS
+from lerobot_wmrl.common.files import write_text
+from lerobot_wmrl.common.statistics import Proportion
+from lerobot_wmrl.data.recorded_episodes import recorded_episodes
 
 CARD_FILE = Path("README.md")
 
@@ -23,7 +23,7 @@ KIND_MEANINGS = {
     "optimal": "a planner's straight way",
     "waypoint": "a planner's way by an unrelated point",
     "interpolated": "a planner's way off the straight lines",
-    "disturbed": "a planner whose points are a little off, so that some episodes fail",
+    "noisy": "a planner whose points are a little off, so that some episodes fail",
     "near_miss": "a planner that misses on purpose",
     "policy": "a policy's attempts",
     "play": "wandering, pushing and lifting without a reset",
@@ -41,7 +41,7 @@ def name_card(root: Path, repo_id: str) -> None:
 def write_card(root: Path, repo_id: str, table: Mapping[str, np.ndarray]) -> None:
     """The pictures, then the card, of the dataset at `root`, called `repo_id`.
 
-    `table` is `lerobot_wmrl.episodes.recorded_episodes`.
+    `table` is `lerobot_wmrl.data.recorded_episodes.recorded_episodes`.
     """
     write_pictures(root, repo_id, table)
     vocabulary = json.loads((root / VOCABULARY_FILE).read_text())

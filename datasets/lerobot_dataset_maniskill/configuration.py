@@ -13,12 +13,12 @@ from lerobot.configs.policies import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_dataset_maniskill.planners import MOTIONS
-from lerobot_wmrl.command import RunConfig
-from lerobot_wmrl.constants import EVALUATION_SEED, KINDS
+from lerobot_wmrl.common.command_line import RunConfig
+from lerobot_wmrl.common.constants import EVALUATION_SEED, KINDS
+from lerobot_wmrl.common.policy_checkpoints import read_policy_config
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.maniskill.tasks import task_of
-from lerobot_wmrl.policy_checkpoints import read_policy_config
 
 POLICY_KIND = "policy"
 
@@ -28,7 +28,7 @@ LOCAL = "local"
 
 def default_kinds() -> dict[str, float]:
     """Shares of the trajectory kinds; they need not sum to 1."""
-    return {"optimal": 0.20, "waypoint": 0.06, "interpolated": 0.06, "disturbed": 0.13, "near_miss": 0.55}
+    return {"optimal": 0.20, "waypoint": 0.06, "interpolated": 0.06, "noisy": 0.13, "near_miss": 0.55}
 
 
 @dataclass

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_wmrl.constants import KINDS, TASKS
-from lerobot_wmrl.strips import enlarged, evenly_spaced, in_a_row
+from lerobot_wmrl.common.constants import KINDS, TASKS
+from lerobot_wmrl.common.frame_strips import enlarged, evenly_spaced, in_a_row
 
 MEDIA = Path("media")
 FRAMES = 6
@@ -34,7 +34,7 @@ class Example:
 def chosen_examples(table: Mapping[str, np.ndarray]) -> list[Example]:
     """One episode of each recorded task: the first success, optimal if possible; else the first failure.
 
-    `table` is `lerobot_wmrl.episodes.recorded_episodes`.
+    `table` is `lerobot_wmrl.data.recorded_episodes.recorded_episodes`.
     """
     best = np.lexsort((table["episode"], table["kind"], ~table["success"]))
     rows = [best[table["task"][best] == task][0] for task in np.unique(table["task"])]

@@ -14,11 +14,11 @@ from lerobot_dataset_maniskill.drivers import ExplorationNoise
 from lerobot_dataset_maniskill.manifest import EpisodePlan, Part
 from lerobot_dataset_maniskill.worker import EpisodeResult, Report, whole_part
 from lerobot_dataset_maniskill.writer import Outcome, StartColumns, add_step
-from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, ACTION_NAMES, STATE_NAMES
+from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW, ACTION_NAMES, STATE_NAMES
+from lerobot_wmrl.common.policy_checkpoints import check_fit, load_policy, load_processors
 from lerobot_wmrl.envs.evaluation_adapter import pictures
 from lerobot_wmrl.maniskill.simulation import Frame
 from lerobot_wmrl.maniskill.tasks import task_of
-from lerobot_wmrl.policy_checkpoints import check_fit, load_policy, load_processors
 from lerobot_wmrl.rl.protocol import make_pipeline
 
 Row = tuple[Frame, np.ndarray, Outcome]

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from lerobot_dataset_maniskill.configuration import POLICY_KIND, RecordConfig
-from lerobot_wmrl.constants import KINDS, START_COLUMNS, TASKS
-from lerobot_wmrl.episodes import recorded_episodes
+from lerobot_wmrl.common.constants import KINDS, START_COLUMNS, TASKS
+from lerobot_wmrl.data.recorded_episodes import recorded_episodes
 from lerobot_wmrl.maniskill.scenes import SCENES, Scene, scene_for_seed
 
 
@@ -65,8 +65,8 @@ def simulated_episodes(config: RecordConfig) -> list[EpisodePlan]:
 def imagined_episodes(config: RecordConfig) -> list[EpisodePlan]:
     """From the environment's start frames in turn. Task, scene and seed are those of the real episodes that
     began so: an imagined episode can be repeated for real."""
+    from lerobot_wmrl.data.episode_table import open_dataset, read_episodes
     from lerobot_wmrl.envs.first_frames import chosen_episodes
-    from lerobot_wmrl.world_models.episode_table import open_dataset, read_episodes
 
     assert config.imagination is not None
     source = config.imagination.dataset

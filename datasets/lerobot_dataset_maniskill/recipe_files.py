@@ -10,8 +10,8 @@ from typing import Any
 import yaml
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
+from lerobot_wmrl.common.suggestion import suggestion
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
-from lerobot_wmrl.suggestion import suggestion
 
 NESTED = {"env": {"type", *(field.name for field in fields(WmrlManiSkillEnv))}}
 KEYS = {field.name for field in fields(RecordConfig)} | set(NESTED)

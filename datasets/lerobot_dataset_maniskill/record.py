@@ -4,8 +4,8 @@ from huggingface_hub import HfApi
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.recipe_files import expand_recipes
-from lerobot_wmrl.command import run_command
-from lerobot_wmrl.files import writing
+from lerobot_wmrl.common.command_line import run_command
+from lerobot_wmrl.common.files import writing
 from lerobot_wmrl.maniskill.scenes import describe_scenes
 
 

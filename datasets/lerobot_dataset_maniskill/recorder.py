@@ -20,11 +20,11 @@ from lerobot_dataset_maniskill.manifest import Part, planned_parts
 from lerobot_dataset_maniskill.merging import finish, merge_folders
 from lerobot_dataset_maniskill.worker import EpisodeResult, PartRecorder, Report, serve_parts
 from lerobot_dataset_maniskill.writer import VOCABULARY_FILE
-from lerobot_wmrl.constants import ACTION_NAMES, KINDS
-from lerobot_wmrl.files import foreign_files, write_json, writing
+from lerobot_wmrl.common.constants import ACTION_NAMES, KINDS
+from lerobot_wmrl.common.files import foreign_files, write_json, writing
+from lerobot_wmrl.common.policy_checkpoints import check_fit, check_weights
 from lerobot_wmrl.maniskill.processes import simulating_context
 from lerobot_wmrl.maniskill.renderer import render_backend
-from lerobot_wmrl.policy_checkpoints import check_fit, check_weights
 
 CONTENT_FILE = "recording.json"
 POLL_SECONDS = 1.0

@@ -10,7 +10,7 @@ from lerobot.configs.video import DepthEncoderConfig, RGBEncoderConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_dataset_maniskill.manifest import EpisodePlan
-from lerobot_wmrl.constants import (
+from lerobot_wmrl.common.constants import (
     ACTION_HIGH,
     ACTION_LOW,
     ACTION_NAMES,
@@ -20,7 +20,7 @@ from lerobot_wmrl.constants import (
     STATE_NAMES,
     TASKS,
 )
-from lerobot_wmrl.files import write_json
+from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.maniskill.scenes import SCENES
 from lerobot_wmrl.maniskill.simulation import Frame
 

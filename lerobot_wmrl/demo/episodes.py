@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lerobot_wmrl.constants import KINDS
-from lerobot_wmrl.episodes import recorded_episodes
+from lerobot_wmrl.common.constants import KINDS
+from lerobot_wmrl.data.recorded_episodes import recorded_episodes
 
 
 def optimal_episodes(root: Path, count: int) -> list[int]:

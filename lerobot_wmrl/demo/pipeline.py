@@ -8,9 +8,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from lerobot_wmrl.common.files import foreign_files, write_json
 from lerobot_wmrl.demo.process import preload, run_measured
 from lerobot_wmrl.demo.stages import Stage
-from lerobot_wmrl.files import foreign_files, write_json
 
 MARKER = "settings.json"
 

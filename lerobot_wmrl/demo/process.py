@@ -20,9 +20,9 @@ from typing import BinaryIO
 
 import psutil
 
-from lerobot_wmrl.die_with_parent import die_with
-from lerobot_wmrl.malloc import keep_freed_memory
-from lerobot_wmrl.progress import own_progress_lock
+from lerobot_wmrl.common.die_with_parent import die_with
+from lerobot_wmrl.common.malloc import keep_freed_memory
+from lerobot_wmrl.common.progress import own_progress_lock
 
 SAMPLE_SECONDS = 1.0
 """How often memory is sampled and progress is reported."""

@@ -8,10 +8,10 @@ from pathlib import Path
 
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 
-from lerobot_wmrl.checkpoints import LAST_CHECKPOINT, latest_checkpoint
-from lerobot_wmrl.constants import EVALUATION_SEED
+from lerobot_wmrl.common.checkpoints import LAST_CHECKPOINT, latest_checkpoint
+from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.presets import DEMO_IMAGE_SIZE, DEMO_SCENES, Flags, format_flags, preset_flags
 from lerobot_wmrl.demo.episodes import optimal_episodes
-from lerobot_wmrl.presets import DEMO_IMAGE_SIZE, DEMO_SCENES, Flags, format_flags, preset_flags
 
 SEED_STRIDE = 100_000
 """Demo seed s records and trains with seeds from s·SEED_STRIDE on, below EVALUATION_SEED."""
@@ -38,7 +38,7 @@ class DemoConfig:
         seed: of recording, training and PPO; the evaluation seeds stay the same.
         stage_preset: the --preset that each stage's command gets.
         sft_episodes: optimal episodes the first policy is cloned from.
-        explore_episodes: episodes of that policy, disturbed, that the world models learn from as well.
+        explore_episodes: episodes of that policy, noisy, that the world models learn from as well.
         eval_episodes: held-out episodes of each success rate.
     """
 
@@ -78,7 +78,7 @@ def demo_stages(config: DemoConfig) -> list[Stage]:
     return [
         Stage("record", "Record planned trajectories in ManiSkill", partial(record, config)),
         Stage("sft", "Clone a policy from a few optimal episodes", partial(clone, config)),
-        Stage("explore", "Record disturbed attempts of that policy", partial(explore, config)),
+        Stage("explore", "Record noisy attempts of that policy", partial(explore, config)),
         Stage("merge", "Merge both recordings", partial(merge, config)),
         *(
             Stage(model, f"Train the {model.replace('_', ' ')}", partial(train_model, config, model))

@@ -11,7 +11,14 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
-from lerobot_wmrl.constants import ACTION_NAMES, CAMERAS, FPS, IMAGE_SIZE, ROBOT_MESH_DETAIL, STATE_NAMES
+from lerobot_wmrl.common.constants import (
+    ACTION_NAMES,
+    CAMERAS,
+    FPS,
+    IMAGE_SIZE,
+    ROBOT_MESH_DETAIL,
+    STATE_NAMES,
+)
 from lerobot_wmrl.maniskill.scenes import Scene, scenes_of
 from lerobot_wmrl.rewards.rule_based import RuleBasedReward
 

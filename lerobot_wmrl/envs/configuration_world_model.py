@@ -10,9 +10,9 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
-from lerobot_wmrl.constants import FPS, TASKS
-from lerobot_wmrl.dataset_source import DatasetSource
-from lerobot_wmrl.envs.doubt import Doubt
+from lerobot_wmrl.common.constants import FPS, TASKS
+from lerobot_wmrl.data.dataset_source import DatasetSource
+from lerobot_wmrl.envs.uncertainty import Uncertainty
 from lerobot_wmrl.rewards.configuration_general import GeneralConfig
 
 
@@ -83,7 +83,7 @@ class WorldModelEnv(EnvConfig):
             `reward_classifier`.
         episode_length: frames after which an episode is truncated.
         done_threshold: θ_sps of eq. 7. done_frames: k, consecutive frames that must reach it.
-        doubt: what becomes of episodes that the world model is not sure of; see `--env.doubt.*`.
+        uncertainty: what becomes of episodes that the world model is not sure of; see `--env.uncertainty.*`.
         device: where the models live; the best there is by default.
     """
 
@@ -96,7 +96,7 @@ class WorldModelEnv(EnvConfig):
     episode_length: int = 40
     done_threshold: float = 0.5
     done_frames: int = 3
-    doubt: Doubt = field(default_factory=Doubt)
+    uncertainty: Uncertainty = field(default_factory=Uncertainty)
     device: str | None = None
     features: dict[str, PolicyFeature] = field(
         default_factory=lambda: {ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(7,))}
@@ -117,7 +117,7 @@ class WorldModelEnv(EnvConfig):
             raise ValueError(f"--env.done_threshold={self.done_threshold}: must be a probability")
         if self.dataset.max_starts < 1:
             raise ValueError(f"--env.dataset.max_starts={self.dataset.max_starts}: must be at least 1")
-        self.doubt.check()
+        self.uncertainty.check()
         unknown = sorted({*(self.dataset.tasks or ())} - {*TASKS})
         if unknown:
             raise ValueError(f"--env.dataset.tasks={unknown}: choose from {', '.join(TASKS)}")

@@ -10,21 +10,21 @@ import torch
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from lerobot_wmrl.constants import ACTION_LOW, TASKS
-from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
-from lerobot_wmrl.envs.configuration_world_model import StartFrames
-from lerobot_wmrl.maniskill.scenes import scene_for_seed, scenes_of
-from lerobot_wmrl.maniskill.tasks import task_of
-from lerobot_wmrl.world_models.compatibility import check_dataset
-from lerobot_wmrl.world_models.depth_maps import depth_at
-from lerobot_wmrl.world_models.episode_table import (
+from lerobot_wmrl.common.constants import ACTION_LOW, TASKS
+from lerobot_wmrl.data.compatibility import check_dataset
+from lerobot_wmrl.data.depth_maps import depth_at
+from lerobot_wmrl.data.episode_table import (
     EpisodeTable,
     choose_episodes,
     evenly_spread,
     open_dataset,
     read_episodes,
 )
-from lerobot_wmrl.world_models.frame_cache import cached_frames
+from lerobot_wmrl.data.frame_cache import cached_frames
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.envs.configuration_world_model import StartFrames
+from lerobot_wmrl.maniskill.scenes import scene_for_seed, scenes_of
+from lerobot_wmrl.maniskill.tasks import task_of
 
 INSTRUCTION = "task"
 """Name of the instructions in a file of saved frames."""

@@ -10,7 +10,7 @@ from gymnasium.vector import AutoresetMode
 from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
-from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, FPS, STATE_NAMES
+from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW, FPS, STATE_NAMES
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.maniskill_env import make_vector_env
 

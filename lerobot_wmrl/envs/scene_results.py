@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 
+from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.maniskill.scenes import SCENES, UNSEEN_OBJECTS, Scene
-from lerobot_wmrl.statistics import Proportion
 
 
 class SceneResults:

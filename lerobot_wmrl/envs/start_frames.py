@@ -5,10 +5,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from lerobot_wmrl.data.frame_cache import frames_to_tensor
+from lerobot_wmrl.data.frames import Context
 from lerobot_wmrl.envs.first_frames import FirstFrames
 from lerobot_wmrl.rewards.similarity import Description, Similarity
-from lerobot_wmrl.world_models.context import Context
-from lerobot_wmrl.world_models.frame_cache import frames_to_tensor
 from lerobot_wmrl.world_models.goal import imagine_goal
 from lerobot_wmrl.world_models.modeling_world_model import (
     ActionWorldModelRewardModel,

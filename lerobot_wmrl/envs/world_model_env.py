@@ -11,17 +11,17 @@ from lerobot.rewards.factory import make_reward_model
 from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
-from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, FPS
+from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW, FPS
+from lerobot_wmrl.data.compatibility import check_same_tokenizer
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
-from lerobot_wmrl.envs.doubt import entropies
 from lerobot_wmrl.envs.first_frames import FirstFrames, read_first_frames
 from lerobot_wmrl.envs.start_frames import Goals, Starts, load_starts
+from lerobot_wmrl.envs.uncertainty import entropies
 from lerobot_wmrl.rewards.configuration_general import GeneralConfig
 from lerobot_wmrl.rewards.general import consecutive_count, sparse_reward
 from lerobot_wmrl.rewards.loading import Reward, load_reward
 from lerobot_wmrl.rewards.similarity import Similarity, make_similarity, of_rows
 from lerobot_wmrl.world_models.checkpoint import load_model
-from lerobot_wmrl.world_models.compatibility import check_same_tokenizer
 from lerobot_wmrl.world_models.frame_tokenizer import Decoded
 from lerobot_wmrl.world_models.imagination import Imagined
 from lerobot_wmrl.world_models.modeling_world_model import (
@@ -102,14 +102,14 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         """
         clipped = self._clip(actions)
         imagined = self.model.step(self._imagination, clipped, self.generator)
-        doubt = entropies(imagined)
-        terminated, truncated = self._advance(imagined, doubt)
+        uncertainty = entropies(imagined)
+        terminated, truncated = self._advance(imagined, uncertainty)
         decoded = self.model.decode(imagined.tokens, self._imagination.context)
         observation = self._observe(decoded.images, imagined.proprioception)
         parts = {"success": terminated.float(), **self._progress(decoded)}
         reward = self.reward.compute_reward({**observation, **parts, "hidden": imagined.hidden})
-        reward = self.config.doubt.weigh(reward, doubt)
-        parts |= {**doubt, "done_probability": imagined.done_logit.sigmoid()}
+        reward = self.config.uncertainty.weigh(reward, uncertainty)
+        parts |= {**uncertainty, "done_probability": imagined.done_logit.sigmoid()}
         info: dict[str, Any] = {"reward_parts": parts}
         finished = terminated | truncated
         any_finished, any_nan = torch.stack([finished.any(), clipped.isnan().any()]).tolist()
@@ -128,15 +128,15 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         check_same_tokenizer(self.model, model, "the refreshed world model")
         self.model = model
 
-    def _advance(self, imagined: Imagined, doubt: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """Count frames; terminated after k consecutive done frames, truncated at the horizon or in doubt.
+    def _advance(self, imagined: Imagined, uncertainty: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Count frames; terminated after k consecutive done frames, truncated at the horizon or if uncertain.
         → (B,), (B,)"""
         fired = sparse_reward(imagined.done_logit, self.config.done_threshold) > 0
         self._done_streak = consecutive_count(self._done_streak, fired)
         self._elapsed = self._elapsed + 1
-        doubtful = self.config.doubt.ends(doubt)
-        terminated = (self._done_streak >= self.config.done_frames) & ~doubtful
-        return terminated, ((self._elapsed >= self.max_episode_steps) | doubtful) & ~terminated
+        uncertain = self.config.uncertainty.ends(uncertainty)
+        terminated = (self._done_streak >= self.config.done_frames) & ~uncertain
+        return terminated, ((self._elapsed >= self.max_episode_steps) | uncertain) & ~terminated
 
     def _restart(self, mask: Tensor, observation: Observation) -> Observation:
         """New starts where `mask` (B,) is True; other rows of the observation stay."""

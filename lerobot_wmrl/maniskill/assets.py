@@ -9,8 +9,8 @@ import numpy as np
 import trimesh
 import yaml
 
+from lerobot_wmrl.common.suggestion import suggestion
 from lerobot_wmrl.maniskill.objects import OBJECTS, MeshFile, ObjectSpec
-from lerobot_wmrl.suggestion import suggestion
 
 KEYS: Final = ("mesh", "label", "scale", "density")
 WIDEST: Final = 0.072

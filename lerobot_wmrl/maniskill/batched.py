@@ -13,7 +13,7 @@ import torch
 from mani_skill.utils.structs.pose import Pose
 from torch import Tensor
 
-from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, WORKSPACE_FLOOR
+from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW, WORKSPACE_FLOOR
 from lerobot_wmrl.maniskill.objects import OBJECTS
 from lerobot_wmrl.maniskill.renderer import render_backend
 from lerobot_wmrl.maniskill.rendering import Rendering

@@ -7,7 +7,7 @@ import numpy as np
 import sapien
 from transforms3d.euler import euler2quat
 
-from lerobot_wmrl.constants import IMAGE_SIZE, ROBOT_MESH_DETAIL
+from lerobot_wmrl.common.constants import IMAGE_SIZE, ROBOT_MESH_DETAIL
 
 AMBIENT: Final = (0.45, 0.45, 0.45)
 SUN: Final = (1.5, 1.5, 1.5)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, FPS, WORKSPACE_FLOOR
+from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW, FPS, WORKSPACE_FLOOR
 from lerobot_wmrl.maniskill.cameras import VIEWS
 from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS
 from lerobot_wmrl.maniskill.renderer import render_backend

@@ -14,7 +14,7 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.structs.types import SimConfig
 from transforms3d.euler import euler2quat
 
-from lerobot_wmrl.constants import FPS
+from lerobot_wmrl.common.constants import FPS
 from lerobot_wmrl.maniskill.actors import build_carpet, build_container, build_object, build_table
 from lerobot_wmrl.maniskill.cameras import camera_config
 from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS

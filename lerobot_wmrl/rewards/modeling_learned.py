@@ -7,15 +7,15 @@ import torch
 from lerobot.rewards.pretrained import PreTrainedRewardModel
 from torch import Tensor, nn
 
+from lerobot_wmrl.data.clip import take_rows
+from lerobot_wmrl.data.compatibility import check_cameras, frame_size
+from lerobot_wmrl.data.windows import unpadded_rows
 from lerobot_wmrl.rewards.configuration_learned import EmbeddingConfig, ProxyConfig
 from lerobot_wmrl.rewards.learned import recorded_rewards, regression
 from lerobot_wmrl.world_models.checkpoint import load_model
-from lerobot_wmrl.world_models.clip import take_rows
-from lerobot_wmrl.world_models.compatibility import check_cameras, frame_size
 from lerobot_wmrl.world_models.hub_card import HubCard
 from lerobot_wmrl.world_models.modeling_frame_tokenizer import stack_cameras
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
-from lerobot_wmrl.world_models.windows import unpadded_rows
 
 
 class ProxyRewardModel(HubCard, PreTrainedRewardModel):

@@ -10,7 +10,7 @@ from lerobot.rewards.pretrained import PreTrainedRewardModel
 from lerobot.utils.constants import OBS_IMAGE
 from torch import Tensor
 
-from lerobot_wmrl.checkpoints import resolve_checkpoint
+from lerobot_wmrl.common.checkpoints import resolve_checkpoint
 from lerobot_wmrl.world_models.checkpoint import read_config
 
 TASK: Final = "task"

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from lerobot_wmrl.distributed import mean_and_variance
+from lerobot_wmrl.common.distributed import mean_and_variance
 
 
 def generalised_advantages(

@@ -15,9 +15,9 @@ from lerobot.common.train_utils import get_step_identifier
 from lerobot.utils.random_utils import get_rng_state, set_rng_state
 from lerobot.utils.utils import flatten_dict
 
-from lerobot_wmrl.distributed import rank_and_size, wait_for_all
-from lerobot_wmrl.files import write_json
-from lerobot_wmrl.tracking import Tracker
+from lerobot_wmrl.common.distributed import rank_and_size, wait_for_all
+from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.common.tracking import Tracker
 
 RECORD_FILE = "record.json"
 REAL_STEPS = "real_steps"

@@ -5,7 +5,7 @@ from typing import Final
 
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_wmrl.dataset_source import DatasetSource
+from lerobot_wmrl.data.dataset_source import DatasetSource
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 
@@ -90,7 +90,7 @@ class DynaConfig:
 
     Args:
         rounds: how many, evenly spread over the iterations; 0 is off.
-        n_episodes: of the policy recorded in `real_env` each round, half of them disturbed by noise.
+        n_episodes: of the policy recorded in `real_env` each round, half of them noisy by noise.
         dataset: recorded elsewhere instead (on a real robot, say).
         learnt: what the world model has been trained on so far and is not to forget; by default the
             dataset of `env`.

@@ -1,6 +1,6 @@
 """Dyna rounds (Sutton 1991): the world model learns what the policy does by now, and training goes on in it.
 
-A round records the policy in ManiSkill, as it is and disturbed, or takes what was recorded elsewhere, and
+A round records the policy in ManiSkill, as it is and noisy, or takes what was recorded elsewhere, and
 trains the world model further on that and on what it has learnt from. Both are commands of the package, so a
 round that was killed goes on where it was.
 """
@@ -12,20 +12,20 @@ from typing import Final
 
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 
-from lerobot_wmrl.constants import EVALUATION_SEED
-from lerobot_wmrl.dataset_source import DatasetSource
+from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.presets import Flags, format_flags
+from lerobot_wmrl.common.subcommand import run_subcommand
+from lerobot_wmrl.data.dataset_source import DatasetSource
+from lerobot_wmrl.data.episode_table import open_dataset
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
-from lerobot_wmrl.presets import Flags, format_flags
 from lerobot_wmrl.rl.callbacks import REAL_STEPS, Record, record_folder
 from lerobot_wmrl.rl.configuration_callbacks import DYNA_SEEDS, DynaConfig
 from lerobot_wmrl.rl.policy_gradient import TrainingStopped
 from lerobot_wmrl.rl.recording import RolloutRecorder
-from lerobot_wmrl.subcommand import run_subcommand
 from lerobot_wmrl.world_models.checkpoint import load_model
-from lerobot_wmrl.world_models.episode_table import open_dataset
 
-MANNERS: Final = {"calm": 0.0, "disturbed": 0.4}
-"""How the policy acts while it is recorded: exploration. A policy that is only ever seen disturbed is
+MANNERS: Final = {"calm": 0.0, "noisy": 0.4}
+"""How the policy acts while it is recorded: exploration. A policy that is only ever seen noisy is
 believed when it fails calmly."""
 
 WORLD_MODEL = "action_world_model"

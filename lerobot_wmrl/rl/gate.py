@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 from termcolor import colored
 
-from lerobot_wmrl.constants import GATE_SEED
+from lerobot_wmrl.common.constants import GATE_SEED
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
+from lerobot_wmrl.evaluation.gate import Gate, Outcomes, attempted, gate_at, rollouts_for
+from lerobot_wmrl.evaluation.pictures import save_strip, side_by_side
+from lerobot_wmrl.evaluation.replay import Source, replay_episodes
 from lerobot_wmrl.rl.callbacks import REAL_STEPS, Record
 from lerobot_wmrl.rl.configuration_callbacks import GateConfig
 from lerobot_wmrl.rl.policy_gradient import TrainingStopped
 from lerobot_wmrl.rl.recording import RolloutRecorder
-from lerobot_wmrl.world_models.evaluation.gate import Gate, Outcomes, attempted, gate_at, rollouts_for
-from lerobot_wmrl.world_models.evaluation.pictures import save_strip, side_by_side
-from lerobot_wmrl.world_models.evaluation.replay import Source, replay_episodes
 
 SEEDS = 1_000_000
 """From GATE_SEED on."""

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from lerobot_wmrl.distributed import mean_over_processes
+from lerobot_wmrl.common.distributed import mean_over_processes
 from lerobot_wmrl.rl.advantages import group_advantages
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 from lerobot_wmrl.rl.minibatches import Steps

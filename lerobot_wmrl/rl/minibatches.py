@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from lerobot_wmrl.distributed import joined_columns, of_first_process, rank_and_size
+from lerobot_wmrl.common.distributed import joined_columns, of_first_process, rank_and_size
 from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer
 

@@ -16,14 +16,14 @@ from lerobot.rl.algorithms.configs import TrainingStats
 from torch import Tensor, nn
 from torch.optim import AdamW, Optimizer
 
-from lerobot_wmrl.adapters import load_trained_weights
-from lerobot_wmrl.distributed import (
+from lerobot_wmrl.common.adapters import load_trained_weights
+from lerobot_wmrl.common.distributed import (
     largest_over_processes,
     mean_and_variance,
     sum_gradients,
     sum_over_processes,
 )
-from lerobot_wmrl.precision import require_exact_updates
+from lerobot_wmrl.common.precision import require_exact_updates
 from lerobot_wmrl.rl.configuration_policy_gradient import PolicyGradientConfig
 from lerobot_wmrl.rl.minibatches import Minibatch, Steps, make_minibatches, read_steps
 from lerobot_wmrl.rl.objectives import (

@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lerobot_wmrl.distributed import mean_and_variance
+from lerobot_wmrl.common.distributed import mean_and_variance
 from lerobot_wmrl.rl.advantages import generalised_advantages, normalised
 from lerobot_wmrl.rl.configuration_ppo import PPOConfig
 from lerobot_wmrl.rl.minibatches import Steps

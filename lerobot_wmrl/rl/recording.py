@@ -7,9 +7,9 @@ from pathlib import Path
 import draccus
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 
+from lerobot_wmrl.common.presets import Flags, format_flags
+from lerobot_wmrl.common.subcommand import run_subcommand
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
-from lerobot_wmrl.presets import Flags, format_flags
-from lerobot_wmrl.subcommand import run_subcommand
 
 DERIVED = ("features", "features_map", "cameras")
 """Settings of the environment that follow from others, or are given apart."""

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from lerobot_wmrl.distributed import mean_and_variance
+from lerobot_wmrl.common.distributed import mean_and_variance
 
 DECAY = 0.9
 """How much of what is known of the returns an iteration keeps: policies improve, returns with them."""

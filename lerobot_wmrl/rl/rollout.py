@@ -10,8 +10,8 @@ import gymnasium as gym
 import torch
 from torch import Tensor
 
-from lerobot_wmrl.constants import EVALUATION_SEED
-from lerobot_wmrl.distributed import mean_over_processes, rank_and_size
+from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.distributed import mean_over_processes, rank_and_size
 from lerobot_wmrl.rl.observations import ObservationBuffer, as_bytes_see_it
 from lerobot_wmrl.rl.protocol import Observation, Pipeline, Sample, StochasticPolicy
 

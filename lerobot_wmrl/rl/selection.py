@@ -6,12 +6,12 @@ from pathlib import Path
 
 from lerobot.common.train_utils import get_step_checkpoint_dir
 
-from lerobot_wmrl.checkpoints import BEST_CHECKPOINT_LINK, link_checkpoint
-from lerobot_wmrl.distributed import rank_and_size
-from lerobot_wmrl.envs.policy_success import Evaluated
+from lerobot_wmrl.common.checkpoints import BEST_CHECKPOINT_LINK, link_checkpoint
+from lerobot_wmrl.common.distributed import rank_and_size
+from lerobot_wmrl.common.statistics import Proportion
+from lerobot_wmrl.evaluation.policy_success import Evaluated
 from lerobot_wmrl.rl.callbacks import REAL_STEPS, Record
 from lerobot_wmrl.rl.policy_gradient import TrainingStopped
-from lerobot_wmrl.statistics import Proportion
 
 REAL, IMAGINED = "real", "imagined"
 

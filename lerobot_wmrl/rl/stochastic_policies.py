@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from lerobot_wmrl.adapters import unwrapped
+from lerobot_wmrl.common.adapters import unwrapped
 from lerobot_wmrl.rl.act_adapter import ActAdapter
 from lerobot_wmrl.rl.protocol import StochasticPolicy
 

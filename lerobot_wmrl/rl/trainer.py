@@ -18,14 +18,14 @@ from lerobot.utils.constants import ALGORITHM_DIR, PRETRAINED_MODEL_DIR
 from lerobot.utils.logging_utils import MetricsTracker
 from tqdm import tqdm
 
-from lerobot_wmrl.checkpoints import latest_checkpoint, read_weights, write_checkpoint
-from lerobot_wmrl.constants import EVALUATION_SEED
-from lerobot_wmrl.distributed import rank_and_size, wait_for_all
+from lerobot_wmrl.common.checkpoints import latest_checkpoint, read_weights, write_checkpoint
+from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.distributed import rank_and_size, wait_for_all
+from lerobot_wmrl.common.tracking import Tracker
 from lerobot_wmrl.rl.callbacks import Callback, Callbacks
 from lerobot_wmrl.rl.policy_gradient import PolicyGradient
 from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
-from lerobot_wmrl.tracking import Tracker
 
 SHOWN = (
     "success_rate", "reward", "policy_loss", "value_loss", "explained_variance", "kl", "reference_kl",

@@ -15,8 +15,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from lerobot_wmrl.command import RunConfig, run_command
-from lerobot_wmrl.files import foreign_files, writing
+from lerobot_wmrl.common.command_line import RunConfig, run_command
+from lerobot_wmrl.common.files import foreign_files, writing
 
 DIRECTIONS = ("import", "export")
 
@@ -75,8 +75,8 @@ def exporter(source: str) -> Callable[[Path], None]:
     """Load LeRobot's checkpoint. → what writes OpenVLA's. ValueError if it is of another policy."""
     from lerobot_policy_openvla.modeling_openvla import OpenVLAPolicy
     from lerobot_policy_openvla.openvla_export import write_openvla
-    from lerobot_wmrl.adapters import load_with_adapters
-    from lerobot_wmrl.policy_checkpoints import read_policy_config
+    from lerobot_wmrl.common.adapters import load_with_adapters
+    from lerobot_wmrl.common.policy_checkpoints import read_policy_config
 
     config = read_policy_config(source, [])
     if config.type != OpenVLAPolicy.name:

@@ -13,9 +13,9 @@ from typing import NoReturn
 import draccus
 from draccus.utils import DraccusException
 
+from lerobot_wmrl.common.presets import expand_preset
 from lerobot_wmrl.demo.pipeline import StageError, claimed, run_stages
 from lerobot_wmrl.demo.stages import DemoConfig, demo_stages
-from lerobot_wmrl.presets import expand_preset
 
 
 def run_demo(cfg: DemoConfig) -> None:
@@ -24,7 +24,7 @@ def run_demo(cfg: DemoConfig) -> None:
     stages = demo_stages(cfg)
     with claimed(cfg.output_dir, {**asdict(cfg), "output_dir": str(cfg.output_dir)}):
         run_stages(stages, cfg.output_dir)
-        from lerobot_wmrl.report.build import write_report
+        from lerobot_wmrl.demo.report.build import write_report
 
         page = write_report(cfg, [stage.name for stage in stages])
     print(f"\nreport: {page}")

@@ -18,17 +18,17 @@ from typing import TYPE_CHECKING, Any
 import draccus
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_wmrl.command import RunConfig, claim_output_dir, run_command
-from lerobot_wmrl.constants import EVALUATION_SEED
-from lerobot_wmrl.dataset_source import DatasetSource
-from lerobot_wmrl.presets import expand_preset
+from lerobot_wmrl.common.command_line import RunConfig, claim_output_dir, run_command
+from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.presets import expand_preset
+from lerobot_wmrl.data.dataset_source import DatasetSource
 from lerobot_wmrl.rewards.configuration_general import GeneralConfig
 
 if TYPE_CHECKING:
-    from lerobot_wmrl.world_models.evaluation.agreement import Agreement
-    from lerobot_wmrl.world_models.evaluation.evaluate import Evaluation
-    from lerobot_wmrl.world_models.evaluation.replay import Source
-    from lerobot_wmrl.world_models.evaluation.report import Report
+    from lerobot_wmrl.evaluation.agreement import Agreement
+    from lerobot_wmrl.evaluation.evaluate import Evaluation
+    from lerobot_wmrl.evaluation.replay import Source
+    from lerobot_wmrl.evaluation.report import Report
     from lerobot_wmrl.world_models.modeling_world_model import (
         ActionWorldModelRewardModel,
         TextWorldModelRewardModel,
@@ -101,16 +101,16 @@ def check_config(cfg: EvalWorldModelConfig) -> None:
 
 def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     """Replay, measure, write."""
-    from lerobot_wmrl.files import write_json, write_text
+    from lerobot_wmrl.common.files import write_json, write_text
+    from lerobot_wmrl.data.compatibility import check_dataset
+    from lerobot_wmrl.data.episode_table import choose_episodes, open_dataset, read_episodes
+    from lerobot_wmrl.data.frame_cache import cached_frames
+    from lerobot_wmrl.evaluation.evaluate import evaluate
+    from lerobot_wmrl.evaluation.reconstruction import reconstruction_metrics
+    from lerobot_wmrl.evaluation.replay import Source
+    from lerobot_wmrl.evaluation.report import report_action_model
     from lerobot_wmrl.maniskill.scenes import scenes_of
     from lerobot_wmrl.world_models.checkpoint import load_model
-    from lerobot_wmrl.world_models.compatibility import check_dataset
-    from lerobot_wmrl.world_models.episode_table import choose_episodes, open_dataset, read_episodes
-    from lerobot_wmrl.world_models.evaluation.evaluate import evaluate
-    from lerobot_wmrl.world_models.evaluation.replay import Source
-    from lerobot_wmrl.world_models.evaluation.report import report_action_model
-    from lerobot_wmrl.world_models.frame_cache import cached_frames
-    from lerobot_wmrl.world_models.reconstruction import reconstruction_metrics
 
     check_config(cfg)
     model = load_model(cfg.model.path, "action_world_model", cfg.device)
@@ -142,8 +142,8 @@ def load_text_model(
     cfg: EvalWorldModelConfig, model: "ActionWorldModelRewardModel"
 ) -> "TextWorldModelRewardModel | None":
     """The one that is named. ValueError if it speaks of frames in other tokens."""
+    from lerobot_wmrl.data.compatibility import check_same_tokenizer
     from lerobot_wmrl.world_models.checkpoint import load_model
-    from lerobot_wmrl.world_models.compatibility import check_same_tokenizer
 
     if not cfg.text_model.path:
         return None
@@ -155,8 +155,8 @@ def load_text_model(
 def policy_agreement(cfg: EvalWorldModelConfig) -> "Agreement":
     """Every policy's success in the world model and in `real_env`."""
     from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
-    from lerobot_wmrl.envs.policy_success import policy_checkpoints, policy_outcomes
-    from lerobot_wmrl.world_models.evaluation.agreement import Agreement
+    from lerobot_wmrl.evaluation.agreement import Agreement
+    from lerobot_wmrl.evaluation.policy_success import policy_checkpoints, policy_outcomes
 
     real: Any = cfg.real_env
     longest = getattr(real, "horizon", None) or getattr(real, "episode_length", None)
@@ -183,9 +183,9 @@ def report_text_model(
     evaluation: "Evaluation",
 ) -> "Report":
     """Goal frames, and the reward along the shown episodes."""
-    from lerobot_wmrl.rewards.curves import reward_along_episode
-    from lerobot_wmrl.world_models.evaluation.pictures import save_reward_curves
-    from lerobot_wmrl.world_models.evaluation.report import report_goals
+    from lerobot_wmrl.evaluation.pictures import save_reward_curves
+    from lerobot_wmrl.evaluation.report import report_goals
+    from lerobot_wmrl.evaluation.reward_curves import reward_along_episode
 
     curves = {
         name: reward_along_episode(

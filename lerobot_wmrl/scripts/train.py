@@ -24,11 +24,11 @@ from lerobot.configs.default import PeftConfig, WandBConfig
 from lerobot.envs.configs import EnvConfig
 from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 
-from lerobot_wmrl.command import RunConfig, claim_output_dir, run_command
-from lerobot_wmrl.constants import ACTION_NAMES, EVALUATION_SEED
-from lerobot_wmrl.distributed import LONGEST_WAIT, rank_and_size, wait_for_all
-from lerobot_wmrl.malloc import keep_freed_memory
-from lerobot_wmrl.presets import expand_preset
+from lerobot_wmrl.common.command_line import RunConfig, claim_output_dir, run_command
+from lerobot_wmrl.common.constants import ACTION_NAMES, EVALUATION_SEED
+from lerobot_wmrl.common.distributed import LONGEST_WAIT, rank_and_size, wait_for_all
+from lerobot_wmrl.common.malloc import keep_freed_memory
+from lerobot_wmrl.common.presets import expand_preset
 from lerobot_wmrl.rl.configuration_callbacks import CallbackSettings
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 from lerobot_wmrl.rl.configuration_policy_gradient import PolicyGradientConfig
@@ -126,7 +126,7 @@ def rollout_length(cfg: TrainConfig, longest: int) -> int:
 
 def load_config(cfg: TrainConfig) -> PreTrainedConfig:
     """The policy's configuration, also kept in `cfg`. ValueError if no policy is given."""
-    from lerobot_wmrl.policy_checkpoints import read_policy_config
+    from lerobot_wmrl.common.policy_checkpoints import read_policy_config
 
     path = parser.get_path_arg("policy") or (cfg.policy and cfg.policy.pretrained_path)
     if not path:
@@ -141,7 +141,7 @@ def train_policy(cfg: TrainConfig) -> None:
     from accelerate import PartialState
     from lerobot.utils.random_utils import set_seed
 
-    from lerobot_wmrl.policy_checkpoints import load_policy, load_processors
+    from lerobot_wmrl.common.policy_checkpoints import load_policy, load_processors
 
     algorithm = check_config(cfg)
     config = load_config(cfg)
@@ -163,7 +163,7 @@ def train_policy(cfg: TrainConfig) -> None:
 
 def finished(cfg: TrainConfig) -> bool:
     """Whether there is nothing left to do. ValueError if there is nothing to resume."""
-    from lerobot_wmrl.checkpoints import latest_checkpoint
+    from lerobot_wmrl.common.checkpoints import latest_checkpoint
     from lerobot_wmrl.rl.callbacks import has_record
     from lerobot_wmrl.rl.selection import Selection
 
@@ -198,8 +198,8 @@ def train_in(
     processors: tuple[Any, Any],
 ) -> None:
     """See that policy and environment fit, then train."""
-    from lerobot_wmrl.adapters import with_new_adapters
-    from lerobot_wmrl.policy_checkpoints import adopt_features, check_fit
+    from lerobot_wmrl.common.adapters import with_new_adapters
+    from lerobot_wmrl.common.policy_checkpoints import adopt_features, check_fit
     from lerobot_wmrl.rl.factory import make_algorithm
     from lerobot_wmrl.rl.make_callbacks import Trained, make_callbacks
     from lerobot_wmrl.rl.protocol import make_pipeline

@@ -19,12 +19,12 @@ from accelerate import PartialState
 from lerobot.configs import parser
 from lerobot.configs.rewards import RewardModelConfig
 
-from lerobot_wmrl.command import RunConfig, claim_output_dir, require_free, run_command
-from lerobot_wmrl.dataset_source import TrainingData
-from lerobot_wmrl.distributed import LONGEST_WAIT
-from lerobot_wmrl.malloc import keep_freed_memory
-from lerobot_wmrl.precision import PRECISIONS, training_dtype
-from lerobot_wmrl.presets import expand_preset
+from lerobot_wmrl.common.command_line import RunConfig, claim_output_dir, require_free, run_command
+from lerobot_wmrl.common.distributed import LONGEST_WAIT
+from lerobot_wmrl.common.malloc import keep_freed_memory
+from lerobot_wmrl.common.precision import PRECISIONS, training_dtype
+from lerobot_wmrl.common.presets import expand_preset
+from lerobot_wmrl.data.dataset_source import TrainingData
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
 
 TRAINED = ("frame_tokenizer", "action_world_model", "text_world_model")
@@ -92,10 +92,10 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
     """Build or reload the model, cache the data, train; a tokenizer's held-out accuracy goes beside it."""
     from lerobot.utils.random_utils import set_seed
 
-    from lerobot_wmrl.checkpoints import latest_checkpoint
+    from lerobot_wmrl.common.checkpoints import latest_checkpoint
+    from lerobot_wmrl.data.episode_table import open_dataset, read_episodes
+    from lerobot_wmrl.evaluation.reconstruction import write_reconstruction
     from lerobot_wmrl.world_models.checkpoint import config_to_continue
-    from lerobot_wmrl.world_models.episode_table import open_dataset, read_episodes
-    from lerobot_wmrl.world_models.reconstruction import write_reconstruction
     from lerobot_wmrl.world_models.training import build_model, make_joint_sampler, train
 
     if path := parser.get_path_arg("model"):

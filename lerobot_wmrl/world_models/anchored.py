@@ -13,10 +13,10 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
-from lerobot_wmrl.precision import compute_in
-from lerobot_wmrl.world_models.clip import take_rows
+from lerobot_wmrl.common.precision import compute_in
+from lerobot_wmrl.data.clip import take_rows
+from lerobot_wmrl.data.frames import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.conditioning import AddedCondition, Conditioning, ConditionTokens, pooled
-from lerobot_wmrl.world_models.context import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.depth_branch import NoDepth
 from lerobot_wmrl.world_models.frame_grids import ContextEmbedding
 from lerobot_wmrl.world_models.frame_network import FrameNetwork, Prediction

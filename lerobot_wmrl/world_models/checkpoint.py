@@ -10,7 +10,7 @@ from lerobot.configs.rewards import RewardModelConfig
 from lerobot.rewards.factory import get_reward_model_class
 from safetensors import SafetensorError
 
-from lerobot_wmrl.checkpoints import resolve_checkpoint
+from lerobot_wmrl.common.checkpoints import resolve_checkpoint
 
 FLAGS: Final = {
     "frame_tokenizer": "--model.tokenizer_path",

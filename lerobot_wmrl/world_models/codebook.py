@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from lerobot_wmrl.distributed import draw_own_rows
+from lerobot_wmrl.common.distributed import draw_own_rows
 
 LARGEST_TOKEN: Final = 2**31
 """Tokens are cached as int32."""

@@ -13,8 +13,8 @@ from typing import Final
 import torch
 from torch import Tensor, nn
 
-from lerobot_wmrl.distributed import masked_mean
-from lerobot_wmrl.world_models.clip import known_transitions
+from lerobot_wmrl.common.distributed import masked_mean
+from lerobot_wmrl.data.clip import known_transitions
 from lerobot_wmrl.world_models.frame_grids import FrameEmbedding, FrameHead
 from lerobot_wmrl.world_models.st_transformer import LayerHook, SpatialTemporalTransformer, unchanged
 from lerobot_wmrl.world_models.temporal_memory import TemporalMemory

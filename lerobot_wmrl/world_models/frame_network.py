@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from lerobot_wmrl.data.frames import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.codebook import make_codebook
-from lerobot_wmrl.world_models.context import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.depth_branch import NoDepth
 from lerobot_wmrl.world_models.frame_grids import FrameEmbedding, FrameHead
 from lerobot_wmrl.world_models.temporal_memory import FrameCache

@@ -11,9 +11,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from lerobot_wmrl.data.frames import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.autoencoder import PATCH, Decoder, Encoder, check_widths
 from lerobot_wmrl.world_models.codebook import make_codebook
-from lerobot_wmrl.world_models.context import NO_CONTEXT, Context, ContextEncoder
+from lerobot_wmrl.world_models.context import ContextEncoder
 from lerobot_wmrl.world_models.quantizer import make_quantizer
 
 MOTION_THRESHOLD = 0.08

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from lerobot_wmrl.world_models.context import NO_CONTEXT, Context
+from lerobot_wmrl.data.frames import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.frame_tokenizer import Decoded, FrameTokenizer, feature_distance
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from lerobot_wmrl.precision import compute_in, imagination_dtype
-from lerobot_wmrl.world_models.context import NO_CONTEXT, Context
+from lerobot_wmrl.common.precision import compute_in, imagination_dtype
+from lerobot_wmrl.data.frames import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.decoding import Condition, FramesSeen, ShiftedDecoding
 from lerobot_wmrl.world_models.frame_network import FrameNetwork, Prediction
 from lerobot_wmrl.world_models.frame_tokenizer import Decoded, FrameTokenizer

@@ -7,9 +7,9 @@ import torch
 from lerobot.rewards.pretrained import PreTrainedRewardModel
 from torch import Tensor
 
-from lerobot_wmrl.world_models.compatibility import check_cameras
+from lerobot_wmrl.data.compatibility import check_cameras
+from lerobot_wmrl.data.frames import NO_CONTEXT
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
-from lerobot_wmrl.world_models.context import NO_CONTEXT
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer, ImageLoss, motion_weight
 from lerobot_wmrl.world_models.goal import similarity_to_goal
 from lerobot_wmrl.world_models.hub_card import HubCard

@@ -9,9 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lerobot_wmrl.precision import compute_in
+from lerobot_wmrl.common.precision import compute_in
+from lerobot_wmrl.data.frames import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.conditioning import pooled
-from lerobot_wmrl.world_models.context import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.depth_branch import DepthBranch, NoDepth
 from lerobot_wmrl.world_models.frame_network import STATE_STEP, FrameNetwork, Prediction
 from lerobot_wmrl.world_models.st_transformer import SpatialTemporalTransformer

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lerobot_wmrl.world_models.context import NO_CONTEXT, Context
+from lerobot_wmrl.data.frames import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.imagination import ImaginationState
 
 

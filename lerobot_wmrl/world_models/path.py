@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from lerobot_wmrl.precision import compute_in
+from lerobot_wmrl.common.precision import compute_in
 from lerobot_wmrl.world_models.frame_network import STATE_STEP
 
 PLACE_CHANNELS = 16

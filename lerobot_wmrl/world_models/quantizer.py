@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from vector_quantize_pytorch import FSQ, LFQ
 
-from lerobot_wmrl.precision import compute_in
+from lerobot_wmrl.common.precision import compute_in
 from lerobot_wmrl.world_models.codebook import BinaryCodeBook, make_codebook
 
 ENTROPY_WEIGHT: Final = 0.1

@@ -11,7 +11,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from lerobot_wmrl.distributed import draw_own_rows
+from lerobot_wmrl.common.distributed import draw_own_rows
 from lerobot_wmrl.world_models.attention import SelfAttention, attention
 from lerobot_wmrl.world_models.conditioning import (
     Conditioning,

@@ -30,24 +30,24 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 from tqdm import tqdm
 
-from lerobot_wmrl.checkpoints import latest_checkpoint, write_checkpoint
-from lerobot_wmrl.dataset_source import TrainingData
-from lerobot_wmrl.distributed import mean_over_processes
-from lerobot_wmrl.precision import compute_in, training_dtype
-from lerobot_wmrl.tracking import append_metrics
-from lerobot_wmrl.world_models.checkpoint import load_model
-from lerobot_wmrl.world_models.clips import ClipSampler, FrameSampler, InTurn
-from lerobot_wmrl.world_models.compatibility import check_dataset
-from lerobot_wmrl.world_models.configuration_frame_tokenizer import cosine_schedule
-from lerobot_wmrl.world_models.configuration_world_model import TextWorldModelConfig
-from lerobot_wmrl.world_models.depth_maps import cached_depth
-from lerobot_wmrl.world_models.episode_table import (
+from lerobot_wmrl.common.checkpoints import latest_checkpoint, write_checkpoint
+from lerobot_wmrl.common.distributed import mean_over_processes
+from lerobot_wmrl.common.precision import compute_in, training_dtype
+from lerobot_wmrl.common.tracking import append_metrics
+from lerobot_wmrl.data.compatibility import check_dataset
+from lerobot_wmrl.data.dataset_source import TrainingData
+from lerobot_wmrl.data.depth_maps import cached_depth
+from lerobot_wmrl.data.episode_table import (
     EpisodeTable,
     golden_episodes,
     open_dataset,
     read_episodes,
 )
-from lerobot_wmrl.world_models.frame_cache import cached_context, cached_frames, cached_tokens
+from lerobot_wmrl.data.frame_cache import cached_context, cached_frames, cached_tokens
+from lerobot_wmrl.data.samplers import ClipSampler, FrameSampler, InTurn
+from lerobot_wmrl.world_models.checkpoint import load_model
+from lerobot_wmrl.world_models.configuration_frame_tokenizer import cosine_schedule
+from lerobot_wmrl.world_models.configuration_world_model import TextWorldModelConfig
 
 
 def build_model(config: RewardModelConfig, table: EpisodeTable, output_dir: Path) -> PreTrainedRewardModel:

@@ -11,25 +11,25 @@ from lerobot.rewards.pretrained import PreTrainedRewardModel
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor, nn
 
-from lerobot_wmrl.world_models.checkpoint import load_model
-from lerobot_wmrl.world_models.clip import Clip
-from lerobot_wmrl.world_models.compatibility import (
+from lerobot_wmrl.data.clip import Clip
+from lerobot_wmrl.data.compatibility import (
     check_cameras,
     check_dataset,
     check_episode_lengths,
     check_tokenizer_source,
 )
+from lerobot_wmrl.data.depth_maps import depth_of_windows
+from lerobot_wmrl.data.episode_table import success_column
+from lerobot_wmrl.data.windows import clip_from_windows
+from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.configuration_world_model import WorldModelConfig
 from lerobot_wmrl.world_models.decoding import Condition, make_decoding
-from lerobot_wmrl.world_models.depth_maps import depth_of_windows
 from lerobot_wmrl.world_models.dynamics import make_dynamics
-from lerobot_wmrl.world_models.episode_table import success_column
 from lerobot_wmrl.world_models.frame_network import Prediction
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
 from lerobot_wmrl.world_models.hub_card import HubCard
 from lerobot_wmrl.world_models.imagination import Imagination
 from lerobot_wmrl.world_models.modeling_frame_tokenizer import stack_cameras
-from lerobot_wmrl.world_models.windows import clip_from_windows
 
 MIN_SPREAD = 1e-3
 """Components that vary less than this are constants, and left alone by normalisation."""

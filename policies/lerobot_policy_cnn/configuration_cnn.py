@@ -6,7 +6,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.configs.types import FeatureType, NormalizationMode, PolicyFeature
 from lerobot.utils.constants import ACTION, OBS_STATE
 
-from lerobot_wmrl.policy_configuration import ClonedConfig
+from lerobot_wmrl.common.policy_configuration import ClonedConfig
 
 
 @PreTrainedConfig.register_subclass("cnn")

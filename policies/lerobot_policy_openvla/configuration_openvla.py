@@ -8,7 +8,7 @@ from lerobot.configs.types import FeatureType, NormalizationMode, PolicyFeature
 from lerobot.utils.constants import ACTION
 
 from lerobot_policy_openvla.sizes import Sizes
-from lerobot_wmrl.policy_configuration import ClonedConfig
+from lerobot_wmrl.common.policy_configuration import ClonedConfig
 
 DTYPES = ("auto", "float32", "bfloat16")
 

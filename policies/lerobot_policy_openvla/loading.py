@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from lerobot_policy_openvla.configuration_openvla import OpenVLAConfig
 from lerobot_policy_openvla.openvla_checkpoint import CONFIG_FILE, OpenVLACheckpoint
 from lerobot_policy_openvla.statistics import choose_key, used_statistics
-from lerobot_wmrl.precision import multiplies_bfloat16
+from lerobot_wmrl.common.precision import multiplies_bfloat16
 
 NAMED = 5
 """Weights that an error names before it only counts them."""

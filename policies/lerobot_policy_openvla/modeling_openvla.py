@@ -34,7 +34,7 @@ from lerobot_policy_openvla.openvla_checkpoint import (
 )
 from lerobot_policy_openvla.prompts import END_ID, PromptTokenizer, aligned_prompts, train_tokenizer
 from lerobot_policy_openvla.statistics import adopt_statistics
-from lerobot_wmrl.precision import require_exact_updates
+from lerobot_wmrl.common.precision import require_exact_updates
 
 Observation = dict[str, Any]
 

@@ -16,7 +16,7 @@ from transformers import DynamicCache, LlamaConfig, LlamaForCausalLM
 
 from lerobot_policy_openvla.sizes import CHANNELS, LlamaSizes, Sizes
 from lerobot_policy_openvla.vision_transformer import VisionTransformer
-from lerobot_wmrl.precision import compute_in
+from lerobot_wmrl.common.precision import compute_in
 
 PROJECTOR_GROWTH = 4
 """Width of the projector's first layer relative to the features it gets."""

@@ -6,7 +6,7 @@ from typing import Final
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.types import NormalizationMode
 
-from lerobot_wmrl.policy_configuration import SingleStepConfig
+from lerobot_wmrl.common.policy_configuration import SingleStepConfig
 
 OBJECTIVES: Final = ("success", "goal")
 

@@ -9,13 +9,13 @@ from torch import Tensor
 
 from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
 from lerobot_policy_wm_mpc.planning import Objective, best_knots, interpolated, longest_success
-from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW
+from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW
+from lerobot_wmrl.data.compatibility import check_same_tokenizer
+from lerobot_wmrl.data.frames import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.checkpoint import load_model
-from lerobot_wmrl.world_models.compatibility import check_same_tokenizer
-from lerobot_wmrl.world_models.context import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.goal import imagine_goal, similarity_to_goal
-from lerobot_wmrl.world_models.look_ahead import look_ahead
 from lerobot_wmrl.world_models.modeling_frame_tokenizer import stack_cameras
+from lerobot_wmrl.world_models.open_loop import open_loop
 
 Observation = dict[str, Any]
 
@@ -110,7 +110,7 @@ class WmMpcPolicy(PreTrainedPolicy):
         def value(actions: Tensor) -> Tensor:
             every = [0] * len(actions)
             seen = context[every] if len(context) else NO_CONTEXT
-            ahead = look_ahead(model, tokens[[row] * len(actions)], state[every], actions, seen)
+            ahead = open_loop(model, tokens[[row] * len(actions)], state[every], actions, seen)
             if goal is None:
                 return longest_success(ahead.done_logit, config.done_frames)
             features = [layer.repeat(len(actions), 1, 1, 1) for layer in goal.features]

@@ -8,7 +8,7 @@ import pytest
 import torch
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION, preprocess_observation
 
-from lerobot_wmrl.constants import EVALUATION_SEED
+from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.maniskill_env import ManiSkillEnv
 from lerobot_wmrl.envs.maniskill_tensor_env import ManiSkillTensorEnv

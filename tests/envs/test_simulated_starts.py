@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lerobot_wmrl.constants import TASKS
+from lerobot_wmrl.common.constants import TASKS
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.envs.first_frames import read_first_frames

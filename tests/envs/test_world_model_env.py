@@ -7,11 +7,11 @@ import pytest
 import torch
 from gymnasium.vector import AutoresetMode
 
-from lerobot_wmrl.constants import ACTION_HIGH, TASKS
-from lerobot_wmrl.dataset_source import DatasetSource
+from lerobot_wmrl.common.constants import ACTION_HIGH, TASKS
+from lerobot_wmrl.data.dataset_source import DatasetSource
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
-from lerobot_wmrl.envs.doubt import Doubt
 from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
+from lerobot_wmrl.envs.uncertainty import Uncertainty
 from lerobot_wmrl.rewards.configuration_general import GeneralConfig
 from lerobot_wmrl.rewards.configuration_learned import EmbeddingConfig, ProxyConfig
 from lerobot_wmrl.rewards.modeling_learned import EmbeddingRewardModel, ProxyRewardModel
@@ -369,11 +369,13 @@ REWARDS = {
 }
 
 
-@pytest.mark.parametrize("doubt", [Doubt(), Doubt(limit=100.0), Doubt(limit=0.1, effect="weight")])
+@pytest.mark.parametrize(
+    "uncertainty", [Uncertainty(), Uncertainty(limit=100.0), Uncertainty(limit=0.1, effect="weight")]
+)
 @pytest.mark.parametrize("reward", list(REWARDS))
-def test_a_step_asks_the_device_only_whether_an_episode_has_ended(config, reward, doubt):
+def test_a_step_asks_the_device_only_whether_an_episode_has_ended(config, reward, uncertainty):
     """Anchored dynamics ask once more in the first step, who begins."""
-    env = replace(config, reward=REWARDS[reward], doubt=doubt).create_tensor_env(B)
+    env = replace(config, reward=REWARDS[reward], uncertainty=uncertainty).create_tensor_env(B)
     assert fetched_by_steps(env, 4) == [2, 1, 1, 1]
 
 
@@ -427,10 +429,10 @@ def test_instructions_are_those_of_the_starts(env):
     assert observation["task"] == expected() != before
 
 
-def doubtful(config, **doubt):
+def uncertain(config, **uncertainty):
     """One step of four environments, in which done is certain, as likely as not, unlikely and excluded."""
     logits = torch.tensor([20.0, 0.0, -2.0, -20.0])
-    env = replace(config, doubt=Doubt(**doubt)).create_tensor_env(B)
+    env = replace(config, uncertainty=Uncertainty(**uncertainty)).create_tensor_env(B)
     step = env.model.step
     env.model.step = lambda *args: step(*args)._replace(done_logit=logits, entropy=torch.arange(4.0))
     env.reset(seed=0)
@@ -440,19 +442,19 @@ def doubtful(config, **doubt):
 
 def test_what_the_world_model_doubts_ends_or_pays_less(config):
     surely = replace(config, done_frames=1, done_threshold=0.4)
-    paid, terminated, truncated, parts = doubtful(surely)
+    paid, terminated, truncated, parts = uncertain(surely)
     assert terminated.tolist() == [True, True, False, False]
     assert not truncated.any()
     torch.testing.assert_close(parts["done_entropy"], torch.tensor([0, 0.6931, 0.3653, 0]), atol=1e-3, rtol=0)
-    _, terminated, truncated, _ = doubtful(surely, limit=0.5, signal="done_entropy")
+    _, terminated, truncated, _ = uncertain(surely, limit=0.5, signal="done_entropy")
     assert terminated.tolist() == [True, False, False, False]
     assert truncated.tolist() == [False, True, False, False]
-    less, terminated, truncated, parts = doubtful(surely, limit=0.5, signal="token_entropy", effect="weight")
+    less, terminated, truncated, parts = uncertain(surely, limit=0.5, signal="token_entropy", effect="weight")
     assert terminated.tolist() == [True, True, False, False]
     assert not truncated.any()
     assert parts["token_entropy"].tolist() == [0, 1, 2, 3]
     torch.testing.assert_close(less, paid * torch.tensor([1, 1 / 2, 1 / 4, 1 / 6]))
     for wrong in ({"limit": 0.0}, {"signal": "mood"}, {"effect": "scold"}):
         name, value = next(iter(wrong.items()))
-        with pytest.raises(ValueError, match=rf"--env\.doubt\.{name}={value}"):
-            doubtful(config, **wrong)
+        with pytest.raises(ValueError, match=rf"--env\.uncertainty\.{name}={value}"):
+            uncertain(config, **wrong)

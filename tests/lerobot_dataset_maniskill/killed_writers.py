@@ -21,9 +21,9 @@ sys.path.insert(0, str(Path(__file__).parent))
 from made_up import write_missing
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
+from lerobot_wmrl.common.files import writing
+from lerobot_wmrl.common.progress import own_progress_lock
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
-from lerobot_wmrl.files import writing
-from lerobot_wmrl.progress import own_progress_lock
 
 ADVISED, NOT_ADVISED = 3, 4
 """Exit status of a writer whose disk is full: whether its error says what to do."""

@@ -11,7 +11,7 @@ from lerobot_dataset_maniskill.manifest import EpisodePlan, planned_parts
 from lerobot_dataset_maniskill.recorder import merge, missing_parts
 from lerobot_dataset_maniskill.worker import PartRecorder
 from lerobot_dataset_maniskill.writer import Outcome, StartColumns, add_step
-from lerobot_wmrl.constants import TASKS
+from lerobot_wmrl.common.constants import TASKS
 from lerobot_wmrl.maniskill.simulation import Frame
 
 ROWS = 10

@@ -10,10 +10,10 @@ from PIL import Image
 from lerobot_dataset_maniskill.card import KIND_MEANINGS, name_card, scene_rows
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.examples import FRAMES, WIDTH, chosen_examples
-from lerobot_wmrl.constants import KINDS
+from lerobot_wmrl.common.constants import KINDS
+from lerobot_wmrl.common.frame_strips import GAP
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.maniskill.scenes import SCENES
-from lerobot_wmrl.strips import GAP
 from tests.lerobot_dataset_maniskill.made_up import BRIGHTER, NOISE, SUCCESS_ROW, record_made_up
 
 SIZE = 32

@@ -13,8 +13,8 @@ from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.planners import MOTIONS, PLANNERS, Follower, Motion, Plan
 from lerobot_dataset_maniskill.planners.follower import OPTIMAL_SPEED, Waypoint
 from lerobot_dataset_maniskill.recorder import record
-from lerobot_wmrl.constants import KINDS, PLAY
-from lerobot_wmrl.episodes import recorded_episodes
+from lerobot_wmrl.common.constants import KINDS, PLAY
+from lerobot_wmrl.data.recorded_episodes import recorded_episodes
 from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS
 from lerobot_wmrl.maniskill.rendering import Rendering
 from lerobot_wmrl.maniskill.scenes import SCENES
@@ -73,7 +73,7 @@ def places(plan: Plan) -> np.ndarray:
 
 
 def test_the_same_episode_has_the_same_plan_whatever_was_planned_before(mplib: Motion) -> None:
-    episodes = [(task, kind, seed) for task in TASKS for kind in ("optimal", "disturbed") for seed in (0, 1)]
+    episodes = [(task, kind, seed) for task in TASKS for kind in ("optimal", "noisy") for seed in (0, 1)]
     first = {episode: places(plans(mplib, *episode)[1]) for episode in episodes}
     fresh = MOTIONS["mplib"]()
     again = {episode: places(plans(fresh, *episode)[1]) for episode in reversed(episodes)}

@@ -18,7 +18,7 @@ from lerobot_dataset_maniskill.planners.slide import (
     slide_partly,
     stop_short,
 )
-from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW, PLAY
+from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW, PLAY
 from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS
 from lerobot_wmrl.maniskill.rendering import Rendering
 from lerobot_wmrl.maniskill.scenes import SCENES, Scene

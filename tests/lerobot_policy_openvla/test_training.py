@@ -22,12 +22,17 @@ from safetensors.torch import load_file
 from lerobot_policy_openvla.modeling_openvla import OpenVLAPolicy
 from lerobot_policy_openvla.processor_openvla import make_openvla_pre_post_processors
 from lerobot_policy_openvla.statistics import dataset_statistics
-from lerobot_wmrl.adapters import unwrapped
-from lerobot_wmrl.policy_checkpoints import check_weights, load_policy, load_processors, read_policy_config
+from lerobot_wmrl.common.adapters import unwrapped
+from lerobot_wmrl.common.policy_checkpoints import (
+    check_weights,
+    load_policy,
+    load_processors,
+    read_policy_config,
+)
+from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.rl.policy_gradient import reference_of
 from lerobot_wmrl.scripts.convert_openvla import ConvertOpenVLAConfig, convert
 from lerobot_wmrl.scripts.train import main
-from lerobot_wmrl.tracking import read_metrics
 from tests.lerobot_policy_openvla.small import observe, small_policy
 from tests.rl.point_env import PointEnv
 

@@ -11,7 +11,7 @@ from lerobot.scripts import lerobot_eval
 from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
 from lerobot_policy_wm_mpc.modeling_wm_mpc import WmMpcPolicy
 from lerobot_policy_wm_mpc.planning import best_knots, interpolated, longest_success
-from lerobot_wmrl.constants import ACTION_HIGH, ACTION_LOW
+from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW
 
 SMALL = {"horizon": 8, "execute": 3, "samples": 6, "elites": 2, "iterations": 2, "knots": 3, "device": "cpu"}
 IMAGE = "observation.images.third_view"

@@ -5,7 +5,7 @@ import pytest
 import sapien
 from transforms3d.quaternions import qconjugate, qmult, quat2axangle
 
-from lerobot_wmrl.constants import ACTION_HIGH, IMAGE_SIZE, ROBOT_MESH_DETAIL, WORKSPACE_FLOOR
+from lerobot_wmrl.common.constants import ACTION_HIGH, IMAGE_SIZE, ROBOT_MESH_DETAIL, WORKSPACE_FLOOR
 from lerobot_wmrl.maniskill import renderer
 from lerobot_wmrl.maniskill.cameras import VIEWS
 from lerobot_wmrl.maniskill.rendering import Rendering

@@ -1,8 +1,8 @@
 import pytest
 import torch
 
+from lerobot_wmrl.evaluation.reward_curves import success_once
 from lerobot_wmrl.rewards.configuration_general import GeneralConfig
-from lerobot_wmrl.rewards.curves import success_once
 from lerobot_wmrl.rewards.general import consecutive_count, general_reward, sparse_reward
 from lerobot_wmrl.rewards.modeling_general import GeneralRewardModel
 

@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "rl"))
 from chunk_policy import ACTIONS, ChunkPolicy, Sample
 from point_env import PointEnv
 
-from lerobot_wmrl.distributed import rank_and_size
+from lerobot_wmrl.common.distributed import rank_and_size
 from lerobot_wmrl.rl.callbacks import Record
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 from lerobot_wmrl.rl.configuration_policy_gradient import PolicyGradientConfig

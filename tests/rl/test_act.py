@@ -10,8 +10,9 @@ from lerobot.policies.act.modeling_act import ACTPolicy
 from safetensors.torch import load_file
 from torch.distributions import Normal
 
+from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
-from lerobot_wmrl.envs.policy_success import policy_outcomes
+from lerobot_wmrl.evaluation.policy_success import policy_outcomes
 from lerobot_wmrl.rl.act_adapter import INITIAL_STD, ActAdapter
 from lerobot_wmrl.rl.configuration_ppo import PPOConfig
 from lerobot_wmrl.rl.minibatches import read_steps
@@ -20,7 +21,6 @@ from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
 from lerobot_wmrl.rl.trainer import Schedule, train
 from lerobot_wmrl.scripts.train import main
-from lerobot_wmrl.tracking import read_metrics
 from tests.rl.act_checkpoint import ACTED, IMAGE, SCENE, STATE, save_small_act, small_act
 from tests.rl.conformance import check_samples_and_log_probs_agree
 from tests.rl.point_env import PointEnv

@@ -14,9 +14,10 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.processor import PolicyProcessorPipeline
 
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
-from lerobot_wmrl.constants import EVALUATION_SEED, GATE_SEED, SELECTION_SEED
+from lerobot_wmrl.common.constants import EVALUATION_SEED, GATE_SEED, SELECTION_SEED
+from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
-from lerobot_wmrl.envs.policy_success import evaluate_within
+from lerobot_wmrl.evaluation.policy_success import evaluate_within
 from lerobot_wmrl.rl import gate
 from lerobot_wmrl.rl.callbacks import Callback, Record
 from lerobot_wmrl.rl.configuration_callbacks import DYNA_SEEDS
@@ -27,7 +28,6 @@ from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer
 from lerobot_wmrl.rl.selection import Selection
 from lerobot_wmrl.rl.trainer import Schedule, rollout_seed, train
-from lerobot_wmrl.tracking import read_metrics
 from tests.rl.conftest import ACTION_SCALE
 from tests.rl.point_env import PointEnv
 

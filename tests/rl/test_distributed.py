@@ -6,7 +6,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from lerobot_wmrl.tracking import read_metrics
+from lerobot_wmrl.common.tracking import read_metrics
 from tests.rl.parallel_trainings import ITERATIONS, RUNS, run
 from tests.torchrun import torchrun
 

@@ -10,7 +10,7 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from safetensors.torch import load_file
 
-from lerobot_wmrl.dataset_source import DatasetSource
+from lerobot_wmrl.data.dataset_source import DatasetSource
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.rewards.configuration_general import GeneralConfig
 from lerobot_wmrl.rl.callbacks import Callbacks
@@ -108,9 +108,7 @@ def test_rounds_build_on_one_another(
     settings = json.loads((last / "train_config.json").read_text())
     assert settings["model"]["pretrained_path"].startswith(str(tmp_path / "dyna" / "000003"))
     assert settings["dataset"]["more"] == [
-        str(tmp_path / "dyna" / at / manner)
-        for at in ("000003", "000006")
-        for manner in ("calm", "disturbed")
+        str(tmp_path / "dyna" / at / manner) for at in ("000003", "000006") for manner in ("calm", "noisy")
     ]
 
 

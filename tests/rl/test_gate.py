@@ -8,15 +8,15 @@ from typing import Any
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_wmrl.dataset_source import DatasetSource
+from lerobot_wmrl.data.dataset_source import DatasetSource
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
+from lerobot_wmrl.evaluation.gate import success_gate
 from lerobot_wmrl.rewards.configuration_general import GeneralConfig
 from lerobot_wmrl.rl.configuration_callbacks import GateConfig
 from lerobot_wmrl.rl.gate import SuccessGate
 from lerobot_wmrl.rl.policy_gradient import TrainingStopped
 from lerobot_wmrl.rl.recording import RolloutRecorder, env_flags
-from lerobot_wmrl.world_models.evaluation.gate import success_gate
 
 BELIEVES_ALL, BELIEVES_NONE = 0.0001, 0.9999
 """Done thresholds."""

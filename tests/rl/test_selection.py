@@ -5,11 +5,11 @@ from typing import Any
 
 import pytest
 
-from lerobot_wmrl.envs.policy_success import Evaluated
+from lerobot_wmrl.common.statistics import Proportion
+from lerobot_wmrl.evaluation.policy_success import Evaluated
 from lerobot_wmrl.rl.callbacks import Record
 from lerobot_wmrl.rl.policy_gradient import TrainingStopped
 from lerobot_wmrl.rl.selection import Measure, Selection, best_iteration, parted
-from lerobot_wmrl.statistics import Proportion
 
 N = 64
 

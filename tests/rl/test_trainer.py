@@ -7,14 +7,14 @@ import pytest
 import torch
 
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
-from lerobot_wmrl.constants import EVALUATION_SEED
+from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.rl.configuration_ppo import PPOConfig
 from lerobot_wmrl.rl.policy_gradient import TrainingStopped
 from lerobot_wmrl.rl.ppo import PPO
 from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer
 from lerobot_wmrl.rl.trainer import Schedule, rollout_seed, train
-from lerobot_wmrl.tracking import read_metrics
 from tests.rl.point_env import PointEnv
 
 MakePolicy = Callable[..., CnnPolicy]

@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_wmrl.constants import EVALUATION_SEED
+from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.presets import PRESETS
+from lerobot_wmrl.common.tracking import read_metrics
+from lerobot_wmrl.data.recorded_episodes import recorded_episodes
 from lerobot_wmrl.demo.stages import DemoConfig, demo_stages
-from lerobot_wmrl.episodes import recorded_episodes
-from lerobot_wmrl.presets import PRESETS
-from lerobot_wmrl.tracking import read_metrics
 
 KILLED_STAGE = "explore"
 STAGES = [stage.name for stage in demo_stages(DemoConfig())]

@@ -14,9 +14,9 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import EnvConfig
 from safetensors.torch import load_file
 
+from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 from lerobot_wmrl.scripts.train import TrainConfig, check_config, main, rollout_length
-from lerobot_wmrl.tracking import read_metrics
 from tests.rl.checkpoints import save_untrained_policy
 from tests.rl.point_env import PointEnv
 

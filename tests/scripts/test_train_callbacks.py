@@ -14,10 +14,10 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import EnvConfig
 from safetensors.torch import load_file
 
-from lerobot_wmrl.constants import GATE_SEED
-from lerobot_wmrl.episodes import recorded_episodes
+from lerobot_wmrl.common.constants import GATE_SEED
+from lerobot_wmrl.common.tracking import read_metrics
+from lerobot_wmrl.data.recorded_episodes import recorded_episodes
 from lerobot_wmrl.scripts.train import main
-from lerobot_wmrl.tracking import read_metrics
 from tests.rl.checkpoints import save_untrained_policy
 from tests.rl.point_env import PointEnv
 

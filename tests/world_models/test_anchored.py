@@ -6,12 +6,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from lerobot_wmrl.world_models.clip import Clip
+from lerobot_wmrl.data.clip import Clip
+from lerobot_wmrl.data.frames import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.codebook import CodeBook
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig, TextWorldModelConfig
-from lerobot_wmrl.world_models.context import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.imagination import Imagined
-from lerobot_wmrl.world_models.look_ahead import look_ahead
 from lerobot_wmrl.world_models.losses import (
     draw_rows,
     frames_since_start,
@@ -20,6 +19,7 @@ from lerobot_wmrl.world_models.modeling_world_model import (
     ActionWorldModelRewardModel,
     TextWorldModelRewardModel,
 )
+from lerobot_wmrl.world_models.open_loop import open_loop
 from lerobot_wmrl.world_models.st_transformer import Dropout
 from lerobot_wmrl.world_models.world_model import STATE_SPREAD
 
@@ -83,7 +83,7 @@ def test_looking_ahead_ends_where_steps_do(length):
     """In one pass, and by steps where imagination begins anew on the way."""
     model, clip = world_model(), random_clip(length=length)
     steps = imagine(model, clip)
-    ahead = look_ahead(model, clip.tokens[:, 0], clip.state[:, 0], clip.action, clip.context)
+    ahead = open_loop(model, clip.tokens[:, 0], clip.state[:, 0], clip.action, clip.context)
     assert torch.equal(ahead.tokens, steps[-1].tokens)
     for name in ("done_logit", "proprioception"):
         torch.testing.assert_close(getattr(ahead, name), over_time(steps, name), atol=1e-3, rtol=1e-4)

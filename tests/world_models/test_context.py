@@ -6,16 +6,17 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_wmrl.dataset_source import DatasetSource
+from lerobot_wmrl.data.dataset_source import DatasetSource
+from lerobot_wmrl.data.episode_table import read_episodes
+from lerobot_wmrl.data.frame_cache import cached_frames, cached_tokens, frames_to_tensor
+from lerobot_wmrl.data.frames import NO_CONTEXT
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
+from lerobot_wmrl.evaluation.pictures import side_by_side, to_uint8
+from lerobot_wmrl.evaluation.replay import Source, replay_episodes
 from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
-from lerobot_wmrl.world_models.context import NO_CONTEXT, Fusion
-from lerobot_wmrl.world_models.episode_table import read_episodes
-from lerobot_wmrl.world_models.evaluation.pictures import side_by_side, to_uint8
-from lerobot_wmrl.world_models.evaluation.replay import Source, replay_episodes
-from lerobot_wmrl.world_models.frame_cache import cached_frames, cached_tokens, frames_to_tensor
+from lerobot_wmrl.world_models.context import Fusion
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
 from lerobot_wmrl.world_models.training import make_sampler
 from tests.trained import action_config, run_training, text_config

@@ -8,8 +8,8 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig, train_world_model
-from lerobot_wmrl.tracking import read_metrics
 from tests.torchrun import torchrun
 
 SCRIPT = Path(__file__).with_name("trainings.py")

@@ -14,10 +14,10 @@ import pytest
 from lerobot.rewards.factory import make_reward_model
 from lerobot.utils.random_utils import set_seed
 
-from lerobot_wmrl.tracking import read_metrics
-from lerobot_wmrl.world_models.clips import ClipSampler, FrameSampler
+from lerobot_wmrl.common.tracking import read_metrics
+from lerobot_wmrl.data.episode_table import EpisodeTable
+from lerobot_wmrl.data.samplers import ClipSampler, FrameSampler
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig, TextWorldModelConfig
-from lerobot_wmrl.world_models.episode_table import EpisodeTable
 from lerobot_wmrl.world_models.training import train
 from tests.trained import TINY, tokenizer_config
 

@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from lerobot_wmrl.precision import compute_in
+from lerobot_wmrl.common.precision import compute_in
 from lerobot_wmrl.world_models.codebook import CodeBook, make_codebook
 from lerobot_wmrl.world_models.keypoints import (
     KEYPOINTS,
@@ -28,7 +28,7 @@ def crossing() -> Tensor:
 
 
 def sure(digits: Tensor) -> Tensor:
-    """Logits that leave no doubt."""
+    """Logits that leave no uncertainty."""
     return 100 * CODEBOOK.one_hot(digits)
 
 

@@ -11,12 +11,12 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.scripts import lerobot_train
 from safetensors.torch import load_file
 
+from lerobot_wmrl.data.episode_table import open_dataset, read_episodes
+from lerobot_wmrl.data.windows import clip_from_windows
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig
-from lerobot_wmrl.world_models.episode_table import open_dataset, read_episodes
-from lerobot_wmrl.world_models.look_ahead import look_ahead
+from lerobot_wmrl.world_models.open_loop import open_loop
 from lerobot_wmrl.world_models.processor_world_model import make_pass_through_processors
-from lerobot_wmrl.world_models.windows import clip_from_windows
 
 SIZE, ACTIONS, LENGTHS = 32, 3, (9, 14, 2)
 LAST = Path("checkpoints") / "last" / "pretrained_model"
@@ -95,7 +95,7 @@ def test_a_world_model_of_any_dataset_goes_on_bit_for_bit(
     assert model.config.cameras == ["top", "left.fisheye"]
     assert (model.config.action_size, model.config.state_size) == (ACTIONS, 0)
     first = torch.zeros(2, model.tokenizer.tokens_per_frame, dtype=torch.long)
-    ahead = look_ahead(model, first, torch.empty(2, 0), torch.randn(2, 5, ACTIONS))
+    ahead = open_loop(model, first, torch.empty(2, 0), torch.randn(2, 5, ACTIONS))
     assert (ahead.done_logit.sigmoid() < 0.01).all(), "the dataset does not say what success is"
 
 

@@ -61,9 +61,9 @@ def test_who_begins_anew_among_others_is_as_if_all_began(model, before):
     unmoved = begun(model, first)
     for row in range(before):
         model.step(unmoved, first.action[:, row])
-    undisturbed = model.step(unmoved, second.action[:, AGO])
+    unperturbed = model.step(unmoved, second.action[:, AGO])
     rest = ~mask
-    torch.testing.assert_close(together[0].done_logit[rest], undisturbed.done_logit[rest])
+    torch.testing.assert_close(together[0].done_logit[rest], unperturbed.done_logit[rest])
 
 
 def test_a_past_longer_than_the_memory_is_refused(model):

@@ -6,8 +6,8 @@ import pytest
 import torch
 from lpips import LPIPS
 
+from lerobot_wmrl.evaluation.alexnet_lpips import image_distance
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
-from lerobot_wmrl.world_models.evaluation.alexnet_lpips import image_distance
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
 from lerobot_wmrl.world_models.perceptual import PerceptualLoss
 from tests.trained import run_training

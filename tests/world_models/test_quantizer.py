@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from lerobot_wmrl.tracking import read_metrics
+from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.codebook import BinaryCodeBook, CodeBook
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig

@@ -13,8 +13,8 @@ from huggingface_hub import HfApi, constants
 from safetensors.torch import load_file
 from transformers import BertConfig
 
-from lerobot_wmrl.checkpoints import resolve_checkpoint
-from lerobot_wmrl.command import CONFIG_FILE
+from lerobot_wmrl.common.checkpoints import resolve_checkpoint
+from lerobot_wmrl.common.command_line import CONFIG_FILE
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.goal import imagine_goal
 from tests.hub_server import WRITE_TOKEN, running_hub

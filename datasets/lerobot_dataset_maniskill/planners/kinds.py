@@ -1,5 +1,5 @@
 """From a task's essential waypoints to plans of every kind (method: optimal; waypoint, interpolated and
-disturbed; and deliberate near misses). Pure numpy.
+noisy; and deliberate near misses). Pure numpy.
 
 Suboptimal plans also get noise on their actions, so that what a stochastic policy does around a good
 trajectory is in the data as well.
@@ -21,7 +21,7 @@ from lerobot_dataset_maniskill.planners.follower import (
     above_table,
 )
 from lerobot_dataset_maniskill.planners.play import play_waypoints
-from lerobot_wmrl.constants import KINDS, PLAY
+from lerobot_wmrl.common.constants import KINDS, PLAY
 from lerobot_wmrl.maniskill.objects import ContainerSpec, ObjectSpec
 from lerobot_wmrl.maniskill.tasks import Start
 
@@ -31,10 +31,10 @@ FINGER_HALF_THICKNESS: Final = 0.011
 TASK_KINDS: Final = tuple(kind for kind in KINDS if kind not in ("policy", PLAY))
 """Kinds of plan that have to do with the task."""
 
-TURNED: Final = ("waypoint", "disturbed")
-"""Kinds whose rotations and gripper commands are disturbed too."""
+TURNED: Final = ("waypoint", "noisy")
+"""Kinds whose rotations and gripper commands are noisy too."""
 
-CALM_SHARE: Final = {"waypoint": 0.3, "interpolated": 0.3, "disturbed": 0.5, "near_miss": 0.6}
+CALM_SHARE: Final = {"waypoint": 0.3, "interpolated": 0.3, "noisy": 0.5, "near_miss": 0.6}
 """Share of each suboptimal kind that moves as evenly as the optimal trajectories do. If only good episodes
 were calm, a world model would take calm actions for success: a cloned policy is calm when it fails, too."""
 
@@ -88,7 +88,7 @@ class Planner(ABC):
             first = waypoint.position
         return tuple(points)
 
-    def disturbed(self, rng: np.random.Generator) -> Waypoints:
+    def noisy(self, rng: np.random.Generator) -> Waypoints:
         """The essential waypoints, each a little off: some fail by it."""
         return jittered(self.essential(), rng, rng.uniform(0.008, 0.03))
 

@@ -9,7 +9,7 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from lerobot_wmrl.constants import TASKS as TASK_NAMES
+from lerobot_wmrl.common.constants import TASKS as TASK_NAMES
 from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS, ContainerSpec, ObjectSpec
 from lerobot_wmrl.maniskill.scenes import Scene
 

@@ -12,7 +12,7 @@ from typing import Any, Final
 import torch
 from torch import Tensor, nn
 
-from lerobot_wmrl.distributed import draw_own_rows, masked_mean
+from lerobot_wmrl.common.distributed import draw_own_rows, masked_mean
 from lerobot_wmrl.world_models.codebook import gumbel
 from lerobot_wmrl.world_models.conditioning import pooled
 from lerobot_wmrl.world_models.decoding.shifted import FramesSeen, ShiftedDecoding

@@ -5,18 +5,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lerobot_wmrl.precision import compute_in, imagination_dtype
+from lerobot_wmrl.common.precision import compute_in, imagination_dtype
+from lerobot_wmrl.data.clip import Clip
+from lerobot_wmrl.data.frames import Context
 from lerobot_wmrl.world_models.anchored import AnchoredNetwork
-from lerobot_wmrl.world_models.clip import Clip
-from lerobot_wmrl.world_models.context import Context
 from lerobot_wmrl.world_models.frame_network import Prediction
-from lerobot_wmrl.world_models.look_ahead import Ahead, step_ahead
 from lerobot_wmrl.world_models.losses import (
     corrupt_digits,
     draw_rows,
     frames_since_start,
     next_frame_loss,
 )
+from lerobot_wmrl.world_models.open_loop import OpenLoopPrediction, open_loop_stepwise
 
 
 class AnchoredDynamics:
@@ -57,14 +57,14 @@ class AnchoredDynamics:
         )  # fmt: skip
         return prediction
 
-    def look_ahead(
+    def open_loop(
         self, model: Any, tokens: Tensor, state: Tensor, actions: Tensor, context: Context,
         depth: Tensor | None, generator: torch.Generator,
-    ) -> Ahead:  # fmt: skip
+    ) -> OpenLoopPrediction:  # fmt: skip
         """In one pass, unless imagination would begin anew on the way."""
         network, length = model.network, actions.shape[1]
         if length > self.config.clip_length:
-            return step_ahead(model, tokens, state, actions, context, depth, generator)
+            return open_loop_stepwise(model, tokens, state, actions, context, depth, generator)
         digits, first = network.codebook.digits(tokens), model.normalize_state(state)
         last = torch.full((len(tokens), 1), length - 1, device=tokens.device)
         with compute_in(imagination_dtype(tokens.device, len(tokens)), tokens.device):
@@ -74,4 +74,4 @@ class AnchoredDynamics:
             )  # fmt: skip
         drawn = network.codebook.sample(prediction.logits.float(), self.config.temperature, generator)
         states = prediction.proprioception * model.state_std + model.state_mean
-        return Ahead(prediction.done_logit, states, network.codebook.tokens(drawn[:, 0]))
+        return OpenLoopPrediction(prediction.done_logit, states, network.codebook.tokens(drawn[:, 0]))

@@ -5,13 +5,12 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from lerobot_wmrl.precision import computing_dtype
-from lerobot_wmrl.world_models.clip import Clip
-from lerobot_wmrl.world_models.context import Context
+from lerobot_wmrl.common.precision import computing_dtype
+from lerobot_wmrl.data.clip import Clip
+from lerobot_wmrl.data.frames import Context
 from lerobot_wmrl.world_models.decoding import Condition, FramesSeen
 from lerobot_wmrl.world_models.frame_network import FrameNetwork, Prediction
 from lerobot_wmrl.world_models.keypoints import keypoint_loss
-from lerobot_wmrl.world_models.look_ahead import Ahead, step_ahead
 from lerobot_wmrl.world_models.losses import (
     corrupt_digits,
     force_predictions,
@@ -21,6 +20,7 @@ from lerobot_wmrl.world_models.losses import (
     self_rollout_rows,
 )
 from lerobot_wmrl.world_models.next_frame import NextFrameNetwork
+from lerobot_wmrl.world_models.open_loop import OpenLoopPrediction, open_loop_stepwise
 
 
 class Dynamics(Protocol):
@@ -37,11 +37,11 @@ class Dynamics(Protocol):
     def predict(self, model: Any, clip: Clip, drawn: bool) -> Prediction:
         """About the frame after every row of a clip. What is not `drawn` may have no logits, (B, 0, S, V)."""
 
-    def look_ahead(
+    def open_loop(
         self, model: Any, tokens: Tensor, state: Tensor, actions: Tensor, context: Context,
         depth: Tensor | None, generator: torch.Generator,
-    ) -> Ahead:  # fmt: skip
-        """As `look_ahead.look_ahead`."""
+    ) -> OpenLoopPrediction:  # fmt: skip
+        """As `open_loop.open_loop`."""
 
 
 class AutoregressiveDynamics:
@@ -132,8 +132,8 @@ class AutoregressiveDynamics:
         )
         return prediction
 
-    def look_ahead(
+    def open_loop(
         self, model: Any, tokens: Tensor, state: Tensor, actions: Tensor, context: Context,
         depth: Tensor | None, generator: torch.Generator,
-    ) -> Ahead:  # fmt: skip
-        return step_ahead(model, tokens, state, actions, context, depth, generator)
+    ) -> OpenLoopPrediction:  # fmt: skip
+        return open_loop_stepwise(model, tokens, state, actions, context, depth, generator)

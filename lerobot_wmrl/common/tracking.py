@@ -1,0 +1,72 @@
+"""Numbers of a run: JSON lines, which anything can plot; LeRobot's lines in the terminal, and its wandb."""
+
+import json
+import logging
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from lerobot.utils.logging_utils import MetricsTracker
+
+from lerobot_wmrl.common.distributed import rank_and_size
+
+METRICS_FILE = "metrics.jsonl"
+
+
+def append_metrics(output_dir: Path, step: int, metrics: Mapping[str, float]) -> None:
+    """Add one line `{"step": step, name: value, …}` to the run's metrics file."""
+    with (output_dir / METRICS_FILE).open("a") as file:
+        file.write(json.dumps({"step": step, **metrics}) + "\n")
+
+
+def read_metrics(output_dir: Path) -> list[dict[str, Any]]:
+    """What was written of each step, in order of steps; of a number written twice, as after a resume, the
+    later value. Torn lines are dropped."""
+    path = output_dir / METRICS_FILE
+    lines: dict[int, dict[str, Any]] = {}
+    for text in path.read_text().splitlines() if path.is_file() else []:
+        try:
+            line = json.loads(text)
+        except json.JSONDecodeError:
+            continue
+        lines.setdefault(line["step"], {}).update(line)
+    return [lines[step] for step in sorted(lines)]
+
+
+class Tracker:
+    """What a training says of itself.
+
+    Args:
+        output_dir: where metrics.jsonl goes.
+        meters: LeRobot's averages between two lines in the terminal; it shows `shown` of the metrics.
+        log_freq: steps from one line to the next.
+        wandb: LeRobot's WandBLogger, None without.
+    """
+
+    def __init__(
+        self, output_dir: Path, meters: MetricsTracker, shown: tuple[str, ...], log_freq: int, wandb: Any
+    ) -> None:
+        self.output_dir, self.meters, self.shown = output_dir, meters, shown
+        self.log_freq, self.wandb = log_freq, wandb
+
+    def log(self, step: int, metrics: Mapping[str, float], mode: str = "train") -> None:
+        """To the file and to wandb, as `train/…` or `eval/…`; of several processes the first does."""
+        if rank_and_size()[0] > 0:
+            return
+        append_metrics(self.output_dir, step, metrics)
+        if self.wandb is not None:
+            self.wandb.log_dict(dict(metrics), step, mode)
+
+    def log_step(self, step: int, metrics: Mapping[str, float]) -> None:
+        """The same of a step that is finished, and from time to time a line in the terminal."""
+        self.log(step, metrics)
+        self.meters.step()
+        self.meters.update_metrics({name: metrics[name] for name in self.shown if name in metrics})
+        if step % self.log_freq == 0 and rank_and_size()[0] == 0:
+            logging.info(self.meters)
+            self.meters.reset_averages()
+
+    def log_policy(self, checkpoint: Path) -> None:
+        """The policy of a checkpoint as wandb's artifact."""
+        if self.wandb is not None and rank_and_size()[0] == 0:
+            self.wandb.log_policy(checkpoint)

@@ -1,0 +1,1 @@
+"""From a LeRobotDataset to the clips and frames that models learn from."""

@@ -1,0 +1,183 @@
+"""Frames decoded once, tokens encoded once, both in memory-mapped arrays.
+
+Reading random windows from video costs milliseconds an item; from these arrays it is a memory copy.
+The caches stand beside the dataset (`<root>.cache/`), never in it, and are rebuilt when absent.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import psutil
+import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.datasets.video_utils import decode_video_frames
+from tqdm import tqdm
+
+from lerobot_wmrl.data.compatibility import frame_size
+from lerobot_wmrl.data.episode_table import VIDEO_BACKEND
+from lerobot_wmrl.data.frames import NO_CONTEXT, Context
+
+ENCODE_BATCH = 128
+
+
+class FrameEncoder(Protocol):
+    """What these caches need of a frame tokenizer."""
+
+    @property
+    def tokens_per_frame(self) -> int:
+        """S, tokens of all cameras."""
+
+    def parameters(self) -> Iterator[torch.nn.Parameter]:
+        """Its weights, of which the caches are valid."""
+
+    def context(self, images: torch.Tensor) -> Context:
+        """Return the context of first frames (B, N, 3, H, W) in [0, 1]."""
+
+    def encode(self, images: torch.Tensor, context: Context = NO_CONTEXT) -> torch.Tensor:
+        """Return the tokens (B, S) of frames (B, N, 3, H, W) in [0, 1]."""
+
+
+def cache_dir(dataset: LeRobotDataset) -> Path:
+    """Where a dataset's caches stand."""
+    root = Path(dataset.root)
+    return root.with_name(root.name + ".cache")
+
+
+def cached_frames(dataset: LeRobotDataset, camera_keys: Sequence[str]) -> np.ndarray:
+    """All frames as a read-only memory map, uint8 (rows, N, H, W, 3); decoded on the first call."""
+    shape = (dataset.num_frames, len(camera_keys), *frame_size(dataset.features[camera_keys[0]]), 3)
+    key = digest([dataset.num_episodes, dataset.num_frames, *camera_keys, *file_stamps(dataset)])
+
+    def fill(target: np.ndarray) -> None:
+        for episode in tqdm(range(dataset.num_episodes), desc="Decoding frames", unit="episode"):
+            rows = dataset.meta.episodes[episode]
+            begin, end = rows["dataset_from_index"], rows["dataset_to_index"]
+            for camera, name in enumerate(camera_keys):
+                target[begin:end, camera] = _decode_episode(dataset, episode, name)
+
+    return memory_map(cache_dir(dataset) / f"frames-{key}.npy", shape, np.uint8, fill)
+
+
+def cached_tokens(dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer: FrameEncoder) -> np.ndarray:
+    """All frames' tokens as a read-only memory map, int32 (rows, S); encoded on the first call.
+
+    A context-conditioned tokenizer is given the first frame of each row's episode.
+    """
+    frames = cached_frames(dataset, camera_keys)
+    device = next(tokenizer.parameters()).device
+    episodes = dataset.meta.episodes
+    starts = np.repeat(np.asarray(episodes["dataset_from_index"]), np.asarray(episodes["length"]))
+
+    def fill(target: np.ndarray) -> None:
+        for begin in tqdm(range(0, len(frames), ENCODE_BATCH), desc="Encoding tokens", unit="batch"):
+            part = slice(begin, begin + ENCODE_BATCH)
+            first, episode = np.unique(starts[part], return_inverse=True)
+            start, images = (frames_to_tensor(frames[rows]).to(device) for rows in (first, part))
+            with torch.no_grad():
+                context = tokenizer.context(start)[episode]
+                target[part] = tokenizer.encode(images, context).cpu().numpy()
+
+    shape = (len(frames), tokenizer.tokens_per_frame)
+    return memory_map(encoded_path("tokens", dataset, camera_keys, tokenizer), shape, np.int32, fill)
+
+
+def cached_context(
+    dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer: FrameEncoder
+) -> np.ndarray:
+    """The coarsest features of every episode's context as a read-only memory map, float32 (E, N, C, g, g);
+    encoded on the first call."""
+    frames, device = cached_frames(dataset, camera_keys), next(tokenizer.parameters()).device
+    starts = np.asarray(dataset.meta.episodes["dataset_from_index"])
+
+    def features(rows: np.ndarray) -> np.ndarray:
+        with torch.no_grad():
+            context = tokenizer.context(frames_to_tensor(frames[rows]).to(device))
+        return context.features.cpu().numpy()
+
+    def fill(target: np.ndarray) -> None:
+        for begin in range(0, len(starts), ENCODE_BATCH):
+            target[begin : begin + ENCODE_BATCH] = features(starts[begin : begin + ENCODE_BATCH])
+
+    shape = (len(starts), *features(starts[:1]).shape[1:])
+    return memory_map(encoded_path("context", dataset, camera_keys, tokenizer), shape, np.float32, fill)
+
+
+def encoded_path(
+    name: str, dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer: FrameEncoder
+) -> Path:
+    """Where the cache `name` of what exactly this tokenizer makes of these cameras stands."""
+    weights = hashlib.sha256(b"".join(p.detach().cpu().numpy().tobytes() for p in tokenizer.parameters()))
+    key = digest([weights.hexdigest(), *camera_keys, *file_stamps(dataset)])
+    return cache_dir(dataset) / f"{name}-{key}.npy"
+
+
+def frames_to_tensor(frames: np.ndarray) -> torch.Tensor:
+    """uint8 (B, N, H, W, 3) → float32 (B, N, 3, H, W) in [0, 1]."""
+    return torch.from_numpy(np.array(frames)).permute(0, 1, 4, 2, 3).float() / 255
+
+
+def _decode_episode(dataset: LeRobotDataset, episode: int, key: str) -> np.ndarray:
+    """Frames of one episode and camera, uint8 (T, H, W, 3), from video or from stored images."""
+    rows = dataset.meta.episodes[episode]
+    indices = range(rows["dataset_from_index"], rows["dataset_to_index"])
+    if key not in dataset.meta.video_keys:
+        return np.stack(
+            [np.asarray(image.convert("RGB")) for image in dataset.hf_dataset.with_format(None)[indices][key]]
+        )
+    return decode_video(dataset, episode, key).permute(0, 2, 3, 1).numpy()
+
+
+def decode_video(dataset: LeRobotDataset, episode: int, key: str) -> torch.Tensor:
+    """Frames of one episode and camera: uint8 (T, 3, H, W), or codes of depth (T, 1, H, W).
+
+    ValueError if the video is corrupted.
+    """
+    rows = dataset.meta.episodes[episode]
+    first, length = rows[f"videos/{key}/from_timestamp"], rows["length"]
+    times = [first + index / dataset.fps for index in range(length)]
+    path = Path(dataset.root) / dataset.meta.get_video_file_path(episode, key)
+    try:
+        return decode_video_frames(
+            path, times, dataset.tolerance_s, VIDEO_BACKEND, return_uint8=True,
+            is_depth=key in dataset.meta.depth_keys,
+        )  # fmt: skip
+    except Exception as error:
+        raise ValueError(
+            f"dataset {dataset.root}: episode {episode}: {key}: {path.name} cannot be decoded ({error}); "
+            "delete the dataset and record it again with the same command"
+        ) from error
+
+
+def memory_map(
+    path: Path, shape: tuple[int, ...], dtype: type, fill: Callable[[np.ndarray], None]
+) -> np.ndarray:
+    """The array at `path`, or a new one that `fill` writes; it appears only once it is whole."""
+    if not path.is_file():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        for torn in path.parent.glob("*.partial"):
+            if not psutil.pid_exists(int(torn.suffixes[-2][1:])):
+                torn.unlink(missing_ok=True)
+        partial = path.with_suffix(f".{os.getpid()}.partial")
+        target = np.lib.format.open_memmap(partial, mode="w+", dtype=dtype, shape=shape)
+        try:
+            fill(target)
+            target.flush()
+            partial.replace(path)
+        finally:
+            partial.unlink(missing_ok=True)
+    return np.load(path, mmap_mode="r")
+
+
+def file_stamps(dataset: LeRobotDataset) -> list[object]:
+    """Size and time of the dataset's files: another recording in the same folder is another cache."""
+    files = sorted(path for pattern in ("*.mp4", "*.parquet") for path in Path(dataset.root).rglob(pattern))
+    return [item for path in files for item in (path.name, path.stat().st_size, path.stat().st_mtime_ns)]
+
+
+def digest(parts: Sequence[object]) -> str:
+    return hashlib.sha256(json.dumps([str(part) for part in parts]).encode()).hexdigest()[:12]

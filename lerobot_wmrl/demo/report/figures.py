@@ -1,0 +1,68 @@
+"""Numbers → pictures as data URLs. Pure functions."""
+
+import base64
+import io
+from collections.abc import Mapping
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from lerobot_wmrl.common.statistics import Proportion
+from lerobot_wmrl.demo.report.sources import Curve
+
+COLOURS = ("#2b6cb0", "#dd6b20", "#2f855a", "#805ad5")
+REAL, IMAGINED = COLOURS[:2]
+
+
+def data_url(content: bytes, kind: str) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def picture(path: Path) -> str:
+    """A PNG or GIF file as it is."""
+    return data_url(path.read_bytes(), path.suffix.lstrip("."))
+
+
+def drawn(figure: Figure) -> str:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110, bbox_inches="tight")
+    return data_url(buffer.getvalue(), "png")
+
+
+def success_bars(rates: Mapping[str, tuple[Proportion, Proportion]]) -> str:
+    """Real and imagined success of each policy with Wilson intervals: `{policy: (real, imagined)}`."""
+    figure = Figure(figsize=(6.4, 3.4))
+    axes = figure.subplots()
+    for side, (label, colour) in enumerate((("in ManiSkill", REAL), ("in the world model", IMAGINED))):
+        for place, pair in enumerate(rates.values()):
+            rate, x = pair[side], place + (side - 0.5) * 0.36
+            low, high = rate.interval
+            axes.bar(x, rate.share, width=0.33, color=colour, label=label if place == 0 else None)
+            axes.errorbar(x, rate.share, [[rate.share - low], [high - rate.share]], color="#333", capsize=4)
+            axes.annotate(
+                f"{100 * rate.share:.0f} %", (x, high), (0, 3), textcoords="offset points", ha="center"
+            )
+    axes.set_xticks(range(len(rates)), list(rates))
+    axes.set_ylim(0, 1.12)
+    axes.set_ylabel("success rate")
+    return drawn(tidy(figure))
+
+
+def curves(named: Mapping[str, Curve], title: str, xlabel: str = "step") -> str:
+    """One panel with a line a name."""
+    figure = Figure(figsize=(4.6, 2.9))
+    axes = figure.subplots()
+    for colour, (name, (steps, values)) in zip(COLOURS * 4, named.items(), strict=False):
+        axes.plot(steps, values, color=colour, label=name, linewidth=1.4)
+    axes.set_title(title, fontsize=11)
+    axes.set_xlabel(xlabel)
+    return drawn(tidy(figure))
+
+
+def tidy(figure: Figure) -> Figure:
+    for axes in figure.axes:
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(axis="y", alpha=0.25)
+        if axes.get_legend_handles_labels()[0]:
+            axes.legend(frameon=False, fontsize=9)
+    return figure

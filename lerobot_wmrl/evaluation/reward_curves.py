@@ -1,0 +1,75 @@
+"""The general reward along real episodes: what a policy would have been paid for them, frame by frame."""
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from lerobot_wmrl.data.clip import Clip
+from lerobot_wmrl.data.depth_maps import depth_at
+from lerobot_wmrl.data.episode_table import EpisodeTable
+from lerobot_wmrl.data.frame_cache import frames_to_tensor
+from lerobot_wmrl.rewards.configuration_general import GeneralConfig
+from lerobot_wmrl.rewards.general import consecutive_count, general_reward, sparse_reward
+from lerobot_wmrl.rewards.similarity import make_similarity, of_rows
+from lerobot_wmrl.world_models.goal import imagine_goal
+from lerobot_wmrl.world_models.modeling_world_model import (
+    ActionWorldModelRewardModel,
+    TextWorldModelRewardModel,
+)
+
+
+@torch.no_grad()
+def reward_along_episode(
+    model: ActionWorldModelRewardModel, text_model: TextWorldModelRewardModel, reward: GeneralConfig,
+    table: EpisodeTable, frame_store: np.ndarray, episode: int, *, threshold: float, frames: int,
+) -> dict[str, Any]:  # fmt: skip
+    """Eqs. 5-8 on the real frames of one episode, teacher-forced.
+
+    Returns lists over the frames after the start (done_probability, similarity, return), the imagined
+    goal_frame and the real final_frame (N, H, W, 3) uint8, and goal_reached.
+    """
+    rows = slice(table.start[episode], table.start[episode] + table.length[episode])
+    device = model.state_mean.device
+    images = frames_to_tensor(frame_store[rows]).to(device)
+    start = model.tokenizer.context(images[:1])
+    context = start[[0] * len(images)]
+    tokens = model.tokenizer.encode(images, context)
+    state, action = (torch.from_numpy(column[rows]).to(device) for column in (table.state, table.action))
+    known = torch.ones(1, len(tokens), dtype=torch.bool, device=device)
+    instruction = [table.instructions[episode]]
+    depth = depth_at(model, table.dataset, np.arange(rows.start, rows.stop)[None])
+    clip = Clip(
+        tokens[None], state[None], action[None], known.float(), known, known, instruction, depth, start
+    )
+    done_logit = model.predict(clip, drawn=False).done_logit[0, :-1]
+    first_depth = depth_at(text_model, table.dataset, slice(rows.start, rows.start + 1))
+    goal = imagine_goal(text_model, tokens[:1], state[:1], instruction, start, first_depth)
+    alike, cameras = make_similarity(reward.similarity, device), model.tokenizer.num_cameras
+    seen = alike.describe(model.tokenizer.decode_with_features(tokens, context))
+    every = torch.zeros(len(tokens), dtype=torch.long, device=device)
+    closeness = alike(seen, of_rows(alike.describe(goal.decoded), every, cameras), cameras)
+    paid = success_once(done_logit, threshold, frames)
+    earned = general_reward(
+        paid, closeness[1:], closeness[:-1], alpha=reward.alpha, form=reward.form, gamma=reward.gamma
+    )
+    picture = goal.decoded.images[0].permute(0, 2, 3, 1)
+    return {
+        "done_probability": done_logit.sigmoid().tolist(),
+        "similarity": closeness[1:].tolist(),
+        "return": earned.cumsum(0).tolist(),
+        "goal_reached": bool(goal.reached[0]),
+        "goal_frame": (picture * 255).round().byte().cpu().numpy(),
+        "final_frame": np.asarray(frame_store[rows][-1]),
+    }
+
+
+def success_once(done_logit: torch.Tensor, threshold: float, frames: int) -> torch.Tensor:
+    """1 on the frame that completes the first run of `frames` done frames, else 0. (T,) → (T,)"""
+    count, paid = done_logit.new_zeros((), dtype=torch.long), torch.zeros_like(done_logit)
+    for step, logit in enumerate(done_logit):
+        count = consecutive_count(count, sparse_reward(logit, threshold) > 0)
+        if count >= frames:
+            paid[step] = 1
+            break
+    return paid

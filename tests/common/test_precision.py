@@ -1,0 +1,25 @@
+import pytest
+import torch
+
+from lerobot_wmrl.common.precision import compute_in, imagination_dtype, multiplies_bfloat16, training_dtype
+
+
+def test_products_are_in_the_chosen_format_and_weights_stay_as_they_are() -> None:
+    layer = torch.nn.Linear(4, 4)
+    for dtype in (torch.float32, torch.bfloat16):
+        with compute_in(dtype, "cpu"):
+            assert layer(torch.zeros(2, 4)).dtype == dtype
+    assert layer.weight.dtype == torch.float32
+
+
+def test_auto_is_what_the_hardware_multiplies_in() -> None:
+    fast = torch.bfloat16 if multiplies_bfloat16("cpu") else torch.float32
+    assert training_dtype("auto", "cpu") == imagination_dtype("cpu") == fast
+    assert training_dtype("float32", "cpu") == torch.float32
+    assert training_dtype("bfloat16", "cpu") == torch.bfloat16
+    assert not multiplies_bfloat16("meta")
+
+
+def test_another_precision_is_named() -> None:
+    with pytest.raises(ValueError, match="--precision=half: choose one of auto, float32, bfloat16"):
+        training_dtype("half", "cpu")

@@ -1,0 +1,101 @@
+import math
+
+import numpy as np
+import pytest
+
+from lerobot_wmrl.common.statistics import (
+    Z_95,
+    Estimate,
+    MeanChange,
+    PairedChange,
+    Proportion,
+    bootstrap_ratio,
+    wilson_interval,
+)
+
+
+@pytest.mark.parametrize(("k", "n"), [(0, 20), (7, 20), (53, 100), (100, 100)])
+def test_wilson_bounds_are_where_the_score_test_is_exactly_significant(k: int, n: int) -> None:
+    """The definition: |p̂ − p| = z·sqrt(p(1−p)/n) at both bounds p (or the bound is 0 or 1 when k is)."""
+    for bound in wilson_interval(k, n):
+        if 1e-12 < bound < 1 - 1e-12:
+            assert abs(k / n - bound) == pytest.approx(Z_95 * math.sqrt(bound * (1 - bound) / n))
+    low, high = wilson_interval(k, n)
+    assert low <= k / n <= high
+
+
+def test_no_episode_is_no_number() -> None:
+    nothing = Proportion(0, 0)
+    assert nothing.interval == (0.0, 1.0)
+    assert nothing.as_json()["share"] is None
+    assert str(nothing) == "no episode"
+
+
+def test_text_carries_share_count_and_interval() -> None:
+    assert str(Proportion(50, 100)) == "50 % (50 of 100; 40–60 %)"
+
+
+def test_a_change_counts_only_starts_whose_outcome_differs() -> None:
+    before = [True, True, False, False, False, True]
+    after = [True, False, True, True, False, True]
+    change = PairedChange.between(before, after)
+    assert (change.gained, change.lost) == (2, 1)
+    with pytest.raises(ValueError, match="shorter"):
+        PairedChange.between(before, after[:-1])
+
+
+def test_paired_p_value_is_that_of_a_fair_coin() -> None:
+    assert PairedChange(0, 0).p_value == 1.0
+    assert PairedChange(6, 0).p_value == pytest.approx(2 / 2**6)
+    assert PairedChange(6, 1).p_value == pytest.approx(2 * (1 + 7) / 2**7)
+    assert PairedChange(1, 6).p_value == PairedChange(6, 1).p_value
+
+
+def test_the_interval_of_several_runs_counts_a_start_once() -> None:
+    """Three copies of a run say no more than one: its interval is that of the mean over its starts."""
+    rng = np.random.default_rng(0)
+    before, after = rng.random(200) < 0.5, rng.random(200) < 0.7
+    change = after.astype(float) - before
+    once = MeanChange.over_runs([before], [after])
+    thrice = MeanChange.over_runs([before] * 3, [after] * 3)
+    assert (thrice.low, thrice.high) == (once.low, once.high)
+    assert once.mean == pytest.approx(change.mean())
+    assert once.high - once.low == pytest.approx(2 * Z_95 * change.std() / math.sqrt(200), rel=0.1)
+
+
+def test_runs_on_different_starts_are_not_pooled() -> None:
+    with pytest.raises(ValueError, match="different numbers of starts"):
+        MeanChange.over_runs([[True], [True, False]], [[True], [True, False]])
+
+
+def test_runs_that_change_nothing_change_nothing() -> None:
+    assert MeanChange.over_runs([[True, False]], [[True, False]]) == MeanChange(0.0, 0.0, 0.0, 1, 2)
+
+
+def test_the_bootstrap_of_a_mean_is_its_normal_interval() -> None:
+    values = np.random.default_rng(0).normal(3, 2, 400)
+    estimate = Estimate.mean(np.append(values, np.nan))
+    assert estimate.value == pytest.approx(values.mean())
+    assert estimate.n == 400
+    assert estimate.high - estimate.low == pytest.approx(2 * Z_95 * values.std() / math.sqrt(400), rel=0.1)
+
+
+def test_the_bootstrap_draws_whole_episodes() -> None:
+    """The frames of an episode are all right or all wrong: 2000 frames are only twenty draws."""
+    right = np.repeat([[0], [100]], 10, axis=0)[:, 0]
+    estimate = Estimate.ratio(right, np.full(20, 100))
+    assert estimate.value == 0.5
+    assert estimate.high - estimate.low == pytest.approx(2 * Z_95 * 0.5 / math.sqrt(20), rel=0.2)
+    assert estimate == Estimate.ratio(right, np.full(20, 100))
+
+
+def test_bootstraps_by_column_are_those_of_each_column() -> None:
+    values = np.random.default_rng(0).random((30, 3))
+    low = bootstrap_ratio(values, np.ones_like(values))[1]
+    assert low[1] == pytest.approx(Estimate.mean(values[:, 1]).low)
+
+
+def test_a_mean_of_nothing_is_no_number() -> None:
+    for nothing in (np.array([]), np.array([np.nan, np.nan])):
+        assert Estimate.mean(nothing).as_json() == {"value": None, "bootstrap_95": None, "episodes": 0}
+        assert str(Estimate.mean(nothing)) == "not measured"

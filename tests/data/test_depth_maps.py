@@ -1,0 +1,157 @@
+"""LeRobot's depth maps on the tokens' grid, and a world model trained, replayed and lived in with them."""
+
+import json
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from lerobot_wmrl.common.constants import FPS
+from lerobot_wmrl.common.tracking import read_metrics
+from lerobot_wmrl.data.dataset_source import DatasetSource
+from lerobot_wmrl.data.depth_maps import cached_depth, token_depth
+from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
+from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
+from lerobot_wmrl.world_models.checkpoint import load_model
+from tests.trained import action_config, run_training, text_config
+
+CAMERA = "observation.images.third_view"
+SIZE, GRID = 32, 4
+
+
+@pytest.fixture(scope="module")
+def deep_dataset(make_synthetic_dataset, tmp_path_factory) -> LeRobotDataset:
+    return make_synthetic_dataset(tmp_path_factory.mktemp("deep") / "dataset", depth=True)
+
+
+@pytest.fixture(scope="module")
+def models(deep_dataset, trained_models, tmp_path_factory) -> dict[str, Path]:
+    folder, tokenizer = tmp_path_factory.mktemp("models"), trained_models["frame_tokenizer"]
+    configs = {
+        "action_world_model": partial(action_config, dynamics="autoregressive"),
+        "text_world_model": text_config,
+    }
+    return {
+        name: run_training(config(tokenizer, depth=True), Path(deep_dataset.root), folder / name)
+        for name, config in configs.items()
+    }
+
+
+def squares(maps: np.ndarray) -> np.ndarray:
+    """Means of (T, H, W) in every token's square, (T, g²)."""
+    cut = maps.reshape(len(maps), GRID, SIZE // GRID, GRID, SIZE // GRID)
+    return cut.mean((2, 4)).reshape(len(maps), -1)
+
+
+def test_cached_depth_is_the_mean_of_each_square_in_metres(deep_dataset):
+    depth = cached_depth(deep_dataset, [CAMERA], GRID)
+    assert depth.shape == (deep_dataset.num_frames, GRID**2)
+    rows = [0, 7, len(depth) - 1]
+    maps = np.stack([deep_dataset[row][f"{CAMERA}_depth"].numpy()[0] / 1000 for row in rows])
+    assert maps.min() < 0.7
+    np.testing.assert_allclose(depth[rows], squares(maps), atol=1e-3)
+
+
+def test_what_was_not_measured_does_not_count():
+    maps = torch.full((1, 1, SIZE, SIZE), 2.0)
+    maps[..., :4, :8], maps[..., :4, 8:16] = 0.0, torch.nan
+    maps[..., 8:16, :8] = 0.0
+    depth = token_depth(maps, GRID)[0]
+    assert depth.tolist() == [2.0] * 4 + [0.0] + [2.0] * 11
+
+
+@pytest.mark.parametrize(("dtype", "unit"), [(np.uint16, 1000), (np.float32, 1)])
+def test_depth_stored_as_images_is_read_in_its_unit(dtype, unit, tmp_path):
+    depth_map = {
+        "dtype": "image", "shape": (SIZE, SIZE, 1), "names": ["height", "width", "channels"],
+        "info": {"is_depth_map": True},
+    }  # fmt: skip
+    dataset = LeRobotDataset.create(
+        "local/stored", FPS, {f"{CAMERA}_depth": depth_map}, root=tmp_path / "stored", use_videos=False
+    )
+    maps = np.random.default_rng(0).uniform(0.5, 2.0, (3, SIZE, SIZE))
+    for each in maps:
+        dataset.add_frame({f"{CAMERA}_depth": (unit * each).astype(dtype)[..., None], "task": "look"})
+    dataset.save_episode()
+    dataset.finalize()
+    stored = LeRobotDataset("local/stored", root=tmp_path / "stored")
+    np.testing.assert_allclose(cached_depth(stored, [CAMERA], GRID), squares(maps), atol=1e-3)
+
+
+def test_training_reads_depth_and_a_checkpoint_keeps_its_branch(deep_dataset, models):
+    for name, folder in models.items():
+        assert read_metrics(folder)[0]["depth_error_mm"] > 0
+        model = load_model(folder, name)
+        assert model.config.depth
+        assert model.network.depth.fusion[0].weight.abs().sum() > 0, "three steps have moved it"
+
+
+def test_a_batch_of_lerobot_train_has_the_depth_of_the_cache(deep_dataset, models):
+    model = load_model(models["action_world_model"], "action_world_model")
+    times = [step / FPS for step in range(-9, 1)]
+    windows = LeRobotDataset(
+        "local/synthetic", root=deep_dataset.root, video_backend="pyav",
+        delta_timestamps={CAMERA: times, f"{CAMERA}_depth": times, "observation.state": times,
+                          "action": times},
+    )  # fmt: skip
+    batch: dict[str, Any] = torch.utils.data.default_collate([windows[4], windows[9]])
+    clip = model.clip_from_batch(batch)
+    depth = cached_depth(deep_dataset, [CAMERA], model.tokenizer.grid)
+    np.testing.assert_allclose(clip.depth[0, :5], depth[:5], atol=1e-3)
+    np.testing.assert_allclose(clip.depth[1], depth[:10], atol=1e-3)
+    assert torch.isfinite(model(batch)[0])
+    del batch[f"{CAMERA}_depth"]
+    with pytest.raises(ValueError, match=r"depth=true: the batch lacks .*third_view_depth"):
+        model.clip_from_batch(batch)
+
+
+def test_replays_measure_depth_on_the_tokens_grid(deep_dataset, models, tmp_path):
+    eval_world_model(
+        EvalWorldModelConfig(
+            model=Checkpoint(str(models["action_world_model"])),
+            text_model=Checkpoint(str(models["text_world_model"])),
+            dataset=DatasetSource(str(Path(deep_dataset.root))), output_dir=tmp_path / "replay",
+        )
+    )  # fmt: skip
+    metrics = json.loads((tmp_path / "replay" / "metrics.json").read_text())
+    assert 0 < metrics["headline"]["abs_rel"]["value"] < 0.2
+    assert metrics["headline"]["delta_2"]["value"] > 0.9
+    assert len(metrics["abs_rel_by_step"]) == len(metrics["psnr_by_step"])
+
+
+def test_the_environment_begins_with_the_depth_of_its_starts(deep_dataset, models, small_dataset):
+    def config(dataset: LeRobotDataset) -> WorldModelEnv:
+        return WorldModelEnv(
+            world_model_path=str(models["action_world_model"]),
+            text_world_model_path=str(models["text_world_model"]),
+            dataset=StartFrames(root=str(Path(dataset.root))), episode_length=3, done_threshold=0.999,
+        )  # fmt: skip
+
+    env = config(deep_dataset).create_tensor_env(2)
+    env.reset(seed=[1, 4])
+    first = cached_depth(deep_dataset, [CAMERA], env.model.tokenizer.grid)
+    starts = np.asarray(deep_dataset.meta.episodes["dataset_from_index"])
+
+    def begun() -> np.ndarray:
+        return env.model.network.depth.metres(env._imagination.depth[:, 0]).numpy()
+
+    np.testing.assert_allclose(begun(), first[starts[[1, 4]]], atol=1e-4)
+    for _ in range(3):
+        _, _, _, truncated, _ = env.step(torch.full((2, 7), 0.01))
+    assert truncated.all()
+    np.testing.assert_allclose(begun(), first[starts[env._start_index.numpy()]], atol=1e-4)
+    with pytest.raises(ValueError, match=r"third_view_depth .*the dataset has none; record it with"):
+        config(small_dataset).create_tensor_env(2)
+
+
+def test_a_dataset_without_depth_is_named_before_anything_is_trained(small_dataset, trained_models, tmp_path):
+    with pytest.raises(ValueError, match=r"--model\.depth=true: .*third_view_depth .*--depth=true"):
+        run_training(
+            action_config(trained_models["frame_tokenizer"], dynamics="autoregressive", depth=True),
+            Path(small_dataset.root), tmp_path / "out",
+        )  # fmt: skip
+    assert not (tmp_path / "out").exists()

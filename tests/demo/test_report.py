@@ -1,0 +1,140 @@
+"""The page and the summary from a small made-up run, whose numbers are known."""
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from PIL import Image
+
+from lerobot_wmrl.common.constants import KINDS
+from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.common.statistics import PairedChange, Proportion
+from lerobot_wmrl.common.tracking import append_metrics
+from lerobot_wmrl.data.recorded_episodes import recorded_episodes
+from lerobot_wmrl.demo.episodes import optimal_episodes
+from lerobot_wmrl.demo.report.build import verdict, write_report
+from lerobot_wmrl.demo.stages import DemoConfig, demo_stages
+
+SUCCESSES = {"eval_sft": 4, "imagine_sft": 5, "eval_rl": 6, "imagine_rl": 9}
+
+
+@pytest.fixture
+def finished(tmp_path: Path) -> DemoConfig:
+    """An output folder as ten episodes of evaluation and four recorded episodes would leave it."""
+    tmp_path = tmp_path / "demo"
+    config = DemoConfig(tmp_path)
+    write_dataset(tmp_path / "dataset")
+    for stage in demo_stages(config):
+        record: dict[str, object] = {"name": stage.name, "title": stage.title, "command": f"run-{stage.name}"}
+        record |= {"seconds": 3.0, "peak_memory_bytes": 2e9}
+        write_json(
+            tmp_path / "stages" / f"{stage.name}.json", {**record, "seconds": 3.0, "peak_memory_bytes": 2e9}
+        )
+    for folder, successes in SUCCESSES.items():
+        outcomes = [i < successes for i in range(10)]
+        write_json(tmp_path / folder / "eval_info.json", {"per_task": [{"metrics": {"successes": outcomes}}]})
+    for policy in ("sft", "rl", "held_out"):
+        replay = {"false_successes": 2, "real_failures": 5, "recognised_successes": 3, "real_successes": 4}
+        write_json(tmp_path / f"replay_{policy}" / "metrics.json", replay)
+        Image.new("RGB", (8, 8)).save(tmp_path / f"replay_{policy}" / "comparison_0.png")
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "logs" / "sft.log").write_text("INFO step:1 loss:2.0 \nINFO step:2 loss:1.0 \n")
+    for folder in ("frame_tokenizer", "action_world_model", "text_world_model", "rl"):
+        (tmp_path / folder).mkdir()
+        append_metrics(tmp_path / folder, 1, {"loss": 1.0, "success_rate": 0.5})
+    return config
+
+
+def write_dataset(root: Path) -> None:
+    """Four episodes of three rows; the first and the last succeed, at their last row."""
+    kinds = [KINDS.index(kind) for kind in ("optimal", "optimal", "near_miss", "optimal")]
+    starts = {
+        "start.task": [0, 0, 0, 0],
+        "start.kind": kinds,
+        "start.seed": range(4),
+        "start.scene": [0, 0, 1, 1],
+        "episode_index": range(4),
+    }
+    success = np.zeros((4, 3), dtype=bool)
+    success[[0, 3], -1] = True
+    table = {name: np.repeat(values, 3) for name, values in starts.items()}
+    table["next.success"] = success.reshape(-1)
+    (root / "data" / "chunk-000").mkdir(parents=True)
+    pq.write_table(pa.table(table), root / "data" / "chunk-000" / "file-000.parquet")
+
+
+def test_page_is_self_contained_and_says_the_numbers(finished: DemoConfig) -> None:
+    stages = [stage.name for stage in demo_stages(finished)]
+    page = write_report(finished, stages).read_text()
+    assert not re.findall(r"""(?:src|href)=["'](?!data:)""", page), "the page needs other files"
+    assert "4 of 10; 95 %: 17–69 %" in page
+    assert "Real success went from 40 % to 60 % (+20 points): of the same 10 starts, 2 were gained" in page
+    assert "40 % (2 of 5; 12–77 %)" in page
+    for name in stages:
+        assert f"<pre>run-{name}</pre>" in page
+    assert page.count("data:image/png;base64,") >= 8
+
+
+def test_the_gates_last_warning_is_shown_in_red(finished: DemoConfig) -> None:
+    stages, gate = [stage.name for stage in demo_stages(finished)], finished.output_dir / "rl" / "gate"
+    shown = '<p class="warning">'
+    assert shown not in write_report(finished, stages).read_text()
+    write_json(gate / "000000" / "record.json", {"warning": "most failures are believed"})
+    assert f"{shown}most failures are believed" in write_report(finished, stages).read_text()
+    write_json(gate / "000010" / "record.json", {"warning": None})
+    assert shown not in write_report(finished, stages).read_text()
+
+
+def test_summary_holds_every_headline_number(finished: DemoConfig) -> None:
+    write_report(finished, [stage.name for stage in demo_stages(finished)])
+    summary = json.loads((finished.output_dir / "summary.json").read_text())
+    assert summary["policies"]["rl"]["real"]["k"] == SUCCESSES["eval_rl"]
+    assert summary["policies"]["sft"]["false_success"]["share"] == 0.4
+    assert summary["real_change"] == {"gained": 2, "lost": 0, "p_value": 0.5}
+    assert sum(summary["real_outcomes"]["rl"]) == SUCCESSES["eval_rl"]
+    assert summary["dataset"] == {"episodes": 4, "frames": 12}
+    assert summary["seconds"] == 3.0 * len(demo_stages(finished))
+
+
+def test_runs_with_other_seeds_stand_side_by_side(finished: DemoConfig) -> None:
+    """Those beside this one, of the same size and on as many starts; each seed once."""
+    config = replace(finished, eval_episodes=10)
+    stages = [stage.name for stage in demo_stages(config)]
+    assert "Other seeds" not in write_report(config, stages).read_text()
+    own = json.loads((config.output_dir / "summary.json").read_text())
+    beside = config.output_dir.parent
+    other = {**own, "seed": 1, "real_outcomes": {"sft": [False] * 10, "rl": [True] * 4 + [False] * 6}}
+    write_json(beside / "another" / "summary.json", other)
+    write_json(beside / "copy" / "summary.json", own)
+    write_json(beside / "tiny" / "summary.json", {**own, "preset": "tiny", "seed": 2})
+    page = write_report(config, stages).read_text()
+    assert "+30.0 points" in page
+    assert "2 runs on the same 10 starts" in page
+
+
+@pytest.mark.parametrize(
+    ("gained", "lost", "words"),
+    [(20, 5, "It helped in reality"), (5, 20, "made the policy worse"), (14, 9, "does not show")],
+)
+def test_verdict_claims_no_more_than_the_same_starts_show(gained: int, lost: int, words: str) -> None:
+    before, after = Proportion(50, 100), Proportion(50 + gained - lost, 100)
+    assert words in verdict(before, after, PairedChange(gained, lost))
+
+
+def test_episode_table_reads_outcomes_by_episode(tmp_path: Path) -> None:
+    write_dataset(tmp_path)
+    table = recorded_episodes(tmp_path)
+    assert table["length"].tolist() == [3, 3, 3, 3]
+    assert table["success"].tolist() == [True, False, False, True]
+
+
+def test_cloning_takes_successful_optimal_episodes_only(tmp_path: Path) -> None:
+    write_dataset(tmp_path)
+    assert optimal_episodes(tmp_path, 2) == [0, 3]
+    with pytest.raises(ValueError, match="holds 2 successful optimal episodes, 3 are needed"):
+        optimal_episodes(tmp_path, 3)

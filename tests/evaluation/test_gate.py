@@ -1,0 +1,136 @@
+"""The gate's arithmetic on made-up verdicts: no model, no pictures."""
+
+import json
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lerobot_wmrl.evaluation.done import done_delay, done_log_loss, done_quality
+from lerobot_wmrl.evaluation.gate import (
+    Outcomes,
+    best_operating_point,
+    first_run,
+    gate_at,
+    gates_by_task,
+    success_agreement,
+    sweep,
+)
+from lerobot_wmrl.evaluation.tables import gate_lines
+
+
+@pytest.fixture
+def outcomes() -> Outcomes:
+    """A success seen at once, one seen two frames late, one missed; a failure believed in, one not."""
+    nan = np.nan
+    probability = [
+        [0.1, 0.9, 0.9, 0.9, 0.9, 0.9],
+        [0.1, 0.1, 0.1, 0.8, 0.8, 0.8],
+        [0.1, 0.1, 0.1, 0.1, nan, nan],
+        [0.1, 0.7, 0.7, 0.7, 0.1, 0.1],
+        [0.1, 0.6, 0.1, 0.1, nan, nan],
+    ]
+    done = np.zeros((5, 6), bool)
+    done[0, 1:] = done[1, 1:] = done[2, 2:4] = True
+    return Outcomes(np.arange(5), np.array(probability), done)
+
+
+def test_the_first_run_is_of_consecutive_frames():
+    fired = np.array([[0, 1, 1, 0, 1], [1, 0, 1, 1, 1], [0, 0, 0, 0, 0]], bool)
+    assert first_run(fired, 2).tolist() == [1, 2, -1]
+    assert first_run(fired, 1).tolist() == [1, 0, -1]
+    assert first_run(fired, 6).tolist() == [-1, -1, -1]
+
+
+@pytest.mark.parametrize(("threshold", "frames", "false", "recognised"), [
+    (0.5, 3, 1, 2), (0.5, 1, 2, 2), (0.75, 3, 0, 2), (0.85, 3, 0, 1), (0.75, 4, 0, 1), (0.95, 1, 0, 0),
+])  # fmt: skip
+def test_the_gate_counts_as_the_environment_ends_episodes(outcomes, threshold, frames, false, recognised):
+    gate = gate_at(outcomes, threshold, frames)
+    assert (gate.false_success.k, gate.false_success.n) == (false, 2)
+    assert (gate.recognised.k, gate.recognised.n) == (recognised, 3)
+    assert not gate.passed
+
+
+def test_successes_that_end_too_early_for_anyone_are_counted(outcomes):
+    """The third success holds for the last two of its four frames."""
+    assert [gate_at(outcomes, 0.5, frames).cut_short for frames in (1, 2, 3, 4)] == [0, 0, 1, 1]
+    assert "1 of the successes were recorded for fewer than 3 frames" in gate_lines(
+        gate_at(outcomes, 0.5, 3), None
+    )
+    assert "recorded for fewer" not in gate_lines(gate_at(outcomes, 0.5, 2), None)
+
+
+def test_auc_is_the_share_of_pairs_in_the_right_order(outcomes):
+    """Scores over three frames: successes 0.9, 0.8, 0.1; failures 0.7, 0.1. One pair ties."""
+    assert outcomes.scores(3).tolist() == [0.9, 0.8, 0.1, 0.7, 0.1]
+    assert outcomes.auc(3) == pytest.approx((2 + 2 + 0.5) / 6)
+    assert math.isnan(Outcomes(np.arange(2), np.ones((2, 4)), np.ones((2, 4), bool)).auc(3))
+    assert outcomes.auc(7) == 0.5
+
+
+def test_the_best_operating_point_is_tolerable_and_recognises_most(outcomes):
+    best = best_operating_point(sweep(outcomes))
+    assert (best.threshold, best.frames) == (0.8, 3)
+    assert (best.false_success.k, best.recognised.k) == (0, 2)
+    believed = Outcomes(outcomes.episodes, np.ones((5, 6)), outcomes.done)
+    assert best_operating_point(sweep(believed)) is None
+    knowing = Outcomes(outcomes.episodes, outcomes.done.astype(float), outcomes.done)
+    assert gate_at(knowing, 0.5, 2).passed
+
+
+def test_verdicts_of_every_episode_are_reported_as_json(outcomes):
+    agreement = json.loads(json.dumps(success_agreement(outcomes, 0.5, 3)))
+    assert agreement["called_success"] == [True, True, False, True, False]
+    assert agreement["real_success"] == [True, True, True, False, False]
+    assert (agreement["real_failures"], agreement["recognised_successes"]) == (2, 2)
+
+
+def test_done_by_frame_by_episode_and_how_late(outcomes):
+    """By frame: 5 + 3 of 5 + 5 + 2 true ones called, and 3 + 1 false ones."""
+    quality = {name: estimate.value for name, estimate in done_quality(outcomes, 0.5, 3).items()}
+    assert quality["done_precision"] == pytest.approx(8 / 12)
+    assert quality["done_recall"] == pytest.approx(8 / 12)
+    assert quality["done_f1"] == pytest.approx(8 / 12)
+    assert quality["episode_precision"] == pytest.approx(2 / 3)
+    assert quality["episode_recall"] == pytest.approx(2 / 3)
+    assert quality["done_delay_frames"] == pytest.approx((0 + 2) / 2)
+    assert np.isnan(done_delay(outcomes, 0.5, 3)[2:]).all()
+
+
+def test_done_is_scored_without_a_threshold_too():
+    """What happened was thought likely with 0.8, 0.5 and 1; frames after an episode's end do not count."""
+    probability = np.array([[0.8, 0.5, np.nan], [0.0, np.nan, np.nan]])
+    done = np.array([[True, False, False], [False, False, False]])
+    loss = done_log_loss(Outcomes(np.arange(2), probability, done))
+    assert loss.value == pytest.approx(-(math.log(0.8) + math.log(0.5) + math.log(1)) / 3)
+    surprised = done_log_loss(Outcomes(np.arange(1), np.ones((1, 1)), np.zeros((1, 1), bool)))
+    assert surprised.value == pytest.approx(6 * math.log(10), rel=1e-3)
+
+
+def test_early_and_late_calls_do_not_cancel(outcomes):
+    outcomes.done[0, 1] = False
+    quality = {name: estimate.value for name, estimate in done_quality(outcomes, 0.5, 3).items()}
+    assert quality["done_delay_frames"] == pytest.approx((-1 + 2) / 2)
+    assert quality["done_distance_frames"] == pytest.approx((1 + 2) / 2)
+
+
+def test_without_any_success_rates_are_no_numbers():
+    never = Outcomes(np.arange(3), np.zeros((3, 4)), np.zeros((3, 4), bool))
+    assert math.isnan(done_quality(never, 0.5, 3)["done_f1"].value)
+    assert success_agreement(never, 0.5, 3)["recognised_rate"]["share"] is None
+    assert not gate_at(never, 0.5, 3).passed
+
+
+def test_every_task_has_a_gate_of_its_own(outcomes):
+    table: Any = SimpleNamespace(task=np.array([0, 0, 1, 1, -1]))
+    gates = gates_by_task(outcomes, table, 0.5, 3)
+    assert list(gates) == ["push", "pull"]
+    assert (gates["push"].recognised.k, gates["push"].recognised.n, gates["push"].false_success.n) == (
+        2,
+        2,
+        0,
+    )
+    assert (gates["pull"].recognised.k, gates["pull"].false_success.k) == (0, 1)

@@ -1,0 +1,99 @@
+"""The world model as an evaluator of policies."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.statistics import Proportion
+from lerobot_wmrl.data.dataset_source import DatasetSource
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
+from lerobot_wmrl.evaluation import policy_success
+from lerobot_wmrl.evaluation.agreement import Agreement
+from lerobot_wmrl.evaluation.policy_success import policy_checkpoints, policy_outcomes
+from lerobot_wmrl.rewards.configuration_general import GeneralConfig
+from lerobot_wmrl.scripts.eval_world_model import (
+    Checkpoint,
+    EvalWorldModelConfig,
+    eval_world_model,
+    policy_agreement,
+)
+from tests.rl.checkpoints import save_untrained_policy
+
+
+@pytest.fixture
+def imagination(small_dataset, trained_models) -> WorldModelEnv:
+    return WorldModelEnv(
+        world_model_path=str(trained_models["action_world_model"]),
+        dataset=StartFrames(root=str(Path(small_dataset.root))), reward=GeneralConfig(alpha=1.0),
+        done_threshold=0.0001, done_frames=1, episode_length=4, device="cpu",
+    )  # fmt: skip
+
+
+def test_every_checkpoint_of_a_training_counts_in_order(tmp_path):
+    for step in ("000010", "000002", "last"):
+        (tmp_path / "rl" / "checkpoints" / step).mkdir(parents=True)
+    found = policy_checkpoints([str(tmp_path / "rl"), str(tmp_path / "one")])
+    assert [path.name for path in found] == ["000002", "000010", "one"]
+    with pytest.raises(ValueError, match="--policies"):
+        policy_checkpoints([])
+
+
+def test_outcomes_are_those_of_the_environment_one_an_episode(imagination, tmp_path):
+    """A threshold that the first frame reaches ends every episode in success; one out of reach, none."""
+    policy = save_untrained_policy(tmp_path / "policy", actions=7)
+    assert policy_outcomes(imagination, policy, 5, EVALUATION_SEED, num_envs=3) == [True] * 5
+    imagination.done_threshold = 0.9999
+    assert policy_outcomes(imagination, policy, 5, EVALUATION_SEED, num_envs=3) == [False] * 5
+
+
+def test_the_evaluation_reports_policies_beside_reality(imagination, small_dataset, tmp_path):
+    """Reality is a world model here too, so that the test needs no simulator."""
+    policy = save_untrained_policy(tmp_path / "policy", actions=7)
+    cfg = EvalWorldModelConfig(
+        model=Checkpoint(imagination.world_model_path), dataset=DatasetSource(str(Path(small_dataset.root))),
+        output_dir=tmp_path / "check", device="cpu", policies=[str(policy)], policy_episodes=4,
+        done_threshold=0.0001, done_frames=1,
+    )  # fmt: skip
+    with pytest.raises(ValueError, match=r"--real_env\.type is missing"):
+        eval_world_model(cfg)
+    assert not cfg.output_dir.exists()
+    cfg.real_env = imagination
+    eval_world_model(cfg)
+    found = json.loads((cfg.output_dir / "metrics.json").read_text())["policies"]
+    assert found["policies"][str(policy)]["real"]["k"] == 4
+    assert found["policies"][str(policy)]["imagined"]["k"] == 4
+    assert found["pearson"]["value"] is None
+    assert "real success" in (cfg.output_dir / "metrics.md").read_text()
+    assert (cfg.output_dir / "policies.png").is_file()
+
+
+def test_imagined_episodes_are_as_long_as_real_ones(imagination, monkeypatch):
+    """Those of a simulator's task, or of another environment."""
+    asked = []
+    monkeypatch.setattr(policy_success, "policy_outcomes", lambda env, *_: asked.append(env) or [True, False])
+    for real in (WmrlManiSkillEnv(task="pick_place"), imagination):
+        policy_agreement(EvalWorldModelConfig(
+            model=Checkpoint(imagination.world_model_path), policies=["policy"], real_env=real, device="cpu"
+        ))  # fmt: skip
+    imagined, of_pick_place, again, of_imagination = asked
+    assert imagined.episode_length == of_pick_place.horizon > 100
+    assert again.episode_length == of_imagination.episode_length == 4
+
+
+def test_agreement_is_pearsons_correlation_with_fishers_interval():
+    """r by hand; with four policies arctanh(r) ± 1.96 / √(4 − 3)."""
+    shares = zip((2, 4, 6, 8), (1, 4, 5, 8), strict=True)
+    agreement = Agreement({str(i): (Proportion(a, 10), Proportion(b, 10)) for i, (a, b) in enumerate(shares)})
+    r, low, high = agreement.correlation()
+    assert r == pytest.approx(0.98387, abs=1e-4)
+    assert (low, high) == pytest.approx(
+        (np.tanh(np.arctanh(r) - 1.96), np.tanh(np.arctanh(r) + 1.96)), abs=1e-3
+    )
+    assert agreement.as_json()["r_squared"] == pytest.approx(r * r)
+    equal = Agreement({str(i): (Proportion(5, 10), Proportion(i, 10)) for i in range(4)})
+    assert equal.as_json()["pearson"]["value"] is None
+    assert "No correlation" in equal.table()

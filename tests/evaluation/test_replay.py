@@ -1,0 +1,206 @@
+"""Replays by small trained models on a small dataset, measured and written."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from lerobot_wmrl.common.constants import KINDS
+from lerobot_wmrl.data.dataset_source import DatasetSource
+from lerobot_wmrl.data.episode_table import choose_episodes, open_dataset, read_episodes
+from lerobot_wmrl.data.frame_cache import cached_frames
+from lerobot_wmrl.data.frames import NO_CONTEXT
+from lerobot_wmrl.evaluation import replay as replay_module
+from lerobot_wmrl.evaluation.accuracy import EpisodeAccuracy, by_step, episode_numbers, measure
+from lerobot_wmrl.evaluation.evaluate import evaluate
+from lerobot_wmrl.evaluation.extreme_actions import extreme_actions, robustness
+from lerobot_wmrl.evaluation.gate import Outcomes, gate_at, success_gate
+from lerobot_wmrl.evaluation.replay import EpisodeReplay, Source, replay_episodes
+from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
+from lerobot_wmrl.world_models.checkpoint import load_model
+from tests.relabelled import UNLABELLED, relabelled
+
+
+@pytest.fixture(scope="module")
+def model(trained_models):
+    return load_model(trained_models["action_world_model"], "action_world_model")
+
+
+@pytest.fixture
+def source(small_dataset, model) -> Source:
+    return Source(read_episodes(small_dataset), cached_frames(small_dataset, model.config.camera_keys))
+
+
+def perfect(source: Source, model, episode: int) -> EpisodeReplay:
+    """The replay of an episode by a model that imagines exactly what happened."""
+    rows = source.rows(episode)
+    following = torch.cat([model.tokenizer.encode(source.images(episode, torch.device("cpu")))[1:]] * 2)
+    state, done = torch.from_numpy(source.table.state[rows]), source.table.done[rows]
+    length = len(done)
+    return EpisodeReplay(
+        episode, NO_CONTEXT, following[:length], torch.from_numpy(done).float(), state.roll(-1, 0), None, done
+    )
+
+
+def test_a_perfect_model_reaches_the_ceiling_and_passes_the_gate(source, model):
+    runs = [perfect(source, model, episode) for episode in range(6)]
+    measured = measure(model, source, runs[0], None)
+    assert len(measured.steps["psnr"]) == source.table.length[0] - 1
+    np.testing.assert_allclose(measured.steps["psnr"], measured.steps["psnr_ceiling"])
+    assert (measured.steps["token_accuracy"] == 1).all()
+    assert (measured.steps["tcp_error_mm"] == 0).all()
+    np.testing.assert_allclose(measured.steps["tokenizer_lpips"], 0, atol=1e-6)
+    gate = gate_at(Outcomes.of(runs), 0.5, 3)
+    assert gate.passed
+    assert (gate.false_success.n, gate.recognised.n) == (2, 4)
+
+
+def test_replays_do_not_depend_on_the_batch(source, model, monkeypatch):
+    together = {run.episode: run for run in replay_episodes(model, source, np.arange(6))}
+    monkeypatch.setattr(replay_module, "BATCH", 2)
+    for run in replay_episodes(model, source, np.arange(6)):
+        other = together[run.episode]
+        assert torch.equal(run.tokens, other.tokens)
+        torch.testing.assert_close(run.done_probability, other.done_probability)
+        assert (run.shuffled is None) == (other.shuffled is None)
+        assert run.shuffled is None or torch.equal(run.shuffled, other.shuffled)
+        assert len(run.done) == source.table.length[run.episode]
+
+
+def test_delta_psnr_compares_with_the_actions_of_another_episode(source, model):
+    alone = next(replay_episodes(model, source, np.array([2])))
+    assert alone.shuffled is None
+    compared = {run.episode: run for run in replay_episodes(model, source, np.array([2, 5]))}[2]
+    assert compared.shuffled is not None
+    same = replace(compared, shuffled=compared.tokens[14])
+    assert measure(model, source, same, None).whole["delta_psnr_15"] == pytest.approx(0, abs=1e-5)
+    assert "delta_psnr_15" not in measure(model, source, alone, None).whole
+
+
+def test_depth_is_measured_where_a_replay_has_it(source, model):
+    run = perfect(source, model, 0)
+    real = torch.full((len(run.done) - 1, 1, 32, 32), 2.0)
+    steps = measure(model, source, replace(run, depth=(real, 1.1 * real)), None).steps
+    np.testing.assert_allclose(steps["abs_rel"], 0.1, rtol=1e-5)
+    assert (steps["delta_1"] == 1).all()
+
+
+def test_steps_are_averaged_over_the_episodes_that_last_so_long():
+    short, long = (EpisodeAccuracy(i, {"psnr": np.full(n, float(10 * n))}, {}) for i, n in enumerate((1, 3)))
+    curves = by_step([short, long, EpisodeAccuracy(2, {}, {})], horizon=2)
+    assert curves["psnr_by_step"] == [20, 30]
+    assert curves["episodes_by_step"] == [2, 1]
+    assert curves["bands"]["psnr"][0][0] <= 20 <= curves["bands"]["psnr"][1][0]
+    assert by_step([], horizon=2) == {"bands": {}, "episodes_by_step": []}
+
+
+def test_step_30_is_compared_with_the_tokenizer():
+    steps = {"psnr": np.arange(40.0), "psnr_ceiling": np.full(40, 50.0)}
+    numbers = episode_numbers(EpisodeAccuracy(0, steps, {}))
+    assert (numbers["psnr_30"], numbers["psnr_below_ceiling_30"]) == (29, 21)
+    short = {name: values[:29] for name, values in steps.items()}
+    assert "psnr_30" not in episode_numbers(EpisodeAccuracy(0, short, {}))
+
+
+def test_extreme_actions_are_what_they_are_called(source, model):
+    own = source.actions(np.arange(6), 4, torch.device("cpu"))
+    low, high = source.table.action.min(0), source.table.action.max(0)
+    actions = extreme_actions(own, low, high)
+    at_a_bound = torch.from_numpy(low), torch.from_numpy(high)
+    assert torch.stack([actions["saturated"] == bound for bound in at_a_bound]).any(0).all()
+    assert torch.equal(actions["reversed"], -own)
+    assert not actions["frozen"].any()
+    result = robustness(model, source, np.arange(6), threshold=1e-9, frames=1)
+    assert result["frozen"]["called_success"]["share"] == 1
+
+
+def test_splits_compose(small_dataset):
+    table = read_episodes(small_dataset)
+    assert choose_episodes(table, "all", 4).tolist() == [0, 1, 3, 5]
+    assert choose_episodes(table, "ind", 6, unseen={1}).tolist() == [0, 2, 4]
+    assert choose_episodes(table, "train,ood", 6, unseen={1}).tolist() == [1, 3, 5]
+    with pytest.raises(ValueError, match="no episode in its validation split"):
+        choose_episodes(table, "validation", 4)
+    with pytest.raises(ValueError, match="split='test': choose one of train, validation, all, ind, ood"):
+        choose_episodes(table, "test", 4, unseen={1})
+    with pytest.raises(ValueError, match="does not say which scenes"):
+        choose_episodes(replace(table, scene=np.full(6, -1)), "ood", 4, unseen={1})
+
+
+def test_play_is_no_attempt(source, model):
+    runs = [perfect(source, model, episode) for episode in range(6)]
+    kind = np.array([KINDS.index("play")] * 2 + [KINDS.index("optimal")] * 4)
+    assert Outcomes.of(runs).attempts(replace(source.table, kind=kind)).episodes.tolist() == [2, 3, 4, 5]
+
+
+def test_episodes_of_one_frame_are_named(source, model):
+    table = replace(source.table, length=np.ones(6, int))
+    with pytest.raises(ValueError, match="every chosen episode has a single frame"):
+        evaluate(model, Source(table, source.frames), np.arange(6))
+
+
+def test_the_gate_is_one_call(small_dataset, model):
+    gate = success_gate(model, Path(small_dataset.root), threshold=1e-9, frames=1)
+    assert (gate.false_success.share, gate.recognised.share) == (1, 1)
+
+
+def test_an_episode_that_ends_without_success_is_a_failure(small_dataset, model, tmp_path):
+    """As in LeRobot's own datasets, where `next.done` is the last row's whatever the outcome."""
+    table = read_episodes(small_dataset)
+    ends = np.isin(np.arange(len(table.done)), table.start + table.length - 1)
+    root = relabelled(Path(small_dataset.root), tmp_path / "ends", {"next.done": ends.tolist()})
+    assert read_episodes(open_dataset(root)).done.tolist() == table.done.tolist()
+    gate = success_gate(model, root)
+    assert (gate.false_success.n, gate.recognised.n) == (2, 4)
+    root = relabelled(Path(small_dataset.root), tmp_path / "old", {"next.success": None})
+    assert read_episodes(open_dataset(root)).done.tolist() == table.done.tolist()
+    root = relabelled(Path(small_dataset.root), tmp_path / "unlabelled", UNLABELLED)
+    with pytest.raises(ValueError, match=r"neither next\.success nor next\.done"):
+        success_gate(model, root)
+
+
+def test_episodes_of_which_nobody_knows_the_outcome_are_no_failures(small_dataset, trained_models, tmp_path):
+    root = relabelled(Path(small_dataset.root), tmp_path / "unlabelled", UNLABELLED)
+    config = EvalWorldModelConfig(
+        model=Checkpoint(str(trained_models["action_world_model"])), dataset=DatasetSource(str(root)),
+        output_dir=tmp_path / "check",
+    )  # fmt: skip
+    eval_world_model(config)
+    metrics = json.loads((tmp_path / "check" / "metrics.json").read_text(), parse_constant=pytest.fail)
+    assert (metrics["real_failures"], metrics["real_successes"], metrics["passed"]) == (0, 0, False)
+    assert metrics["headline"]["done_f1"]["value"] is None
+    assert (metrics["headline"]["psnr"]["episodes"], metrics["extreme_actions"]["episodes"]) == (6, 6)
+
+
+def test_the_command_writes_figures_and_pictures(small_dataset, trained_models, tmp_path, capsys):
+    folder = tmp_path / "check"
+    config = EvalWorldModelConfig(
+        model=Checkpoint(str(trained_models["action_world_model"])),
+        text_model=Checkpoint(str(trained_models["text_world_model"])),
+        dataset=DatasetSource(str(Path(small_dataset.root))),
+        split="train,ind",
+        output_dir=folder,
+    )
+    eval_world_model(config)
+    metrics = json.loads((folder / "metrics.json").read_text(), parse_constant=pytest.fail)
+    assert metrics["real_failures"] + metrics["real_successes"] == 6
+    longest = read_episodes(small_dataset).length.max()
+    for name in ("psnr", "psnr_ceiling", "ssim", "tokenizer_lpips", "token_accuracy", "tcp_error_mm"):
+        assert len(metrics[f"{name}_by_step"]) == longest - 1
+        low, high = metrics["headline"][name]["bootstrap_95"]
+        assert low <= metrics["headline"][name]["value"] <= high
+    assert math.isfinite(metrics["delta_psnr_15"])
+    assert len(metrics["gate_sweep"]) == 14 * 6
+    assert metrics["goal_frames"]["goals"] == 6
+    page = (folder / "metrics.md").read_text()
+    assert page in capsys.readouterr().out + "\n"
+    assert "| PSNR (dB) |" in page
+    for name in (
+        "comparison_success.gif", "comparison_failure_strip.png", "goal_frames.png", "accuracy.png",
+        "gate_sweep.png", "reward_along_episodes.png",
+    ):  # fmt: skip
+        assert (folder / name).stat().st_size > 0
