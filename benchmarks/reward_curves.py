@@ -25,7 +25,7 @@ on similarity to the goal, absolute), its two parts, `embedding` and `proxy`. Of
 successes and of failures with its band, Spearman's correlation with the rule-based reward within an episode,
 and the AUC of its highest run of three frames, success against failure. The same starts are also given to
 hands that move at random, not at all, and to one corner: they should earn less than the planner's actions.
-Does the environment's uncertainty warn? Of the episodes that the world model calls successes, how often is the
+Does uncertainty warn? Of the episodes that the world model calls successes, how often is the
 greatest uncertainty until then in a false one above that in a true one. Writes
 docs/results/reward_curves.json and a picture beside it.
 """

@@ -1,0 +1,47 @@
+"""Errors that know the field they are about; the command that was called knows its flag."""
+
+from collections.abc import Iterable
+
+
+class FieldError(ValueError):
+    """Report a setting that cannot be, by the name of its field.
+
+    Code below the commands does not know how its settings were given, so it names the field as its own
+    configuration does (`patch`, `reward.form`), and other fields in `remedy` in backquotes. The command line
+    says both as the flags that were typed (`--env.reward.form`).
+
+    Args:
+        field: dotted name of the field, relative to the configuration that raises.
+        value: what it was set to.
+        problem: why that cannot be.
+        remedy: what to set instead.
+    """
+
+    def __init__(self, field: str, value: object, problem: str, remedy: str = "") -> None:
+        super().__init__(field, value, problem, remedy)
+        self.field, self.value, self.problem, self.remedy = field, value, problem, remedy
+
+    def __str__(self) -> str:
+        said = f"{self.field}={self.value}: {self.problem}"
+        return f"{said}; {self.remedy}" if self.remedy else said
+
+
+def require_at_least(settings: object, least: float, *fields: str) -> None:
+    """Raise FieldError for the first of the `fields` of `settings` that is below `least`."""
+    for field in fields:
+        if getattr(settings, field) < least:
+            raise FieldError(field, getattr(settings, field), f"must be at least {least}")
+
+
+def require_share(settings: object, *fields: str) -> None:
+    """Raise FieldError for the first of the `fields` of `settings` that is not within 0 and 1."""
+    for field in fields:
+        if not 0 <= getattr(settings, field) <= 1:
+            raise FieldError(field, getattr(settings, field), "must be between 0 and 1")
+
+
+def require_choice(settings: object, field: str, choices: Iterable[object]) -> None:
+    """Raise FieldError unless the field is one of the choices."""
+    value, known = getattr(settings, field), list(choices)
+    if value not in known:
+        raise FieldError(field, value, f"choose one of {', '.join(map(str, known))}")
