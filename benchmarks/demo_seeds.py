@@ -22,7 +22,7 @@ RESULTS = Path(__file__).parents[1] / "docs" / "results"
 
 def results(runs: list[Summary]) -> dict[str, Any]:
     """Every run, and what they agree on."""
-    return {"real_change": asdict(mean_change(runs)), "runs": runs}
+    return {"change": asdict(mean_change(runs)), "runs": runs}
 
 
 def draw(summaries: list[Summary], path: Path) -> None:
@@ -30,7 +30,11 @@ def draw(summaries: list[Summary], path: Path) -> None:
     figure = Figure(figsize=(8, 3.4))
     panels = figure.subplots(1, 2, sharey=True)
     for axes, key, title, colour in zip(
-        panels, ("real", "imagined"), ("in ManiSkill", "in the world model"), (REAL, IMAGINED), strict=True
+        panels,
+        ("maniskill", "imagined"),
+        ("in ManiSkill", "in the world model"),
+        (REAL, IMAGINED),
+        strict=True,
     ):
         for offset, summary in enumerate(summaries):
             rates = [rate(summary, policy, key) for policy in ("sft", "rl")]

@@ -69,8 +69,8 @@ def measure(found: np.ndarray, success: np.ndarray, errors_mm: Sequence[float]) 
     return [
         {
             "error_mm": error,
-            "false_success_rate": Proportion(int(calls[~success].sum()), int((~success).sum())).as_json(),
-            "recognised_rate": Proportion(int(calls[success].sum()), int(success.sum())).as_json(),
+            "false_positive_rate": Proportion(int(calls[~success].sum()), int((~success).sum())).as_json(),
+            "recall": Proportion(int(calls[success].sum()), int(success.sum())).as_json(),
         }
         for error, calls in zip(errors_mm, found.T, strict=True)
     ]
@@ -80,7 +80,7 @@ def results_table(rows: Sequence[dict[str, Any]]) -> str:
     """A line an error."""
     lines = []
     for row in rows:
-        rates = (row[name] for name in ("false_success_rate", "recognised_rate"))
+        rates = (row[name] for name in ("false_positive_rate", "recall"))
         lines.append([row["error_mm"], *(str(Proportion(rate["k"], rate["n"])) for rate in rates)])
     return markdown_table(["error (mm)", "failures called successes", "successes recognised"], lines)
 

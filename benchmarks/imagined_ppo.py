@@ -116,7 +116,7 @@ class Experiment:
         are recognised and that of failures that are believed."""
 
         def distance(gate: Mapping[str, Any]) -> float:
-            return gate["recognised_rate"]["share"] - gate["false_success_rate"]["share"]
+            return gate["recall"]["share"] - gate["false_positive_rate"]["share"]
 
         sweep = json.loads((self.gate / "check" / "metrics.json").read_text())["gate_sweep"]
         best = max(sweep, key=distance)

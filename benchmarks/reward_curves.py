@@ -162,7 +162,7 @@ def measure(
 def warnings(uncertainty: Mapping[str, np.ndarray], outcomes: Outcomes) -> dict[str, Any]:
     """Among the episodes that are called successes: how well a signal's maximum up to that call, which is
     what the environment's guard would have seen, tells the false ones."""
-    first = outcomes.called(THRESHOLD, FRAMES)
+    first = outcomes.first_predicted_success(THRESHOLD, FRAMES)
     called, end = outcomes.where(first >= 0), first[first >= 0] + FRAMES
     seen = np.arange(called.done.shape[1]) < end[:, None]
     false = np.repeat(~called.success[:, None], called.done.shape[1], 1)
@@ -170,7 +170,7 @@ def warnings(uncertainty: Mapping[str, np.ndarray], outcomes: Outcomes) -> dict[
         signal: Outcomes(called.episodes, np.where(seen, values[called.episodes], np.nan), false).auc(1)
         for signal, values in uncertainty.items()
     }
-    return {"called_successes": len(false), "false": int((~called.success).sum()), "auc": auc}
+    return {"predicted_successes": len(false), "false": int((~called.success).sum()), "auc": auc}
 
 
 def other_hands(shape: tuple[int, int]) -> dict[str, Tensor]:

@@ -158,7 +158,7 @@ def results_table(rows: Mapping[str, Mapping[str, Any]]) -> str:
         line = [variant, *(estimate_cell(row.get(name)) for name in columns)]
         if gated:
             gate = row["gate"]
-            line += [share_cell(gate[name]) for name in ("false_success_rate", "recognised_rate")]
+            line += [share_cell(gate[name]) for name in ("false_positive_rate", "recall")]
             line.append(f"{gate['auc']:.2f}" if gate["auc"] is not None else "–")
         lines.append(line)
     return markdown_table(head, lines)

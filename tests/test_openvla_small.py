@@ -22,7 +22,7 @@ from lerobot_wmrl.scripts.train import TrainConfig
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 VIEWS = ("third_view", "side_view")
 MEASURED = ("ind", "ood", "drawn")
-RATES = {"recognised_rate": {"share": 0.9}, "false_success_rate": {"share": 0.1}}
+RATES = {"recall": {"share": 0.9}, "false_positive_rate": {"share": 0.1}}
 
 
 @pytest.fixture

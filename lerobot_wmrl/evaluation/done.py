@@ -24,7 +24,7 @@ def precision_recall_f1(called: np.ndarray, real: np.ndarray) -> dict[str, Estim
 
 def done_delay(outcomes: Outcomes, threshold: float, frames: int) -> np.ndarray:
     """Frames from the real to the imagined first success of each episode, NaN unless it has both. (E,)"""
-    begin = outcomes.called(threshold, frames)
+    begin = outcomes.first_predicted_success(threshold, frames)
     return np.where((begin >= 0) & outcomes.success, begin - outcomes.done.argmax(1), np.nan)
 
 
@@ -39,7 +39,7 @@ def done_log_loss(outcomes: Outcomes) -> Estimate:
 def done_quality(outcomes: Outcomes, threshold: float, frames: int) -> dict[str, Estimate]:
     """`done_*` over frames at `threshold`, `episode_*` as the environment ends episodes, log loss, delay."""
     fired = outcomes.probability >= threshold
-    called = outcomes.called(threshold, frames) >= 0
+    called = outcomes.first_predicted_success(threshold, frames) >= 0
     per_frame = precision_recall_f1(fired, outcomes.done)
     per_episode = precision_recall_f1(called, outcomes.success)
     delay = done_delay(outcomes, threshold, frames)

@@ -49,7 +49,7 @@ def robustness(
         called = first_run((imagined.done_probability >= threshold).cpu().numpy(), frames) >= 0
         first, last = (model.tokenizer.decode(t, context) for t in (tokens, imagined.tokens[:, -1]))
         result[name] = {
-            "called_success": Proportion(int(called.sum()), len(called)).as_json(),
+            "predicted_success": Proportion(int(called.sum()), len(called)).as_json(),
             "psnr_to_start": Estimate.mean(psnr(last, first).cpu().numpy()).as_json(),
         }
     return result

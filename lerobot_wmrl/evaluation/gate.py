@@ -77,7 +77,7 @@ class Outcomes:
         """Really. (E,)"""
         return np.any(self.done, axis=1)
 
-    def called(self, threshold: float, frames: int) -> np.ndarray:
+    def first_predicted_success(self, threshold: float, frames: int) -> np.ndarray:
         """Where the model first sees success, as the environment would end an episode: the first of `frames`
         consecutive frames at `threshold`, −1 if there is none. (E,)"""
         return first_run(self.probability >= threshold, frames)
@@ -107,22 +107,22 @@ class Gate:
 
     threshold: float
     frames: int
-    false_success: Proportion
-    recognised: Proportion
+    false_positives: Proportion
+    recall: Proportion
     cut_short: int
     auc: float
 
     @property
     def passed(self) -> bool:
         """At most 5 % of the failures called success, at least 90 % of the successes found."""
-        return self.false_success.share <= MOST_FALSE and self.recognised.share >= FEWEST_RECOGNISED
+        return self.false_positives.share <= MOST_FALSE and self.recall.share >= FEWEST_RECOGNISED
 
     def as_json(self) -> dict[str, Any]:
         return {
             "done_threshold": self.threshold,
             "done_frames": self.frames,
-            "false_success_rate": self.false_success.as_json(),
-            "recognised_rate": self.recognised.as_json(),
+            "false_positive_rate": self.false_positives.as_json(),
+            "recall": self.recall.as_json(),
             "successes_cut_short": self.cut_short,
             "auc": None if math.isnan(self.auc) else self.auc,
             "passed": self.passed,
@@ -169,7 +169,7 @@ def judged_episodes(model: ActionWorldModelRewardModel, source: Source) -> Itera
 
 def gate_at(outcomes: Outcomes, threshold: float, frames: int) -> Gate:
     """Count at one operating point."""
-    called, real = outcomes.called(threshold, frames) >= 0, outcomes.success
+    called, real = outcomes.first_predicted_success(threshold, frames) >= 0, outcomes.success
     return Gate(
         threshold,
         frames,
@@ -201,9 +201,9 @@ def best_operating_point(gates: Sequence[Gate]) -> Gate | None:
     """
 
     def merit(gate: Gate) -> tuple[float, ...]:
-        return gate.recognised.k, -gate.false_success.k, gate.threshold, gate.frames
+        return gate.recall.k, -gate.false_positives.k, gate.threshold, gate.frames
 
-    tolerable = [gate for gate in gates if gate.false_success.share <= MOST_FALSE and gate.recognised.n]
+    tolerable = [gate for gate in gates if gate.false_positives.share <= MOST_FALSE and gate.recall.n]
     return max(tolerable, key=merit, default=None)
 
 
@@ -211,14 +211,14 @@ def success_agreement(outcomes: Outcomes, threshold: float, frames: int) -> dict
     """The gate at one operating point, in detail: counts, rates, and every episode's verdict."""
     gate = gate_at(outcomes, threshold, frames)
     return {
-        "real_failures": gate.false_success.n,
-        "false_successes": gate.false_success.k,
-        "real_successes": gate.recognised.n,
-        "recognised_successes": gate.recognised.k,
+        "failures": gate.false_positives.n,
+        "false_positives": gate.false_positives.k,
+        "successes": gate.recall.n,
+        "true_positives": gate.recall.k,
         **gate.as_json(),
         "episodes": outcomes.episodes.tolist(),
-        "called_success": (outcomes.called(threshold, frames) >= 0).tolist(),
-        "real_success": outcomes.success.tolist(),
+        "predicted_success": (outcomes.first_predicted_success(threshold, frames) >= 0).tolist(),
+        "recorded_success": outcomes.success.tolist(),
     }
 
 

@@ -120,7 +120,7 @@ def save_accuracy(by_step: Mapping[str, Any], path: Path) -> None:
 def save_sweep(gates: Sequence[Gate], path: Path) -> None:
     """False successes and recognised successes by threshold, a line for each number of frames."""
     figure, axes = plt.subplots(1, 2, figsize=(8, 2.8))
-    titles = {"false_success": "failures called successes (%)", "recognised": "successes recognised (%)"}
+    titles = {"false_positives": "failures called successes (%)", "recall": "successes recognised (%)"}
     for axis, (name, title), limit in zip(axes, titles.items(), (5, 90), strict=True):
         for frames in SWEEP_FRAMES:
             shares = [100 * getattr(gate, name).share for gate in gates if gate.frames == frames]

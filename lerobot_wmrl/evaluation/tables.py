@@ -57,7 +57,7 @@ def gate_lines(gate: Gate, best: Gate | None) -> str:
     lines = [
         f"Gate at --done_threshold={gate.threshold} --done_frames={gate.frames}: "
         f"{'passed' if gate.passed else 'not passed'}.",
-        f"Failures called successes: {gate.false_success}. Successes recognised: {gate.recognised}.",
+        f"Failures called successes: {gate.false_positives}. Successes recognised: {gate.recall}.",
         f"AUC of successes against failures, whatever the threshold: {gate.auc:.2f} (0.5 by chance).",
     ]
     if gate.cut_short:
@@ -70,8 +70,8 @@ def gate_lines(gate: Gate, best: Gate | None) -> str:
     else:
         lines.append(
             f"Best with at most 5 % false successes: --done_threshold={best.threshold} "
-            f"--done_frames={best.frames}; false successes {best.false_success}; "
-            f"recognised {best.recognised}."
+            f"--done_frames={best.frames}; false successes {best.false_positives}; "
+            f"recognised {best.recall}."
         )
     return "\n".join(lines)
 
@@ -79,7 +79,7 @@ def gate_lines(gate: Gate, best: Gate | None) -> str:
 def task_table(gates: Mapping[str, Gate]) -> str:
     """The gate of each task, at one operating point."""
     rows = [
-        (task, gate.false_success, gate.recognised, f"{gate.auc:.2f}", "yes" if gate.passed else "no")
+        (task, gate.false_positives, gate.recall, f"{gate.auc:.2f}", "yes" if gate.passed else "no")
         for task, gate in gates.items()
     ]
     return markdown_table(
@@ -128,7 +128,7 @@ def goal_table(result: Mapping[str, Any]) -> str:
 
 def _percents(gate: Gate) -> str:
     false, recognised = (
-        f"{100 * rate.share:.0f}" if rate.n else "–" for rate in (gate.false_success, gate.recognised)
+        f"{100 * rate.share:.0f}" if rate.n else "–" for rate in (gate.false_positives, gate.recall)
     )
     return f"{false} / {recognised}"
 

@@ -103,13 +103,13 @@ class SuccessGate:
         return rollouts_for(self.env.model, folder)
 
     def _above(self, verdict: Gate) -> bool:
-        return verdict.false_success.share > self.config.limit
+        return verdict.false_positives.share > self.config.limit
 
     def _warning(self, iteration: int, verdicts: Mapping[str, Gate]) -> str | None:
         """What is wrong, in plain words, if anything is."""
         failed = {place: verdict for place, verdict in verdicts.items() if self._above(verdict)}
         if failed:
-            told = " and ".join(f"{v.false_success} of {place} rollouts" for place, v in failed.items())
+            told = " and ".join(f"{v.false_positives} of {place} rollouts" for place, v in failed.items())
             return (
                 f"Gate, iteration {iteration}: the world model calls real failures successes, {told}, above "
                 f"--gate.limit={self.config.limit}. {REMEDIES}"
@@ -120,7 +120,7 @@ class SuccessGate:
                 "imagines may be wrong; give labelled rollouts (--gate.dataset.root) or a simulator "
                 "(--real_env.type=wmrl_maniskill)"
             )
-        if not any(verdict.false_success.n for verdict in verdicts.values()):
+        if not any(verdict.false_positives.n for verdict in verdicts.values()):
             return f"Gate, iteration {iteration}: no rollout failed, so they say nothing of the world model"
         return None
 
@@ -131,7 +131,7 @@ def save_strips(
     """Two short episodes as they happened, above, and as they are imagined, below: a success and a failure,
     one that the model believes in if there is one."""
     folder.mkdir(parents=True, exist_ok=True)
-    called = outcomes.called(env.config.done_threshold, env.config.done_frames) >= 0
+    called = outcomes.first_predicted_success(env.config.done_threshold, env.config.done_frames) >= 0
     believed = called & ~outcomes.success
     failures = believed if believed.any() else ~outcomes.success
     for name, rows in {"success": outcomes.success, "failure": failures}.items():

@@ -39,7 +39,7 @@ def finished(tmp_path: Path) -> DemoConfig:
         outcomes = [i < successes for i in range(10)]
         write_json(tmp_path / folder / "eval_info.json", {"per_task": [{"metrics": {"successes": outcomes}}]})
     for policy in ("sft", "rl", "held_out"):
-        replay = {"false_successes": 2, "real_failures": 5, "recognised_successes": 3, "real_successes": 4}
+        replay = {"false_positives": 2, "failures": 5, "true_positives": 3, "successes": 4}
         write_json(tmp_path / f"replay_{policy}" / "metrics.json", replay)
         Image.new("RGB", (8, 8)).save(tmp_path / f"replay_{policy}" / "comparison_0.png")
     (tmp_path / "logs").mkdir()
@@ -93,10 +93,10 @@ def test_the_gates_last_warning_is_shown_in_red(finished: DemoConfig) -> None:
 def test_summary_holds_every_headline_number(finished: DemoConfig) -> None:
     write_report(finished, [stage.name for stage in demo_stages(finished)])
     summary = json.loads((finished.output_dir / "summary.json").read_text())
-    assert summary["policies"]["rl"]["real"]["k"] == SUCCESSES["eval_rl"]
-    assert summary["policies"]["sft"]["false_success"]["share"] == 0.4
-    assert summary["real_change"] == {"gained": 2, "lost": 0, "p_value": 0.5}
-    assert sum(summary["real_outcomes"]["rl"]) == SUCCESSES["eval_rl"]
+    assert summary["policies"]["rl"]["maniskill"]["k"] == SUCCESSES["eval_rl"]
+    assert summary["policies"]["sft"]["false_positive_rate"]["share"] == 0.4
+    assert summary["change"] == {"gained": 2, "lost": 0, "p_value": 0.5}
+    assert sum(summary["outcomes"]["rl"]) == SUCCESSES["eval_rl"]
     assert summary["dataset"] == {"episodes": 4, "frames": 12}
     assert summary["seconds"] == 3.0 * len(demo_stages(finished))
 
@@ -108,7 +108,7 @@ def test_runs_with_other_seeds_stand_side_by_side(finished: DemoConfig) -> None:
     assert "Other seeds" not in write_report(config, stages).read_text()
     own = json.loads((config.output_dir / "summary.json").read_text())
     beside = config.output_dir.parent
-    other = {**own, "seed": 1, "real_outcomes": {"sft": [False] * 10, "rl": [True] * 4 + [False] * 6}}
+    other = {**own, "seed": 1, "outcomes": {"sft": [False] * 10, "rl": [True] * 4 + [False] * 6}}
     write_json(beside / "another" / "summary.json", other)
     write_json(beside / "copy" / "summary.json", own)
     write_json(beside / "tiny" / "summary.json", {**own, "preset": "tiny", "seed": 2})

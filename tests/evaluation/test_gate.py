@@ -49,8 +49,8 @@ def test_the_first_run_is_of_consecutive_frames():
 ])  # fmt: skip
 def test_the_gate_counts_as_the_environment_ends_episodes(outcomes, threshold, frames, false, recognised):
     gate = gate_at(outcomes, threshold, frames)
-    assert (gate.false_success.k, gate.false_success.n) == (false, 2)
-    assert (gate.recognised.k, gate.recognised.n) == (recognised, 3)
+    assert (gate.false_positives.k, gate.false_positives.n) == (false, 2)
+    assert (gate.recall.k, gate.recall.n) == (recognised, 3)
     assert not gate.passed
 
 
@@ -74,7 +74,7 @@ def test_auc_is_the_share_of_pairs_in_the_right_order(outcomes):
 def test_the_best_operating_point_is_tolerable_and_recognises_most(outcomes):
     best = best_operating_point(sweep(outcomes))
     assert (best.threshold, best.frames) == (0.8, 3)
-    assert (best.false_success.k, best.recognised.k) == (0, 2)
+    assert (best.false_positives.k, best.recall.k) == (0, 2)
     believed = Outcomes(outcomes.episodes, np.ones((5, 6)), outcomes.done)
     assert best_operating_point(sweep(believed)) is None
     knowing = Outcomes(outcomes.episodes, outcomes.done.astype(float), outcomes.done)
@@ -83,9 +83,9 @@ def test_the_best_operating_point_is_tolerable_and_recognises_most(outcomes):
 
 def test_verdicts_of_every_episode_are_reported_as_json(outcomes):
     agreement = json.loads(json.dumps(success_agreement(outcomes, 0.5, 3)))
-    assert agreement["called_success"] == [True, True, False, True, False]
-    assert agreement["real_success"] == [True, True, True, False, False]
-    assert (agreement["real_failures"], agreement["recognised_successes"]) == (2, 2)
+    assert agreement["predicted_success"] == [True, True, False, True, False]
+    assert agreement["recorded_success"] == [True, True, True, False, False]
+    assert (agreement["failures"], agreement["true_positives"]) == (2, 2)
 
 
 def test_done_by_frame_by_episode_and_how_late(outcomes):
@@ -120,7 +120,7 @@ def test_early_and_late_calls_do_not_cancel(outcomes):
 def test_without_any_success_rates_are_no_numbers():
     never = Outcomes(np.arange(3), np.zeros((3, 4)), np.zeros((3, 4), bool))
     assert math.isnan(done_quality(never, 0.5, 3)["done_f1"].value)
-    assert success_agreement(never, 0.5, 3)["recognised_rate"]["share"] is None
+    assert success_agreement(never, 0.5, 3)["recall"]["share"] is None
     assert not gate_at(never, 0.5, 3).passed
 
 
@@ -128,9 +128,9 @@ def test_every_task_has_a_gate_of_its_own(outcomes):
     table: Any = SimpleNamespace(task=np.array([0, 0, 1, 1, -1]))
     gates = gates_by_task(outcomes, table, 0.5, 3)
     assert list(gates) == ["push", "pull"]
-    assert (gates["push"].recognised.k, gates["push"].recognised.n, gates["push"].false_success.n) == (
+    assert (gates["push"].recall.k, gates["push"].recall.n, gates["push"].false_positives.n) == (
         2,
         2,
         0,
     )
-    assert (gates["pull"].recognised.k, gates["pull"].false_success.k) == (0, 1)
+    assert (gates["pull"].recall.k, gates["pull"].false_positives.k) == (0, 1)

@@ -56,7 +56,7 @@ def test_a_perfect_model_reaches_the_ceiling_and_passes_the_gate(source, model):
     np.testing.assert_allclose(measured.steps["tokenizer_lpips"], 0, atol=1e-6)
     gate = gate_at(Outcomes.of(runs), 0.5, 3)
     assert gate.passed
-    assert (gate.false_success.n, gate.recognised.n) == (2, 4)
+    assert (gate.false_positives.n, gate.recall.n) == (2, 4)
 
 
 def test_replays_do_not_depend_on_the_batch(source, model, monkeypatch):
@@ -115,7 +115,7 @@ def test_extreme_actions_are_what_they_are_called(source, model):
     assert torch.equal(actions["reversed"], -own)
     assert not actions["frozen"].any()
     result = robustness(model, source, np.arange(6), threshold=1e-9, frames=1)
-    assert result["frozen"]["called_success"]["share"] == 1
+    assert result["frozen"]["predicted_success"]["share"] == 1
 
 
 def test_splits_compose(small_dataset):
@@ -145,7 +145,7 @@ def test_episodes_of_one_frame_are_named(source, model):
 
 def test_the_gate_is_one_call(small_dataset, model):
     gate = success_gate(model, Path(small_dataset.root), threshold=1e-9, frames=1)
-    assert (gate.false_success.share, gate.recognised.share) == (1, 1)
+    assert (gate.false_positives.share, gate.recall.share) == (1, 1)
 
 
 def test_an_episode_that_ends_without_success_is_a_failure(small_dataset, model, tmp_path):
@@ -155,7 +155,7 @@ def test_an_episode_that_ends_without_success_is_a_failure(small_dataset, model,
     root = relabelled(Path(small_dataset.root), tmp_path / "ends", {"next.done": ends.tolist()})
     assert read_episodes(open_dataset(root)).done.tolist() == table.done.tolist()
     gate = success_gate(model, root)
-    assert (gate.false_success.n, gate.recognised.n) == (2, 4)
+    assert (gate.false_positives.n, gate.recall.n) == (2, 4)
     root = relabelled(Path(small_dataset.root), tmp_path / "old", {"next.success": None})
     assert read_episodes(open_dataset(root)).done.tolist() == table.done.tolist()
     root = relabelled(Path(small_dataset.root), tmp_path / "unlabelled", UNLABELLED)
@@ -171,7 +171,7 @@ def test_episodes_of_which_nobody_knows_the_outcome_are_no_failures(small_datase
     )  # fmt: skip
     eval_world_model(config)
     metrics = json.loads((tmp_path / "check" / "metrics.json").read_text(), parse_constant=pytest.fail)
-    assert (metrics["real_failures"], metrics["real_successes"], metrics["passed"]) == (0, 0, False)
+    assert (metrics["failures"], metrics["successes"], metrics["passed"]) == (0, 0, False)
     assert metrics["headline"]["done_f1"]["value"] is None
     assert (metrics["headline"]["psnr"]["episodes"], metrics["extreme_actions"]["episodes"]) == (6, 6)
 
@@ -187,7 +187,7 @@ def test_the_command_writes_figures_and_pictures(small_dataset, trained_models, 
     )
     eval_world_model(config)
     metrics = json.loads((folder / "metrics.json").read_text(), parse_constant=pytest.fail)
-    assert metrics["real_failures"] + metrics["real_successes"] == 6
+    assert metrics["failures"] + metrics["successes"] == 6
     longest = read_episodes(small_dataset).length.max()
     for name in ("psnr", "psnr_ceiling", "ssim", "tokenizer_lpips", "token_accuracy", "tcp_error_mm"):
         assert len(metrics[f"{name}_by_step"]) == longest - 1

@@ -49,7 +49,7 @@ def test_a_verdict_is_the_evaluations_own(
     found = gate.run(0, tmp_path, tmp_path / "gate")
     asked = success_gate(env.model, small_dataset.root, BELIEVES_ALL, frames=2)
     assert found["labelled"] == asked.as_json()
-    assert found["labelled"]["false_success_rate"]["share"] == 1.0
+    assert found["labelled"]["false_positive_rate"]["share"] == 1.0
     assert found["failed"]
     assert found["real_steps"] == 0
     strips = {path.name for path in (tmp_path / "gate").glob("*.png")}
@@ -79,7 +79,7 @@ def test_at_the_limit_training_goes_on(
 ) -> None:
     gate = make_gate(BELIEVES_NONE)
     record = gate.run(0, tmp_path, tmp_path / "gate")
-    assert record["labelled"]["false_success_rate"]["k"] == 0
+    assert record["labelled"]["false_positive_rate"]["k"] == 0
     with caplog.at_level(logging.WARNING):
         gate.apply({0: record})
     assert not [entry for entry in caplog.records if entry.levelno >= logging.WARNING]

@@ -116,9 +116,9 @@ def test_the_summary_counts_what_was_evaluated(outputs: tuple[Path, str]) -> Non
     summary = json.loads((demo / "summary.json").read_text())
     n = PRESETS["tiny"]["demo"]["eval_episodes"]
     for policy in ("sft", "rl"):
-        assert [summary["policies"][policy][key]["n"] for key in ("real", "imagined")] == [n, n]
+        assert [summary["policies"][policy][key]["n"] for key in ("maniskill", "imagined")] == [n, n]
         replayed = summary["policies"][policy]
-        assert replayed["false_success"]["n"] + replayed["recognised"]["n"] == len(
+        assert replayed["false_positive_rate"]["n"] + replayed["recall"]["n"] == len(
             recorded_episodes(demo / f"rollouts_{policy}")["episode"]
         )
     assert summary["peak_memory_bytes"] < 8e9

@@ -144,7 +144,7 @@ def test_the_gate_is_asked_before_the_first_update(improve: Any, capsys: pytest.
     out = improve(*flags, "--env.done_threshold=0.0001", "--gate.action=warn")
     assert (out / "checkpoints" / "last").resolve().name == "000002"
     assert [line["step"] for line in read_metrics(out)] == [0, 1, 2]
-    assert read_metrics(out)[0]["gate/labelled/false_success_rate/share"] == 1.0
+    assert read_metrics(out)[0]["gate/labelled/false_positive_rate/share"] == 1.0
 
 
 def test_gate_and_selection_in_the_simulator(improve: Any) -> None:
@@ -156,7 +156,7 @@ def test_gate_and_selection_in_the_simulator(improve: Any) -> None:
     first, *_, last = read_metrics(out)
     assert (last["real_steps/gate"], last["real_steps/selection"]) == (3, 6)
     assert last["selection/real/n"] == last["selection/imagined/n"] == 1
-    assert first["gate/fresh/false_success_rate/n"] == 1
+    assert first["gate/fresh/false_positive_rate/n"] == 1
     assert (out / "gate" / "000000" / "fresh_failure.png").is_file()
     assert recorded_episodes(out / "gate" / "000000" / "rollouts")["seed"].tolist() == [GATE_SEED]
 

@@ -36,7 +36,7 @@ def measure(output_dir: Path) -> dict[str, dict[str, Proportion]]:
     """For each policy: real and imagined success, false successes and recognised successes."""
     return {
         policy: {
-            "real": sources.success_rate(output_dir / f"eval_{policy}"),
+            "maniskill": sources.success_rate(output_dir / f"eval_{policy}"),
             "imagined": sources.success_rate(output_dir / f"imagine_{policy}"),
             **sources.replayed(output_dir / f"replay_{policy}"),
         }
@@ -64,10 +64,8 @@ def summary(
         "preset": config.stage_preset,
         "seed": config.seed,
         "policies": {policy: {k: v.as_json() for k, v in row.items()} for policy, row in measured.items()},
-        "real_change": sources.real_change(config.output_dir).as_json(),
-        "real_outcomes": {
-            policy: sources.outcomes(config.output_dir / f"eval_{policy}") for policy in POLICIES
-        },
+        "change": sources.real_change(config.output_dir).as_json(),
+        "outcomes": {policy: sources.outcomes(config.output_dir / f"eval_{policy}") for policy in POLICIES},
         "dataset": {"episodes": len(table["episode"]), "frames": int(table["length"].sum())},
         "seconds": sum(record["seconds"] for record in records),
         "peak_memory_bytes": max(record["peak_memory_bytes"] for record in records),
@@ -96,7 +94,7 @@ def verdict(before: Proportion, after: Proportion, change: PairedChange) -> str:
 def headline_cards(measured: dict[str, dict[str, Proportion]]) -> list[dict[str, Any]]:
     cards = []
     for policy, row in measured.items():
-        for key, where in (("real", "in ManiSkill"), ("imagined", "in the world model")):
+        for key, where in (("maniskill", "in ManiSkill"), ("imagined", "in the world model")):
             rate = row[key]
             value = "–" if math.isnan(rate.share) else f"{100 * rate.share:.0f} %"
             cards.append({"label": f"{POLICIES[policy]}, {where}", "value": value, "n": rate.n,
@@ -130,7 +128,7 @@ def other_seeds(config: DemoConfig) -> dict[str, Any] | None:
     found = [
         run
         for run in runs.finished_runs(config.output_dir, config.stage_preset)
-        if len(run["real_outcomes"]["sft"]) == config.eval_episodes
+        if len(run["outcomes"]["sft"]) == config.eval_episodes
     ]
     if len(found) < 2:
         return None
@@ -166,9 +164,11 @@ def render(
         peak_memory=f"{max(record['peak_memory_bytes'] for record in records) / 1e9:.1f}",
         cards=headline_cards(measured),
         verdict=verdict(
-            measured["sft"]["real"], measured["rl"]["real"], sources.real_change(config.output_dir)
+            measured["sft"]["maniskill"], measured["rl"]["maniskill"], sources.real_change(config.output_dir)
         ),
-        bars=figures.success_bars({POLICIES[p]: (r["real"], r["imagined"]) for p, r in measured.items()}),
+        bars=figures.success_bars(
+            {POLICIES[p]: (r["maniskill"], r["imagined"]) for p, r in measured.items()}
+        ),
         trust=trust_rows(config.output_dir),
         warning=sources.gate_warning(config.output_dir / "rl"),
         pictures=picture_sections(config.output_dir),

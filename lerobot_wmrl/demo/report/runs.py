@@ -17,14 +17,14 @@ def finished_runs(output_dir: Path, preset: str) -> list[Summary]:
     folders = sorted(path.parent for path in output_dir.absolute().parent.glob("*/summary.json"))
     for folder in sorted(folders, key=lambda folder: folder != output_dir.absolute()):
         summary = json.loads((folder / "summary.json").read_text())
-        if summary.get("preset") == preset and "real_outcomes" in summary:
+        if summary.get("preset") == preset and "outcomes" in summary:
             found.setdefault(summary["seed"], summary)
     return [found[seed] for seed in sorted(found)]
 
 
 def mean_change(runs: Sequence[Summary]) -> MeanChange:
     """Of real success from the cloned to the PPO policy. ValueError if the runs met different starts."""
-    outcomes = [run["real_outcomes"] for run in runs]
+    outcomes = [run["outcomes"] for run in runs]
     return MeanChange.over_runs([each["sft"] for each in outcomes], [each["rl"] for each in outcomes])
 
 
@@ -38,12 +38,12 @@ def run_rows(runs: Sequence[Summary]) -> list[dict[str, str]]:
     """One row a run, as text."""
     rows = []
     for run in runs:
-        change = PairedChange(run["real_change"]["gained"], run["real_change"]["lost"])
+        change = PairedChange(run["change"]["gained"], run["change"]["lost"])
         row = {"seed": str(run["seed"]), "change": str(change)}
-        for key in ("real", "imagined"):
+        for key in ("maniskill", "imagined"):
             row[key] = " → ".join(f"{100 * rate(run, policy, key).share:.0f} %" for policy in ("sft", "rl"))
-        false, recognised = (rate(run, "sft", key) for key in ("false_success", "recognised"))
-        row["false_success"] = f"{false.k} of {false.n}"
-        row["recognised"] = f"{recognised.k} of {recognised.n}"
+        false, recognised = (rate(run, "sft", key) for key in ("false_positive_rate", "recall"))
+        row["false_positive_rate"] = f"{false.k} of {false.n}"
+        row["recall"] = f"{recognised.k} of {recognised.n}"
         rows.append(row)
     return rows

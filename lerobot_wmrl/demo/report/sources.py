@@ -72,6 +72,6 @@ def replayed(replay_dir: Path) -> dict[str, Proportion]:
     """From the world model's evaluation on real episodes: failures called successes, successes recognised."""
     metrics = json.loads((replay_dir / "metrics.json").read_text())
     return {
-        "false_success": Proportion(metrics["false_successes"], metrics["real_failures"]),
-        "recognised": Proportion(metrics["recognised_successes"], metrics["real_successes"]),
+        "false_positive_rate": Proportion(metrics["false_positives"], metrics["failures"]),
+        "recall": Proportion(metrics["true_positives"], metrics["successes"]),
     }
