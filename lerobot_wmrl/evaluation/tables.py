@@ -100,7 +100,11 @@ def sweep_table(gates: Sequence[Gate]) -> str:
 def robustness_table(result: Mapping[str, Any]) -> str:
     """Extreme actions: how many episodes are called successes, and how far the picture stays."""
     rows = [
-        (name, f"{row['called_success']['k']} of {row['called_success']['n']}", _value(row["psnr_to_start"]))
+        (
+            name,
+            f"{row['predicted_success']['k']} of {row['predicted_success']['n']}",
+            _value(row["psnr_to_start"]),
+        )
         for name, row in result.items()
         if isinstance(row, Mapping)
     ]
