@@ -9,8 +9,7 @@ import importlib
 CONFIGURATION_MODULES = (
     "lerobot_wmrl.world_models.configuration_frame_tokenizer",
     "lerobot_wmrl.world_models.configuration_world_model",
-    "lerobot_wmrl.rewards.configuration_general",
-    "lerobot_wmrl.rewards.configuration_learned",
+    "lerobot_wmrl.rewards.configuration_rewards",
     "lerobot_wmrl.envs.configuration_world_model",
     "lerobot_wmrl.envs.configuration_wmrl_maniskill",
     "lerobot_wmrl.rl.configuration_grpo",

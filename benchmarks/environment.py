@@ -25,12 +25,10 @@ from imagined_env import add_world_models, world_model_env
 from lerobot_wmrl.common.constants import ACTION_LOW
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
-from lerobot_wmrl.envs.first_frames import read_first_frames
-from lerobot_wmrl.envs.world_model_env import WorldModels, WorldModelVectorEnv, begin_in, load_world_models
-from lerobot_wmrl.rewards.configuration_general import GeneralConfig
-from lerobot_wmrl.rewards.configuration_learned import EmbeddingConfig, ProxyConfig
-from lerobot_wmrl.rewards.modeling_general import GeneralRewardModel
-from lerobot_wmrl.rewards.modeling_learned import EmbeddingRewardModel, ProxyRewardModel
+from lerobot_wmrl.envs.start_frames import read_first_frames
+from lerobot_wmrl.envs.world_model_env import WorldModels, WorldModelVectorEnv, load_world_models, make_env_at
+from lerobot_wmrl.rewards.configuration_rewards import EmbeddingConfig, GeneralConfig, ProxyConfig
+from lerobot_wmrl.rewards.modeling_rewards import EmbeddingRewardModel, GeneralRewardModel, ProxyRewardModel
 from lerobot_wmrl.rewards.similarity import PixelSimilarity
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 from machine import rates
@@ -61,10 +59,10 @@ def environments(config: WorldModelEnv, models: WorldModels, count: int) -> dict
     variants = {
         "sparse": sparse,
         "general": models,
-        "general, mse": models._replace(alike=PixelSimilarity()),
+        "general, mse": models._replace(measure=PixelSimilarity()),
         **{name: goalless._replace(reward=reward) for name, reward in learned_rewards(models.model).items()},
     }
-    return {name: begin_in(frames, variant, config, count) for name, variant in variants.items()}
+    return {name: make_env_at(frames, variant, config, count) for name, variant in variants.items()}
 
 
 def stepping(env: WorldModelVectorEnv) -> Work:

@@ -49,12 +49,12 @@ from lerobot_wmrl.common.statistics import Estimate
 from lerobot_wmrl.data.episode_table import EpisodeTable, open_dataset, read_episodes
 from lerobot_wmrl.demo.report.figures import COLOURS, tidy
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
-from lerobot_wmrl.envs.first_frames import chosen_episodes
+from lerobot_wmrl.envs.start_frames import chosen_episodes
 from lerobot_wmrl.envs.uncertainty import SIGNALS
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv, make_world_model_env
 from lerobot_wmrl.evaluation.gate import Outcomes
 from lerobot_wmrl.evaluation.tables import markdown_table
-from lerobot_wmrl.rewards.configuration_general import GeneralConfig
+from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.world_models.checkpoint import load_model
 
 RESULTS: Final = Path(__file__).parents[1] / "docs" / "results" / "reward_curves.json"

@@ -66,7 +66,7 @@ def imagined_episodes(config: RecordConfig) -> list[EpisodePlan]:
     """From the environment's start frames in turn. Task, scene and seed are those of the real episodes that
     began so: an imagined episode can be repeated for real."""
     from lerobot_wmrl.data.episode_table import open_dataset, read_episodes
-    from lerobot_wmrl.envs.first_frames import chosen_episodes
+    from lerobot_wmrl.envs.start_frames import chosen_episodes
 
     assert config.imagination is not None
     source = config.imagination.dataset

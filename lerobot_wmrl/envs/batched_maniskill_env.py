@@ -61,7 +61,7 @@ class BatchedManiSkillEnv(gym.vector.VectorEnv):
         self._elapsed += 1
         terminated = frame.success
         truncated = (self._elapsed >= self.max_episode_steps) & ~terminated
-        reward = self.config.reward.of_step(terminated.float(), frame.reward, self._progress)
+        reward = self.config.reward.step_reward(terminated.float(), frame.reward, self._progress)
         self._progress = frame.reward
         observation, info = self._observation(frame), {}
         ended = terminated | truncated

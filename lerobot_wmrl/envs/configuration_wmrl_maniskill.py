@@ -20,7 +20,7 @@ from lerobot_wmrl.common.constants import (
     STATE_NAMES,
 )
 from lerobot_wmrl.maniskill.scenes import Scene, scenes_of
-from lerobot_wmrl.rewards.rule_based import RuleBasedReward
+from lerobot_wmrl.rewards.general import RuleBasedReward
 
 if TYPE_CHECKING:
     import gymnasium as gym

@@ -1,4 +1,4 @@
-"""Configuration of the world model as an environment."""
+"""Configuration of the world model as an environment, `--env.type=world_model`."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,27 +11,29 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
 from lerobot_wmrl.common.constants import FPS, TASKS
+from lerobot_wmrl.common.errors import FieldError, require_at_least
 from lerobot_wmrl.data.dataset_source import DatasetSource
 from lerobot_wmrl.envs.uncertainty import Uncertainty
-from lerobot_wmrl.rewards.configuration_general import GeneralConfig
+from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 
 
 @dataclass
 class StartFrames(DatasetSource):
-    """Where imagined episodes begin: in the first frames of a LeRobotDataset's episodes, in saved frames, or
-    in ManiSkill's resets.
+    """Where imagined episodes begin: in the first frames of a LeRobotDataset's episodes (`root`), in saved
+    frames (`frames`) or in ManiSkill's resets (`resets`).
 
     Args:
-        frames: a file by numpy.savez, in place of a dataset: `observation.images.<camera>` (K, H, W, 3)
-            uint8, `observation.state` (K, P) and `task` (K,), the instructions.
-        resets: start frames to take from ManiSkill, in place of a dataset, of `tasks` (push by default),
-            `scenes` and the split `ind` (by default) or `ood`.
-        split: `train` (what the world model was trained on), `validation` (held out) or `all`; `ind` or
-            `ood`, scenes that training may see and those held out. Joined by a comma: what is in both.
-        tasks, scenes: only episodes of these tasks (by name) and scenes (by index).
-        max_starts: at most so many episodes or saved frames, drawn evenly; each needs a goal frame.
-        past: frames of each episode of the dataset that the world model is shown, with what was done in
-            them, before it imagines on from the next one.
+        split: `train` (what the world model was trained on), `validation` (held out) or `all`; `ind` (scenes
+            that training may see) or `ood` (scenes held out). Several joined by a comma: their intersection.
+        tasks: only episodes of these tasks, by name.
+        scenes: only episodes of these scenes, by index.
+        max_starts: number of episodes or saved frames at most, spread evenly; each needs a goal frame.
+        past: frames of each episode of the dataset that the world model is shown, with their actions, before
+            it imagines on from the next one.
+        frames: a file written by numpy.savez, in place of a dataset: `observation.images.<camera>`
+            (K, H, W, 3) uint8, `observation.state` (K, P) and `task` (K,), the instructions.
+        resets: number of start frames to take from ManiSkill, in place of a dataset, of `tasks` (push by
+            default), `scenes` and the split `ind` (by default) or `ood`.
     """
 
     split: str = "all"
@@ -43,48 +45,48 @@ class StartFrames(DatasetSource):
     resets: int = 0
 
     def check(self) -> None:
-        """ValueError unless there is exactly one place to begin in, and what is chosen of it can be."""
+        """Raise FieldError unless there is exactly one kind of starts, and it can be chosen as asked."""
         given = [name for name in ("root", "frames", "resets") if getattr(self, name)]
         if len(given) != 1:
-            raise ValueError(
-                f"--env.dataset: starts are given by {' and '.join(given) or 'nothing'}; give one of "
-                "--env.dataset.root, --env.dataset.frames and --env.dataset.resets"
-            )
+            raise FieldError(
+                "dataset.root", self.root, f"starts are given by {' and '.join(given) or 'nothing'}",
+                "give one of `dataset.root`, `dataset.frames` and `dataset.resets`",
+            )  # fmt: skip
         if self.past < 0 or (self.past and not self.root):
-            raise ValueError(
-                f"--env.dataset.past={self.past}: the frames before a start are those of --env.dataset.root, "
-                "at least 0; saved frames and resets have none"
-            )
+            raise FieldError(
+                "dataset.past", self.past, "the frames before a start are those of a dataset, at least 0",
+                "give `dataset.root`; saved frames and resets have no past",
+            )  # fmt: skip
         if self.frames and (self.tasks or self.scenes or self.split != "all"):
-            raise ValueError(
-                "--env.dataset.frames: saved frames do not say their task, scene or split; leave out "
-                "--env.dataset.tasks, --env.dataset.scenes and --env.dataset.split"
-            )
+            raise FieldError(
+                "dataset.frames", self.frames, "saved frames do not say their task, scene or split",
+                "leave out `dataset.tasks`, `dataset.scenes` and `dataset.split`",
+            )  # fmt: skip
         if self.resets and self.split not in ("all", "ind", "ood"):
-            raise ValueError(
-                f"--env.dataset.split={self.split}: ManiSkill's resets are of ind or ood, which none was "
-                "trained on; choose one"
-            )
+            raise FieldError(
+                "dataset.split", self.split, "no world model was trained on ManiSkill's resets",
+                "choose ind or ood",
+            )  # fmt: skip
         if self.resets < 0:
-            raise ValueError(f"--env.dataset.resets={self.resets}: must be at least 1")
+            raise FieldError("dataset.resets", self.resets, "must be at least 1")
 
 
 @EnvConfig.register_subclass("world_model")
 @dataclass
 class WorldModelEnv(EnvConfig):
-    """The action world model answers a policy; the text world model sets the goal (method: Algorithm 1).
+    """The action world model answers the policy's actions; the text world model imagines goal frames.
 
     Args:
         world_model_path: the action world model, a checkpoint or the output folder of its training.
-        text_world_model_path: the text world model, for goal frames; not needed by rewards that know no goal.
+        text_world_model_path: the text world model; not needed by rewards without a goal frame.
         dataset: start frames and instructions.
-        reward: `--env.reward.type=general` and its settings, or `embedding` or `proxy` with the output folder
-            of its training as `--env.reward.pretrained_path`; or one of LeRobot's own, such as
-            `reward_classifier`.
+        reward: `general` and its settings; `embedding` or `proxy` with the output folder of its training as
+            `reward.pretrained_path`; or one of LeRobot's own, such as `reward_classifier`.
         episode_length: frames after which an episode is truncated.
-        done_threshold: θ_sps of eq. 7. done_frames: k, consecutive frames that must reach it.
-        uncertainty: what becomes of episodes that the world model is not sure of; see `--env.uncertainty.*`.
-        device: where the models live; the best there is by default.
+        done_threshold: done probability θ from which a frame counts as done (eq. 7).
+        done_frames: consecutive done frames that make a success (k).
+        uncertainty: what becomes of episodes of which the world model is uncertain.
+        device: where the models live; the best device there is by default.
     """
 
     task: str | None = "imagination"
@@ -104,30 +106,15 @@ class WorldModelEnv(EnvConfig):
     features_map: dict[str, str] = field(default_factory=lambda: {ACTION: ACTION, "agent_pos": OBS_STATE})
 
     def __post_init__(self) -> None:
-        """Describe observation and action as the world model's checkpoint has them."""
-        for name in ("episode_length", "done_frames"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"--env.{name}={getattr(self, name)}: must be at least 1")
-        if self.episode_length < self.done_frames:
-            raise ValueError(
-                f"--env.episode_length={self.episode_length}: shorter than the {self.done_frames} frames "
-                "for which done must hold, so no episode could succeed; raise it, or lower --env.done_frames"
-            )
-        if not 0 < self.done_threshold < 1:
-            raise ValueError(f"--env.done_threshold={self.done_threshold}: must be a probability")
-        if self.dataset.max_starts < 1:
-            raise ValueError(f"--env.dataset.max_starts={self.dataset.max_starts}: must be at least 1")
-        self.uncertainty.check()
-        unknown = sorted({*(self.dataset.tasks or ())} - {*TASKS})
-        if unknown:
-            raise ValueError(f"--env.dataset.tasks={unknown}: choose from {', '.join(TASKS)}")
+        """Check the settings; describe observation and action as the world model's checkpoint has them."""
+        self._check()
         if not self.world_model_path:
             return
         if getattr(self.reward, "needs_goal", False) and not self.text_world_model_path:
-            raise ValueError(
-                "--env.text_world_model_path is missing: the dense part of the general reward needs goal "
-                "frames; give a text world model, or --env.reward.type=general --env.reward.alpha=1"
-            )
+            raise FieldError(
+                "text_world_model_path", "", "the dense part of the general reward needs goal frames",
+                "give a text world model, or set `reward.alpha` to 1",
+            )  # fmt: skip
         from lerobot_wmrl.world_models.checkpoint import read_config
 
         model: Any = read_config(self.world_model_path, "action_world_model")
@@ -139,12 +126,29 @@ class WorldModelEnv(EnvConfig):
             self.features[f"pixels/{camera}"] = PolicyFeature(type=FeatureType.VISUAL, shape=shape)
             self.features_map[f"pixels/{camera}"] = f"{OBS_IMAGES}.{camera}"
 
+    def _check(self) -> None:
+        require_at_least(self, 1, "episode_length", "done_frames")
+        if self.episode_length < self.done_frames:
+            raise FieldError(
+                "episode_length", self.episode_length,
+                f"shorter than the {self.done_frames} frames for which done must hold, so that no episode "
+                "could succeed", "raise it, or lower `done_frames`",
+            )  # fmt: skip
+        if not 0 < self.done_threshold < 1:
+            raise FieldError("done_threshold", self.done_threshold, "must be a probability")
+        if self.dataset.max_starts < 1:
+            raise FieldError("dataset.max_starts", self.dataset.max_starts, "must be at least 1")
+        unknown = sorted({*(self.dataset.tasks or ())} - {*TASKS})
+        if unknown:
+            raise FieldError("dataset.tasks", unknown, f"choose from {', '.join(TASKS)}")
+        self.uncertainty.check()
+
     @property
     def gym_kwargs(self) -> dict[str, Any]:
         return {}
 
     def create_tensor_env(self, n_envs: int, device: str | None = None) -> gym.vector.VectorEnv:
-        """`n_envs` imaginations in one batch, tensors on the device: what PPO steps."""
+        """Return one batch of `n_envs` imaginations on the device, for reinforcement learning."""
         from lerobot_wmrl.envs.world_model_env import make_world_model_env
 
         return make_world_model_env(self, n_envs, device or self.device)
@@ -152,8 +156,10 @@ class WorldModelEnv(EnvConfig):
     def create_envs(
         self, n_envs: int, use_async_envs: bool = False
     ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
-        """The same behind numpy and one for each task, for lerobot-eval. Batched natively, so
-        `use_async_envs` changes nothing."""
+        """Return one environment for each task, in numpy, for lerobot-eval.
+
+        They are batched by themselves, so `use_async_envs` changes nothing.
+        """
         from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
         from lerobot_wmrl.envs.world_model_env import make_task_envs
 

@@ -1,4 +1,4 @@
-"""A tensor environment as lerobot-eval wants it: numpy, and finished sub-environments that stand still."""
+"""Adapters for lerobot-eval: a tensor environment in numpy, and a counter of steps."""
 
 from typing import Any
 
@@ -12,22 +12,25 @@ Observation = dict[str, Any]
 
 
 class EvaluationAdapter(gym.vector.VectorEnv):
-    """lerobot-eval counts one step past the end of an episode, so a finished sub-environment is frozen: its
-    last observation is repeated with reward 0 until the next rollout resets all."""
+    """A tensor environment as lerobot-eval drives it: numpy arrays, and finished episodes that stand still.
+
+    lerobot-eval counts one step past the end of an episode. A finished sub-environment is therefore frozen:
+    its last observation is repeated with reward 0 until the next rollout resets all.
+    """
 
     def __init__(self, env: gym.vector.VectorEnv) -> None:
         self.env: Any = env
         self.num_envs = env.num_envs
         self.metadata = env.metadata
         self.single_action_space, self.action_space = env.single_action_space, env.action_space
-        self.single_observation_space = shown_space(env.single_observation_space)
+        self.single_observation_space = numpy_space(env.single_observation_space)
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, env.num_envs)
         self._max_episode_steps = self.env.max_episode_steps
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Thaw and restart all; `seed` may be an int or one a sub-environment."""
+        """Begin an episode in every sub-environment; `seed` is an int or one for each of them."""
         self._last, info = self.env.reset(seed=seed)
         self._frozen = torch.zeros(self.num_envs, dtype=torch.bool, device=self.env.device)
         self._success = torch.zeros_like(self._frozen)
@@ -36,7 +39,7 @@ class EvaluationAdapter(gym.vector.VectorEnv):
     def step(
         self, actions: np.ndarray
     ) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Step all, then hold back what was frozen before."""
+        """Step all, and repeat the last observation of those that were frozen before."""
         observation, reward, terminated, truncated, info = self.env.step(
             torch.from_numpy(np.asarray(actions))
         )
@@ -53,7 +56,7 @@ class EvaluationAdapter(gym.vector.VectorEnv):
         return self._to_numpy(self._last), reward.cpu().numpy(), *flags, result
 
     def _hold(self, held: Observation, new: Observation) -> Observation:
-        """Rows of frozen sub-environments from `held`, the others from `new`."""
+        """Return `held` in the rows of frozen sub-environments and `new` in the others."""
         kept: Observation = {}
         for key, value in new.items():
             if isinstance(value, Tensor):
@@ -66,13 +69,17 @@ class EvaluationAdapter(gym.vector.VectorEnv):
         return kept
 
     def _to_numpy(self, observation: Observation) -> Observation:
-        converted: Observation = {"pixels": pictures(observation)}
+        converted: Observation = {"pixels": images_to_numpy(observation)}
         if OBS_STATE in observation:
             converted["agent_pos"] = observation[OBS_STATE].cpu().numpy()
         return converted
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """One value a sub-environment: `task`, `task_description`, `render`, `_max_episode_steps`."""
+        """Return one value for each sub-environment.
+
+        Args:
+            name: `task`, `task_description`, `render` or `_max_episode_steps`.
+        """
         if name == "render":
             return tuple(next(iter(self._to_numpy(self._last)["pixels"].values())))
         if name in ("task", "task_description"):
@@ -86,8 +93,8 @@ class EvaluationAdapter(gym.vector.VectorEnv):
         self.env.close(**kwargs)
 
 
-def pictures(observation: Observation) -> dict[str, np.ndarray]:
-    """Camera → (B, H, W, 3) uint8."""
+def images_to_numpy(observation: Observation) -> dict[str, np.ndarray]:
+    """Return each camera's images of a batch: (B, 3, H, W) float in [0, 1] → (B, H, W, 3) uint8."""
     prefix = f"{OBS_IMAGES}."
     return {
         key.removeprefix(prefix): (value.permute(0, 2, 3, 1) * 255).round().byte().cpu().numpy()
@@ -96,8 +103,8 @@ def pictures(observation: Observation) -> dict[str, np.ndarray]:
     }
 
 
-def shown_space(space: Any) -> gym.spaces.Dict:
-    """That of the same observation as `_to_numpy` shows it."""
+def numpy_space(space: Any) -> gym.spaces.Dict:
+    """Return the space of the observations that `EvaluationAdapter` makes of those in `space`."""
     cameras = {
         key.removeprefix(f"{OBS_IMAGES}."): gym.spaces.Box(0, 255, (*box.shape[1:], 3), np.uint8)
         for key, box in space.items()
@@ -105,3 +112,28 @@ def shown_space(space: Any) -> gym.spaces.Dict:
     }
     state = {"agent_pos": space[OBS_STATE]} if OBS_STATE in space.spaces else {}
     return gym.spaces.Dict({"pixels": gym.spaces.Dict(cameras), **state})
+
+
+class StepCounter:
+    """A vector environment that counts the steps of unfinished episodes in `steps`.
+
+    In ManiSkill and on a robot, these are what an evaluation costs.
+    """
+
+    def __init__(self, env: gym.vector.VectorEnv) -> None:
+        self.env, self.steps = env, 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.env, name)
+
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode in every sub-environment."""
+        self._running = np.ones(self.env.num_envs, bool)
+        return self.env.reset(**kwargs)
+
+    def step(self, actions: Any) -> tuple[Any, ...]:
+        """Step all, and count those whose first episode since the reset goes on."""
+        self.steps += int(self._running.sum())
+        result: tuple[Any, ...] = self.env.step(actions)
+        self._running &= ~(result[2] | result[3])
+        return result

@@ -1,14 +1,38 @@
-"""First frames, states, instructions and goals from which imagined episodes begin."""
+"""Where imagined episodes begin, and the goal frame of each.
 
-from typing import NamedTuple
+First frames are read from a dataset's episodes, from a file or from ManiSkill's resets (`FirstFrames`). A
+world model then tokenises them (`Starts`), and the text world model imagines their goal frames (`Goals`).
+K is the number of starts, T the frames of each (all but the last are the past), N the number of cameras.
+"""
 
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+from zipfile import BadZipFile
+
+import numpy as np
 import torch
+from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from lerobot_wmrl.data.frame_cache import frames_to_tensor
+from lerobot_wmrl.common.constants import ACTION_LOW, TASKS
+from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.data.compatibility import check_dataset
+from lerobot_wmrl.data.depth_maps import depth_at
+from lerobot_wmrl.data.episode_table import (
+    EpisodeTable,
+    choose_episodes,
+    evenly_spread,
+    open_dataset,
+    read_episodes,
+)
+from lerobot_wmrl.data.frame_cache import cached_frames, frames_to_tensor
 from lerobot_wmrl.data.frames import Context
-from lerobot_wmrl.envs.first_frames import FirstFrames
-from lerobot_wmrl.rewards.similarity import Description, Similarity
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.envs.configuration_world_model import StartFrames
+from lerobot_wmrl.maniskill.scenes import scene_for_seed, scenes_of
+from lerobot_wmrl.maniskill.tasks import task_of
+from lerobot_wmrl.rewards.similarity import Features, Similarity
 from lerobot_wmrl.world_models.goal import imagine_goal
 from lerobot_wmrl.world_models.modeling_world_model import (
     ActionWorldModelRewardModel,
@@ -17,11 +41,44 @@ from lerobot_wmrl.world_models.modeling_world_model import (
 from lerobot_wmrl.world_models.past import Frames, Past
 
 GOAL_BATCH = 64
+"""Goal frames that are imagined at once."""
+
+INSTRUCTION = "task"
+"""Name of the instructions in a file of saved frames."""
+
+
+class FirstFrames(NamedTuple):
+    """The frames in which K episodes begin, each after T − 1 frames that the model is only shown.
+
+    images (K, T, N, H, W, 3) uint8; state (K, T, P); actions (K, T − 1, A); K instructions; tasks (K,),
+    indices into `TASKS`, −1 where unknown; depth, a function of a world model that returns (K, T, S) in
+    metres, or None if the model does not look at depth.
+    """
+
+    images: np.ndarray
+    state: np.ndarray
+    actions: np.ndarray
+    instructions: list[str]
+    tasks: np.ndarray
+    depth: Callable[[Any], Tensor | None]
+
+    def of_task(self, task: int) -> "FirstFrames":
+        """Return the starts of one task, an index into `TASKS`."""
+        rows = np.flatnonzero(self.tasks == task)
+
+        def depth(model: Any) -> Tensor | None:
+            every = self.depth(model)
+            return every if every is None else every[torch.from_numpy(rows).to(every.device)]
+
+        instructions = [self.instructions[row] for row in rows]
+        return FirstFrames(
+            self.images[rows], self.state[rows], self.actions[rows], instructions, self.tasks[rows], depth
+        )
 
 
 class Starts(NamedTuple):
-    """K starts: frames, the images they decode to (K, N, 3, H, W), the frames before, the tokenizer's context
-    of the earliest, instructions."""
+    """K starts, tokenised: the frames before (past), the first frames (now), the images (K, N, 3, H, W) that
+    these decode to, the tokenizer's context of the earliest frame, K instructions."""
 
     now: Frames
     images: Tensor
@@ -34,19 +91,172 @@ class Starts(NamedTuple):
 
 
 class Goals(NamedTuple):
-    """Of K starts: what the goal frame is compared by [(K·N, …)] and how, the start's similarity to it (K,),
-    and reached (K,), False where the text model never reached θ."""
+    """Goal frames of K starts: their features [(K·N, …)] and the measure that compares them, the similarity
+    of each start to its goal (K,), and reached (K,), False where the text model never reached θ."""
 
-    described: Description
-    alike: Similarity
+    features: Features
+    measure: Similarity
     similarity: Tensor
     reached: Tensor
+
+
+def read_first_frames(source: StartFrames, config: Any) -> FirstFrames:
+    """Read the first frames that a world model of this configuration can begin in.
+
+    Raises:
+        ValueError: `source` asks for frames that are not there or do not fit the world model.
+    """
+    source.check()
+    if source.frames is not None:
+        return read_saved_frames(source.frames, source.max_starts, config)
+    if source.resets:
+        return simulate_first_frames(source, config)
+    return read_dataset_frames(source, config)
+
+
+def chosen_episodes(table: EpisodeTable, source: StartFrames) -> np.ndarray:
+    """Return the episodes of the split, tasks and scenes that `source` names. (K,)
+
+    Raises:
+        ValueError: there is no such episode.
+    """
+    unseen = {scene.index for scene in scenes_of("ood")}
+    wanted = np.ones(len(table.start), bool)
+    for name, column, values in (
+        ("tasks", table.task, [TASKS.index(task) for task in source.tasks or ()]),
+        ("scenes", table.scene, source.scenes or ()),
+    ):
+        if values and not np.isin(column, values).any():
+            raise FieldError(
+                f"dataset.{name}", getattr(source, name), f"no episode of {source.root} has one of them"
+            )
+        wanted &= np.isin(column, values) if values else True
+    if source.past:
+        wanted &= undecided_after(table, source.past)
+    return choose_episodes(table, source.split, source.max_starts, unseen, wanted)
+
+
+def undecided_after(table: EpisodeTable, frames: int) -> np.ndarray:
+    """Return which episodes last longer than `frames` frames and have not succeeded by then. (E,) bool"""
+    begun = [table.done[start : start + frames + 1].any() for start in table.start]
+    return (table.length > frames) & ~np.array(begun)
+
+
+def read_dataset_frames(source: StartFrames, config: Any) -> FirstFrames:
+    """Read the first frames of a LeRobotDataset's episodes."""
+    table = read_episodes(open_dataset(source.root, source.repo_id))
+    check_dataset(config, table.dataset.features)
+    episodes = chosen_episodes(table, source)
+    if source.past >= config.memory:
+        raise FieldError(
+            "dataset.past", source.past, f"the world model remembers {config.memory} frames",
+            f"give at most {config.memory - 1}",
+        )  # fmt: skip
+    rows = table.start[episodes, None] + np.arange(source.past + 1)
+
+    def depth(model: Any) -> Tensor | None:
+        check_dataset(model.config, table.dataset.features)
+        every = depth_at(model, table.dataset, rows.reshape(-1))
+        return every if every is None else every.unflatten(0, rows.shape)
+
+    return FirstFrames(
+        cached_frames(table.dataset, config.camera_keys)[rows],
+        table.state[rows],
+        table.action[rows[:, :-1]],
+        [table.instructions[episode] for episode in episodes],
+        table.task[episodes],
+        depth,
+    )
+
+
+def read_saved_frames(path: Path, max_starts: int, config: Any) -> FirstFrames:
+    """Read first frames from a file written by `numpy.savez`.
+
+    Args:
+        path: a file with `observation.images.<camera>` (K, H, W, 3) uint8, `observation.state` (K, P) and
+            `task` (K,), the instructions.
+        max_starts: number of frames to keep at most, spread evenly.
+        config: configuration of the world model.
+
+    Raises:
+        FieldError: the file lacks one of these, or has it in another shape.
+    """
+    found = read_arrays(path)
+    shape = (config.image_size, config.image_size, 3)
+    wanted = {**dict.fromkeys(config.camera_keys, shape), OBS_STATE: (config.state_size,), INSTRUCTION: ()}
+    count = max((len(found[name]) for name in wanted if name in found and found[name].ndim), default=0)
+    for name, size in wanted.items():
+        if name not in found or not count or found[name].shape != (count, *size):
+            has = found[name].shape if name in found else "nothing of that name"
+            raise FieldError(
+                "dataset.frames", path, f"needs {name} of shape {(count or 'K', *size)}, has {has}"
+            )
+    images = np.stack([found[name] for name in config.camera_keys], 1)
+    if images.dtype != np.uint8:
+        raise FieldError("dataset.frames", path, f"images are {images.dtype}, they must be uint8")
+    if not np.isfinite(found[OBS_STATE]).all():
+        raise FieldError("dataset.frames", path, f"{OBS_STATE} contains NaN or infinity")
+    rows = evenly_spread(count, max_starts)
+    instructions = [str(text) for text in found[INSTRUCTION][rows]]
+    state = found[OBS_STATE][rows].astype(np.float32)
+    return _without_past(images[rows], state, instructions, np.full(len(rows), -1))
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Read the arrays of a file written by `numpy.savez`. FieldError if it is none."""
+    try:
+        with np.load(path) as file:
+            return {name: file[name] for name in file.files}
+    except (OSError, ValueError, TypeError, EOFError, BadZipFile) as error:
+        raise FieldError(
+            "dataset.frames", path, f"cannot be read ({error})", "write it with numpy.savez"
+        ) from error
+
+
+def simulate_first_frames(source: StartFrames, config: Any) -> FirstFrames:
+    """Render the first frames of ManiSkill's resets with seeds 0, 1, …
+
+    Consecutive seeds visit the scenes in turn, then the next task.
+    """
+    tasks = source.tasks or TASKS[:1]
+    env = WmrlManiSkillEnv(
+        task=tasks[0], split="ood" if source.split == "ood" else "ind", scenes=source.scenes,
+        cameras=list(config.cameras), image_size=config.image_size,
+    )  # fmt: skip
+    scenes, simulation = env.selected_scenes(), env.create_simulation()
+    frames, instructions, indices = [], [], []
+    for seed in range(source.resets):
+        simulation.task = task_of(tasks[seed // len(scenes) % len(tasks)])
+        frames.append(simulation.reset(scene_for_seed(scenes, seed), seed))
+        instructions.append(simulation.instruction)
+        indices.append(simulation.task.index)
+    simulation.close()
+    images = np.stack([np.stack([frame.images[camera] for camera in config.cameras]) for frame in frames])
+    state = np.stack([frame.state for frame in frames])
+    return _without_past(images, state, instructions, np.array(indices))
+
+
+def _without_past(
+    images: np.ndarray, state: np.ndarray, instructions: list[str], tasks: np.ndarray
+) -> FirstFrames:
+    """Return starts of a single frame each, without depth. images (K, N, H, W, 3), state (K, P)"""
+    actions = np.zeros((len(images), 0, len(ACTION_LOW)), np.float32)
+    return FirstFrames(images[:, None], state[:, None], actions, instructions, tasks, _no_depth)
+
+
+def _no_depth(model: Any) -> None:
+    """Raise FieldError if the model looks at depth."""
+    if model.config.depth:
+        raise FieldError(
+            "dataset.root", None, "this world model looks at depth, which saved frames and resets lack",
+            "give a dataset that was recorded with depth",
+        )  # fmt: skip
 
 
 @torch.no_grad()
 def load_starts(
     frames: FirstFrames, model: ActionWorldModelRewardModel, text_model: TextWorldModelRewardModel | None,
-    alike: Similarity,
+    measure: Similarity,
 ) -> tuple[Starts, Goals | None]:  # fmt: skip
     """Tokenise first frames and, with a text model, imagine each one's goal frame once (eq. 6)."""
     device = model.state_mean.device
@@ -66,15 +276,20 @@ def load_starts(
         return starts, None
     depth = frames.depth(text_model)
     last = depth if depth is None else depth[:, -1]
-    return starts, imagine_goals(text_model, starts, alike.describe(decoded), alike, state[:, -1], last)
+    return starts, imagine_goals(text_model, starts, measure.features(decoded), measure, state[:, -1], last)
 
 
 @torch.no_grad()
 def imagine_goals(
-    model: TextWorldModelRewardModel, starts: Starts, described: Description, alike: Similarity,
+    model: TextWorldModelRewardModel, starts: Starts, features: Features, measure: Similarity,
     state: Tensor, depth: Tensor | None,
 ) -> Goals:  # fmt: skip
-    """Goal frames of all starts, which are so `described`; state (K, P) as the dataset has it."""
+    """Imagine the goal frame of every start, GOAL_BATCH at once.
+
+    Args:
+        features: of the first frames, as `measure` computes them, [(K·N, …)].
+        state: (K, P) in the dataset's units. depth: (K, S) in metres if the model looks at it.
+    """
     goals = [
         imagine_goal(
             model, starts.now.tokens[part], state[part], starts.instructions[part], starts.context[part],
@@ -82,7 +297,7 @@ def imagine_goals(
         )
         for part in (slice(i, i + GOAL_BATCH) for i in range(0, len(state), GOAL_BATCH))
     ]  # fmt: skip
-    parts = zip(*(alike.describe(goal.decoded) for goal in goals), strict=True)
-    wanted = [torch.cat(part) for part in parts]
-    reached = torch.cat([goal.reached for goal in goals])
-    return Goals(wanted, alike, alike(described, wanted, model.tokenizer.num_cameras), reached)
+    parts = zip(*(measure.features(goal.decoded) for goal in goals), strict=True)
+    goal_features = [torch.cat(part) for part in parts]
+    similarity = measure(features, goal_features, model.tokenizer.num_cameras)
+    return Goals(goal_features, measure, similarity, torch.cat([goal.reached for goal in goals]))

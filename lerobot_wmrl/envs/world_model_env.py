@@ -12,15 +12,15 @@ from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
 from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW, FPS
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.compatibility import check_same_tokenizer
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
-from lerobot_wmrl.envs.first_frames import FirstFrames, read_first_frames
-from lerobot_wmrl.envs.start_frames import Goals, Starts, load_starts
+from lerobot_wmrl.envs.start_frames import FirstFrames, Goals, Starts, load_starts, read_first_frames
 from lerobot_wmrl.envs.uncertainty import entropies
-from lerobot_wmrl.rewards.configuration_general import GeneralConfig
+from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rewards.general import consecutive_count, sparse_reward
 from lerobot_wmrl.rewards.loading import Reward, load_reward
-from lerobot_wmrl.rewards.similarity import Similarity, make_similarity, of_rows
+from lerobot_wmrl.rewards.similarity import Similarity, make_similarity, select_features
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.frame_tokenizer import Decoded
 from lerobot_wmrl.world_models.imagination import Imagined
@@ -34,15 +34,15 @@ Observation = dict[str, Any]
 
 
 class WorldModelVectorEnv(gym.vector.VectorEnv):
-    """Tensors in, tensors out, SAME_STEP autoreset with `final_obs` and `final_info`.
-
-    A step asks the device one thing, whether an episode has ended and every action was a number: `final_obs`
-    is there only where one has, and to begin again costs too much to do it for nobody. Only then the
-    instructions of new episodes are fetched.
+    """B imagined episodes: tensors in, tensors out, SAME_STEP autoreset with `final_obs` and `final_info`.
 
     Observations: `observation.images.<camera>` (B, 3, H, W) in [0, 1], `observation.state` (B, P) if the
     model predicts it, `task` (B strings). Actions (B, A) in metres, radians and gripper, clipped to the box;
     NaN is refused.
+
+    A step synchronises with the device once, to learn whether an episode has ended and whether every action
+    was a number. Resets are expensive, so they run only when an episode has ended, and only then the
+    instructions of new episodes are fetched.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_fps": FPS, "autoreset_mode": AutoresetMode.SAME_STEP}
@@ -80,9 +80,13 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin B episodes. An int seeds the draw of starts; B of them name each environment's start.
+        """Begin B episodes.
 
-        ValueError for another number of seeds.
+        Args:
+            seed: an int seeds the draw of starts; B ints name the start of each environment.
+
+        Raises:
+            ValueError: another number of seeds.
         """
         drawn = self._seeded_starts(seed)
         self._begin_at(drawn)
@@ -96,9 +100,10 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
 
     @torch.no_grad()
     def step(self, actions: Tensor) -> tuple[Observation, Tensor, Tensor, Tensor, dict[str, Any]]:
-        """Imagine one frame in every environment; finished ones restart at once.
+        """Imagine one frame in every environment and restart the finished ones. actions (B, A)
 
-        ValueError unless there is an action for each, without NaN; a reset comes next then.
+        Raises:
+            ValueError: the actions have another shape, or contain NaN; then reset before the next step.
         """
         clipped = self._clip(actions)
         imagined = self.model.step(self._imagination, clipped, self.generator)
@@ -123,14 +128,17 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         return observation, reward, terminated, truncated, info
 
     def adopt(self, model: ActionWorldModelRewardModel) -> None:
-        """Imagine with a refreshed model from the next reset on. ValueError if starts and goals mean nothing
-        to it: they are in the tokens of the first one."""
+        """Imagine with a refreshed model from the next reset on.
+
+        Raises:
+            ValueError: it has another tokenizer, so that it cannot read the tokens of starts and goals.
+        """
         check_same_tokenizer(self.model, model, "the refreshed world model")
         self.model = model
 
     def _advance(self, imagined: Imagined, uncertainty: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """Count frames; terminated after k consecutive done frames, truncated at the horizon or if uncertain.
-        → (B,), (B,)"""
+        """Count frames. Return terminated (k consecutive done frames) and truncated (at the horizon, or where
+        the model is uncertain). → (B,) bool, (B,) bool"""
         fired = sparse_reward(imagined.done_logit, self.config.done_threshold) > 0
         self._done_streak = consecutive_count(self._done_streak, fired)
         self._elapsed = self._elapsed + 1
@@ -139,7 +147,7 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         return terminated, ((self._elapsed >= self.max_episode_steps) | uncertain) & ~terminated
 
     def _restart(self, mask: Tensor, observation: Observation) -> Observation:
-        """New starts where `mask` (B,) is True; other rows of the observation stay."""
+        """Begin new episodes where `mask` (B,) is True. Return the observation with these rows replaced."""
         self._begin_at(torch.where(mask, self._draw_starts(), self._start_index))
         index, starts = self._start_index, self.starts
         past, now, context = starts.past[index], starts.now[index], starts.context[index]
@@ -147,8 +155,7 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         self._elapsed = self._elapsed.masked_fill(mask, 0)
         self._done_streak = self._done_streak.masked_fill(mask, 0)
         if self.goals is not None:
-            closeness = self.goals.similarity[index]
-            self._similarity = torch.where(mask, closeness, self._similarity)
+            self._similarity = torch.where(mask, self.goals.similarity[index], self._similarity)
         fresh = self._observe(starts.images[index], now.proprioception)
         for key, value in observation.items():
             if isinstance(value, Tensor):
@@ -156,12 +163,12 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         return fresh
 
     def _begin_at(self, index: Tensor) -> None:
-        """Which start every environment's episode has, (B,); the instructions are then known to the host."""
+        """Set the start of every environment's episode, index (B,), and fetch its instruction."""
         self._start_index = index
         self._instructions = [self.starts.instructions[row] for row in index.tolist()]
 
     def _clip(self, actions: Tensor) -> Tensor:
-        """To the action box, float32 on the device. ValueError for another shape than (B, A)."""
+        """Clip actions to the box, float32 on the device. ValueError for another shape than (B, A)."""
         if tuple(actions.shape) != self.action_space.shape:
             raise ValueError(
                 f"action: shape {tuple(actions.shape)}, but {self.num_envs} environments take "
@@ -171,7 +178,7 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         return given.clamp(self.action_low, self.action_high)
 
     def _seeded_starts(self, seed: int | Sequence[int] | None) -> Tensor:
-        """Seed the generator, by the first of several seeds. → (B,)"""
+        """Seed the generator (by the first of several seeds) and return the starts. → (B,)"""
         if seed is None:
             return self._draw_starts()
         if isinstance(seed, int | np.integer):
@@ -187,12 +194,12 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         return torch.randint(len(self.starts), (self.num_envs,), generator=self.generator, device=self.device)
 
     def _progress(self, frame: Decoded) -> dict[str, Tensor]:
-        """How near to their goals the frames are, and the ones before were; nothing without goals."""
+        """Return the similarity to the goals, now and before this step; nothing without goals. (B,) each"""
         if self.goals is None:
             return {}
         cameras, before = self.model.tokenizer.num_cameras, self._similarity
-        described, wanted = self.goals.alike.describe(frame), self.goals.described
-        self._similarity = self.goals.alike(described, of_rows(wanted, self._start_index, cameras), cameras)
+        goals = select_features(self.goals.features, self._start_index, cameras)
+        self._similarity = self.goals.measure(self.goals.measure.features(frame), goals, cameras)
         return {
             "similarity": self._similarity,
             "previous.similarity": before,
@@ -211,56 +218,57 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
 
 
 class WorldModels(NamedTuple):
-    """What environments of one configuration share: both world models, and how similarity to a goal is
-    measured and paid."""
+    """What the environments of one configuration share: both world models, the measure of similarity to a
+    goal frame, and the reward."""
 
     model: ActionWorldModelRewardModel
     text_model: TextWorldModelRewardModel | None
-    alike: Similarity
+    measure: Similarity
     reward: Reward
 
 
 def load_world_models(config: WorldModelEnv, device: str | None) -> WorldModels:
-    """ValueError says which of them is not there or does not fit."""
+    """Load the models that `config` names. ValueError if one is missing or does not fit the others."""
     model = load_model(config.world_model_path, "action_world_model", device)
     if model.config.action_size != len(ACTION_LOW):
-        raise ValueError(
-            f"--env.world_model_path={config.world_model_path}: was trained on {model.config.action_size} "
-            f"action components; the action box has {len(ACTION_LOW)}, so record with lerobot-wmrl-record"
-        )
+        raise FieldError(
+            "world_model_path", config.world_model_path,
+            f"was trained on {model.config.action_size} action components, the action box has "
+            f"{len(ACTION_LOW)}", "train it on a dataset of lerobot-wmrl-record",
+        )  # fmt: skip
     text_model = None
     if config.text_world_model_path:
         text_model = load_model(config.text_world_model_path, "text_world_model", device)
-        check_same_tokenizer(model, text_model, f"--env.text_world_model_path={config.text_world_model_path}")
-    alike = make_similarity(getattr(config.reward, "similarity", "tokenizer"), model.state_mean.device)
-    return WorldModels(model, text_model, alike, load_reward(config.reward, model))
+        check_same_tokenizer(model, text_model, f"text_world_model_path={config.text_world_model_path}")
+    measure = make_similarity(getattr(config.reward, "similarity", "tokenizer"), model.state_mean.device)
+    return WorldModels(model, text_model, measure, load_reward(config.reward, model))
 
 
 def make_world_model_env(config: WorldModelEnv, n_envs: int, device: str | None) -> WorldModelVectorEnv:
-    """One environment for all start frames."""
+    """Return one environment for all start frames."""
     models = load_world_models(config, device)
-    return begin_in(read_first_frames(config.dataset, models.model.config), models, config, n_envs)
+    return make_env_at(read_first_frames(config.dataset, models.model.config), models, config, n_envs)
 
 
 def make_task_envs(config: WorldModelEnv, n_envs: int, device: str | None) -> dict[int, WorldModelVectorEnv]:
-    """One environment for each task among the start frames, by its index; one in all if they do not say."""
+    """Return one environment for each task among the start frames, by its index; one if tasks are unknown."""
     models = load_world_models(config, device)
     frames = read_first_frames(config.dataset, models.model.config)
     tasks = np.unique(frames.tasks).tolist()
-    return {max(task, 0): begin_in(frames.of_task(task), models, config, n_envs) for task in tasks}
+    return {max(task, 0): make_env_at(frames.of_task(task), models, config, n_envs) for task in tasks}
 
 
-def begin_in(
+def make_env_at(
     frames: FirstFrames, models: WorldModels, config: WorldModelEnv, n_envs: int
 ) -> WorldModelVectorEnv:
-    """An environment whose episodes begin in these frames."""
-    starts, goals = load_starts(frames, models.model, models.text_model, models.alike)
+    """Return an environment whose episodes begin in these frames."""
+    starts, goals = load_starts(frames, models.model, models.text_model, models.measure)
     return WorldModelVectorEnv(models.model, starts, goals, models.reward, config, n_envs)
 
 
-def success_env(env: WorldModelVectorEnv, source: StartFrames) -> WorldModelVectorEnv:
-    """The same world model, and as many imaginations, from other starts: to count successes, so its reward is
-    success and there are no goals."""
+def make_success_env(env: WorldModelVectorEnv, source: StartFrames) -> WorldModelVectorEnv:
+    """Return an environment that counts successes: the same world model and as many imaginations, other
+    starts, success as the reward and no goals."""
     reward = make_reward_model(GeneralConfig(alpha=1.0, device=env.device.type))
     models = WorldModels(env.model, None, make_similarity("tokenizer", env.device), reward)
-    return begin_in(read_first_frames(source, env.model.config), models, env.config, env.num_envs)
+    return make_env_at(read_first_frames(source, env.model.config), models, env.config, env.num_envs)

@@ -12,8 +12,7 @@ from lerobot.scripts.lerobot_eval import eval_policy, eval_policy_all
 from lerobot.utils.constants import CHECKPOINTS_DIR
 
 from lerobot_wmrl.common.policy_checkpoints import load_policy, load_processors, read_policy_config
-from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
-from lerobot_wmrl.envs.step_counter import StepCounter
+from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter, StepCounter
 
 
 class Evaluated(NamedTuple):

@@ -9,9 +9,9 @@ from lerobot_wmrl.data.clip import Clip
 from lerobot_wmrl.data.depth_maps import depth_at
 from lerobot_wmrl.data.episode_table import EpisodeTable
 from lerobot_wmrl.data.frame_cache import frames_to_tensor
-from lerobot_wmrl.rewards.configuration_general import GeneralConfig
+from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rewards.general import consecutive_count, general_reward, sparse_reward
-from lerobot_wmrl.rewards.similarity import make_similarity, of_rows
+from lerobot_wmrl.rewards.similarity import make_similarity, select_features
 from lerobot_wmrl.world_models.goal import imagine_goal
 from lerobot_wmrl.world_models.modeling_world_model import (
     ActionWorldModelRewardModel,
@@ -45,18 +45,19 @@ def reward_along_episode(
     done_logit = model.predict(clip, drawn=False).done_logit[0, :-1]
     first_depth = depth_at(text_model, table.dataset, slice(rows.start, rows.start + 1))
     goal = imagine_goal(text_model, tokens[:1], state[:1], instruction, start, first_depth)
-    alike, cameras = make_similarity(reward.similarity, device), model.tokenizer.num_cameras
-    seen = alike.describe(model.tokenizer.decode_with_features(tokens, context))
+    measure, cameras = make_similarity(reward.similarity, device), model.tokenizer.num_cameras
+    features = measure.features(model.tokenizer.decode_with_features(tokens, context))
     every = torch.zeros(len(tokens), dtype=torch.long, device=device)
-    closeness = alike(seen, of_rows(alike.describe(goal.decoded), every, cameras), cameras)
+    goal_features = select_features(measure.features(goal.decoded), every, cameras)
+    similarity = measure(features, goal_features, cameras)
     paid = success_once(done_logit, threshold, frames)
     earned = general_reward(
-        paid, closeness[1:], closeness[:-1], alpha=reward.alpha, form=reward.form, gamma=reward.gamma
+        paid, similarity[1:], similarity[:-1], alpha=reward.alpha, form=reward.form, gamma=reward.gamma
     )
     picture = goal.decoded.images[0].permute(0, 2, 3, 1)
     return {
         "done_probability": done_logit.sigmoid().tolist(),
-        "similarity": closeness[1:].tolist(),
+        "similarity": similarity[1:].tolist(),
         "return": earned.cumsum(0).tolist(),
         "goal_reached": bool(goal.reached[0]),
         "goal_frame": (picture * 255).round().byte().cpu().numpy(),

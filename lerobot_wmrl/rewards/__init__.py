@@ -1,1 +1,1 @@
-"""The general reward, as a LeRobot reward model."""
+"""Rewards of imagined and simulated episodes: the general reward, learned ones, LeRobot's own."""

@@ -1,38 +1,108 @@
-"""The reward of an environment, from its configuration or from a training's checkpoint."""
+"""Load an environment's reward: ours, or one of LeRobot's own reward models with its preprocessor."""
 
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
+import torch
 from lerobot.configs.rewards import RewardModelConfig
-from lerobot.rewards.factory import make_reward_model
+from lerobot.processor import PolicyProcessorPipeline
+from lerobot.rewards.factory import make_reward_model, make_reward_pre_post_processors
+from lerobot.rewards.pretrained import PreTrainedRewardModel
+from lerobot.utils.constants import OBS_IMAGE
 from torch import Tensor
 
-from lerobot_wmrl.rewards.configuration_general import GeneralConfig
-from lerobot_wmrl.rewards.configuration_learned import LearnedRewardConfig
-from lerobot_wmrl.rewards.modeling_learned import EmbeddingRewardModel, ProxyRewardModel
-from lerobot_wmrl.rewards.prepared import load_prepared
-from lerobot_wmrl.world_models.checkpoint import load_model
+from lerobot_wmrl.common.checkpoints import resolve_checkpoint
+from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig, LearnedRewardConfig
+from lerobot_wmrl.rewards.modeling_rewards import EmbeddingRewardModel, ProxyRewardModel
+from lerobot_wmrl.world_models.checkpoint import load_model, read_config
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
+
+TASK: Final = "task"
+PREPROCESSORS: Final = "*preprocessor.json"
+"""Each type of reward model saves its preprocessor under a name of its own."""
 
 
 class Reward(Protocol):
-    """What an environment asks."""
+    """A reward as the environment calls it."""
 
     def compute_reward(self, batch: dict[str, Any]) -> Tensor:
-        """Of frames as the environment describes them. → (B,)"""
+        """Return the reward of the frames in the environment's batch. → (B,)"""
 
 
 def load_reward(config: RewardModelConfig, model: ActionWorldModelRewardModel) -> Reward:
-    """Where there is a checkpoint, its settings count. ValueError if the reward does not fit `model`."""
+    """Return the reward of an environment that imagines with `model`.
+
+    A reward with a checkpoint takes its settings from there.
+
+    Raises:
+        FieldError: the reward does not fit the world model, or has to be trained first.
+    """
     device = model.state_mean.device.type
     if isinstance(config, GeneralConfig):
         return make_reward_model(config)
     if not isinstance(config, LearnedRewardConfig):
-        return load_prepared(config, model.config.camera_keys, device)
+        return load_lerobot_reward(config, model.config.camera_keys, device)
     if not config.pretrained_path:
-        raise ValueError(
-            f"--env.reward.pretrained_path is missing: --env.reward.type={config.type} is learnt; train it "
-            f"with lerobot-train --reward_model.type={config.type} and give its output folder"
-        )
+        raise FieldError(
+            "reward.pretrained_path", config.pretrained_path, f"the {config.type} reward is learnt",
+            f"train a reward model of type {config.type} with lerobot-train and give its output folder",
+        )  # fmt: skip
     reward: EmbeddingRewardModel | ProxyRewardModel = load_model(config.pretrained_path, config.type, device)
     reward.check_world_model(model)
     return reward
+
+
+class LeRobotReward:
+    """One of LeRobot's reward models with its preprocessor, given the present frame and the instruction."""
+
+    def __init__(self, reward: PreTrainedRewardModel, preprocessor: PolicyProcessorPipeline) -> None:
+        self.reward, self.preprocessor = reward.eval(), preprocessor
+
+    @torch.no_grad()
+    def compute_reward(self, batch: dict[str, Any]) -> Tensor:
+        """Return the reward of the environment's batch. → (B,)
+
+        The reward is shown its input features alone.
+        """
+        known = {*(self.reward.config.input_features or batch), TASK}
+        device = batch["success"].device
+        prepared = self.preprocessor({name: value for name, value in batch.items() if name in known})
+        return self.reward.compute_reward(prepared).float().to(device)
+
+
+def load_lerobot_reward(config: RewardModelConfig, cameras: list[str], device: str) -> LeRobotReward:
+    """Return the reward with its checkpoint's settings and preprocessor, or new ones without a checkpoint.
+
+    Raises:
+        FieldError: the reward needs what an imagined episode does not have.
+    """
+    config.device, saved = device, []
+    if config.pretrained_path:
+        folder = resolve_checkpoint(config.pretrained_path)
+        config, saved = read_config(folder, config.type, device), sorted(folder.glob(PREPROCESSORS))
+        config.pretrained_path = str(folder)
+    check_observation(config, cameras)
+    if saved:
+        overrides = {"device_processor": {"device": device}}
+        preprocessor = PolicyProcessorPipeline.from_pretrained(
+            saved[0].parent, config_filename=saved[0].name, overrides=overrides
+        )
+    else:
+        preprocessor = make_reward_pre_post_processors(config)[0]
+    return LeRobotReward(make_reward_model(config), preprocessor)
+
+
+def check_observation(config: RewardModelConfig, cameras: list[str]) -> None:
+    """Raise FieldError unless one frame of `cameras` (dataset keys) is all that the reward needs."""
+    if any(step > 0 for step in config.observation_delta_indices or ()):
+        raise FieldError(
+            "reward.type", config.type,
+            "looks at frames of the future, which an acting policy does not have", "choose another reward",
+        )  # fmt: skip
+    missing = [name for name in config.input_features if name.startswith(OBS_IMAGE) and name not in cameras]
+    if missing:
+        raise FieldError(
+            "reward.type", config.type,
+            f"looks at {', '.join(missing)}, the world model imagines {', '.join(cameras)}",
+            "train the reward on these cameras",
+        )  # fmt: skip

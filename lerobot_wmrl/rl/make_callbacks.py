@@ -9,7 +9,7 @@ from lerobot.envs.configs import EnvConfig
 
 from lerobot_wmrl.common.constants import SELECTION_SEED
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
-from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv, success_env
+from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv, make_success_env
 from lerobot_wmrl.evaluation.policy_success import evaluate_policy, evaluate_within
 from lerobot_wmrl.rl.callbacks import Callback
 from lerobot_wmrl.rl.configuration_callbacks import CallbackSettings
@@ -73,7 +73,7 @@ def make_measures(settings: CallbackSettings, trained: Trained) -> dict[str, Mea
     def within() -> Any:
         place = env
         if dataset.root and isinstance(env, WorldModelVectorEnv):
-            place = success_env(env, StartFrames(dataset.root, dataset.repo_id))
+            place = make_success_env(env, StartFrames(dataset.root, dataset.repo_id))
         return evaluate_within(place, config, policy, processors, episodes, SELECTION_SEED)
 
     if isinstance(env, WorldModelVectorEnv):

@@ -22,7 +22,7 @@ from lerobot_wmrl.common.command_line import RunConfig, claim_output_dir, run_co
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.presets import expand_preset
 from lerobot_wmrl.data.dataset_source import DatasetSource
-from lerobot_wmrl.rewards.configuration_general import GeneralConfig
+from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 
 if TYPE_CHECKING:
     from lerobot_wmrl.evaluation.agreement import Agreement

@@ -55,9 +55,9 @@ def similarity_to_goal(
 ) -> Tensor:
     """Eq. 5 with 1 − LPIPS's formula on tokenizer features: tokens (B, S) → similarity in [0, 1] (B,)."""
     features = tokenizer.decode_with_features(tokens, context).features
-    return alikeness(feature_distance(features, goal_features), tokens.shape[0])
+    return similarity_from_distance(feature_distance(features, goal_features), tokens.shape[0])
 
 
-def alikeness(distance: Tensor, batch: int) -> Tensor:
+def similarity_from_distance(distance: Tensor, batch: int) -> Tensor:
     """1 − distance of each camera's frame (B·N,), averaged over its cameras, in [0, 1]. → (B,)"""
     return (1 - distance.unflatten(0, (batch, -1)).mean(1)).clamp(0, 1)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
-from lerobot_wmrl.rewards.configuration_general import GeneralConfig
+from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rewards.similarity import PerceptualSimilarity, Similarity, make_similarity
 
 STILL = torch.zeros(1, 7)
@@ -27,7 +27,7 @@ def config(small_dataset, trained_models) -> WorldModelEnv:
 
 
 @pytest.fixture(params=["tokenizer", "mse", "lpips"])
-def alike(request) -> Similarity:
+def measure(request) -> Similarity:
     """LPIPS with its own linear heads, on a backbone that was never trained: nothing is downloaded."""
     if request.param != "lpips":
         return make_similarity(request.param, torch.device("cpu"))
@@ -42,13 +42,13 @@ def way_to_goal(env: WorldModelVectorEnv) -> list[Tensor]:
     return [tokens, torch.where(torch.arange(tokens.shape[1]) % 2 == 0, goal, tokens), goal]
 
 
-def set_goal(env: WorldModelVectorEnv, alike: Similarity, tokens: Tensor) -> None:
+def set_goal(env: WorldModelVectorEnv, measure: Similarity, tokens: Tensor) -> None:
     """The goal frame of the one start."""
     frames = torch.cat([env.starts.now.tokens, tokens])
-    begin, goal = (alike.describe(env.model.decode(frame[None], env.starts.context)) for frame in frames)
-    similarity = alike(begin, goal, env.model.tokenizer.num_cameras)
+    begin, goal = (measure.features(env.model.decode(frame[None], env.starts.context)) for frame in frames)
+    similarity = measure(begin, goal, env.model.tokenizer.num_cameras)
     assert env.goals is not None
-    env.goals = env.goals._replace(described=goal, alike=alike, similarity=similarity)
+    env.goals = env.goals._replace(features=goal, measure=measure, similarity=similarity)
 
 
 def paid_along(env: WorldModelVectorEnv, way: list[Tensor], done: float = -20.0) -> list[float]:
@@ -61,12 +61,12 @@ def paid_along(env: WorldModelVectorEnv, way: list[Tensor], done: float = -20.0)
     return paid
 
 
-def test_going_to_the_goal_pays_and_leaving_it_costs(config, alike):
+def test_going_to_the_goal_pays_and_leaving_it_costs(config, measure):
     """An LPIPS that is taken for a similarity pays the wrong way round."""
     dense = replace(config, reward=GeneralConfig(device="cpu", alpha=0.0, gamma=1.0))
     env = dense.create_tensor_env(1)
     way = way_to_goal(env)
-    set_goal(env, alike, way[-1])
+    set_goal(env, measure, way[-1])
     env.reset(seed=0)
     closer, away = paid_along(env, [way[-1], way[0]])
     assert closer == pytest.approx(1 - env.goals.similarity.item(), abs=1e-5)
@@ -74,21 +74,21 @@ def test_going_to_the_goal_pays_and_leaving_it_costs(config, alike):
     assert closer > 1e-4
 
 
-def test_the_paper_s_reward_is_largest_at_the_goal(config, alike):
+def test_the_paper_s_reward_is_largest_at_the_goal(config, measure):
     absolute = replace(config, reward=GeneralConfig(device="cpu", alpha=0.0, form="absolute"))
     env = absolute.create_tensor_env(1)
     way = way_to_goal(env)
-    set_goal(env, alike, way[-1])
+    set_goal(env, measure, way[-1])
     env.reset(seed=0)
     begin, between, goal = paid_along(env, way)
     assert max(begin, between) < goal == pytest.approx(1, abs=1e-5)
 
 
-def test_by_default_lingering_earns_nothing_and_done_ends_the_episode(config, alike):
+def test_by_default_lingering_earns_nothing_and_done_ends_the_episode(config, measure):
     """Amid the way and at the goal; the next episode is not paid for where the last one was."""
     env = replace(config, reward=GeneralConfig(device="cpu")).create_tensor_env(1)
     way = way_to_goal(env)
-    set_goal(env, alike, way[-1])
+    set_goal(env, measure, way[-1])
     env.reset(seed=0)
     for frame in way[1:]:
         assert max(paid_along(env, [frame] * 4)[1:]) <= 0

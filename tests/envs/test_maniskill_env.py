@@ -12,7 +12,7 @@ from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.maniskill_env import ManiSkillEnv
 from lerobot_wmrl.envs.maniskill_tensor_env import ManiSkillTensorEnv
-from lerobot_wmrl.rewards.rule_based import RuleBasedReward
+from lerobot_wmrl.rewards.general import RuleBasedReward
 
 HORIZON = 3
 STAY = np.array([0, 0, 0, 0, 0, 0, -1], np.float32)

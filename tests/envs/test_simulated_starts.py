@@ -6,7 +6,7 @@ import pytest
 from lerobot_wmrl.common.constants import TASKS
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
-from lerobot_wmrl.envs.first_frames import read_first_frames
+from lerobot_wmrl.envs.start_frames import read_first_frames
 from lerobot_wmrl.maniskill.scenes import SCENES
 from lerobot_wmrl.maniskill.tasks import task_of
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig

@@ -14,7 +14,7 @@ from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelE
 from lerobot_wmrl.evaluation import policy_success
 from lerobot_wmrl.evaluation.agreement import Agreement
 from lerobot_wmrl.evaluation.policy_success import policy_checkpoints, policy_outcomes
-from lerobot_wmrl.rewards.configuration_general import GeneralConfig
+from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.scripts.eval_world_model import (
     Checkpoint,
     EvalWorldModelConfig,

@@ -1,10 +1,17 @@
+"""The general reward, in imagination and in the simulator."""
+
+from itertools import pairwise
+
 import pytest
 import torch
 
 from lerobot_wmrl.evaluation.reward_curves import success_once
-from lerobot_wmrl.rewards.configuration_general import GeneralConfig
-from lerobot_wmrl.rewards.general import consecutive_count, general_reward, sparse_reward
-from lerobot_wmrl.rewards.modeling_general import GeneralRewardModel
+from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
+from lerobot_wmrl.rewards.general import RuleBasedReward, consecutive_count, general_reward, sparse_reward
+from lerobot_wmrl.rewards.modeling_rewards import GeneralRewardModel
+
+GAMMA = 0.97
+HORIZON = 40
 
 
 def test_the_sparse_part_pays_at_the_threshold():
@@ -42,9 +49,43 @@ def test_success_is_paid_once():
 
 
 def test_bad_settings_name_the_field():
-    with pytest.raises(ValueError, match=r"--reward\.form=relative: choose"):
+    with pytest.raises(ValueError, match=r"^form=relative: choose"):
         GeneralConfig(device="cpu", form="relative")
     with pytest.raises(ValueError, match=r"alpha=1\.5"):
         GeneralConfig(device="cpu", alpha=1.5)
-    with pytest.raises(ValueError, match=r"gamma=97: choose a discount"):
+    with pytest.raises(ValueError, match=r"gamma=97: must be a discount"):
         GeneralConfig(device="cpu", gamma=97)
+
+
+def returned(reward: RuleBasedReward, progress: list[float], succeeds: bool) -> float:
+    """Discounted sum along an episode."""
+    steps = enumerate(pairwise(progress))
+    last = len(progress) - 2
+    return sum(
+        GAMMA**t * reward.step_reward(float(succeeds and t == last), now, before)
+        for t, (before, now) in steps
+    )
+
+
+def test_to_succeed_pays_more_than_to_linger_just_before_it() -> None:
+    reward, approach = RuleBasedReward(), [0.2, 0.5, 0.9]
+    assert returned(reward, [*approach, 1.0], True) > 2 * returned(
+        reward, [*approach, *[0.9] * HORIZON], False
+    )
+
+
+def test_the_potential_form_pays_for_the_way_not_for_its_length() -> None:
+    reward = RuleBasedReward(alpha=0.0, gamma=1.0)
+    slow = [0.1, 0.2, 0.15, 0.3, 0.8]
+    assert returned(reward, slow, False) == pytest.approx(
+        sum(GAMMA**t * (b - a) for t, (a, b) in enumerate(pairwise(slow)))
+    )
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [({"form": "sum"}, "form=sum"), ({"alpha": 2.0}, "alpha=2.0"), ({"gamma": -1.0}, "gamma=-1.0")],
+)
+def test_there_is_no_other_reward(fields: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        RuleBasedReward(**fields)

@@ -9,8 +9,8 @@ import torch
 from lerobot.scripts import lerobot_train
 
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
-from lerobot_wmrl.rewards.configuration_learned import EmbeddingConfig, ProxyConfig
-from lerobot_wmrl.rewards.modeling_learned import EmbeddingRewardModel, ProxyRewardModel, digest
+from lerobot_wmrl.rewards.configuration_rewards import EmbeddingConfig, ProxyConfig
+from lerobot_wmrl.rewards.modeling_rewards import EmbeddingRewardModel, ProxyRewardModel, weights_digest
 from lerobot_wmrl.world_models.checkpoint import load_model
 
 IMAGE = "observation.images.third_view"
@@ -91,7 +91,7 @@ def test_windows_and_imagination_meet_the_same_hidden_states(embedding, trained_
     """lerobot-train shows the head windows padded at the front; imagination begins at a first frame."""
     reward = load_model(embedding, "embedding")
     reward.config.world_model_path = str(trained_models["action_world_model"])
-    model = reward.source
+    model = reward.world_model
     rows = [small_dataset[index] for index in range(3)]
     length = model.config.clip_length
     order = [0] * (length - 3) + [0, 1, 2]
@@ -115,7 +115,7 @@ def test_windows_and_imagination_meet_the_same_hidden_states(embedding, trained_
 def test_the_world_model_is_no_part_of_the_heads_checkpoint(embedding, trained_models):
     reward = load_model(embedding, "embedding")
     assert all(name.startswith("head.") for name in reward.state_dict())
-    assert reward.config.world_model == digest(
+    assert reward.config.world_model == weights_digest(
         load_model(trained_models["action_world_model"], "action_world_model")
     )
 
@@ -143,13 +143,13 @@ def test_a_reward_for_other_frames_is_refused(sees, message, trained_models, sma
 
 
 def test_bad_settings_name_the_field_and_the_remedy(trained_models, small_dataset, proxy):
-    with pytest.raises(ValueError, match=r"--env\.reward\.pretrained_path is missing.*lerobot-train"):
+    with pytest.raises(ValueError, match=r"^reward\.pretrained_path=None: .*lerobot-train"):
         environment(trained_models, small_dataset, "proxy", None).create_tensor_env(1)
     with pytest.raises(ValueError, match="'embedding' is needed here"):
         environment(trained_models, small_dataset, "embedding", proxy).create_tensor_env(1)
-    with pytest.raises(ValueError, match=r"--reward_model\.world_model_path is missing"):
+    with pytest.raises(ValueError, match=r"^world_model_path=None: .*give the action world model"):
         EmbeddingRewardModel(EmbeddingConfig(device="cpu"))
-    with pytest.raises(ValueError, match=r"hidden=0: must be above 0"):
+    with pytest.raises(ValueError, match=r"hidden=0: must be at least 1"):
         ProxyConfig(device="cpu", hidden=0)
     with pytest.raises(ValueError, match=r"image_size=0: must be at least 8"):
         ProxyRewardModel(ProxyConfig(device="cpu"))
@@ -157,5 +157,5 @@ def test_bad_settings_name_the_field_and_the_remedy(trained_models, small_datase
     images = {IMAGE: torch.zeros(2, 3, 32, 32)}
     with pytest.raises(ValueError, match=r"next\.reward: the dataset has none"):
         model(images)
-    with pytest.raises(ValueError, match=r"next\.reward: holds NaN"):
+    with pytest.raises(ValueError, match=r"next\.reward: contains NaN"):
         model({**images, "next.reward": torch.tensor([0.0, torch.nan])})

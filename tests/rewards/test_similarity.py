@@ -4,8 +4,8 @@ import pytest
 import torch
 from lpips import LPIPS
 
-from lerobot_wmrl.rewards.configuration_general import SIMILARITIES, GeneralConfig
-from lerobot_wmrl.rewards.similarity import PerceptualSimilarity, Similarity, make_similarity, of_rows
+from lerobot_wmrl.rewards.configuration_rewards import SIMILARITIES, GeneralConfig
+from lerobot_wmrl.rewards.similarity import PerceptualSimilarity, Similarity, make_similarity, select_features
 from lerobot_wmrl.world_models.frame_tokenizer import Decoded, FrameTokenizer
 
 CPU = torch.device("cpu")
@@ -20,7 +20,7 @@ def network() -> LPIPS:
 
 
 @pytest.fixture(params=["tokenizer", "mse", "lpips"])
-def alike(request, network) -> Similarity:
+def measure(request, network) -> Similarity:
     return PerceptualSimilarity(network) if request.param == "lpips" else make_similarity(request.param, CPU)
 
 
@@ -39,25 +39,25 @@ def frames() -> Decoded:
     return decoded(torch.cat([tokens, near, (tokens + 7) % 20]))
 
 
-def test_what_is_nearer_to_the_goal_is_more_alike(alike):
-    described = alike.describe(frames())
-    goal = of_rows(described, torch.zeros(3, dtype=torch.long), CAMERAS)
-    same, near, far = alike(described, goal, CAMERAS).tolist()
+def test_what_is_nearer_to_the_goal_is_more_alike(measure):
+    features = measure.features(frames())
+    goal = select_features(features, torch.zeros(3, dtype=torch.long), CAMERAS)
+    same, near, far = measure(features, goal, CAMERAS).tolist()
     assert same == pytest.approx(1)
     assert 0 <= far < near < same
 
 
 def test_lpips_is_that_of_its_package(network):
-    alike, images = PerceptualSimilarity(network), torch.rand(2, 3, CAMERAS, 3, 64, 64)
-    a, b = (alike.describe(Decoded(part, [])) for part in images)
+    measure, images = PerceptualSimilarity(network), torch.rand(2, 3, CAMERAS, 3, 64, 64)
+    a, b = (measure.features(Decoded(part, [])) for part in images)
     expected = network(images[0].flatten(0, 1), images[1].flatten(0, 1), normalize=True).flatten()
-    torch.testing.assert_close(alike.distance(a, b), expected, atol=1e-6, rtol=1e-5)
+    torch.testing.assert_close(measure.distance(a, b), expected, atol=1e-6, rtol=1e-5)
 
 
 def test_lpips_without_its_backbone_is_an_error_and_never_something_else(tmp_path, monkeypatch):
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    message = r"--env\.reward\.similarity=lpips_alex: .*hub/checkpoints/alexnet-.*\.pth is missing.*tokenizer"
+    message = r"reward\.similarity=lpips_alex: .*hub/checkpoints/alexnet-.*\.pth is missing.*tokenizer"
     with pytest.raises(ValueError, match=message):
         make_similarity("lpips_alex", CPU)
-    with pytest.raises(ValueError, match=r"--reward\.similarity=ssim: choose " + ", ".join(SIMILARITIES)):
+    with pytest.raises(ValueError, match=r"^similarity=ssim: choose one of " + ", ".join(SIMILARITIES)):
         GeneralConfig(device="cpu", similarity="ssim")

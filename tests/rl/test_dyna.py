@@ -12,7 +12,7 @@ from safetensors.torch import load_file
 
 from lerobot_wmrl.data.dataset_source import DatasetSource
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
-from lerobot_wmrl.rewards.configuration_general import GeneralConfig
+from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rl.callbacks import Callbacks
 from lerobot_wmrl.rl.configuration_callbacks import DynaConfig, NewRollouts
 from lerobot_wmrl.rl.dyna import DynaRounds, round_iterations

@@ -12,7 +12,7 @@ from lerobot_wmrl.data.dataset_source import DatasetSource
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.evaluation.gate import success_gate
-from lerobot_wmrl.rewards.configuration_general import GeneralConfig
+from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rl.configuration_callbacks import GateConfig
 from lerobot_wmrl.rl.gate import SuccessGate
 from lerobot_wmrl.rl.policy_gradient import TrainingStopped
