@@ -42,7 +42,8 @@ BARE: Final = "imagined and drawn"
 def learned_rewards(model: ActionWorldModelRewardModel) -> dict[str, PreTrainedRewardModel]:
     """Proxy and embedding, untrained."""
     config, device = model.config, model.state_mean.device.type
-    proxy = ProxyConfig(device=device, cameras=config.cameras, image_size=config.image_size)
+    sizes = config.tokenizer
+    proxy = ProxyConfig(device=device, cameras=sizes.cameras, image_size=sizes.image_size)
     embedding = EmbeddingConfig(device=device, world_model="untrained", hidden_size=config.width)
     return {
         "proxy": ProxyRewardModel(proxy).to(device).eval(),

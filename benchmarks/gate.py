@@ -158,7 +158,8 @@ class Experiment:
 
     def train_tokenizer(self) -> list[str]:
         flags: Flags = {
-            "model.type": "frame_tokenizer", "model.cameras": CAMERAS, "model.context": True, "steps": 1600,
+            "model.type": "frame_tokenizer", "model.tokenizer.cameras": CAMERAS,
+            "model.tokenizer.context": True, "steps": 1600,
             "dataset.root": self.path("planned"), "output_dir": self.path("frame_tokenizer"),
         }  # fmt: skip
         return ["lerobot-wmrl-train-world-model", "--preset=demo", *format_flags(flags)]

@@ -147,7 +147,9 @@ def main() -> None:
     if given.simulators:
         model: Any = read_config(given.world_model, "action_world_model")
         simulator = WmrlManiSkillEnv(
-            cameras=list(model.cameras), image_size=model.image_size, episode_length=given.steps
+            cameras=list(model.tokenizer.cameras),
+            image_size=model.tokenizer.image_size,
+            episode_length=given.steps,
         )
         worlds["maniskill"] = (simulator, given.simulators)
     results: dict[str, Any] = {"device": given.device, "threads": torch.get_num_threads()}

@@ -117,9 +117,7 @@ def make_model(given: argparse.Namespace, flags: Sequence[str]) -> ActionWorldMo
         preset_config(given.sizes, kind, flags if kind == "action_world_model" else ())
         for kind in ("frame_tokenizer", "action_world_model")
     )
-    config.device, config.image_size, config.tokenizer_widths = device, tokenizer.image_size, tokenizer.widths
-    config.levels, config.quantizer = tokenizer.levels, tokenizer.quantizer
-    config.cameras, config.tokenizer_context = tokenizer.cameras, tokenizer.context
+    config.device, config.tokenizer = device, tokenizer.tokenizer
     return ActionWorldModelRewardModel(config).to(device).eval()
 
 
@@ -157,18 +155,21 @@ def main() -> None:
         "machine": torch.cuda.get_device_name() if device.type == "cuda" else platform.machine(),
         "threads": torch.get_num_threads(),
         "dtype": str(dtype).removeprefix("torch."),
-        "image_size": config.image_size,
+        "image_size": config.tokenizer.image_size,
         "network": {
             name: getattr(config, name)
-            for name in ("dynamics", "layers", "width", "heads", "patch", "window", "clip_length", "cameras")
-        },
+            for name in ("dynamics", "layers", "width", "heads", "patch", "window", "clip_length")
+        }
+        | {"cameras": config.tokenizer.cameras},
         "transformer_tokens": model.network.transformer_tokens,
         "matmul_gflop_per_s": round(matmul / 1e9, 1),
         "stream_gbyte_per_s": round(stream / 1e9, 1),
         "by_batch": [measure_batch(model, batch, matmul, stream) for batch in given.batches],
     }
     if not given.no_maniskill:
-        simulated = figures["maniskill_frames_per_s"] = maniskill_rates(config.image_size, config.cameras)
+        simulated = figures["maniskill_frames_per_s"] = maniskill_rates(
+            config.tokenizer.image_size, config.tokenizer.cameras
+        )
         figures["times_faster_than_maniskill"] = {
             meshes: {
                 str(row["batch"]): round(row["frames_per_s"]["imagined_and_decoded"] / rate, 2)

@@ -98,7 +98,7 @@ def measure(given: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """One variant's row: estimates of held-out episodes, and the gate's counts."""
     model = load_model(folder, "action_world_model", given.device)
     table = read_episodes(open_dataset(given.dataset_root))
-    source = Source(table, cached_frames(table.dataset, model.config.camera_keys))
+    source = Source(table, cached_frames(table.dataset, model.config.tokenizer.camera_keys))
     unseen = {scene.index for scene in scenes_of("ood")}
     evaluation = evaluate(model, source, choose_episodes(table, given.split, given.max_episodes, unseen))
     estimates = headline(evaluation.accuracy) | done_quality(evaluation.outcomes, threshold=0.5, frames=3)

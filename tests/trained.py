@@ -5,7 +5,7 @@ from typing import Any
 
 from lerobot_wmrl.data.dataset_source import TrainingData
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig, train_world_model
-from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
+from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig, TokenizerConfig
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig, TextWorldModelConfig
 
 TINY: dict[str, Any] = {
@@ -29,9 +29,14 @@ def run_training(config: Any, root: Path, output_dir: Path, steps: int = 3, **se
     return output_dir
 
 
-def tokenizer_config() -> FrameTokenizerConfig:
-    """A small frame tokenizer for 32x32 images."""
-    return FrameTokenizerConfig(image_size=32, widths=[8, 16], levels=[5, 4], device="cpu")
+def small_tokenizer(**settings: Any) -> TokenizerConfig:
+    """Sizes for 32x32 images, 16 tokens of 20 codes a camera."""
+    return TokenizerConfig(**{"image_size": 32, "widths": [8, 16], "levels": [5, 4], **settings})
+
+
+def tokenizer_config(**settings: Any) -> FrameTokenizerConfig:
+    """A small frame tokenizer."""
+    return FrameTokenizerConfig(tokenizer=small_tokenizer(**settings), device="cpu")
 
 
 def train_tokenizer(root: Path, output_dir: Path, **settings: Any) -> Path:

@@ -37,9 +37,9 @@ TINY_WORLD_MODEL: Final[Flags] = {
 }
 
 CPU_TOKENIZER: Final[Flags] = {
-    "model.cameras": "[third_view,side_view]",
-    "model.widths": "[32,64,128]",
-    "model.context": True,
+    "model.tokenizer.cameras": "[third_view,side_view]",
+    "model.tokenizer.widths": "[32,64,128]",
+    "model.tokenizer.context": True,
     "steps": 1600,
     "batch_size": 48,
     "save_freq": 200,
@@ -97,8 +97,8 @@ GPU_WORLD_MODEL: Final[Flags] = {
 """64 transformer tokens a frame of 128 pixels a side, beside the register."""
 
 LFQ_TOKENIZER: Final[Flags] = {
-    "model.quantizer": "lfq",
-    "model.levels": "[512,512]",
+    "model.tokenizer.quantizer": "lfq",
+    "model.tokenizer.levels": "[512,512]",
     "steps": 50_000,
     "batch_size": 64,
     "save_freq": 1000,
@@ -142,8 +142,8 @@ SMALL_OPENVLA: Final[Flags] = {
 PRESETS: Final[dict[str, dict[str, Flags]]] = {
     "tiny": {
         "train-world-model:frame_tokenizer": {
-            "model.image_size": DEMO_IMAGE_SIZE,
-            "model.widths": "[8,16]",
+            "model.tokenizer.image_size": DEMO_IMAGE_SIZE,
+            "model.tokenizer.widths": "[8,16]",
             "steps": 20,
             "batch_size": 8,
             "save_freq": 10,
@@ -181,9 +181,9 @@ PRESETS: Final[dict[str, dict[str, Flags]]] = {
     },
     "demo": {
         "train-world-model:frame_tokenizer": {
-            "model.image_size": DEMO_IMAGE_SIZE,
-            "model.cameras": DEMO_CAMERAS,
-            "model.context": True,
+            "model.tokenizer.image_size": DEMO_IMAGE_SIZE,
+            "model.tokenizer.cameras": DEMO_CAMERAS,
+            "model.tokenizer.context": True,
             "steps": 800,
             "batch_size": 48,
             "save_freq": 100,

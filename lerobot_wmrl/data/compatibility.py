@@ -1,10 +1,12 @@
 """Whether a dataset has what a model looks at."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
+
+from lerobot_wmrl.common.errors import FieldError
 
 
 def frame_size(feature: Mapping[str, Any]) -> tuple[int, int]:
@@ -14,23 +16,27 @@ def frame_size(feature: Mapping[str, Any]) -> tuple[int, int]:
     return height, width
 
 
-def check_cameras(config: Any, features: Mapping[str, Any]) -> None:
-    """ValueError unless the dataset has the config's cameras at its image size."""
-    for key in config.camera_keys:
+def check_cameras(features: Mapping[str, Any], camera_keys: Sequence[str], image_size: int) -> None:
+    """Raise FieldError unless the dataset has these cameras at that image size."""
+    for key in camera_keys:
         if key not in features:
             cameras = ", ".join(name for name in features if name.startswith(OBS_IMAGES)) or "none"
-            raise ValueError(
-                f"cameras={config.cameras}: the dataset has no {key} (its cameras: {cameras}); set "
-                "--model.cameras to match, or use a dataset with this camera"
-            )
+            raise FieldError(
+                "tokenizer.cameras", camera_names(camera_keys),
+                f"the dataset has no {key} (its cameras: {cameras})",
+                "set `tokenizer.cameras` to match, or use a dataset with this camera",
+            )  # fmt: skip
         height, width = frame_size(features[key])
-        if (height, width) != (config.image_size, config.image_size):
-            raise ValueError(
-                f"image_size={config.image_size}: the dataset's {key} is {height}x{width}; "
-                f"train a tokenizer with --model.image_size={height} or record at {config.image_size}"
-            )
-    if getattr(config, "depth", False):
-        check_depth(config, features)
+        if (height, width) != (image_size, image_size):
+            raise FieldError(
+                "tokenizer.image_size", image_size, f"the dataset's {key} is {height}x{width}",
+                f"train a tokenizer with `tokenizer.image_size`={height} or record at {image_size}",
+            )  # fmt: skip
+
+
+def camera_names(camera_keys: Sequence[str]) -> list[str]:
+    """Return the cameras' names without the prefix of their keys."""
+    return [key.removeprefix(f"{OBS_IMAGES}.") for key in camera_keys]
 
 
 def depth_key(camera_key: str) -> str:
@@ -38,22 +44,26 @@ def depth_key(camera_key: str) -> str:
     return f"{camera_key}_depth"
 
 
-def check_depth(config: Any, features: Mapping[str, Any]) -> None:
-    """ValueError unless the dataset has the depth of the config's cameras, at their image size."""
-    for key in map(depth_key, config.camera_keys):
+def check_depth(features: Mapping[str, Any], camera_keys: Sequence[str], image_size: int) -> None:
+    """Raise FieldError unless the dataset has the depth of these cameras, at their image size."""
+    for key in map(depth_key, camera_keys):
         found = frame_size(features[key]) if key in features else None
-        if found != (config.image_size, config.image_size):
+        if found != (image_size, image_size):
             size = "none" if found is None else f"one of {found[0]}x{found[1]}"
-            raise ValueError(
-                f"--model.depth=true: the world model looks at {key} of {config.image_size} x "
-                f"{config.image_size} pixels, the dataset has {size}; record it with "
-                "lerobot-wmrl-record --depth=true"
-            )
+            raise FieldError(
+                "depth", True,
+                f"the world model looks at {key} of {image_size} x {image_size} pixels, the dataset has "
+                f"{size}",
+                "record it with lerobot-wmrl-record --depth=true",
+            )  # fmt: skip
 
 
 def check_dataset(config: Any, features: Mapping[str, Any]) -> None:
-    """ValueError unless a trained model can learn from, start in or replay the dataset's episodes."""
-    check_cameras(config, features)
+    """Raise ValueError unless a trained model can learn from, start in or replay the dataset's episodes."""
+    sizes = config.tokenizer
+    check_cameras(features, sizes.camera_keys, sizes.image_size)
+    if getattr(config, "depth", False):
+        check_depth(features, sizes.camera_keys, sizes.image_size)
     sizes = {OBS_STATE: getattr(config, "state_size", 0), ACTION: getattr(config, "action_size", 0)}
     for name, wanted in sizes.items():
         found = features[name]["shape"][0] if name in features else 0
@@ -62,20 +72,6 @@ def check_dataset(config: Any, features: Mapping[str, Any]) -> None:
                 f"{name}: the world model was trained with {wanted} components, the dataset has "
                 f"{found or 'none'}; use a dataset like the one it was trained on"
             )
-
-
-def check_tokenizer_source(config: Any) -> None:
-    """ValueError unless a world model that is to be trained gets its codes from exactly one place."""
-    if config.tokenizer_path and config.pretrained_path:
-        raise ValueError(
-            f"--model.tokenizer_path={config.tokenizer_path}: the world model at {config.pretrained_path} "
-            "carries the tokenizer whose codes it has learnt; leave one of the two out"
-        )
-    if not config.tokenizer_path and not config.pretrained_path:
-        raise ValueError(
-            "--model.tokenizer_path is missing (--reward_model.tokenizer_path in lerobot-train): give the "
-            "output folder of a training with type=frame_tokenizer"
-        )
 
 
 def check_episode_lengths(meta: Any) -> None:

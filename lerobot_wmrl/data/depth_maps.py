@@ -49,7 +49,7 @@ def depth_at(model: Any, dataset: LeRobotDataset, rows: Any) -> Tensor | None:
     """Depth (…, S) of these rows of the dataset on the model's device, None if it does not look at depth."""
     if not model.config.depth:
         return None
-    depth = cached_depth(dataset, model.config.camera_keys, model.tokenizer.grid)[rows]
+    depth = cached_depth(dataset, model.config.tokenizer.camera_keys, model.tokenizer.grid)[rows]
     return torch.from_numpy(np.array(depth)).to(model.state_mean.device)
 
 

@@ -121,8 +121,8 @@ class WorldModelEnv(EnvConfig):
         self.features[ACTION] = PolicyFeature(type=FeatureType.ACTION, shape=(model.action_size,))
         if model.state_size:
             self.features["agent_pos"] = PolicyFeature(type=FeatureType.STATE, shape=(model.state_size,))
-        for camera in model.cameras:
-            shape = (model.image_size, model.image_size, 3)
+        for camera in model.tokenizer.cameras:
+            shape = (model.tokenizer.image_size, model.tokenizer.image_size, 3)
             self.features[f"pixels/{camera}"] = PolicyFeature(type=FeatureType.VISUAL, shape=shape)
             self.features_map[f"pixels/{camera}"] = f"{OBS_IMAGES}.{camera}"
 

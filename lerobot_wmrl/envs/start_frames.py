@@ -160,7 +160,7 @@ def read_dataset_frames(source: StartFrames, config: Any) -> FirstFrames:
         return every if every is None else every.unflatten(0, rows.shape)
 
     return FirstFrames(
-        cached_frames(table.dataset, config.camera_keys)[rows],
+        cached_frames(table.dataset, config.tokenizer.camera_keys)[rows],
         table.state[rows],
         table.action[rows[:, :-1]],
         [table.instructions[episode] for episode in episodes],
@@ -182,8 +182,8 @@ def read_saved_frames(path: Path, max_starts: int, config: Any) -> FirstFrames:
         FieldError: the file lacks one of these, or has it in another shape.
     """
     found = read_arrays(path)
-    shape = (config.image_size, config.image_size, 3)
-    wanted = {**dict.fromkeys(config.camera_keys, shape), OBS_STATE: (config.state_size,), INSTRUCTION: ()}
+    side, cameras = config.tokenizer.image_size, config.tokenizer.camera_keys
+    wanted = {**dict.fromkeys(cameras, (side, side, 3)), OBS_STATE: (config.state_size,), INSTRUCTION: ()}
     count = max((len(found[name]) for name in wanted if name in found and found[name].ndim), default=0)
     for name, size in wanted.items():
         if name not in found or not count or found[name].shape != (count, *size):
@@ -191,7 +191,7 @@ def read_saved_frames(path: Path, max_starts: int, config: Any) -> FirstFrames:
             raise FieldError(
                 "dataset.frames", path, f"needs {name} of shape {(count or 'K', *size)}, has {has}"
             )
-    images = np.stack([found[name] for name in config.camera_keys], 1)
+    images = np.stack([found[name] for name in cameras], 1)
     if images.dtype != np.uint8:
         raise FieldError("dataset.frames", path, f"images are {images.dtype}, they must be uint8")
     if not np.isfinite(found[OBS_STATE]).all():
@@ -218,10 +218,10 @@ def simulate_first_frames(source: StartFrames, config: Any) -> FirstFrames:
 
     Consecutive seeds visit the scenes in turn, then the next task.
     """
-    tasks = source.tasks or TASKS[:1]
+    tasks, sizes = source.tasks or TASKS[:1], config.tokenizer
     env = WmrlManiSkillEnv(
         task=tasks[0], split="ood" if source.split == "ood" else "ind", scenes=source.scenes,
-        cameras=list(config.cameras), image_size=config.image_size,
+        cameras=list(sizes.cameras), image_size=sizes.image_size,
     )  # fmt: skip
     scenes, simulation = env.selected_scenes(), env.create_simulation()
     frames, instructions, indices = [], [], []
@@ -231,7 +231,7 @@ def simulate_first_frames(source: StartFrames, config: Any) -> FirstFrames:
         instructions.append(simulation.instruction)
         indices.append(simulation.task.index)
     simulation.close()
-    images = np.stack([np.stack([frame.images[camera] for camera in config.cameras]) for frame in frames])
+    images = np.stack([np.stack([frame.images[camera] for camera in sizes.cameras]) for frame in frames])
     state = np.stack([frame.state for frame in frames])
     return _without_past(images, state, instructions, np.array(indices))
 

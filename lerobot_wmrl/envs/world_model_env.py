@@ -68,10 +68,11 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         self.generator.seed()
 
     def _observation_space(self) -> gym.spaces.Dict:
-        size, config = self.model.config.image_size, self.model.config
+        config = self.model.config
+        size = config.tokenizer.image_size
         spaces: dict[str, gym.Space] = {
             f"{OBS_IMAGES}.{camera}": gym.spaces.Box(0.0, 1.0, (3, size, size), np.float32)
-            for camera in config.cameras
+            for camera in config.tokenizer.cameras
         }
         if config.state_size:
             spaces[OBS_STATE] = gym.spaces.Box(-np.inf, np.inf, (config.state_size,), np.float32)
@@ -209,7 +210,7 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
     def _observe(self, images: Tensor, state: Tensor) -> Observation:
         observation: Observation = {
             f"{OBS_IMAGES}.{camera}": images[:, index]
-            for index, camera in enumerate(self.model.config.cameras)
+            for index, camera in enumerate(self.model.config.tokenizer.cameras)
         }
         if self.model.config.state_size:
             observation[OBS_STATE] = state

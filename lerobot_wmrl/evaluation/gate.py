@@ -146,7 +146,7 @@ def rollouts_for(model: ActionWorldModelRewardModel, dataset_root: str | Path) -
             f"dataset.root={dataset_root}: has neither next.success nor next.done, which say whether success "
             "holds; use rollouts with labels"
         )
-    return Source(table, cached_frames(table.dataset, model.config.camera_keys))
+    return Source(table, cached_frames(table.dataset, model.config.tokenizer.camera_keys))
 
 
 def attempted(model: ActionWorldModelRewardModel, source: Source) -> Outcomes:

@@ -53,12 +53,13 @@ def reconstruction_metrics(
         psnr_from_mse(measured.error).mean(0),
         psnr_from_mse(measured.moving_error.sum(0) / colors),
     )
-    cameras = list(enumerate(model.config.cameras))
+    sizes = model.config.tokenizer
+    cameras = list(enumerate(sizes.cameras))
     return {
         "frames": len(rows),
         "psnr": {camera: round(whole[i].item(), 3) for i, camera in cameras},
         "moving_psnr": {camera: round(moving[i].item(), 3) if colors[i] else None for i, camera in cameras},
-        **code_use(make_codebook(model.config.quantizer, model.config.levels), measured.tokens),
+        **code_use(make_codebook(sizes.quantizer, sizes.levels), measured.tokens),
     }
 
 
@@ -97,7 +98,7 @@ def write_reconstruction(model: Any, table: EpisodeTable, output_dir: Path) -> N
         return
     split = "validation" if table.validation.any() else "all"
     episodes = choose_episodes(table, split, MAX_FRAMES)
-    frames = cached_frames(table.dataset, model.config.camera_keys)
+    frames = cached_frames(table.dataset, model.config.tokenizer.camera_keys)
     measured = {"split": split, **reconstruction_metrics(model.eval(), table, frames, episodes)}
     write_json(output_dir / RECONSTRUCTION_FILE, measured)
 

@@ -41,7 +41,7 @@ def load_reward(config: RewardModelConfig, model: ActionWorldModelRewardModel) -
     if isinstance(config, GeneralConfig):
         return make_reward_model(config)
     if not isinstance(config, LearnedRewardConfig):
-        return load_lerobot_reward(config, model.config.camera_keys, device)
+        return load_lerobot_reward(config, model.config.tokenizer.camera_keys, device)
     if not config.pretrained_path:
         raise FieldError(
             "reward.pretrained_path", config.pretrained_path, f"the {config.type} reward is learnt",

@@ -70,11 +70,11 @@ class ProxyRewardModel(HubCard, PreTrainedRewardModel):
         first = self.config.camera_keys[0]
         if not self.config.image_size and first in features:
             self.config.image_size = frame_size(features[first])[0]
-        check_cameras(self.config, features)
+        check_cameras(features, self.config.camera_keys, self.config.image_size)
 
     def check_world_model(self, model: ActionWorldModelRewardModel) -> None:
         """Raise FieldError unless the model imagines frames like those that the network was trained on."""
-        size, cameras = model.config.image_size, model.config.cameras
+        size, cameras = model.config.tokenizer.image_size, model.config.tokenizer.cameras
         if self.config.image_size != size or not {*self.config.cameras} <= {*cameras}:
             raise FieldError(
                 "reward.pretrained_path", self.config.pretrained_path,

@@ -83,7 +83,7 @@ def make_similarity(kind: str, device: torch.device) -> Similarity:
     """
     if kind in LPIPS_BACKBONES:
         net = LPIPS_BACKBONES[kind]
-        require_backbone(net, f"reward.similarity={kind}", "tokenizer or mse")
+        require_backbone(net, "reward.similarity", kind, "tokenizer or mse")
         return PerceptualSimilarity(lpips_network(net, device))
     return PixelSimilarity() if kind == "mse" else TokenizerSimilarity()
 

@@ -54,7 +54,7 @@ def make_recorder(settings: CallbackSettings, env: WorldModelVectorEnv) -> Rollo
     simulator, model = settings.simulator, env.model.config
     if simulator is None:
         return None
-    cameras = list(dict.fromkeys([*simulator.cameras, *model.cameras]))
+    cameras = list(dict.fromkeys([*simulator.cameras, *model.tokenizer.cameras]))
     return RolloutRecorder(simulator, settings.real_num_envs, cameras, model.depth)
 
 

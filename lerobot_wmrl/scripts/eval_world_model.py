@@ -120,7 +120,7 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     unseen = {scene.index for scene in scenes_of("ood")}
     episodes = choose_episodes(table, cfg.split, cfg.max_episodes, unseen)
     claim_output_dir(cfg.output_dir, draccus.encode(cfg))
-    source = Source(table, cached_frames(table.dataset, model.config.camera_keys))
+    source = Source(table, cached_frames(table.dataset, model.config.tokenizer.camera_keys))
     evaluation = evaluate(model, source, episodes)
     numbers, page = report_action_model(
         model, source, evaluation, cfg.done_threshold, cfg.done_frames, cfg.output_dir

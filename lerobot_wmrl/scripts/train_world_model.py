@@ -21,6 +21,7 @@ from lerobot.configs.rewards import RewardModelConfig
 
 from lerobot_wmrl.common.command_line import RunConfig, claim_output_dir, require_free, run_command
 from lerobot_wmrl.common.distributed import LONGEST_WAIT
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.malloc import keep_freed_memory
 from lerobot_wmrl.common.precision import PRECISIONS, training_dtype
 from lerobot_wmrl.common.presets import expand_preset
@@ -77,8 +78,14 @@ def check_config(cfg: TrainWorldModelConfig) -> None:
 
 def check_processes(cfg: TrainWorldModelConfig, processes: int) -> None:
     """ValueError for what cannot be shared: LFQ's entropy is of the whole batch, and the library's is not."""
-    if processes > 1 and isinstance(cfg.model, FrameTokenizerConfig) and cfg.model.quantizer == "lfq":
-        raise ValueError("--model.quantizer=lfq: trains in one process only; leave torchrun out, or take fsq")
+    if (
+        processes > 1
+        and isinstance(cfg.model, FrameTokenizerConfig)
+        and cfg.model.tokenizer.quantizer == "lfq"
+    ):
+        raise FieldError(
+            "tokenizer.quantizer", "lfq", "trains in one process only", "leave torchrun out, or take fsq"
+        )
 
 
 def publish(model: Any, cfg: TrainWorldModelConfig) -> None:

@@ -7,10 +7,8 @@ from typing import cast
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from lerobot_wmrl.world_models.configuration_frame_tokenizer import NORM_GROUPS, PATCH
 from lerobot_wmrl.world_models.context import Fusion
-
-PATCH = 4
-NORM_GROUPS = 8
 
 
 class ResidualBlock(nn.Module):
@@ -82,12 +80,3 @@ class Decoder(nn.Module):
 
     def _fuse(self, x: Tensor, offers: Sequence[Tensor], scale: int) -> Tensor:
         return self.fusions[scale](x, offers[scale]) if self.fusions else x
-
-
-def check_widths(widths: Sequence[int]) -> None:
-    """ValueError unless there are widths, and the coarsest can be normalised in groups."""
-    if not widths or min(widths) < 1 or widths[-1] % NORM_GROUPS:
-        raise ValueError(
-            f"--model.widths={list(widths)}: give the channels from fine to coarse, the last a multiple of "
-            f"{NORM_GROUPS}; each further entry halves the token grid"
-        )

@@ -5,22 +5,15 @@ Codes are handled factor by factor: a token of FSQ levels (8, 5, 5, 5) costs 23 
 embedding, since networks see the code's values and not its index.
 """
 
-import math
 from collections.abc import Sequence
 from functools import partial
-from typing import ClassVar, Final
+from typing import Final
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lerobot_wmrl.common.distributed import draw_own_rows
-
-LARGEST_TOKEN: Final = 2**31
-"""Tokens are cached as int32."""
-
-LARGEST_BINARY_FACTOR: Final = 2**12
-"""LFQ's entropy term holds a probability for every code of a factor at every token of the batch."""
 
 
 def gumbel(like: Tensor, generator: torch.Generator | None) -> Tensor:
@@ -38,7 +31,6 @@ class CodeBook(nn.Module):
         levels: codes of each factor. A token is the number whose digits in this mixed radix they are.
     """
 
-    fewest_levels: ClassVar[int] = 3
     factor_of_logit: Tensor
     level_of_logit: Tensor
     levels: Tensor
@@ -46,7 +38,6 @@ class CodeBook(nn.Module):
 
     def __init__(self, levels: Sequence[int]) -> None:
         super().__init__()
-        check_levels(levels, self.fewest_levels)
         self.level_counts = tuple(levels)
         factors = [factor for factor, count in enumerate(levels) for _ in range(count)]
         within = [level for count in levels for level in range(count)]
@@ -125,12 +116,10 @@ class BinaryCodeBook(CodeBook):
     Its digit has them as bits, the first sign as the highest.
     """
 
-    fewest_levels: ClassVar[int] = 2
     place: Tensor
 
     def __init__(self, levels: Sequence[int]) -> None:
         super().__init__(levels)
-        check_binary_levels(levels)
         self.bits = levels[0].bit_length() - 1
         self.register_buffer("place", torch.arange(self.bits - 1, -1, -1), persistent=False)
 
@@ -157,29 +146,5 @@ CODEBOOKS: Final[dict[str, type[CodeBook]]] = {"fsq": CodeBook, "lfq": BinaryCod
 
 
 def make_codebook(quantizer: str, levels: Sequence[int]) -> CodeBook:
-    """The code book of `fsq` or `lfq`. ValueError for another name, or levels it cannot have."""
-    if quantizer not in CODEBOOKS:
-        raise ValueError(f"--model.quantizer={quantizer}: choose one of {', '.join(CODEBOOKS)}")
+    """Return the code book of `fsq` or `lfq`."""
     return CODEBOOKS[quantizer](levels)
-
-
-def check_levels(levels: Sequence[int], fewest: int) -> None:
-    """ValueError unless every factor has `fewest` levels or more, and tokens can be stored."""
-    if not levels or min(levels) < fewest:
-        raise ValueError(
-            f"--model.levels={list(levels)}: give at least one factor, each of {fewest} or more levels"
-        )
-    if math.prod(levels) > LARGEST_TOKEN:
-        raise ValueError(
-            f"--model.levels={list(levels)}: {math.prod(levels)} codes are more than 2^31; give fewer factors"
-        )
-
-
-def check_binary_levels(levels: Sequence[int]) -> None:
-    """ValueError unless all factors are the same, not too large, power of two."""
-    size = levels[0]
-    if len(set(levels)) > 1 or size & (size - 1) or size > LARGEST_BINARY_FACTOR:
-        raise ValueError(
-            f"--model.levels={list(levels)}: with --model.quantizer=lfq all factors must be the same power "
-            f"of two, at most {LARGEST_BINARY_FACTOR}; [512,512] is 18 bits in two factors"
-        )

@@ -1,16 +1,34 @@
-"""Configuration of the frame tokenizer."""
+"""Configuration of the frame tokenizer, alone and as a world model carries it."""
 
+import math
 from dataclasses import dataclass, field
+from typing import Final
 
 from lerobot.configs.rewards import RewardModelConfig
 from lerobot.optim.optimizers import AdamWConfig
 from lerobot.optim.schedulers import CosineDecayWithWarmupSchedulerConfig, LRSchedulerConfig
 
+from lerobot_wmrl.common.errors import FieldError, require_at_least
 
-@RewardModelConfig.register_subclass("frame_tokenizer")
+PATCH: Final = 4
+"""Side in pixels of the squares that the first convolution sees as one."""
+
+NORM_GROUPS: Final = 8
+"""Groups of channels that are normalised together at the coarsest scale."""
+
+LARGEST_TOKEN: Final = 2**31
+"""Tokens are cached as int32."""
+
+LARGEST_BINARY_FACTOR: Final = 2**12
+"""LFQ's entropy term holds a probability for every code of a factor at every token of the batch."""
+
+FEWEST_LEVELS: Final = {"fsq": 3, "lfq": 2}
+"""Known quantizers, and how many levels a factor of a token needs at least."""
+
+
 @dataclass
-class FrameTokenizerConfig(RewardModelConfig):
-    """Frames to tokens. As a reward model it scores the similarity of a frame to a goal frame (eq. 5).
+class TokenizerConfig:
+    """Which frames become tokens, and how.
 
     Args:
         cameras: camera names whose frames make one time step.
@@ -20,9 +38,7 @@ class FrameTokenizerConfig(RewardModelConfig):
         quantizer: `fsq` (finite scalar quantisation) or `lfq` (MAGVIT-2's lookup-free quantisation).
         levels: codes of each factor of a token; with `lfq` the same power of two for all, such as [512,512]
             for 18 bits.
-        motion_weight: how much more a pixel counts in the loss once it differs from the episode's start.
         context: give encoder and decoder the episode's first frame, so that tokens need carry only motion.
-        perceptual_weight: of LPIPS in the loss. Needs torchvision's VGG-16 in its cache; 0 does without.
     """
 
     cameras: list[str] = field(default_factory=lambda: ["third_view"])
@@ -31,28 +47,92 @@ class FrameTokenizerConfig(RewardModelConfig):
     quantizer: str = "fsq"
     levels: list[int] = field(default_factory=lambda: [5, 5, 5, 5, 5, 5])
     context: bool = False
-    motion_weight: float = 4.0
+
+    def __post_init__(self) -> None:
+        if not self.cameras or len(set(self.cameras)) < len(self.cameras):
+            raise FieldError("tokenizer.cameras", self.cameras, "give at least one camera, each once")
+        self._check_sizes()
+        self._check_levels()
+
+    def _check_sizes(self) -> None:
+        """Raise FieldError unless the coarsest scale can be normalised, and tokens fill the frame."""
+        if not self.widths or min(self.widths) < 1 or self.widths[-1] % NORM_GROUPS:
+            raise FieldError(
+                "tokenizer.widths", list(self.widths),
+                f"must be channels from fine to coarse, the last a multiple of {NORM_GROUPS}",
+                "each further entry halves the token grid",
+            )  # fmt: skip
+        if self.image_size < 1 or self.image_size % self.downsample:
+            raise FieldError(
+                "tokenizer.image_size", self.image_size,
+                f"must be a multiple of {self.downsample}, a token's side with "
+                f"`tokenizer.widths`={list(self.widths)}",
+            )  # fmt: skip
+
+    def _check_levels(self) -> None:
+        """Raise FieldError unless the quantizer is known and can have these levels."""
+        levels = list(self.levels)
+        if self.quantizer not in FEWEST_LEVELS:
+            raise FieldError(
+                "tokenizer.quantizer", self.quantizer, f"choose one of {', '.join(FEWEST_LEVELS)}"
+            )
+        fewest = FEWEST_LEVELS[self.quantizer]
+        if not levels or min(levels) < fewest:
+            raise FieldError(
+                "tokenizer.levels", levels, f"give at least one factor, each of {fewest} or more levels"
+            )
+        if math.prod(levels) > LARGEST_TOKEN:
+            raise FieldError(
+                "tokenizer.levels",
+                levels,
+                f"{math.prod(levels)} codes are more than 2^31",
+                "give fewer factors",
+            )
+        size = levels[0]
+        same_power = len(set(levels)) == 1 and not size & (size - 1) and size <= LARGEST_BINARY_FACTOR
+        if self.quantizer == "lfq" and not same_power:
+            raise FieldError(
+                "tokenizer.levels", levels,
+                "with `tokenizer.quantizer`=lfq all factors must be the same power of two, at most "
+                f"{LARGEST_BINARY_FACTOR}",
+                "[512,512] is 18 bits in two factors",
+            )  # fmt: skip
+
+    @property
+    def downsample(self) -> int:
+        """Side of a token in pixels."""
+        return PATCH * 2 ** (len(self.widths) - 1)
+
+    @property
+    def camera_keys(self) -> list[str]:
+        """The dataset's keys of the cameras."""
+        return [f"observation.images.{camera}" for camera in self.cameras]
+
+
+@RewardModelConfig.register_subclass("frame_tokenizer")
+@dataclass
+class FrameTokenizerConfig(RewardModelConfig):
+    """Train a frame tokenizer. As a reward model it scores the similarity of a frame to a goal frame (eq. 5).
+
+    Args:
+        tokenizer: which frames become tokens, and how.
+        perceptual_weight: of LPIPS in the loss. Needs torchvision's VGG-16 in its cache; 0 does without.
+        learning_rate: peak of the schedule.
+    """
+
+    tokenizer: TokenizerConfig = field(default_factory=TokenizerConfig)
     perceptual_weight: float = 0.0
     learning_rate: float = 2e-3
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("motion_weight", "perceptual_weight"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"--model.{name}={getattr(self, name)}: must not be negative")
-        if not self.cameras or len(set(self.cameras)) < len(self.cameras):
-            raise ValueError(f"--model.cameras={self.cameras}: give at least one camera, each once")
+        require_at_least(self, 0, "perceptual_weight")
 
     def get_optimizer_preset(self) -> AdamWConfig:
         return AdamWConfig(lr=self.learning_rate, weight_decay=1e-4, grad_clip_norm=1.0)
 
     def get_scheduler_preset(self) -> LRSchedulerConfig | None:
         return None
-
-    @property
-    def camera_keys(self) -> list[str]:
-        """The dataset's keys of the cameras."""
-        return [f"observation.images.{camera}" for camera in self.cameras]
 
 
 def cosine_schedule(learning_rate: float, steps: int) -> CosineDecayWithWarmupSchedulerConfig:

@@ -1,11 +1,13 @@
 """Configurations of the action-conditioned and the text-conditioned world model."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final
 
 from lerobot.configs.rewards import RewardModelConfig
 from lerobot.optim.optimizers import AdamWConfig
 from lerobot.optim.schedulers import LRSchedulerConfig
+
+from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 
 AUTOREGRESSIVE_ONLY: Final = {
     "decoding": "shifted", "depth": False, "self_rollout": 0.0, "keypoint_weight": 0.0,
@@ -19,8 +21,7 @@ class WorldModelConfig(RewardModelConfig):
 
     Args:
         tokenizer_path: frame tokenizer checkpoint to start from; a trained world model carries its own copy.
-        cameras, image_size, tokenizer_widths, levels, quantizer, tokenizer_context: of that tokenizer, filled
-            in from its checkpoint.
+        tokenizer: that tokenizer's settings, filled in from its checkpoint.
         state_size: width of `observation.state`, 0 to do without proprioception; filled in from the dataset.
         dynamics: what a frame is predicted from: `autoregressive`, the frame before it (eq. 1); `anchored`,
             the episode's first frame and what was done since, so that errors in pictures do not add up.
@@ -55,12 +56,7 @@ class WorldModelConfig(RewardModelConfig):
     """
 
     tokenizer_path: str | None = None
-    cameras: list[str] = field(default_factory=lambda: ["third_view"])
-    image_size: int = 128
-    tokenizer_widths: list[int] = field(default_factory=lambda: [48, 96])
-    levels: list[int] = field(default_factory=lambda: [5, 5, 5, 5, 5, 5])
-    quantizer: str = "fsq"
-    tokenizer_context: bool = False
+    tokenizer: TokenizerConfig | None = None
     state_size: int = 8
 
     dynamics: str = "autoregressive"
@@ -145,11 +141,6 @@ class WorldModelConfig(RewardModelConfig):
         return None
 
     @property
-    def camera_keys(self) -> list[str]:
-        """The dataset's keys of the cameras."""
-        return [f"observation.images.{camera}" for camera in self.cameras]
-
-    @property
     def memory(self) -> int:
         """Frames that imagination remembers at most."""
         return self.clip_length if self.dynamics == "anchored" else self.window
@@ -157,7 +148,9 @@ class WorldModelConfig(RewardModelConfig):
     @property
     def context_channels(self) -> int:
         """Of the tokenizer's context, as far as the dynamics look at it; 0 if they do not."""
-        return self.tokenizer_widths[-1] if self.tokenizer_context and self.dynamics == "anchored" else 0
+        if self.tokenizer is None or not self.tokenizer.context or self.dynamics != "anchored":
+            return 0
+        return self.tokenizer.widths[-1]
 
     @property
     def observation_delta_indices(self) -> list[int]:

@@ -12,13 +12,17 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lerobot_wmrl.data.frames import NO_CONTEXT, Context
-from lerobot_wmrl.world_models.autoencoder import PATCH, Decoder, Encoder, check_widths
+from lerobot_wmrl.world_models.autoencoder import Decoder, Encoder
 from lerobot_wmrl.world_models.codebook import make_codebook
+from lerobot_wmrl.world_models.configuration_frame_tokenizer import PATCH, TokenizerConfig
 from lerobot_wmrl.world_models.context import ContextEncoder
 from lerobot_wmrl.world_models.quantizer import make_quantizer
 
 MOTION_THRESHOLD = 0.08
 """A pixel has moved when a colour, in [0, 1], differs by more from the episode's first frame."""
+
+MOTION_WEIGHT = 4.0
+"""How much more a pixel counts in the loss once it has moved."""
 
 ImageLoss = Callable[[Tensor, Tensor], Tensor]
 """Reconstructions and images (F, 3, H, W) in [−1, 1] → a loss ()."""
@@ -37,38 +41,18 @@ class FrameTokenizer(nn.Module):
     With the option `context`, c is `context` of the first frames of their episodes; else it is left out.
 
     Args:
-        image_size: side of the square frames, a multiple of `4 · 2^(len(widths) − 1)`.
-        widths: channels from fine to coarse; each further entry halves the grid.
-        levels: codes of each factor; a token is one of their product.
-        num_cameras: frames a time step, N.
-        quantizer: `fsq` or `lfq`.
-        context: whether tokens are conditioned on the episode's first frame.
+        config: cameras, sizes, quantizer and levels, and whether tokens are conditioned on the first frame.
     """
 
-    def __init__(
-        self,
-        image_size: int,
-        widths: Sequence[int],
-        levels: Sequence[int],
-        num_cameras: int = 1,
-        quantizer: str = "fsq",
-        context: bool = False,
-    ) -> None:
+    def __init__(self, config: TokenizerConfig) -> None:
         super().__init__()
-        check_widths(widths)
-        self.downsample = PATCH * 2 ** (len(widths) - 1)
-        if image_size < 1 or image_size % self.downsample:
-            raise ValueError(
-                f"--model.image_size={image_size}: must be a multiple of {self.downsample}, a token's side "
-                f"with --model.widths={list(widths)}"
-            )
-        self.image_size = image_size
-        self.grid = image_size // self.downsample
-        self.num_cameras = num_cameras
-        channels = make_codebook(quantizer, levels).channels
+        widths, context = config.widths, config.context
+        self.image_size, self.num_cameras = config.image_size, len(config.cameras)
+        self.grid = config.image_size // config.downsample
+        channels = make_codebook(config.quantizer, config.levels).channels
         self.encoder = Encoder(widths, channels, context)
         self.decoder = Decoder(widths, channels, context)
-        self.quantizer = make_quantizer(quantizer, levels)
+        self.quantizer = make_quantizer(config.quantizer, config.levels)
         self.whiten = nn.ModuleList(
             nn.BatchNorm2d(channels, affine=False) for channels in (widths[-1], widths[0])
         )
@@ -158,15 +142,15 @@ class FrameTokenizer(nn.Module):
         return loss, metrics | quantized.metrics
 
 
-def motion_weight(images: Tensor, reference: Tensor, strength: float) -> Tensor:
-    """1 on the static background, up to 1 + strength where a frame differs from its episode's start.
+def motion_weight(images: Tensor, reference: Tensor) -> Tensor:
+    """1 on the static background, up to 1 + MOTION_WEIGHT where a frame differs from its episode's start.
 
     A static background otherwise dominates the mean error and hides what decides success. All images
     (B, N, 3, H, W) in [0, 1] → (B, N, 1, H, W).
     """
     change = (images - reference).abs().amax(dim=2, keepdim=True)
     moved = F.max_pool2d((change.flatten(0, 1) > MOTION_THRESHOLD).float(), 5, stride=1, padding=2)
-    return 1 + strength * moved.reshape(change.shape)
+    return 1 + MOTION_WEIGHT * moved.reshape(change.shape)
 
 
 def feature_distance(features: Sequence[Tensor], goal: Sequence[Tensor]) -> Tensor:

@@ -7,6 +7,7 @@ import torch
 from lerobot.rewards.pretrained import PreTrainedRewardModel
 from torch import Tensor
 
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.compatibility import check_cameras
 from lerobot_wmrl.data.frames import NO_CONTEXT
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
@@ -46,40 +47,40 @@ class FrameTokenizerRewardModel(HubCard, PreTrainedRewardModel):
     def __init__(self, config: FrameTokenizerConfig, dataset_meta: Any = None, **kwargs: Any) -> None:
         super().__init__(config)
         self.config: FrameTokenizerConfig = config
+        sizes = config.tokenizer
         if dataset_meta is not None:
-            check_cameras(config, dataset_meta.features)
+            check_cameras(dataset_meta.features, sizes.camera_keys, sizes.image_size)
             if config.perceptual_weight:
-                require_backbone("vgg", "--model.perceptual_weight", "0")
-        self.tokenizer = FrameTokenizer(
-            config.image_size, config.widths, config.levels, len(config.cameras), config.quantizer,
-            config.context,
-        )  # fmt: skip
+                require_backbone("vgg", "perceptual_weight", config.perceptual_weight, "0")
+        self.tokenizer = FrameTokenizer(sizes)
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
         """Reconstruction loss of images (B, 3, H, W); `reference.*`: the episodes' first frames, if known."""
         images, reference = self._stack(batch, "observation.images"), self._reference(batch)
         weight, context = None, NO_CONTEXT
         if reference is not None:
-            weight = motion_weight(images, reference, self.config.motion_weight)
+            weight = motion_weight(images, reference)
             context = self.tokenizer.context(reference)
         return self.tokenizer(images, weight, self._perceptual_loss(images.device), context)
 
     def _stack(self, batch: dict[str, Tensor], prefix: str) -> Tensor:
-        keys = [f"{prefix}.{camera}" for camera in self.config.cameras]
-        return stack_cameras(batch, keys, self.config.image_size)
+        keys = [f"{prefix}.{camera}" for camera in self.config.tokenizer.cameras]
+        return stack_cameras(batch, keys, self.config.tokenizer.image_size)
 
     def _reference(self, batch: dict[str, Tensor]) -> Tensor | None:
         """The first frames of the episodes, if the batch has them. ValueError if they are needed."""
         missing = [
-            key for key in (f"reference.{camera}" for camera in self.config.cameras) if key not in batch
+            key
+            for key in (f"reference.{camera}" for camera in self.config.tokenizer.cameras)
+            if key not in batch
         ]
         if not missing:
             return self._stack(batch, "reference")
-        if self.config.context:
-            raise ValueError(
-                f"--model.context=true: the batch lacks {missing}, the first frames of the episodes; train "
-                "with lerobot-wmrl-train-world-model, which adds them"
-            )
+        if self.config.tokenizer.context:
+            raise FieldError(
+                "tokenizer.context", True, f"the batch lacks {missing}, the first frames of the episodes",
+                "train with lerobot-wmrl-train-world-model, which adds them",
+            )  # fmt: skip
         return None
 
     def _perceptual_loss(self, device: torch.device) -> ImageLoss | None:

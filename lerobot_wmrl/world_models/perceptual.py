@@ -14,6 +14,8 @@ from lpips import LPIPS
 from torch import Tensor
 from torchvision.models import AlexNet_Weights, VGG16_Weights
 
+from lerobot_wmrl.common.errors import FieldError
+
 BACKBONES: Final = {"vgg": VGG16_Weights.IMAGENET1K_V1, "alex": AlexNet_Weights.IMAGENET1K_V1}
 CONSTRUCTORS: Final = {"vgg": ("VGG-16", "vgg16"), "alex": ("AlexNet", "alexnet")}
 
@@ -35,17 +37,20 @@ def backbone_path(net: str) -> Path:
     return Path(torch.hub.get_dir()) / "checkpoints" / PurePosixPath(BACKBONES[net].url).name
 
 
-def require_backbone(net: str, flag: str, otherwise: str) -> None:
-    """ValueError says where the backbone that `flag` asks for belongs and how to get it there, unless it is
-    there; `otherwise` is what to set the flag to without."""
+def require_backbone(net: str, field: str, value: object, otherwise: str) -> None:
+    """Raise FieldError unless torch's cache has the backbone that `field` asks for.
+
+    The error says where the file belongs and how to get it there; `otherwise` is what to set the field to
+    without it.
+    """
     path, (name, constructor) = backbone_path(net), CONSTRUCTORS[net]
     if not path.is_file():
-        raise ValueError(
-            f"{flag}: LPIPS needs the {name} of torchvision, and {path} is missing. On a machine with a "
-            f'network run python -c "import torchvision; torchvision.models.{constructor}('
+        raise FieldError(
+            field, value, f"LPIPS needs the {name} of torchvision, and {path} is missing",
+            f'where there is a network run python -c "import torchvision; torchvision.models.{constructor}('
             "weights='IMAGENET1K_V1')\" and copy the file there (TORCH_HOME says where the cache is), or set "
-            f"it to {otherwise}"
-        )
+            f"`{field}` to {otherwise}",
+        )  # fmt: skip
 
 
 @cache

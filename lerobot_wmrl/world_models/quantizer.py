@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from vector_quantize_pytorch import FSQ, LFQ
 
 from lerobot_wmrl.common.precision import compute_in
-from lerobot_wmrl.world_models.codebook import BinaryCodeBook, make_codebook
+from lerobot_wmrl.world_models.codebook import BinaryCodeBook
 
 ENTROPY_WEIGHT: Final = 0.1
 """Of LFQ's entropy term, as in MAGVIT-2: of a token's code (low: decided) minus of all codes (high: used)."""
@@ -77,6 +77,5 @@ class LookupFreeQuantizer(nn.Module):
 
 
 def make_quantizer(name: str, levels: Sequence[int]) -> FiniteScalarQuantizer | LookupFreeQuantizer:
-    """The quantiser `fsq` or `lfq`. ValueError for another name, or levels it cannot have."""
-    make_codebook(name, levels)
+    """Return the quantiser `fsq` or `lfq`."""
     return FiniteScalarQuantizer(levels) if name == "fsq" else LookupFreeQuantizer(levels)

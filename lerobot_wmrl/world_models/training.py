@@ -80,9 +80,9 @@ def make_sampler(
             "others with --dataset.episodes: every twentieth is held out"
         )
     if model.name == "frame_tokenizer":
-        frames = cached_frames(table.dataset, config.camera_keys)
+        frames = cached_frames(table.dataset, config.tokenizer.camera_keys)
         return FrameSampler(
-            table, frames, episodes.nonzero()[0], config.cameras, batch_size, seed, config.device
+            table, frames, episodes.nonzero()[0], config.tokenizer.cameras, batch_size, seed, config.device
         )
     if isinstance(config, TextWorldModelConfig):
         episodes = episodes & golden_episodes(table)
@@ -97,11 +97,12 @@ def make_sampler(
             table.dataset.root,
         )
     tokenizer: Any = model.tokenizer
-    tokens = cached_tokens(table.dataset, config.camera_keys, tokenizer)
-    depth = cached_depth(table.dataset, config.camera_keys, tokenizer.grid) if config.depth else None
+    cameras = config.tokenizer.camera_keys
+    tokens = cached_tokens(table.dataset, cameras, tokenizer)
+    depth = cached_depth(table.dataset, cameras, tokenizer.grid) if config.depth else None
     context = None
     if config.context_channels:
-        context = cached_context(table.dataset, config.camera_keys, tokenizer)
+        context = cached_context(table.dataset, cameras, tokenizer)
     return ClipSampler(
         table, tokens, episodes.nonzero()[0], config.clip_length, config.from_start, batch_size, seed,
         config.device, depth, context, done_known,

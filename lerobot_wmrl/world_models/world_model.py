@@ -11,12 +11,13 @@ from lerobot.rewards.pretrained import PreTrainedRewardModel
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor, nn
 
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.clip import Clip
 from lerobot_wmrl.data.compatibility import (
     check_cameras,
     check_dataset,
+    check_depth,
     check_episode_lengths,
-    check_tokenizer_source,
 )
 from lerobot_wmrl.data.depth_maps import depth_of_windows
 from lerobot_wmrl.data.episode_table import success_column
@@ -46,6 +47,26 @@ NEVER = -5.0
 chance, and every second imagination would succeed."""
 
 
+def check_tokenizer_source(config: WorldModelConfig) -> None:
+    """Raise FieldError unless the model gets its tokenizer from exactly one place."""
+    if config.tokenizer_path and config.pretrained_path:
+        raise FieldError(
+            "tokenizer_path", config.tokenizer_path,
+            f"the world model at {config.pretrained_path} carries the tokenizer whose codes it has learnt",
+            "leave one of the two out",
+        )  # fmt: skip
+    if config.tokenizer_path and config.tokenizer is not None:
+        raise FieldError(
+            "tokenizer", config.tokenizer, "is that of the checkpoint at `tokenizer_path`",
+            "leave its settings out",
+        )  # fmt: skip
+    if not config.tokenizer_path and config.tokenizer is None:
+        raise FieldError(
+            "tokenizer_path", config.tokenizer_path, "is missing",
+            "give the output folder of a training with type=frame_tokenizer",
+        )  # fmt: skip
+
+
 class WorldModelRewardModel(HubCard, Imagination, PreTrainedRewardModel):
     """Base of both: tokenizer, next-frame network and statistics in one checkpoint."""
 
@@ -60,16 +81,14 @@ class WorldModelRewardModel(HubCard, Imagination, PreTrainedRewardModel):
         super().__init__(config)
         self.config: Any = config
         self.training_progress = 1.0
+        check_tokenizer_source(config)
         if dataset_meta is not None:
-            check_tokenizer_source(config)
             check_episode_lengths(dataset_meta)
         source = self._adopt_tokenizer() if config.tokenizer_path else None
         if dataset_meta is not None:
             self._adopt_features(dataset_meta.features)
-        self.tokenizer = FrameTokenizer(
-            config.image_size, config.tokenizer_widths, config.levels, len(config.cameras), config.quantizer,
-            config.tokenizer_context,
-        ).requires_grad_(False)  # fmt: skip
+        sizes: Any = config.tokenizer  # given, or adopted above
+        self.tokenizer = FrameTokenizer(sizes).requires_grad_(False)
         if source is not None:
             self.tokenizer.load_state_dict(source.tokenizer.state_dict())
         if self.tokenizer.grid % config.patch:
@@ -78,9 +97,9 @@ class WorldModelRewardModel(HubCard, Imagination, PreTrainedRewardModel):
             )
         self.dynamics = make_dynamics(config)
         self.network = self.dynamics.make_network(
-            levels=config.levels, grid=self.tokenizer.grid, num_cameras=len(config.cameras),
+            levels=sizes.levels, grid=self.tokenizer.grid, num_cameras=len(sizes.cameras),
             state_size=config.state_size, patch=config.patch, width=config.width,
-            code_width=config.code_width, quantizer=config.quantizer,
+            code_width=config.code_width, quantizer=sizes.quantizer,
         )  # fmt: skip
         if dataset_meta is not None and success_column(dataset_meta.features) is None:
             last: Any = self.network.done[-1]
@@ -98,9 +117,7 @@ class WorldModelRewardModel(HubCard, Imagination, PreTrainedRewardModel):
     def _adopt_tokenizer(self) -> Any:
         """Take the tokenizer's sizes into the config; a trained checkpoint no longer needs its path."""
         source = load_model(self.config.tokenizer_path, "frame_tokenizer")
-        self.config.cameras, self.config.image_size = source.config.cameras, source.config.image_size
-        self.config.tokenizer_widths, self.config.levels = source.config.widths, source.config.levels
-        self.config.quantizer, self.config.tokenizer_context = source.config.quantizer, source.config.context
+        self.config.tokenizer = source.config.tokenizer
         self.config.tokenizer_path = None
         return source
 
@@ -108,7 +125,10 @@ class WorldModelRewardModel(HubCard, Imagination, PreTrainedRewardModel):
         """Take the widths from the dataset; a trained model must find its own there."""
         if self.config.pretrained_path:
             check_dataset(self.config, features)
-        check_cameras(self.config, features)
+        sizes = self.config.tokenizer
+        check_cameras(features, sizes.camera_keys, sizes.image_size)
+        if self.config.depth:
+            check_depth(features, sizes.camera_keys, sizes.image_size)
         if self.config.state_size and OBS_STATE not in features:
             logging.info("the dataset has no observation.state: the world model does without proprioception")
         if self.config.state_size:
@@ -147,20 +167,23 @@ class WorldModelRewardModel(HubCard, Imagination, PreTrainedRewardModel):
     @torch.no_grad()
     def clip_from_batch(self, batch: dict[str, Any]) -> Clip:
         """Tokenise a batch of LeRobot's windows, beside their first frames: they lack their episodes'."""
-        images = stack_cameras(batch, self.config.camera_keys, self.config.image_size)
+        sizes = self.config.tokenizer
+        images = stack_cameras(batch, sizes.camera_keys, sizes.image_size)
         shape = images.shape[:2]
         context = self.tokenizer.context(images[:, 0])
         rows = torch.arange(shape[0]).repeat_interleave(shape[1])
         tokens = self.tokenizer.encode(images.flatten(0, 1), context[rows]).unflatten(0, shape)
         depth = self._depth(batch)
-        clip = clip_from_windows(tokens, batch, self.config.camera_keys[0], self.config.state_size, depth)
+        clip = clip_from_windows(
+            tokens, batch, self.config.tokenizer.camera_keys[0], self.config.state_size, depth
+        )
         return clip._replace(context=context)
 
     def _depth(self, batch: dict[str, Any]) -> Tensor | None:
         """Of the windows' frames, (B, T, S) metres, if the model looks at depth."""
         if not self.config.depth:
             return None
-        return depth_of_windows(batch, self.config.camera_keys, self.tokenizer.grid)
+        return depth_of_windows(batch, self.config.tokenizer.camera_keys, self.tokenizer.grid)
 
     @torch.no_grad()
     def predict(self, clip: Clip, drawn: bool = True) -> Prediction:

@@ -72,7 +72,7 @@ class WmMpcPolicy(PreTrainedPolicy):
     def predict_action_chunk(self, batch: Observation, **_: Any) -> Tensor:
         """Plan from images (B, 3, H, W), state (B, P) and instructions. → the whole plans (B, T, A)"""
         model, config = self._model[0], self.config
-        images = stack_cameras(batch, model.config.camera_keys, model.config.image_size)
+        images = stack_cameras(batch, model.config.tokenizer.camera_keys, model.config.tokenizer.image_size)
         if self._context is None:
             self._context = model.tokenizer.context(images)
         tokens = model.tokenizer.encode(images, self._context)

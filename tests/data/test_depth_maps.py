@@ -11,6 +11,7 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wmrl.common.constants import FPS
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data.dataset_source import DatasetSource
 from lerobot_wmrl.data.depth_maps import cached_depth, token_depth
@@ -149,7 +150,7 @@ def test_the_environment_begins_with_the_depth_of_its_starts(deep_dataset, model
 
 
 def test_a_dataset_without_depth_is_named_before_anything_is_trained(small_dataset, trained_models, tmp_path):
-    with pytest.raises(ValueError, match=r"--model\.depth=true: .*third_view_depth .*--depth=true"):
+    with pytest.raises(FieldError, match=r"^depth=True: .*third_view_depth .*--depth=true"):
         run_training(
             action_config(trained_models["frame_tokenizer"], dynamics="autoregressive", depth=True),
             Path(small_dataset.root), tmp_path / "out",

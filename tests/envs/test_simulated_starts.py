@@ -9,12 +9,15 @@ from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.envs.start_frames import read_first_frames
 from lerobot_wmrl.maniskill.scenes import SCENES
 from lerobot_wmrl.maniskill.tasks import task_of
+from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig
 
 
 def test_they_are_what_the_simulator_shows(recwarn):
     """Two scenes in turn, then the next task."""
-    config = ActionWorldModelConfig(cameras=["side_view", "third_view"], image_size=32, device="cpu")
+    config = ActionWorldModelConfig(
+        tokenizer=TokenizerConfig(["side_view", "third_view"], image_size=32), device="cpu"
+    )
     source = StartFrames(resets=4, tasks=["push", "pull"], scenes=[0, 2], split="ind")
     found = read_first_frames(source, config)
     assert found.images.shape == (4, 1, 2, 32, 32, 3)

@@ -379,9 +379,9 @@ def test_a_step_asks_the_device_only_whether_an_episode_has_ended(config, reward
 
 
 def test_learned_rewards_ask_nothing_more(env):
-    width = env.model.config.width
+    width, cameras = env.model.config.width, env.model.config.tokenizer.cameras
     for reward in (
-        ProxyRewardModel(ProxyConfig(device="cpu", cameras=env.model.config.cameras, image_size=32)),
+        ProxyRewardModel(ProxyConfig(device="cpu", cameras=cameras, image_size=32)),
         EmbeddingRewardModel(EmbeddingConfig(device="cpu", world_model="untrained", hidden_size=width)),
     ):
         env.reward = reward.eval()

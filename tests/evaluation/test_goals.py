@@ -16,6 +16,7 @@ from lerobot_wmrl.evaluation.pictures import save_goals
 from lerobot_wmrl.evaluation.replay import Source
 from lerobot_wmrl.evaluation.success_probe import is_held_out, labelled_frames, train_probe
 from lerobot_wmrl.world_models.checkpoint import load_model
+from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer, feature_distance
 
 
@@ -58,7 +59,7 @@ def test_the_least_allowed_distance_counts():
 
 def test_distances_of_all_pairs_average_over_cameras():
     torch.manual_seed(0)
-    tokenizer = FrameTokenizer(16, [8, 16], [5, 4], num_cameras=2).eval()
+    tokenizer = FrameTokenizer(TokenizerConfig(["left", "right"], 16, [8, 16], levels=[5, 4])).eval()
     with torch.no_grad():
         goals, finals = (
             tokenizer.decode_with_features(torch.randint(0, 20, (n, 8))).features for n in (2, 3)
@@ -70,7 +71,7 @@ def test_distances_of_all_pairs_average_over_cameras():
 
 
 def test_a_final_frame_is_the_first_in_which_success_holds(small_dataset, text_model):
-    source = source_of(small_dataset, text_model.config.camera_keys)
+    source = source_of(small_dataset, text_model.config.tokenizer.camera_keys)
     episodes, rows = final_rows(source)
     assert episodes.tolist() == source.table.success.nonzero()[0].tolist()
     assert source.table.done[rows - 1].all()
@@ -78,7 +79,7 @@ def test_a_final_frame_is_the_first_in_which_success_holds(small_dataset, text_m
 
 
 def test_goals_are_compared_with_real_successes(small_dataset, text_model):
-    source = source_of(small_dataset, text_model.config.camera_keys)
+    source = source_of(small_dataset, text_model.config.tokenizer.camera_keys)
     goals = imagine_goals(text_model, source, np.arange(6))
     assert set(goals.nearest) <= set(range(len(goals.finals.episodes)))
     quality = goal_quality(goals, train_probe(text_model.tokenizer, source))
@@ -88,7 +89,7 @@ def test_goals_are_compared_with_real_successes(small_dataset, text_model):
 
 
 def test_without_a_real_success_there_is_no_distance_and_no_probe(small_dataset, text_model, tmp_path):
-    source = source_of(small_dataset, text_model.config.camera_keys)
+    source = source_of(small_dataset, text_model.config.tokenizer.camera_keys)
     source.table.done[:] = False
     goals = imagine_goals(text_model, source, np.arange(6))
     probe = train_probe(text_model.tokenizer, source)

@@ -13,7 +13,7 @@ from lerobot_wmrl.evaluation.image_metrics import psnr_from_mse
 from lerobot_wmrl.evaluation.reconstruction import code_use, reconstruction_metrics
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.codebook import BinaryCodeBook, CodeBook
-from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
+from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig, TokenizerConfig
 from lerobot_wmrl.world_models.frame_tokenizer import MOTION_THRESHOLD
 from tests.trained import run_training
 
@@ -30,7 +30,7 @@ def dataset(make_synthetic_dataset, tmp_path_factory):
 @pytest.fixture(scope="module")
 def output_dir(dataset, tmp_path_factory) -> Path:
     config = FrameTokenizerConfig(
-        cameras=list(CAMERAS), image_size=32, widths=[8, 16], levels=[5, 4], device="cpu"
+        tokenizer=TokenizerConfig(list(CAMERAS), 32, [8, 16], levels=[5, 4]), device="cpu"
     )
     return run_training(config, Path(dataset.root), tmp_path_factory.mktemp("runs") / "tokenizer")
 
@@ -38,7 +38,7 @@ def output_dir(dataset, tmp_path_factory) -> Path:
 @torch.no_grad()
 def test_psnr_is_that_of_each_camera_and_of_its_moved_pixels(dataset, output_dir):
     model, table = load_model(output_dir, "frame_tokenizer"), read_episodes(dataset)
-    frames = np.array(cached_frames(dataset, model.config.camera_keys))
+    frames = np.array(cached_frames(dataset, model.config.tokenizer.camera_keys))
     frames[:, 1] = frames[table.start[4], 1]
     metrics = reconstruction_metrics(model, table, frames, np.array([4]))
     rows = slice(table.start[4], table.start[4] + table.length[4])
@@ -54,7 +54,7 @@ def test_psnr_is_that_of_each_camera_and_of_its_moved_pixels(dataset, output_dir
 
 def test_frames_are_thinned_evenly(dataset, output_dir):
     model, table = load_model(output_dir, "frame_tokenizer"), read_episodes(dataset)
-    frames = cached_frames(dataset, model.config.camera_keys)
+    frames = cached_frames(dataset, model.config.tokenizer.camera_keys)
     assert reconstruction_metrics(model, table, frames, np.arange(21), max_frames=10)["frames"] == 10
 
 

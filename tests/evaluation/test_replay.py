@@ -32,7 +32,9 @@ def model(trained_models):
 
 @pytest.fixture
 def source(small_dataset, model) -> Source:
-    return Source(read_episodes(small_dataset), cached_frames(small_dataset, model.config.camera_keys))
+    return Source(
+        read_episodes(small_dataset), cached_frames(small_dataset, model.config.tokenizer.camera_keys)
+    )
 
 
 def perfect(source: Source, model, episode: int) -> EpisodeReplay:

@@ -6,6 +6,7 @@ from lpips import LPIPS
 
 from lerobot_wmrl.rewards.configuration_rewards import SIMILARITIES, GeneralConfig
 from lerobot_wmrl.rewards.similarity import PerceptualSimilarity, Similarity, make_similarity, select_features
+from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 from lerobot_wmrl.world_models.frame_tokenizer import Decoded, FrameTokenizer
 
 CPU = torch.device("cpu")
@@ -26,7 +27,7 @@ def measure(request, network) -> Similarity:
 
 def decoded(tokens: torch.Tensor) -> Decoded:
     torch.manual_seed(1)
-    tokenizer = FrameTokenizer(64, [8, 16], [5, 4], CAMERAS).eval()
+    tokenizer = FrameTokenizer(TokenizerConfig(["left", "right"], 64, [8, 16], levels=[5, 4])).eval()
     with torch.no_grad():
         return tokenizer.decode_with_features(tokens)
 

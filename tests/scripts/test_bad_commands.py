@@ -19,7 +19,7 @@ from tests.rl.checkpoints import save_untrained_policy
 Command = Callable[[], None]
 REPLAY = ["--model.path={action_world_model}", "--dataset.root={data}"]
 SIMULATOR = ["--env.type=wmrl_maniskill"]
-TRAIN = ["--dataset.root={data}", "--model.type=frame_tokenizer", "--model.image_size=32"]
+TRAIN = ["--dataset.root={data}", "--model.type=frame_tokenizer", "--model.tokenizer.image_size=32"]
 NEW = "--target={foreign}/new"
 IMPORT = ["--direction=import", "--source={policy}"]
 ROLL_OUT = ["--policy.path={policy}", *SIMULATOR, "--num_episodes=1"]

@@ -8,6 +8,7 @@ from torch import Tensor
 from lerobot_wmrl.data.clip import Clip
 from lerobot_wmrl.world_models.configuration_world_model import TextWorldModelConfig
 from lerobot_wmrl.world_models.modeling_world_model import TextWorldModelRewardModel
+from tests.trained import small_tokenizer
 
 LEVELS = [5, 4]
 TOKENS = 16
@@ -23,7 +24,7 @@ def text_model(**settings: Any) -> TextWorldModelRewardModel:
     """A small text world model with random weights; no tokenizer is trained, as no picture is looked at."""
     torch.manual_seed(0)
     config = TextWorldModelConfig(
-        image_size=32, tokenizer_widths=[8, 16], levels=LEVELS, state_size=STATE, layers=1, width=32, heads=2,
+        tokenizer=small_tokenizer(levels=LEVELS), state_size=STATE, layers=1, width=32, heads=2,
         window=8, code_width=8, device="cpu", self_forcing=0.0, token_noise=0.0,
         **{"goal_horizon": 6, **settings},
     )  # fmt: skip

@@ -22,11 +22,13 @@ from lerobot_wmrl.world_models.modeling_world_model import (
 from lerobot_wmrl.world_models.open_loop import open_loop
 from lerobot_wmrl.world_models.st_transformer import Dropout
 from lerobot_wmrl.world_models.world_model import STATE_SPREAD
+from tests.trained import small_tokenizer
 
 BATCH, LENGTH, TOKENS, CODES = 3, 6, 32, 20
+CAMERAS = ["third_view", "wrist"]
 SIZES: dict[str, Any] = {
-    "device": "cpu", "cameras": ["third_view", "wrist"], "image_size": 32, "tokenizer_widths": [8, 16],
-    "levels": [5, 4], "tokenizer_context": True, "layers": 2, "width": 32, "heads": 2, "code_width": 8,
+    "device": "cpu", "tokenizer": small_tokenizer(cameras=CAMERAS, context=True),
+    "layers": 2, "width": 32, "heads": 2, "code_width": 8,
     "clip_length": LENGTH,
 }  # fmt: skip
 
@@ -151,7 +153,7 @@ def test_what_the_tokenizer_sees_in_the_first_frame_is_looked_at_and_needed():
     for ask in (lambda: model.predict(alone), lambda: imagine(model, alone)):
         with pytest.raises(ValueError, match=r"the context of 0 first frames for 3 imaginations"):
             ask()
-    assert world_model(tokenizer_context=False).predict(alone).done_logit.isfinite().all()
+    assert world_model(tokenizer=small_tokenizer(cameras=CAMERAS)).predict(alone).done_logit.isfinite().all()
 
 
 def reached(clip: Clip) -> Clip:

@@ -10,6 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.dataset_source import DatasetSource
 from lerobot_wmrl.data.episode_table import choose_episodes, read_episodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
@@ -27,7 +28,7 @@ def test_wrong_input_is_named(small_dataset, trained_models, tmp_path):
         run_training(action_config(tokenizer), tmp_path / "nothing", tmp_path / "a")
     config = action_config(tokenizer)
     config.tokenizer_path = None
-    with pytest.raises(ValueError, match=r"--model\.tokenizer_path is missing"):
+    with pytest.raises(FieldError, match=r"^tokenizer_path=None: is missing"):
         run_training(config, root, tmp_path / "b")
     with pytest.raises(ValueError, match="type=general: this command trains frame_tokenizer"):
         run_training(GeneralConfig(device="cpu"), root, tmp_path / "d")
@@ -188,9 +189,7 @@ def test_a_second_tokenizer_is_refused(small_dataset, trained_models, tmp_path):
     with pytest.raises(ValueError, match=r"holds a run with other settings \(model"):
         run_training(action_config(other), root, run, steps=3)
     trained = str(run / "checkpoints" / "last" / "pretrained_model")
-    with pytest.raises(
-        ValueError, match=r"--model\.tokenizer_path=.*other: the world model at .* carries the tok"
-    ):
+    with pytest.raises(FieldError, match=r"^tokenizer_path=.*other: the world model at .* carries the tok"):
         run_training(action_config(other, pretrained_path=trained), root, tmp_path / "again")
     assert not (tmp_path / "again").exists()
 

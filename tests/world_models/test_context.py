@@ -15,11 +15,10 @@ from lerobot_wmrl.evaluation.pictures import side_by_side, to_uint8
 from lerobot_wmrl.evaluation.replay import Source, replay_episodes
 from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
 from lerobot_wmrl.world_models.checkpoint import load_model
-from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
 from lerobot_wmrl.world_models.context import Fusion
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
 from lerobot_wmrl.world_models.training import make_sampler
-from tests.trained import action_config, run_training, text_config
+from tests.trained import action_config, run_training, small_tokenizer, text_config, tokenizer_config
 
 CAMERA = "observation.images.third_view"
 
@@ -28,7 +27,7 @@ CAMERA = "observation.images.third_view"
 def models(small_dataset, tmp_path_factory) -> dict[str, Path]:
     """A conditioned tokenizer and both world models on it, a few steps each."""
     root, folder = Path(small_dataset.root), tmp_path_factory.mktemp("conditioned")
-    config = FrameTokenizerConfig(image_size=32, widths=[8, 16], levels=[5, 4], context=True, device="cpu")
+    config = tokenizer_config(context=True)
     tokenizer = run_training(config, root, folder / "frame_tokenizer")
     return {
         "frame_tokenizer": tokenizer,
@@ -73,7 +72,7 @@ def test_static_detail_comes_from_the_first_frame_and_not_through_the_tokens():
     errors = {}
     for conditioned in (False, True):
         torch.manual_seed(0)
-        tokenizer = FrameTokenizer(32, (16, 32), (3,), context=conditioned)
+        tokenizer = FrameTokenizer(small_tokenizer(widths=[16, 32], levels=[3], context=conditioned))
         optimizer = torch.optim.Adam(tokenizer.parameters(), 5e-3)
         with torch.enable_grad():
             for _ in range(100):
@@ -91,7 +90,7 @@ def test_static_detail_comes_from_the_first_frame_and_not_through_the_tokens():
 @torch.no_grad()
 def test_a_row_is_decoded_beside_its_own_context():
     start, frames = scenes()
-    tokenizer = FrameTokenizer(32, (8, 16), (5, 4), context=True).eval()
+    tokenizer = FrameTokenizer(small_tokenizer(context=True)).eval()
     context = tokenizer.context(start)
     tokens = tokenizer.encode(frames, context)
     order = torch.randperm(16)
@@ -103,7 +102,10 @@ def test_a_row_is_decoded_beside_its_own_context():
 
 def test_a_missing_superfluous_or_short_context_is_named():
     start, frames = scenes()
-    plain, conditioned = FrameTokenizer(32, (8, 8), (5,)), FrameTokenizer(32, (8, 8), (5,), context=True)
+    plain, conditioned = (
+        FrameTokenizer(small_tokenizer(widths=[8, 8], levels=[5], context=context))
+        for context in (False, True)
+    )
     context = conditioned.context(start)
     tokens = plain.encode(frames)
     assert plain.context(start) is NO_CONTEXT
@@ -137,7 +139,7 @@ def test_clips_carry_what_the_tokenizer_sees_in_their_episodes_first_frame(
     expected = model.tokenizer.context(frames_to_tensor(frames[table.start[[2, 0]]])).features
     torch.testing.assert_close(clip.context.features, expected)
     assert torch.equal(clip.done_known, clip.valid)
-    model.config.tokenizer_context = False
+    model.config.tokenizer.context = False
     plain = make_sampler(model, table, None, batch_size=4, seed=0)
     clip = plain.clips(np.array([2, 0]), np.array([3, 0]))
     assert clip.context is NO_CONTEXT
@@ -207,6 +209,6 @@ def test_rewards_of_batches_take_the_context_from_the_batch(models):
     torch.testing.assert_close(tokenizer.compute_reward(frame), torch.ones(2))
     del frame["reference.third_view"]
     with pytest.raises(
-        ValueError, match=r"--model\.context=true: the batch lacks \['reference\.third_view'\]"
+        ValueError, match=r"^tokenizer\.context=True: the batch lacks \['reference\.third_view'\]"
     ):
         tokenizer(frame)

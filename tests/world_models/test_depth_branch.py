@@ -12,11 +12,13 @@ from lerobot_wmrl.world_models.decoding import DECODINGS
 from lerobot_wmrl.world_models.depth_branch import FAR
 from lerobot_wmrl.world_models.frame_network import Prediction
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
+from tests.trained import small_tokenizer
 
 SIZES: dict[str, Any] = {
-    "device": "cpu", "dynamics": "autoregressive", "image_size": 32, "tokenizer_widths": [8, 16],
-    "levels": [5, 4], "layers": 2, "width": 32, "heads": 2, "window": 4, "code_width": 8, "maskgit_steps": 3,
-    "depth": True, "cameras": ["third_view", "wrist"], "token_noise": 0.0,
+    "device": "cpu", "dynamics": "autoregressive",
+    "tokenizer": small_tokenizer(cameras=["third_view", "wrist"]),
+    "layers": 2, "width": 32, "heads": 2, "window": 4, "code_width": 8, "maskgit_steps": 3,
+    "depth": True, "token_noise": 0.0,
 }  # fmt: skip
 BATCH, TOKENS, CODES, FRAMES = 3, 32, 20, 12
 CHANGED = 5
@@ -143,7 +145,9 @@ def moving_depth_clip() -> Clip:
 
 def test_a_moving_depth_is_learnt_and_imagined():
     """Open loop, much better than depth that stays: the branch heeds actions and its own predictions."""
-    model = world_model(cameras=["third_view"], state_size=0, patch=1, layers=1, self_forcing=0.0).train()
+    model = world_model(
+        tokenizer=small_tokenizer(), state_size=0, patch=1, layers=1, self_forcing=0.0
+    ).train()
     clip = moving_depth_clip()
     optimizer = torch.optim.Adam(model.network.parameters(), 3e-3)
     for _ in range(120):

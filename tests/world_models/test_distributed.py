@@ -16,7 +16,10 @@ SCRIPT = Path(__file__).with_name("trainings.py")
 TRAINED_WEIGHTS = "checkpoints/last/pretrained_model/model.safetensors"
 STEPS, BATCH = 6, 8
 SIZES = {
-    "frame_tokenizer": ["--model.image_size=32", "--model.widths=[8,16]", "--model.levels=[5,4]"],
+    "frame_tokenizer": [
+        "--model.tokenizer.image_size=32", "--model.tokenizer.widths=[8,16]",
+        "--model.tokenizer.levels=[5,4]",
+    ],
     "action_world_model": [
         "--model.layers=1", "--model.width=32", "--model.heads=2", "--model.clip_length=14",
         "--model.code_width=8", "--model.token_noise=0.1", "--model.self_rollout=0.5",

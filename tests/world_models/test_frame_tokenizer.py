@@ -1,6 +1,8 @@
 import pytest
 import torch
 
+from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer, feature_distance, motion_weight
 
 
@@ -17,7 +19,7 @@ def frames() -> torch.Tensor:
 @pytest.fixture(scope="module")
 def trained(frames: torch.Tensor) -> FrameTokenizer:
     torch.manual_seed(0)
-    tokenizer = FrameTokenizer(32, (16, 32), (5, 5, 5))
+    tokenizer = FrameTokenizer(TokenizerConfig(image_size=32, widths=[16, 32], levels=[5, 5, 5]))
     optimizer = torch.optim.Adam(tokenizer.parameters(), 3e-3)
     for _ in range(150):
         loss, _ = tokenizer(frames)
@@ -34,7 +36,9 @@ def test_it_overfits_a_batch(trained, frames):
 
 
 def test_tokens_are_a_grid_a_camera_within_the_codebook():
-    tokenizer = FrameTokenizer(32, (16, 32), (5, 4), num_cameras=2)
+    tokenizer = FrameTokenizer(
+        TokenizerConfig(["left", "right"], image_size=32, widths=[16, 32], levels=[5, 4])
+    )
     tokens = tokenizer.encode(torch.rand(3, 2, 3, 32, 32))
     assert tokens.shape == (3, 2 * 4 * 4)
     assert tokens.dtype == torch.int64
@@ -53,7 +57,7 @@ def test_feature_distance_is_zero_for_the_same_frame_and_grows_with_the_change(t
 
 
 def test_motion_counts_more_than_background(frames):
-    weight = motion_weight(frames[1:2], frames[0:1], strength=4.0)
+    weight = motion_weight(frames[1:2], frames[0:1])
     assert weight[0, 0, 0, 4, 4] == 5
     assert weight[0, 0, 0, 4, 12] == 5
     assert weight[0, 0, 0, 28, 28] == 1
@@ -62,7 +66,9 @@ def test_motion_counts_more_than_background(frames):
 @pytest.mark.parametrize("image_size", [64, 96, 128, 256])
 @pytest.mark.parametrize("quantizer", ["fsq", "lfq"])
 def test_any_square_resolution_and_several_cameras(image_size, quantizer):
-    tokenizer = FrameTokenizer(image_size, (8, 8, 8), (16, 16), 2, quantizer).eval()
+    tokenizer = FrameTokenizer(
+        TokenizerConfig(["left", "right"], image_size, [8, 8, 8], quantizer, [16, 16])
+    ).eval()
     images = torch.rand(1, 2, 3, image_size, image_size)
     with torch.no_grad():
         tokens = tokenizer.encode(images)
@@ -77,7 +83,7 @@ def test_any_square_resolution_and_several_cameras(image_size, quantizer):
 def test_fsq_learns_and_reconstructs_as_it_did_before_there_was_a_choice_of_quantizers():
     """Written down before; if a change of the numbers is meant, write the new ones down."""
     torch.manual_seed(0)
-    tokenizer = FrameTokenizer(32, (16, 32), (8, 5, 3))
+    tokenizer = FrameTokenizer(TokenizerConfig(image_size=32, widths=[16, 32], levels=[8, 5, 3]))
     optimizer = torch.optim.Adam(tokenizer.parameters(), 3e-3)
     images = torch.rand(4, 1, 3, 32, 32)
     for _ in range(10):
@@ -91,25 +97,25 @@ def test_fsq_learns_and_reconstructs_as_it_did_before_there_was_a_choice_of_quan
 
 
 @pytest.mark.parametrize(("settings", "message"), [
-    ({"image_size": 30}, r"--model\.image_size=30: must be a multiple of 8"),
-    ({"widths": (16, 36)}, r"--model\.widths=\[16, 36\]: .*the last a multiple of 8"),
-    ({"widths": ()}, r"--model\.widths=\[\]"),
-    ({"levels": (5, 2)}, r"--model\.levels=\[5, 2\]: .*each of 3 or more"),
-    ({"quantizer": "lfq", "levels": (1, 1)}, r"--model\.levels=\[1, 1\]: .*each of 2 or more"),
-    ({"levels": (2**16, 2**16)}, r"--model\.levels=.*more than 2\^31"),
-    ({"quantizer": "lfq"}, r"--model\.levels=\[5, 5\]: with --model\.quantizer=lfq .*power of two"),
-    ({"quantizer": "lfq", "levels": (8, 4)}, r"--model\.levels=\[8, 4\]: .*the same power"),
-    ({"quantizer": "lfq", "levels": (2**13,)}, r"--model\.levels=\[8192\]: .*at most 4096"),
-    ({"quantizer": "vq"}, r"--model\.quantizer=vq: choose one of fsq, lfq"),
+    ({"image_size": 30}, r"^tokenizer\.image_size=30: must be a multiple of 8"),
+    ({"widths": (16, 36)}, r"^tokenizer\.widths=\[16, 36\]: .*the last a multiple of 8"),
+    ({"widths": ()}, r"^tokenizer\.widths=\[\]"),
+    ({"levels": (5, 2)}, r"^tokenizer\.levels=\[5, 2\]: .*each of 3 or more"),
+    ({"quantizer": "lfq", "levels": (1, 1)}, r"^tokenizer\.levels=\[1, 1\]: .*each of 2 or more"),
+    ({"levels": (2**16, 2**16)}, r"^tokenizer\.levels=.*more than 2\^31"),
+    ({"quantizer": "lfq"}, r"^tokenizer\.levels=\[5, 5\]: with `tokenizer\.quantizer`=lfq .*power of two"),
+    ({"quantizer": "lfq", "levels": (8, 4)}, r"^tokenizer\.levels=\[8, 4\]: .*the same power"),
+    ({"quantizer": "lfq", "levels": (2**13,)}, r"^tokenizer\.levels=\[8192\]: .*at most 4096"),
+    ({"quantizer": "vq"}, r"^tokenizer\.quantizer=vq: choose one of fsq, lfq"),
 ])  # fmt: skip
 def test_impossible_settings_are_named(settings, message):
-    with pytest.raises(ValueError, match=message):
-        FrameTokenizer(**{"image_size": 32, "widths": (16, 32), "levels": (5, 5), **settings})
+    with pytest.raises(FieldError, match=message):
+        TokenizerConfig(**{"image_size": 32, "widths": (16, 32), "levels": (5, 5), **settings})
 
 
 @pytest.mark.parametrize("shape", [(2, 1, 3, 48, 48), (2, 2, 3, 32, 32), (2, 3, 32, 32)])
 def test_other_frames_than_the_tokenizers_are_named(shape):
-    tokenizer = FrameTokenizer(32, (8, 8), (5, 5))
+    tokenizer = FrameTokenizer(TokenizerConfig(image_size=32, widths=[8, 8], levels=[5, 5]))
     for use in (tokenizer.encode, tokenizer):
         with pytest.raises(ValueError, match=r"this tokenizer takes .* \(B, 1, 3, 32, 32\)"):
             use(torch.rand(shape))

@@ -19,7 +19,7 @@ from lerobot_wmrl.data.episode_table import EpisodeTable
 from lerobot_wmrl.data.samplers import ClipSampler, FrameSampler
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig, TextWorldModelConfig
 from lerobot_wmrl.world_models.training import train
-from tests.trained import TINY, tokenizer_config
+from tests.trained import TINY, small_tokenizer, tokenizer_config
 
 EPISODES, ROWS, TOKENS, CODES = 4, 14, 16, 20
 GOLDEN = {
@@ -30,7 +30,7 @@ GOLDEN = {
     "text_world_model": [3.7513, 3.5552, 3.3833, 3.4729, 3.4508, 3.4538, 3.2883, 3.4127],
 }
 WORLD_MODEL: dict[str, Any] = {
-    "device": "cpu", "image_size": 32, "tokenizer_widths": [8, 16], "levels": [5, 4], "token_noise": 0.1,
+    "device": "cpu", "tokenizer": small_tokenizer(), "token_noise": 0.1,
     **TINY,
 }  # fmt: skip
 

@@ -13,10 +13,11 @@ from lerobot_wmrl.world_models.modeling_world_model import (
     ActionWorldModelRewardModel,
     TextWorldModelRewardModel,
 )
+from tests.trained import small_tokenizer
 
 SIZES: dict[str, Any] = {
-    "device": "cpu", "dynamics": "autoregressive", "image_size": 32, "tokenizer_widths": [8, 16],
-    "levels": [5, 4], "layers": 2, "width": 32, "heads": 2, "window": 4, "code_width": 8, "maskgit_steps": 3,
+    "device": "cpu", "dynamics": "autoregressive", "tokenizer": small_tokenizer(),
+    "layers": 2, "width": 32, "heads": 2, "window": 4, "code_width": 8, "maskgit_steps": 3,
 }  # fmt: skip
 BATCH, TOKENS, CODES = 3, 16, 20
 

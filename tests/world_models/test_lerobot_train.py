@@ -66,9 +66,9 @@ def foreign_tokenizer(foreign_dataset, tmp_path_factory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         return lerobot_trained(
             patch, tmp_path_factory.mktemp("tokenizer") / "run", *on(foreign_dataset, 2),
-            "--reward_model.type=frame_tokenizer", f"--reward_model.image_size={SIZE}",
-            "--reward_model.cameras=[top,left.fisheye]", "--reward_model.widths=[8,16]",
-            "--reward_model.levels=[5,4]",
+            "--reward_model.type=frame_tokenizer", f"--reward_model.tokenizer.image_size={SIZE}",
+            "--reward_model.tokenizer.cameras=[top,left.fisheye]", "--reward_model.tokenizer.widths=[8,16]",
+            "--reward_model.tokenizer.levels=[5,4]",
         )  # fmt: skip
 
 
@@ -92,7 +92,7 @@ def test_a_world_model_of_any_dataset_goes_on_bit_for_bit(
     assert (link.resolve().name, expected.keys()) == ("000004", resumed.keys())
     assert all(torch.equal(expected[name], resumed[name]) for name in expected)
     model = load_model(whole, "action_world_model")
-    assert model.config.cameras == ["top", "left.fisheye"]
+    assert model.config.tokenizer.cameras == ["top", "left.fisheye"]
     assert (model.config.action_size, model.config.state_size) == (ACTIONS, 0)
     first = torch.zeros(2, model.tokenizer.tokens_per_frame, dtype=torch.long)
     ahead = open_loop(model, first, torch.empty(2, 0), torch.randn(2, 5, ACTIONS))

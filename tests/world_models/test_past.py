@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from lerobot_wmrl.world_models.past import Frames, Past, restart_after, start_after
-from tests.world_models.test_anchored import BATCH, random_clip, world_model
+from tests.trained import small_tokenizer
+from tests.world_models.test_anchored import BATCH, CAMERAS, random_clip, world_model
 
 AGO = 2
 """Frames of past."""
@@ -22,7 +23,9 @@ def past_of(clip, first: int) -> Past:
 @pytest.fixture(params=["autoregressive", "anchored"])
 def model(request):
     context = request.param == "anchored"
-    return world_model(dynamics=request.param, tokenizer_context=context, window=4)
+    return world_model(
+        dynamics=request.param, tokenizer=small_tokenizer(cameras=CAMERAS, context=context), window=4
+    )
 
 
 def begun(model, clip, first: int = 0):

@@ -9,13 +9,12 @@ from torch.nn import functional as F
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.codebook import BinaryCodeBook, CodeBook
-from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
 from lerobot_wmrl.world_models.losses import (
     corrupt_digits,
 )
 from lerobot_wmrl.world_models.next_frame import NextFrameNetwork
 from lerobot_wmrl.world_models.quantizer import COMMITMENT_WEIGHT, ENTROPY_WEIGHT, LookupFreeQuantizer
-from tests.trained import action_config, run_training
+from tests.trained import action_config, run_training, tokenizer_config
 
 LEVELS = (16, 16, 16)
 
@@ -94,15 +93,13 @@ def test_the_copy_bias_is_that_of_the_present_code():
 def test_a_world_model_takes_its_quantizer_from_the_tokenizer(small_dataset, tmp_path):
     """Trained on LFQ tokens, saved, loaded and imagined in."""
     root = Path(small_dataset.root)
-    config = FrameTokenizerConfig(
-        image_size=32, widths=[8, 16], quantizer="lfq", levels=list(LEVELS), device="cpu"
-    )
+    config = tokenizer_config(quantizer="lfq", levels=list(LEVELS))
     tokenizer = run_training(config, root, tmp_path / "tokenizer", steps=4)
     logged = read_metrics(tokenizer)[-1]
     assert logged.keys() >= {"quantizer_loss", "token_entropy", "code_entropy", "commitment_loss"}
     folder = run_training(action_config(tokenizer), root, tmp_path / "action")
     model = load_model(folder, "action_world_model")
-    assert (model.config.quantizer, tuple(model.config.levels)) == ("lfq", LEVELS)
+    assert (model.config.tokenizer.quantizer, tuple(model.config.tokenizer.levels)) == ("lfq", LEVELS)
     trained = load_model(tokenizer, "frame_tokenizer").tokenizer
     images = torch.rand(3, 1, 3, 32, 32)
     tokens = model.tokenizer.encode(images)

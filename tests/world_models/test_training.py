@@ -33,7 +33,7 @@ WEIGHTS = "checkpoints/last/pretrained_model/model.safetensors"
 def sampler(small_dataset, trained_models) -> ClipSampler:
     table = read_episodes(small_dataset)
     model = load_model(trained_models["action_world_model"], "action_world_model")
-    tokens = cached_tokens(small_dataset, model.config.camera_keys, model.tokenizer)
+    tokens = cached_tokens(small_dataset, model.config.tokenizer.camera_keys, model.tokenizer)
     return ClipSampler(table, tokens, np.arange(6), 12, 0.75, batch_size=8, seed=3, device="cpu")
 
 
@@ -73,7 +73,7 @@ def test_the_flags_of_a_preset_fit_together(preset):
         ]).model
         for kind in ("frame_tokenizer", "action_world_model", "text_world_model")
     )  # fmt: skip
-    assert tokenizer.quantizer == ("lfq" if preset in ("gpu", "paper") else "fsq")
+    assert tokenizer.tokenizer.quantizer == ("lfq" if preset in ("gpu", "paper") else "fsq")
     grid = make_reward_model(tokenizer).tokenizer.grid
     assert all(grid % config.patch == 0 for config in world_models)
 
