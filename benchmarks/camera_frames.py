@@ -8,9 +8,8 @@ import numpy as np
 from tqdm import tqdm
 
 from lerobot_dataset_maniskill.planners import TASK_KINDS, follow_plan
-from lerobot_wmrl.maniskill.cameras import VIEWS, View
-from lerobot_wmrl.maniskill.processes import simulating_context
-from lerobot_wmrl.maniskill.rendering import Rendering
+from lerobot_wmrl.maniskill.backend import simulating_context
+from lerobot_wmrl.maniskill.cameras import VIEWS, Rendering, View
 from lerobot_wmrl.maniskill.scenes import scenes_of
 from lerobot_wmrl.maniskill.simulation import Simulation
 from lerobot_wmrl.maniskill.tasks import TASKS

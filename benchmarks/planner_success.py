@@ -21,7 +21,7 @@ from tqdm import tqdm
 from lerobot_dataset_maniskill.planners import MOTIONS, TASK_KINDS, Motion, follow_plan
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.statistics import Proportion
-from lerobot_wmrl.maniskill.rendering import Rendering
+from lerobot_wmrl.maniskill.cameras import Rendering
 from lerobot_wmrl.maniskill.scenes import SCENES
 from lerobot_wmrl.maniskill.simulation import Simulation
 from lerobot_wmrl.maniskill.tasks import TASKS

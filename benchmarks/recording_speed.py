@@ -17,10 +17,9 @@ import gymnasium as gym
 import mani_skill.envs  # noqa: F401 (registers PushCube)
 import numpy as np
 
-from lerobot_wmrl.common.constants import ROBOT_MESH_DETAIL
 from lerobot_wmrl.common.files import write_json
-from lerobot_wmrl.maniskill.renderer import render_backend
-from lerobot_wmrl.maniskill.rendering import Rendering
+from lerobot_wmrl.maniskill.backend import render_backend
+from lerobot_wmrl.maniskill.cameras import ROBOT_MESH_DETAIL, Rendering
 from lerobot_wmrl.maniskill.scenes import scenes_of
 from lerobot_wmrl.maniskill.simulation import Simulation
 from lerobot_wmrl.maniskill.tasks import TASKS

@@ -10,7 +10,8 @@ from lerobot_dataset_maniskill.manifest import EpisodePlan
 from lerobot_dataset_maniskill.planners import MOTIONS, follow_plan
 from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW, KINDS
 from lerobot_wmrl.common.policy_checkpoints import load_policy, load_processors
-from lerobot_wmrl.maniskill.simulation import Frame, Simulation
+from lerobot_wmrl.maniskill.episode import Frame
+from lerobot_wmrl.maniskill.simulation import Simulation
 
 EXPLORATION_STREAM = 1 << 20
 """Tells this noise from the draws of starts, which are seeded by (seed, task, scene)."""

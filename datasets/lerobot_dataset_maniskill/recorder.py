@@ -23,8 +23,7 @@ from lerobot_dataset_maniskill.writer import VOCABULARY_FILE
 from lerobot_wmrl.common.constants import ACTION_NAMES, KINDS
 from lerobot_wmrl.common.files import foreign_files, write_json, writing
 from lerobot_wmrl.common.policy_checkpoints import check_fit, check_weights
-from lerobot_wmrl.maniskill.processes import simulating_context
-from lerobot_wmrl.maniskill.renderer import render_backend
+from lerobot_wmrl.maniskill.backend import render_backend, simulating_context
 
 CONTENT_FILE = "recording.json"
 POLL_SECONDS = 1.0

@@ -18,7 +18,7 @@ from lerobot_dataset_maniskill.quiet import silence_libraries
 from lerobot_dataset_maniskill.writer import HOLD_FRAMES, Outcome, StartColumns, add_step, create_dataset
 from lerobot_wmrl.common.constants import PLAY
 from lerobot_wmrl.common.progress import own_progress_lock
-from lerobot_wmrl.maniskill.processes import leave_with_command
+from lerobot_wmrl.maniskill.backend import leave_with_command
 from lerobot_wmrl.maniskill.tasks import task_of
 
 

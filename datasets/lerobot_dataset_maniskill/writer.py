@@ -21,8 +21,8 @@ from lerobot_wmrl.common.constants import (
     TASKS,
 )
 from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.maniskill.episode import Frame
 from lerobot_wmrl.maniskill.scenes import SCENES
-from lerobot_wmrl.maniskill.simulation import Frame
 
 HOLD_FRAMES = 5
 """A successful episode goes on for so many rows after the one whose action first succeeded."""

@@ -11,14 +11,9 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
-from lerobot_wmrl.common.constants import (
-    ACTION_NAMES,
-    CAMERAS,
-    FPS,
-    IMAGE_SIZE,
-    ROBOT_MESH_DETAIL,
-    STATE_NAMES,
-)
+from lerobot_wmrl.common.constants import ACTION_NAMES, FPS, STATE_NAMES
+from lerobot_wmrl.maniskill.backend import require_simulator
+from lerobot_wmrl.maniskill.cameras import CAMERAS, IMAGE_SIZE, ROBOT_MESH_DETAIL, Rendering
 from lerobot_wmrl.maniskill.scenes import Scene, scenes_of
 from lerobot_wmrl.rewards.general import RuleBasedReward
 
@@ -92,7 +87,7 @@ class WmrlManiSkillEnv(EnvConfig):
                 f"--env.robot_mesh_detail={self.robot_mesh_detail}: must be above 0 and at most 1"
             )
         if self.assets is not None:
-            from lerobot_wmrl.maniskill.assets import read_assets
+            from lerobot_wmrl.maniskill.objects import read_assets
 
             read_assets(self.assets)
         for name, most in (("light_jitter", 1.0), ("camera_jitter", 0.1)):
@@ -126,6 +121,7 @@ class WmrlManiSkillEnv(EnvConfig):
 
     def create_simulation(self, depth: bool = False) -> "Simulation":
         """A simulator for these scenes and cameras, in this process."""
+        require_simulator()
         from lerobot_wmrl.maniskill.simulation import Simulation
 
         self._use_assets()
@@ -133,6 +129,7 @@ class WmrlManiSkillEnv(EnvConfig):
 
     def create_batched_simulation(self, n_envs: int, device: str) -> "BatchedSimulation":
         """The same for `n_envs` episodes at once. ValueError if light or cameras are to vary."""
+        require_simulator()
         from lerobot_wmrl.maniskill.batched import BatchedSimulation
 
         if self.light_jitter or self.camera_jitter:
@@ -148,19 +145,17 @@ class WmrlManiSkillEnv(EnvConfig):
         """What the user's own meshes are, without where they lie; None if there are none."""
         if self.assets is None:
             return None
-        from lerobot_wmrl.maniskill.assets import describe_assets
+        from lerobot_wmrl.maniskill.objects import describe_assets
 
         return describe_assets(self.assets)
 
     def _use_assets(self) -> None:
-        from lerobot_wmrl.maniskill.assets import use_assets
+        from lerobot_wmrl.maniskill.objects import use_assets
 
         if self.assets is not None:
             use_assets(self.assets)
 
-    def _rendering(self, depth: bool) -> Any:
-        from lerobot_wmrl.maniskill.rendering import Rendering
-
+    def _rendering(self, depth: bool) -> Rendering:
         return Rendering(
             tuple(self.cameras), self.image_size, depth,
             self.robot_mesh_detail, self.light_jitter, self.camera_jitter,
@@ -195,7 +190,7 @@ class WmrlManiSkillEnv(EnvConfig):
             return False
         import torch
 
-        from lerobot_wmrl.maniskill.renderer import render_backend
+        from lerobot_wmrl.maniskill.backend import render_backend
 
         if not (device.startswith("cuda") and torch.cuda.is_available() and render_backend() == "gpu"):
             raise ValueError(

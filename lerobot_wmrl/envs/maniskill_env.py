@@ -11,9 +11,9 @@ from lerobot.envs.utils import FreezeAfterEpisodeEnd
 from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW, EVALUATION_SEED, FPS, STATE_NAMES
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.scene_results import CountingAsyncVectorEnv, CountingSyncVectorEnv
-from lerobot_wmrl.maniskill.processes import simulating_context
+from lerobot_wmrl.maniskill.backend import simulating_context
+from lerobot_wmrl.maniskill.episode import Frame
 from lerobot_wmrl.maniskill.scenes import scene_for_seed
-from lerobot_wmrl.maniskill.simulation import Frame
 
 
 class ManiSkillEnv(gym.Env):

@@ -1,1 +1,1 @@
-"""What exists in the simulator: objects, scenes, tasks, cameras."""
+"""What exists in the simulator: objects, scenes, tasks, cameras, and the simulation itself."""

@@ -1,7 +1,7 @@
-"""Many episodes in one simulation: ManiSkill's batched physics and rendering, for CUDA.
+"""Many episodes in one simulation, with ManiSkill's batched physics and rendering on CUDA.
 
-On the CPU a batch has one episode; that serves to compare it with `simulation.Simulation`.
-"""
+On the CPU a batch has one episode, which serves to compare it with `simulation.Simulation`. B is the number
+of episodes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,30 +13,30 @@ import torch
 from mani_skill.utils.structs.pose import Pose
 from torch import Tensor
 
-from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW, WORKSPACE_FLOOR
+from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW
+from lerobot_wmrl.maniskill.backend import render_backend
+from lerobot_wmrl.maniskill.cameras import Rendering
+from lerobot_wmrl.maniskill.episode import WORKSPACE_FLOOR, Episode
 from lerobot_wmrl.maniskill.objects import OBJECTS
-from lerobot_wmrl.maniskill.renderer import render_backend
-from lerobot_wmrl.maniskill.rendering import Rendering
 from lerobot_wmrl.maniskill.robot import GRIPPER_OPEN
 from lerobot_wmrl.maniskill.scenes import Scene
-from lerobot_wmrl.maniskill.simulation import Episode
-from lerobot_wmrl.maniskill.tabletop import TabletopEnv, arrangement
+from lerobot_wmrl.maniskill.simulation import TabletopEnv, arrangement
 from lerobot_wmrl.maniskill.tasks import Situation, Task
 
 SHELF = -6.0
-"""Height (m) at which objects that no episode needs lie on a shelf, further down than a camera sees."""
+"""Height (m) of the shelf for objects that no episode needs, further down than a camera sees."""
 
 SHELF_HALF_SIZE = (1.0, 1.0, 0.05)
 SHELF_SPACING = 0.35
 SHELF_GAP = 0.01
-"""Objects are put so far above the shelf (m)."""
+"""Height above the shelf at which objects are put (m)."""
 
 CELLAR = -9.0
-"""Height (m) below which tables, containers and mats that no episode needs hang."""
+"""Height (m) below which tables, containers and mats that no episode needs are put."""
 
 
 class BatchedTabletopEnv(TabletopEnv):
-    """Tables beside each other, each with everything that any scene needs."""
+    """B tables beside each other, each with everything that any scene needs."""
 
     def _load_scene(self, options: dict) -> None:
         super()._load_scene(options)
@@ -46,7 +46,7 @@ class BatchedTabletopEnv(TabletopEnv):
         builder.build_static(name="shelf")
 
     def parking_places(self, movable: Sequence[str], fixed: Sequence[str]) -> dict[str, sapien.Pose]:
-        """Objects lie on the shelf, everything else hangs below it."""
+        """Return places on the shelf for objects, below it for everything else."""
         side = int(np.ceil(np.sqrt(len(movable))))
         offset = SHELF_SPACING * (side - 1) / 2
         places = {name: sapien.Pose(p=[0.0, 0.0, CELLAR - index]) for index, name in enumerate(fixed)}
@@ -56,7 +56,7 @@ class BatchedTabletopEnv(TabletopEnv):
         return places
 
     def place_rows(self, rows: Sequence[int], episodes: Sequence[Episode]) -> None:
-        """Put what the episodes need on the tables `rows` (ascending), at rest, and everything else away."""
+        """Set up episodes on the tables `rows` (ascending): what they need at rest, everything else away."""
         self.scene._reset_mask = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self.scene._reset_mask[list(rows)] = True
         layouts = [arrangement(episode.scene, episode.start) for episode in episodes]
@@ -73,7 +73,7 @@ class BatchedTabletopEnv(TabletopEnv):
         self.scene._reset_mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
 
     def _apply(self) -> None:
-        """On CUDA, poses are set in buffers that have to be applied and read again."""
+        """Apply poses: on CUDA they are set in buffers that have to be applied and fetched again."""
         if self.gpu_sim_enabled:
             self.scene._gpu_apply_all()
             self.scene.px.gpu_update_articulation_kinematics()
@@ -82,8 +82,14 @@ class BatchedTabletopEnv(TabletopEnv):
 
 @dataclass(frozen=True)
 class BatchedFrame:
-    """What is known at one control step of B episodes: images camera → (B, H, W, 3) uint8 and state (B, 8),
-    on the simulation's device; reward (B,) float32 and success (B,) bool."""
+    """What is observed at one control step of B episodes, on the simulation's device.
+
+    Args:
+        images: camera → (B, H, W, 3) uint8.
+        state: (B, 8) float32, `constants.STATE_NAMES`.
+        reward: (B,) float32.
+        success: (B,) bool.
+    """
 
     images: dict[str, Tensor]
     state: Tensor
@@ -92,11 +98,13 @@ class BatchedFrame:
 
 
 class BatchedSimulation:
-    """As `Simulation`, with B episodes of one task at once.
+    """Like `Simulation`, with B episodes of one task at once.
 
     Args:
-        task, scenes, rendering: as there; light and cameras do not vary here.
-        num_envs: B; one on the CPU.
+        task: defines starts, success and reward.
+        scenes: the scenes that may be asked for.
+        rendering: which pictures are taken; light and cameras do not vary here.
+        num_envs: B; 1 on the CPU.
         device: "cpu", "cuda" or "cuda:1" and so on, of physics and pictures.
     """
 
@@ -114,9 +122,15 @@ class BatchedSimulation:
         self._high = torch.tensor(ACTION_HIGH, device=self.device)
 
     def reset(self, scenes: Sequence[Scene], seeds: Sequence[int], rows: Sequence[int]) -> BatchedFrame:
-        """Rebuild the starts of (task, scene, seed) in these rows, in ascending order; the others go on.
+        """Set up the starts of (task, scene, seed) in some rows; the other rows go on.
 
-        The first time in all rows.
+        Args:
+            scenes: one for each row in `rows`.
+            seeds: one for each row in `rows`.
+            rows: indices in ascending order; the first time all of them.
+
+        Returns:
+            The frame of all B rows.
         """
         started = [Episode(self.task, scene, seed) for scene, seed in zip(scenes, seeds, strict=True)]
         running = {**dict(enumerate(self.episodes)), **dict(zip(rows, started, strict=True))}
@@ -130,7 +144,8 @@ class BatchedSimulation:
     def step(self, actions: Tensor) -> BatchedFrame:
         """Apply actions (B, 7), clipped to the action box and to the workspace, for one control step.
 
-        ValueError if one is NaN: on CUDA nobody else looks, and the physics of all would be lost.
+        Raises:
+            ValueError: if an action is NaN. On CUDA nothing else checks, and the physics of all rows is lost.
         """
         clipped = actions.to(self.device).clamp(self._low, self._high)
         if bool(clipped.isnan().any()):
@@ -144,16 +159,17 @@ class BatchedSimulation:
         return self._frame()
 
     def object_positions(self) -> Tensor:
-        """(B, 3) centres of the objects."""
+        """Return the centres of the objects (B, 3), metres."""
         every = torch.stack([self.env.objects[name].pose.p for name in self.names], 1)
         active = torch.tensor([self.names.index(e.scene.object) for e in self.episodes], device=self.device)
         return every[torch.arange(len(active), device=self.device), active]
 
     def tcp_poses(self) -> Tensor:
-        """(B, 7) position and quaternion (wxyz)."""
+        """Return position and quaternion (wxyz) of the tool centre points (B, 7)."""
         return self.env.agent.tcp.pose.raw_pose
 
     def close(self) -> None:
+        """Release ManiSkill's environment."""
         self.env.close()
 
     def _frame(self) -> BatchedFrame:
@@ -173,11 +189,9 @@ class BatchedSimulation:
         )  # fmt: skip
 
     def _situations(self, tcp: Tensor, opening: Tensor) -> list[Situation]:
-        """What the task judges, row by row. tcp (B, 3), opening (B,)"""
-        things, places = (
-            values.cpu().numpy().astype(np.float64) for values in (self.object_positions(), tcp)
-        )
-        rows = zip(self.episodes, things, places, opening.tolist(), strict=True)
+        """Return what the task judges, row by row, for tcp (B, 3) and opening (B,)."""
+        objects, tcps = (values.cpu().numpy().astype(np.float64) for values in (self.object_positions(), tcp))
+        rows = zip(self.episodes, objects, tcps, opening.tolist(), strict=True)
         return [episode.situation(*row) for episode, *row in rows]
 
     def _images(self) -> dict[str, Tensor]:

@@ -1,7 +1,19 @@
-"""The things of the scenes, as numbers: nothing is downloaded. Metres, z up, table top at z = 0."""
+"""The things on the table, as numbers, and a user's own meshes in their place. Imports no simulator.
 
-from dataclasses import dataclass
-from typing import Final, Literal
+Nothing is downloaded. Units are metres, z points up, the table top is at z = 0.
+"""
+
+import hashlib
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+import yaml
+
+from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.suggestion import suggestion
+from lerobot_wmrl.maniskill.backend import require_simulator
 
 Shape = Literal["box", "cylinder", "ellipsoid", "revolved", "mesh"]
 Colour = tuple[float, float, float]
@@ -20,16 +32,20 @@ class MeshFile:
 
 @dataclass(frozen=True)
 class ObjectSpec:
-    """Something to manipulate, standing on the table.
+    """An object to manipulate, standing on the table.
 
     Args:
-        half_size: half extents in x, y, z. A cylinder stands upright.
+        name: key in `OBJECTS`, part of a scene.
+        shape: how its mesh is made. A cylinder stands upright.
+        half_size: half extents in x, y, z (m).
+        colour: RGB in [0, 1].
         label: how an instruction calls it.
         profile: outline of a revolved shape.
         lies: whether it is revolved around x, not z.
         lobes: bulges around the axis, as a bell pepper has them.
-        stalk: colour of a stalk at the upper (or far) end, which is only seen.
-        mesh: of the shape "mesh", which has its own colours.
+        stalk: colour of a stalk at the upper (or far) end, which has no collision shape.
+        density: kg/m³.
+        mesh: the file, for the shape "mesh". It has its own colours.
     """
 
     name: str
@@ -47,7 +63,7 @@ class ObjectSpec:
 
 @dataclass(frozen=True)
 class ContainerSpec:
-    """A plate (flat) or a bowl (with a rim): the target of pick_place, scenery in the other tasks."""
+    """A plate or a bowl: the target of pick_place, scenery in the other tasks. Metres."""
 
     name: str
     radius: float
@@ -114,9 +130,9 @@ OBJECTS: Final[dict[str, ObjectSpec]] = {
         ObjectSpec("glue_stick", "cylinder", (0.018, 0.018, 0.036), (0.45, 0.12, 0.62), "purple glue stick"),
     )
 }  # fmt: skip
-"""Twenty things, told apart by shape, size and colour, each narrow enough for the gripper (8 cm).
+"""Twenty objects that differ in shape, size and colour, each narrow enough for the gripper (8 cm).
 
-`assets.use_assets` puts a user's own in their places."""
+`use_assets` replaces some by a user's own meshes."""
 
 CONTAINERS: Final = {
     spec.name: spec
@@ -131,3 +147,108 @@ TABLES: Final[dict[str, Colour]] = {"wood": (0.50, 0.36, 0.22), "slate": (0.36, 
 CARPET_RADIUS: Final = 0.05
 CARPET_COLOUR: Final[Colour] = (0.10, 0.60, 0.85)
 """The target of move_to_aim: a flat round mat."""
+
+ASSET_KEYS: Final = ("mesh", "label", "scale", "density")
+MAX_ASSET_WIDTH: Final = 0.072
+"""Largest width along y (m) that the fingers, which open 8 cm, can grasp."""
+
+MIN_ASSET_HEIGHT: Final = 0.02
+"""Least height (m) that a closed gripper can push."""
+
+
+def use_assets(path: Path) -> None:
+    """Replace the objects that the file names by its meshes, in this process."""
+    OBJECTS.update(read_assets(path))
+
+
+def read_assets(path: Path) -> dict[str, ObjectSpec]:
+    """Read a user's own meshes (YCB or others), to use in place of the objects made by code.
+
+    Args:
+        path: a YAML file with one line an object, such as
+            `lemon: {mesh: ycb/014_lemon/textured.obj, label: lemon, scale: 1.0, density: 500}`. A relative
+            mesh is looked for beside the file; everything but `mesh` may be left out.
+
+    Returns:
+        Object name → its new specification.
+
+    Raises:
+        FieldError: names the entry that cannot be used, and the remedy.
+    """
+    try:
+        content = yaml.safe_load(path.read_text())
+    except (OSError, yaml.YAMLError) as error:
+        raise FieldError("assets", path, f"cannot be read ({error})") from error
+    if not isinstance(content, dict) or not all(isinstance(entry, dict) for entry in content.values()):
+        raise FieldError("assets", path, "must hold lines like lemon: {mesh: lemon.obj}")
+    return {name: _specification(path, str(name), entry) for name, entry in content.items()}
+
+
+def describe_assets(path: Path) -> dict[str, dict[str, Any]]:
+    """Describe a user's meshes by their content, wherever the files lie: object name → JSON values."""
+    described = {}
+    for name, spec in read_assets(path).items():
+        assert spec.mesh is not None
+        described[name] = {
+            "label": spec.label, "density": spec.density, "half_size": [round(x, 6) for x in spec.half_size],
+            "scale": spec.mesh.scale, "sha256": hashlib.sha256(Path(spec.mesh.path).read_bytes()).hexdigest(),
+        }  # fmt: skip
+    return described
+
+
+def _specification(path: Path, name: str, entry: dict[str, Any]) -> ObjectSpec:
+    _check_name(path, "object", name, tuple(OBJECTS))
+    for key in entry:
+        _check_name(path, f"key of {name}", str(key), ASSET_KEYS)
+    if "mesh" not in entry:
+        raise FieldError("assets", path, f"{name} has no mesh", "add mesh: and its file")
+    file = path.parent / str(entry["mesh"])
+    scale, density = (_positive(path, name, entry, *pair) for pair in (("scale", 1.0), ("density", 500.0)))
+    require_simulator()
+    import trimesh
+
+    try:
+        low, high = scale * np.asarray(trimesh.load(file, force="mesh").bounds)
+    except Exception as error:  # whatever a mesh format's reader raises
+        raise FieldError("assets", path, f"{name}.mesh={file} cannot be loaded ({error})") from error
+    half_size = (high - low) / 2
+    _check_size(path, name, half_size, scale)
+    centre = (low + high) / 2
+    return replace(
+        OBJECTS[name], shape="mesh", half_size=tuple(half_size.tolist()),
+        mesh=MeshFile(str(file.resolve()), scale, tuple(centre.tolist())),
+        label=str(entry.get("label", OBJECTS[name].label)), density=density,
+    )  # fmt: skip
+
+
+def _positive(path: Path, name: str, entry: dict[str, Any], key: str, default: float) -> float:
+    value = entry.get(key, default)
+    if not isinstance(value, int | float) or not 0 < value < np.inf:
+        raise FieldError("assets", path, f"{name}.{key}={value!r} must be a number above 0")
+    return float(value)
+
+
+def _check_name(path: Path, what: str, name: str, known: tuple[str, ...]) -> None:
+    if name in known:
+        return
+    raise FieldError("assets", path, f"the {what} {name!r} is unknown", suggestion(name, known))
+
+
+def _check_size(path: Path, name: str, half_size: np.ndarray, scale: float) -> None:
+    width, height = 2 * half_size[1], 2 * half_size[2]
+    if width > MAX_ASSET_WIDTH:
+        raise FieldError(
+            "assets",
+            path,
+            f"{name} is {100 * width:.1f} cm wide along y, more than the gripper gets around "
+            f"({100 * MAX_ASSET_WIDTH:.1f} cm)",
+            f"turn the mesh, or set its scale to at most {scale * MAX_ASSET_WIDTH / width:.3g}",
+        )
+    if height < MIN_ASSET_HEIGHT:
+        raise FieldError(
+            "assets",
+            path,
+            f"{name} is {100 * height:.2g} cm high, too low to be pushed (at least "
+            f"{100 * MIN_ASSET_HEIGHT:.0f} cm)",
+            "if its units are not metres, set its scale",
+        )

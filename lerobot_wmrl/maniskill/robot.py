@@ -1,4 +1,4 @@
-"""The robot: ManiSkill's Panda, commanded by delta poses in metres and radians along the base's axes."""
+"""The robot: ManiSkill's Panda, commanded by pose deltas in metres and radians along the base's axes."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,21 +15,21 @@ from sapien.wrapper.pinocchio_model import PinocchioModel
 CONTROL_MODE = "base_delta_pose"
 BASE_POSITION = (-0.615, 0.0, 0.0)
 POINTING_DOWN = (0.0, 1.0, 0.0, 0.0)
-"""The gripper's quaternion (wxyz) when it does."""
+"""Quaternion (wxyz) of a gripper that points down."""
 
 GRIPPER_OPEN = 0.04
 """Finger joint position (m) of the open gripper."""
 
 FINE_LINKS = ("panda_hand", "panda_leftfinger", "panda_rightfinger")
-"""Links whose outline decides whether there is contact keep more triangles."""
+"""Links that keep more triangles, because their outline shows whether there is contact."""
 
 
 @register_agent()
 class BaseAxesPanda(Panda):
-    """Panda whose rotation actions turn the way they say.
+    """Panda whose rotation actions turn by the angles they state.
 
     ManiSkill's own `pd_ee_delta_pose` scales rotations by its (negative) lower bound. Without normalisation
-    the action is metres and radians, and nothing is clipped: the caller clips to the action box.
+    the action is in metres and radians, and nothing is clipped: the caller clips to the action box.
     """
 
     uid = "wmrl_panda"
@@ -54,9 +54,9 @@ class BaseAxesPanda(Panda):
 
 
 class InverseKinematics:
-    """Joint positions of a gripper that points down, sought from the rest position, on the CPU.
+    """Inverse kinematics of a gripper that points down, on the CPU, starting from the rest position.
 
-    The same for one robot and for many, whatever they are simulated on: starts must not depend on it.
+    It runs on the CPU whatever the simulation runs on, so that starts do not depend on the device.
     """
 
     def __init__(self, agent: Panda) -> None:
@@ -71,7 +71,11 @@ class InverseKinematics:
         self.rest[-2:] = 0.0
 
     def solve(self, tcp: np.ndarray, finger: float) -> np.ndarray:
-        """(9,) joint positions for the TCP at `tcp` (3,), fingers at `finger` (m). RuntimeError if none."""
+        """Return joint positions (9,) for the TCP at `tcp` (3,) and fingers at `finger` (m).
+
+        Raises:
+            RuntimeError: if there are none.
+        """
         target = sapien.Pose(p=np.asarray(tcp) - np.array(BASE_POSITION), q=POINTING_DOWN)
         qpos, solved, _ = self.model.compute_inverse_kinematics(
             self.end_link, target, initial_qpos=self.rest, active_qmask=self.movable, max_iterations=200
@@ -83,12 +87,12 @@ class InverseKinematics:
 
 
 def lighten_meshes(robot: Any, detail: float) -> None:
-    """Replace the robot's visual meshes by decimated ones, `detail` of their triangles.
+    """Replace the robot's visual meshes by decimated ones with the share `detail` of their triangles.
 
     Software rendering is bound by vertices: 4 % of the triangles draw several times faster and look the same
     at 64 and 128 px.
     """
-    known: dict[tuple[str, int, int], tuple[np.ndarray, ...]] = {}  # robots beside each other are alike
+    known: dict[tuple[str, int, int], tuple[np.ndarray, ...]] = {}  # robots beside each other share meshes
     for name, body in _render_bodies(robot):
         share = min(1.0, 3.0 * detail) if name in FINE_LINKS else detail
         light = sapien.render.RenderBodyComponent()
@@ -115,7 +119,11 @@ def _render_bodies(robot: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _decimated(part: Any, share: float, smallest: int = 120) -> tuple[np.ndarray, ...]:
-    """A mesh part with `share` of its triangles, at least `smallest`: vertices, triangles, normals, no uv."""
+    """Return a mesh part with `share` of its triangles, at least `smallest`.
+
+    Returns:
+        Vertices (V, 3), triangles (F, 3), normals (V, 3), and an empty array for texture coordinates.
+    """
     vertices, inverse = np.unique(np.asarray(part.vertices, np.float32).round(5), axis=0, return_inverse=True)
     triangles = inverse.reshape(-1)[np.asarray(part.triangles)].astype(np.int32)
     reduction = 1.0 - max(smallest, share * len(triangles)) / len(triangles)
@@ -127,7 +135,7 @@ def _decimated(part: Any, share: float, smallest: int = 120) -> tuple[np.ndarray
 
 
 def _vertex_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """(V, 3) area-weighted mean of the adjoining faces' normals."""
+    """Return the area-weighted mean of the adjoining faces' normals at each vertex (V, 3)."""
     corners = vertices[triangles]
     faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals = np.zeros_like(vertices, dtype=np.float64)

@@ -1,10 +1,14 @@
-"""The table of scenes: object x container x table, and which training may see. Imports no simulator."""
+"""The scenes: every object with every container on every table, and which of them training may see.
+
+Imports no simulator.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Final, Literal, get_args
 
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS, TABLES
 
 Split = Literal["ind", "ood"]
@@ -13,9 +17,15 @@ SPLITS: Final[tuple[str, ...]] = get_args(Split)
 
 @dataclass(frozen=True)
 class Scene:
-    """One scene. `split` is "ind" (in-domain: recorded and trained on) or "ood" (held out).
+    """What is on the table, and whether training may see it.
 
-    An "ood" scene has either an object that no "ind" scene has, or a new combination of known things.
+    Args:
+        index: stored in datasets, so it never changes.
+        object: key of `objects.OBJECTS`.
+        container: key of `objects.CONTAINERS`.
+        table: key of `objects.TABLES`.
+        split: "ind" (in domain: recorded and trained on) or "ood" (held out). An "ood" scene has either an
+            object that no "ind" scene has, or a new combination of known things.
     """
 
     index: int
@@ -40,18 +50,18 @@ _FIRST: Final = (
     ("lime", "bowl", "slate"),
     ("tomato_can", "plate", "wood"),
 )
-"""Scenes whose index datasets held before there were eighty."""
+"""The first scenes that there were: their indices are in datasets."""
 
 
 def _make_scenes() -> tuple[Scene, ...]:
-    """Every object with every container on every table; the index is stored in datasets: append only."""
+    """Return every object with every container on every table. Datasets store indices: append only."""
     every = product(OBJECTS, CONTAINERS, TABLES)
     rows = [*_FIRST, *(row for row in every if row not in _FIRST)]
     return tuple(Scene(index, *row, split=_split(*row[:2])) for index, row in enumerate(rows))
 
 
-def _split(thing: str, container: str) -> Split:
-    held_out = thing in UNSEEN_OBJECTS or (thing, container) in UNSEEN_COMBINATIONS
+def _split(object_name: str, container: str) -> Split:
+    held_out = object_name in UNSEEN_OBJECTS or (object_name, container) in UNSEEN_COMBINATIONS
     return "ood" if held_out else "ind"
 
 
@@ -60,27 +70,34 @@ SCENES: Final = _make_scenes()
 
 
 def scenes_of(split: str, scenes: Sequence[int] | None = None) -> tuple[Scene, ...]:
-    """The scenes of a split, or those of `scenes` (indices), all of that split. ValueError otherwise."""
+    """Return the scenes of a split, or those with the indices `scenes`, which must belong to it.
+
+    Raises:
+        FieldError: if the split is unknown, or a scene does not belong to it.
+    """
     if split not in SPLITS:
-        raise ValueError(f"split={split!r} is unknown; choose one of {', '.join(SPLITS)}")
+        raise FieldError("split", split, f"unknown; choose one of {', '.join(SPLITS)}")
     members = {scene.index: scene for scene in SCENES if scene.split == split}
     if scenes is None:
         return tuple(members.values())
     unknown = [index for index in scenes if index not in members]
     if unknown or not scenes:
-        raise ValueError(
-            f"scenes={list(scenes)}: the split {split!r} has {sorted(members)} (see --list_scenes=true)"
+        raise FieldError(
+            "scenes",
+            list(scenes),
+            f"the split {split!r} has {sorted(members)}",
+            "lerobot-wmrl-record --list_scenes=true shows them",
         )
     return tuple(members[index] for index in scenes)
 
 
 def scene_for_seed(scenes: Sequence[Scene], seed: int) -> Scene:
-    """The scene of an episode seed: consecutive seeds visit `scenes` in turn."""
+    """Return the scene of an episode seed: consecutive seeds visit `scenes` in turn."""
     return scenes[seed % len(scenes)]
 
 
 def describe_scenes() -> str:
-    """The table as text, one scene a line."""
+    """Return the table of scenes as text, one scene a line."""
     rows = [("index", "object", "container", "table", "split")]
     rows += [(str(s.index), s.object, s.container, s.table, s.split) for s in SCENES]
     return "\n".join("  ".join(f"{cell:<10}" for cell in row).rstrip() for row in rows)

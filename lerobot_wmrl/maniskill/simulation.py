@@ -1,75 +1,188 @@
-"""One simulated episode at a time, in numpy: what the recorder and the environments drive."""
+"""The simulator: a ManiSkill table with a Panda (`TabletopEnv`), and one episode on it at a time in numpy
+(`Simulation`), which the recorder and the environments drive.
+
+Every object and container of the scenes is built once. Only the active scene's things stand on the table; the
+others are parked out of sight. Changing the scene therefore costs nothing, where rebuilding it would cost
+most of a second."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any, Final
 
 import numpy as np
+import sapien
 import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils.structs.types import SimConfig
+from transforms3d.euler import euler2quat
 
-from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW, FPS, WORKSPACE_FLOOR
-from lerobot_wmrl.maniskill.cameras import VIEWS
+from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW, FPS
+from lerobot_wmrl.maniskill.actors import build_carpet, build_container, build_object, build_table
+from lerobot_wmrl.maniskill.backend import render_backend
+from lerobot_wmrl.maniskill.cameras import VIEWS, Rendering
+from lerobot_wmrl.maniskill.episode import WORKSPACE_FLOOR, Episode, Frame
 from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS
-from lerobot_wmrl.maniskill.renderer import render_backend
-from lerobot_wmrl.maniskill.rendering import Rendering, Variation
-from lerobot_wmrl.maniskill.robot import GRIPPER_OPEN
+from lerobot_wmrl.maniskill.rendering import AMBIENT, SUN, SUN_DIRECTION, Variation, camera_config
+from lerobot_wmrl.maniskill.robot import (
+    BASE_POSITION,
+    CONTROL_MODE,
+    GRIPPER_OPEN,
+    BaseAxesPanda,
+    InverseKinematics,
+    lighten_meshes,
+)
 from lerobot_wmrl.maniskill.scenes import Scene
-from lerobot_wmrl.maniskill.tabletop import TabletopEnv
 from lerobot_wmrl.maniskill.tasks import Situation, Start, Task
 
+PHYSICS_STEPS: Final = 4
+"""Physics steps per control step."""
 
-@dataclass(frozen=True)
-class Frame:
-    """What is known at one control step.
+TABLE_POSITION: Final = (-0.1, 0.0, -0.05)
+PARKING: Final = (-3.0, 3.0, 0.3)
+"""Where the first of the parked things stands (m); the others stand in a row beside it."""
 
-    Args:
-        images: camera → (H, W, 3) uint8.
-        depth: camera → (H, W, 1) uint16, millimetres along the camera's axis, 0 where nothing is; no entry
-            unless it was asked for.
-        state: (8,) float32, `constants.STATE_NAMES`.
-        reward: the task's rule-based reward of being here.
-        success: whether the task is solved here.
-    """
-
-    images: dict[str, np.ndarray]
-    depth: dict[str, np.ndarray]
-    state: np.ndarray
-    reward: float
-    success: bool
+CARPET: Final = "carpet"
+ANGULAR_DAMPING: Final = 5.0
+"""Makes round objects come to rest."""
 
 
-class Episode:
-    """What is to be remembered of an episode in order to judge it.
+class TabletopEnv(BaseEnv):
+    """One robot, one table, the things of some scenes. `Simulation`, which owns it, takes the pictures.
 
     Args:
-        task, scene, seed: which together decide its start.
+        scenes: the scenes that may be set up.
+        rendering: which pictures are taken.
+        num_envs: tables beside each other; 1 on the CPU.
+        sim_backend: ManiSkill's name of the physics.
+        **kwargs: passed on to ManiSkill.
     """
 
-    object_start: np.ndarray
-    object_before: np.ndarray
+    SUPPORTED_ROBOTS = [BaseAxesPanda.uid]  # noqa: RUF012 (ManiSkill's own declaration)
+    agent: BaseAxesPanda
 
-    def __init__(self, task: Task, scene: Scene, seed: int) -> None:
-        self.scene, self.seed, self.start = scene, seed, task.start(scene, seed)
-
-    def begin(self, position: np.ndarray) -> None:
-        """The object has been put at `position` (3,)."""
-        self.object_start = self.object_before = position
-
-    def situation(self, position: np.ndarray, tcp: np.ndarray, opening: float) -> Situation:
-        """What the task judges when the object is at `position` (3,), the TCP at `tcp` (3,)."""
-        return Situation(
-            self.start, OBJECTS[self.scene.object], CONTAINERS[self.scene.container],
-            self.object_start, position, tcp, opening,
-            float(np.linalg.norm(position - self.object_before)) * FPS,
+    def __init__(
+        self,
+        scenes: Sequence[Scene],
+        rendering: Rendering,
+        num_envs: int = 1,
+        sim_backend: str = "physx_cpu",
+        **kwargs: Any,
+    ) -> None:
+        self.scenes, self.rendering = tuple(scenes), rendering
+        super().__init__(
+            num_envs=num_envs, obs_mode="none", reward_mode="none", control_mode=CONTROL_MODE,
+            robot_uids=BaseAxesPanda.uid, sim_backend=sim_backend, **kwargs,
         )  # fmt: skip
+
+    @property
+    def _default_sim_config(self) -> SimConfig:
+        return SimConfig(sim_freq=PHYSICS_STEPS * FPS, control_freq=FPS)
+
+    @property
+    def _default_sensor_configs(self) -> list[Any]:
+        size, robot = self.rendering.image_size, self.agent.robot
+        return [camera_config(name, size, robot) for name in self.rendering.cameras]
+
+    def _load_agent(self, options: dict, *args: Any, **kwargs: Any) -> None:
+        super()._load_agent(options, sapien.Pose(p=BASE_POSITION))
+        if self.rendering.robot_mesh_detail < 1.0:
+            lighten_meshes(self.agent.robot, self.rendering.robot_mesh_detail)
+
+    def _load_scene(self, options: dict) -> None:
+        names = {kind: _names(self.scenes, kind) for kind in ("object", "container", "table")}
+        self.parking = self.parking_places(names["object"], [*names["container"], *names["table"], CARPET])
+        places, scene = self.parking, self.scene
+        self.objects = {n: build_object(scene, OBJECTS[n], places[n]) for n in names["object"]}
+        self.containers = {n: build_container(scene, CONTAINERS[n], places[n]) for n in names["container"]}
+        self.carpets = {CARPET: build_carpet(scene, places[CARPET])}
+        self.tables = {n: build_table(scene, n, places[n]) for n in names["table"]}
+        for actor in self.objects.values():
+            for body in actor._bodies:
+                body.set_angular_damping(ANGULAR_DAMPING)
+        self.inverse_kinematics = InverseKinematics(self.agent)
+
+    def parking_places(self, movable: Sequence[str], fixed: Sequence[str]) -> dict[str, sapien.Pose]:
+        """Return where each thing is while no episode needs it.
+
+        Args:
+            movable: names of the objects.
+            fixed: names of what never moves by itself: containers, tables, the mat.
+        """
+        names = [*movable, *fixed]
+        return {
+            name: sapien.Pose(p=[PARKING[0], PARKING[1] + 3.0 * index, PARKING[2]])
+            for index, name in enumerate(names)
+        }
+
+    def _load_lighting(self, options: dict) -> None:
+        self.scene.set_ambient_light(AMBIENT)
+        self.scene.add_directional_light(
+            direction=SUN_DIRECTION,
+            color=SUN,
+            shadow=True,  # the gripper's shadow shows its height
+            shadow_scale=0.4,
+            shadow_near=-1.5,
+            shadow_far=1.5,
+            shadow_map_size=256,
+        )
+
+    def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
+        """Do nothing: `place` puts everything where the task's start says."""
+
+    def place(self, scene: Scene, start: Start) -> None:
+        """Put the scene's things and the robot where the episode starts, at rest."""
+        places = arrangement(scene, start)
+        for actors in (self.tables, self.containers, self.carpets, self.objects):
+            _show_only(actors, places, self.parking)
+        self.active = self.objects[scene.object]
+        self.agent.reset(self.start_qpos(start))
+        self.agent.controller.reset()
+
+    def start_qpos(self, start: Start) -> np.ndarray:
+        """Return the robot's joint positions (9,) at the start."""
+        return self.inverse_kinematics.solve(start.tcp, GRIPPER_OPEN if start.gripper_open else 0.0)
+
+
+def arrangement(scene: Scene, start: Start) -> dict[str, sapien.Pose]:
+    """Return the poses of the table and of what stands on it, by name."""
+    height = OBJECTS[scene.object].half_size[2]
+    places = {
+        scene.table: sapien.Pose(p=TABLE_POSITION),
+        scene.container: sapien.Pose(p=[*start.container_xy, 0.0]),
+        scene.object: sapien.Pose(p=[*start.object_xy, height], q=euler2quat(0, 0, start.object_yaw)),
+    }
+    if start.carpet_xy is not None:
+        places[CARPET] = sapien.Pose(p=[*start.carpet_xy, 0.0])
+    return places
+
+
+def _names(scenes: Sequence[Scene], field: str) -> list[str]:
+    return sorted({getattr(scene, field) for scene in scenes})
+
+
+def _show_only(
+    actors: dict[str, Any], places: dict[str, sapien.Pose], parking: dict[str, sapien.Pose]
+) -> None:
+    """Put the actors that `places` names there, at rest; park the others: hidden, immovable, far away."""
+    for name, actor in actors.items():
+        entity = actor._objs[0]
+        body = entity.find_component_by_type(sapien.physx.PhysxRigidDynamicComponent)
+        visual = entity.find_component_by_type(sapien.render.RenderBodyComponent)
+        visual.visibility = float(name in places)
+        entity.set_pose(places.get(name, parking[name]))
+        if actor.px_body_type == "dynamic":
+            body.set_kinematic(name not in places)
+            if name in places:
+                body.set_linear_velocity(np.zeros(3))
+                body.set_angular_velocity(np.zeros(3))
 
 
 class Simulation:
     """A ManiSkill table that plays episodes of one task in some scenes.
 
     Args:
-        task: what succeeds and what pays; another may be set before a reset.
+        task: defines starts, success and reward; another task may be set before a reset.
         scenes: the scenes that may be asked for.
-        rendering: what pictures are taken.
+        rendering: which pictures are taken.
     """
 
     def __init__(self, task: Task, scenes: Sequence[Scene], rendering: Rendering = Rendering()) -> None:  # noqa: B008 (frozen)
@@ -82,7 +195,7 @@ class Simulation:
         self._low, self._high = np.array(ACTION_LOW, np.float32), np.array(ACTION_HIGH, np.float32)
 
     def reset(self, scene: Scene, seed: int) -> Frame:
-        """Rebuild the start of (task, scene, seed). The same arguments give the same frame."""
+        """Set up the start of (task, scene, seed). The same arguments give the same frame."""
         self.episode = Episode(self.task, scene, seed)
         self.env.place(scene, self.episode.start)
         self.variation.draw(seed, self.task.index, scene.index)
@@ -99,37 +212,40 @@ class Simulation:
 
     @property
     def current_start(self) -> Start:
+        """Start of the running episode."""
         return self.episode.start
 
     @property
     def instruction(self) -> str:
+        """Instruction of the running episode."""
         return self.current_start.instruction
 
     @property
     def object_position(self) -> np.ndarray:
-        """(3,) centre of the object."""
+        """Centre of the object (3,), metres."""
         return np.asarray(self.env.active._objs[0].pose.p, np.float64)
 
     @property
     def gripper_opening(self) -> float:
-        """0 closed to 1 open."""
+        """From 0 (closed) to 1 (open)."""
         return float(np.clip(self.env.agent.robot._objs[0].qpos[-1] / GRIPPER_OPEN, 0.0, 1.0))
 
     @property
     def tcp_position(self) -> np.ndarray:
-        """(3,)"""
+        """Position of the tool centre point (3,), metres."""
         return np.asarray(self.env.agent.tcp._objs[0].entity.pose.p, np.float64)
 
     def situation(self) -> Situation:
-        """What the task judges now."""
+        """Return what the task judges now."""
         return self.episode.situation(self.object_position, self.tcp_position, self.gripper_opening)
 
     def close(self) -> None:
+        """Release ManiSkill's environment."""
         self.env.close()
 
     def _frame(self) -> Frame:
         situation = self.situation()
-        images, depth = self._pictures()
+        images, depth = self._take_pictures()
         reward, success = self.task.reward(situation), self.task.success(situation)
         return Frame(images, depth, self._state(), reward, success)
 
@@ -137,8 +253,8 @@ class Simulation:
         pose = self.env.agent.tcp._objs[0].entity.pose
         return np.array([*pose.p, *continuous(pose.q), self.gripper_opening], np.float32)
 
-    def _pictures(self) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """Images and depth of every camera."""
+    def _take_pictures(self) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+        """Take images and, if asked for, depth with every camera."""
         images: dict[str, np.ndarray] = {}
         depth: dict[str, np.ndarray] = {}
         if self.cameras:
@@ -153,8 +269,8 @@ class Simulation:
 
 
 def continuous(quaternion: np.ndarray) -> np.ndarray:
-    """q or −q, which are the same rotation: the one nearer to a hand that points down, (0, 1, 0, 0) wxyz.
+    """Return q or −q, the same rotation: the one nearer to a hand that points down, (0, 1, 0, 0) wxyz.
 
-    Otherwise the sign jumps while nothing moves, and drowns the statistics and whoever learns from them.
+    Otherwise the sign would jump while nothing moves, which dominates statistics and losses.
     """
     return -quaternion if quaternion[1] < 0 else quaternion

@@ -13,8 +13,8 @@ from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
 from lerobot_wmrl.envs.maniskill_tensor_env import ManiSkillTensorEnv
 from lerobot_wmrl.maniskill.batched import BatchedFrame
+from lerobot_wmrl.maniskill.episode import Episode
 from lerobot_wmrl.maniskill.scenes import Scene
-from lerobot_wmrl.maniskill.simulation import Episode
 from lerobot_wmrl.maniskill.tasks import TASKS
 
 HORIZON = 3

@@ -12,7 +12,7 @@ from lerobot_dataset_maniskill.recorder import merge, missing_parts
 from lerobot_dataset_maniskill.worker import PartRecorder
 from lerobot_dataset_maniskill.writer import Outcome, StartColumns, add_step
 from lerobot_wmrl.common.constants import TASKS
-from lerobot_wmrl.maniskill.simulation import Frame
+from lerobot_wmrl.maniskill.episode import Frame
 
 ROWS = 10
 SUCCESS_ROW = 5

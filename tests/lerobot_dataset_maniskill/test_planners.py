@@ -19,8 +19,8 @@ from lerobot_dataset_maniskill.planners.slide import (
     stop_short,
 )
 from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW, PLAY
+from lerobot_wmrl.maniskill.cameras import Rendering
 from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS
-from lerobot_wmrl.maniskill.rendering import Rendering
 from lerobot_wmrl.maniskill.scenes import SCENES, Scene
 from lerobot_wmrl.maniskill.simulation import Simulation
 from lerobot_wmrl.maniskill.tasks import TASKS, Push

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from lerobot_wmrl.maniskill.rendering import Rendering
+from lerobot_wmrl.maniskill.cameras import Rendering
 from lerobot_wmrl.maniskill.scenes import SCENES
 from lerobot_wmrl.maniskill.simulation import Simulation
 from lerobot_wmrl.maniskill.tasks import Push

@@ -8,8 +8,7 @@ import pytest
 import trimesh
 
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
-from lerobot_wmrl.maniskill.assets import read_assets
-from lerobot_wmrl.maniskill.objects import OBJECTS
+from lerobot_wmrl.maniskill.objects import OBJECTS, read_assets
 from lerobot_wmrl.maniskill.scenes import SCENES
 
 
@@ -57,5 +56,5 @@ def test_a_mesh_takes_the_place_of_an_object(assets: Path) -> None:
 )
 def test_what_cannot_be_used_is_named(assets: Path, text: str, message: str) -> None:
     assets.write_text(text)
-    with pytest.raises(ValueError, match=rf"--env.assets=.*{message}"):
+    with pytest.raises(ValueError, match=rf"assets=.*{message}"):
         read_assets(assets)

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from lerobot_wmrl.maniskill.batched import BatchedSimulation
-from lerobot_wmrl.maniskill.rendering import Rendering
+from lerobot_wmrl.maniskill.cameras import Rendering
 from lerobot_wmrl.maniskill.scenes import SCENES
 from lerobot_wmrl.maniskill.simulation import Simulation
 from lerobot_wmrl.maniskill.tasks import TASKS

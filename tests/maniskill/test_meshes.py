@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lerobot_wmrl.maniskill.meshes import container_mesh, object_mesh
+from lerobot_wmrl.maniskill.actors import container_mesh, object_mesh
 from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS
 
 ROUND = [name for name, spec in OBJECTS.items() if spec.shape in ("ellipsoid", "revolved")]

@@ -41,7 +41,7 @@ def test_scenes_of_another_split_cannot_be_chosen() -> None:
     held_out = scenes_of("ood")[0].index
     with pytest.raises(ValueError, match="split 'ind' has"):
         scenes_of("ind", [held_out])
-    with pytest.raises(ValueError, match="split='test' is unknown"):
+    with pytest.raises(ValueError, match="split=test: unknown"):
         scenes_of("test")
 
 

@@ -5,12 +5,12 @@ import pytest
 import sapien
 from transforms3d.quaternions import qconjugate, qmult, quat2axangle
 
-from lerobot_wmrl.common.constants import ACTION_HIGH, IMAGE_SIZE, ROBOT_MESH_DETAIL, WORKSPACE_FLOOR
-from lerobot_wmrl.maniskill import renderer
-from lerobot_wmrl.maniskill.cameras import VIEWS
-from lerobot_wmrl.maniskill.rendering import Rendering
+from lerobot_wmrl.common.constants import ACTION_HIGH
+from lerobot_wmrl.maniskill import backend
+from lerobot_wmrl.maniskill.cameras import IMAGE_SIZE, ROBOT_MESH_DETAIL, VIEWS, Rendering
+from lerobot_wmrl.maniskill.episode import WORKSPACE_FLOOR, Frame
 from lerobot_wmrl.maniskill.scenes import SCENES
-from lerobot_wmrl.maniskill.simulation import Frame, Simulation
+from lerobot_wmrl.maniskill.simulation import Simulation
 from lerobot_wmrl.maniskill.tasks import Push
 
 CLOSED = -1.0
@@ -145,8 +145,8 @@ def test_without_a_device_the_error_says_what_to_do(monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr(sapien, "Device", no_device)
     monkeypatch.setattr(sapien.render, "get_device_summary", lambda: "")
-    with pytest.raises(renderer.NoRendererError, match="make setup"):
-        renderer.render_backend()
+    with pytest.raises(backend.NoRendererError, match="make setup"):
+        backend.render_backend()
 
 
 def rendered(rendering: Rendering, seed: int) -> Frame:

@@ -115,5 +115,5 @@ def test_the_object_starts_clear_of_the_container(task: Task) -> None:
 
 
 def test_an_unknown_task_is_named() -> None:
-    with pytest.raises(ValueError, match="task='juggle' is unknown; choose one of push"):
+    with pytest.raises(ValueError, match="task=juggle: unknown; choose one of push"):
         task_of("juggle")

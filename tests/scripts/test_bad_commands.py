@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from lerobot_dataset_maniskill.record import main as record
-from lerobot_wmrl.maniskill import renderer
+from lerobot_wmrl.maniskill import backend
 from lerobot_wmrl.scripts.convert_openvla import main as convert_openvla
 from lerobot_wmrl.scripts.demo import main as demo
 from lerobot_wmrl.scripts.eval_world_model import main as eval_world_model
@@ -82,7 +82,7 @@ def test_without_a_renderer_nothing_is_recorded(
 
     monkeypatch.setattr(sapien, "Device", no_device)
     monkeypatch.setattr(sapien.render, "get_device_summary", lambda: "")
-    assert renderer.REMEDY in error_of(record, [f"--output_dir={tmp_path / 'new'}"], monkeypatch, capfd)
+    assert backend.NO_RENDERER in error_of(record, [f"--output_dir={tmp_path / 'new'}"], monkeypatch, capfd)
     assert not list(tmp_path.iterdir())
 
 

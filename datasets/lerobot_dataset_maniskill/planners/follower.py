@@ -6,7 +6,8 @@ from typing import Final
 
 import numpy as np
 
-from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW, WORKSPACE_FLOOR
+from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW
+from lerobot_wmrl.maniskill.episode import WORKSPACE_FLOOR
 
 GAIN: Final = 2.0
 """Commanded delta over remaining distance; the arm achieves about a third of a command in one step."""

@@ -8,8 +8,7 @@ import numpy as np
 from lerobot_dataset_maniskill.planners.follower import Waypoint, above_table
 from lerobot_dataset_maniskill.planners.kinds import FINGER_HALF_THICKNESS, Planner, Waypoints
 from lerobot_wmrl.maniskill.objects import ContainerSpec, ObjectSpec
-from lerobot_wmrl.maniskill.tasks import Start
-from lerobot_wmrl.maniskill.tasks.push import Pull, Push, Slide
+from lerobot_wmrl.maniskill.tasks import Pull, Push, Slide, Start
 
 MARGIN: Final = 0.04
 """How much further than success demands a good slide aims (m), so that a clone stops no hair early."""
