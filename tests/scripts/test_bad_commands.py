@@ -26,7 +26,7 @@ ROLL_OUT = ["--policy.path={policy}", *SIMULATOR, "--num_episodes=1"]
 
 
 @pytest.mark.parametrize(("command", "flags", "message"), [
-    (record, [*SIMULATOR, "--env.task=juggle"], "task='juggle' is unknown; choose one of push"),
+    (record, [*SIMULATOR, "--env.task=juggle"], "task=juggle: unknown; choose one of push"),
     (record, ["--preset=huge"], "--preset=huge: unknown preset; choose one of cpu, demo"),
     (record, ["--push_to_hub=true"], "called local/new; give its name on the hub, --repo_id=user/name"),
     (record, ["--output_dir={foreign}"], "foreign holds something else"),
