@@ -19,12 +19,12 @@ from typing import Any
 
 from lerobot.utils.import_utils import register_third_party_plugins
 
-from lerobot_wmrl.common.presets import DEMO_SCENES, Flags, format_flags, preset_flags
+from lerobot_wmrl.common.presets import Flags, format_flags, preset_flags
 from lerobot_wmrl.demo.pipeline import claimed, run_stages
 from lerobot_wmrl.demo.stages import Stage, checkpoint
 
-SCENES: Flags = {"env.scenes": DEMO_SCENES}
-UNSEEN_SCENES: Flags = {"env.split": "ood"}
+SCENES: Flags = {"env.scenes": "[0,1,2]"}
+UNSEEN_SCENES: Flags = {"env.split": "ood", "env.scenes": "null"}
 
 CAMERAS = "[third_view,side_view]"
 """Both stand still: what moves in them is what happens."""
@@ -198,7 +198,7 @@ def main() -> None:
     parser.add_argument(
         "--depth", default="false", choices=("true", "false"), help="record it, for world_model_ablation.py"
     )
-    parser.add_argument("--scenes", default=DEMO_SCENES, help="indices of scenes, as in [0,1,2]")
+    parser.add_argument("--scenes", default="[0,1,2]", help="indices of scenes, as in [0,1,2]")
     given, model_flags = parser.parse_known_args()
     depth = given.depth == "true"
     scenes: Flags = {"env.scenes": given.scenes}

@@ -16,7 +16,7 @@ from typing import Any, Final
 
 from matplotlib.figure import Figure
 
-from lerobot_wmrl.common.presets import PRESETS, Flags
+from lerobot_wmrl.common.presets import Flags, preset_settings
 from lerobot_wmrl.data.episode_table import open_dataset
 from lerobot_wmrl.demo.report.figures import COLOURS, tidy
 from world_model_ablation import add_arguments, compare, results_table
@@ -38,7 +38,7 @@ PANELS: Final = (("data", "episodes"), ("time", "minutes"), ("size", "parameters
 
 def variants(preset: str, steps: int | None, episodes: int) -> dict[str, Flags]:
     """Name → what differs from the full training on `episodes` of them."""
-    full = steps or int(PRESETS[preset]["train-world-model:action_world_model"]["steps"])
+    full = steps or int(preset_settings(preset, "train-world-model", ["action_world_model"])["steps"])
     data = {
         f"data_{name}": {"dataset.episodes": str(list(range(0, episodes, part)))}
         for name, part in PARTS.items()

@@ -29,7 +29,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.malloc import keep_freed_memory
 from lerobot_wmrl.common.precision import imagination_dtype
-from lerobot_wmrl.common.presets import PRESETS, preset_flags
+from lerobot_wmrl.common.presets import preset_flags, presets_of
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig
 from lerobot_wmrl.world_models.checkpoint import load_model
@@ -137,7 +137,7 @@ def main() -> None:
     )
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("--world_model", help="output folder of an action world model's training")
-    sizes = [name for name, commands in PRESETS.items() if "train-world-model:action_world_model" in commands]
+    sizes = list(presets_of("train-world-model"))
     source.add_argument("--sizes", choices=sizes, help="random weights of this preset's sizes")
     parser.add_argument("--batches", type=int, nargs="+", default=BATCHES, help="batch sizes")
     parser.add_argument("--device", help="cpu or cuda; by default CUDA if there is any")

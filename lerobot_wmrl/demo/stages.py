@@ -10,7 +10,7 @@ from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 
 from lerobot_wmrl.common.checkpoints import LAST_CHECKPOINT, latest_checkpoint
 from lerobot_wmrl.common.constants import EVALUATION_SEED
-from lerobot_wmrl.common.presets import DEMO_IMAGE_SIZE, DEMO_SCENES, Flags, format_flags, preset_flags
+from lerobot_wmrl.common.presets import Flags, format_flags, preset_flags
 from lerobot_wmrl.demo.episodes import optimal_episodes
 
 SEED_STRIDE = 100_000
@@ -197,14 +197,7 @@ def reinforce(config: DemoConfig) -> list[str]:
 
 def evaluate(config: DemoConfig, policy: str) -> list[str]:
     """LeRobot's own evaluation, on the same held-out starts for every policy and every demo seed."""
-    real: Flags = {
-        "env.type": "wmrl_maniskill",
-        "env.task": "push",
-        "env.split": "ind",
-        "env.scenes": DEMO_SCENES,
-        "env.image_size": DEMO_IMAGE_SIZE,
-    }
-    return success_rate(config, policy, real, preset="eval", folder=f"eval_{policy}")
+    return success_rate(config, policy, {}, preset="eval", folder=f"eval_{policy}")
 
 
 def imagine(config: DemoConfig, policy: str) -> list[str]:

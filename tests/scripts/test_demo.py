@@ -12,7 +12,7 @@ import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wmrl.common.constants import EVALUATION_SEED
-from lerobot_wmrl.common.presets import PRESETS
+from lerobot_wmrl.common.presets import preset_settings
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data.recorded_episodes import recorded_episodes
 from lerobot_wmrl.demo.stages import DemoConfig, demo_stages
@@ -99,7 +99,9 @@ def test_no_held_out_seed_is_trained_on(outputs: tuple[Path, str]) -> None:
         assert recorded_episodes(demo / dataset)["seed"].max() < EVALUATION_SEED
     for policy in ("sft", "rl"):
         rollouts = recorded_episodes(demo / f"rollouts_{policy}")["seed"]
-        evaluated = range(EVALUATION_SEED, EVALUATION_SEED + int(PRESETS["tiny"]["demo"]["eval_episodes"]))
+        evaluated = range(
+            EVALUATION_SEED, EVALUATION_SEED + int(preset_settings("tiny", "demo")["eval_episodes"])
+        )
         assert rollouts.min() >= EVALUATION_SEED
         assert not set(rollouts.tolist()) & set(evaluated)
 
@@ -114,7 +116,7 @@ def test_both_policies_meet_the_same_held_out_starts(outputs: tuple[Path, str]) 
 def test_the_summary_counts_what_was_evaluated(outputs: tuple[Path, str]) -> None:
     demo, _ = outputs
     summary = json.loads((demo / "summary.json").read_text())
-    n = PRESETS["tiny"]["demo"]["eval_episodes"]
+    n = preset_settings("tiny", "demo")["eval_episodes"]
     for policy in ("sft", "rl"):
         assert [summary["policies"][policy][key]["n"] for key in ("maniskill", "imagined")] == [n, n]
         replayed = summary["policies"][policy]
