@@ -1,8 +1,8 @@
 """Presets: YAML files of settings, one a command and size, that `--preset` and `--config_path` both read.
 
-`--preset=demo` is replaced, in place, by the settings in `lerobot_wmrl/presets/demo/<command>.yaml` as flags, so
-that flags further right override it. Where a command differs by what it trains, the file is called
-`<command>.<type>.yaml`. Every file is a configuration that LeRobot's `--config_path=FILE` reads too.
+`--preset=demo` is replaced, in place, by the flags of `lerobot_wmrl/presets/demo/<command>.yaml`: what stands
+further right overrides it. Where a command differs by what it trains, the file is `<command>.<type>.yaml`.
+Every file is a configuration that LeRobot's `--config_path=FILE` reads too.
 """
 
 import json
@@ -30,8 +30,8 @@ PREFIX: Final = "lerobot-wmrl-"
 def expand_preset(argv: Sequence[str], command: str) -> list[str]:
     """Replace `--preset=NAME` in `argv` by that preset's flags for `command`.
 
-    Where another type is typed than the preset's (`--algorithm.type=grpo`), the preset's settings of that type
-    are left out.
+    Where another type is typed than the preset's (`--algorithm.type=grpo`), the preset's settings of its own
+    type are left out.
     """
     split = [argument.partition("=") for argument in argv]
     types = {name.removeprefix("--"): value for name, _, value in split if name.endswith(TYPE)}

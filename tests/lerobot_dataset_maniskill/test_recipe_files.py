@@ -28,7 +28,7 @@ def test_flags_stand_where_the_recipe_stood(recipe: Callable[[str], Path]) -> No
     expanded = expand_recipes(["--seed=1", f"--recipe={path}", "--num_episodes=9"])
     assert expanded == [
         "--seed=1", "--num_episodes=7", "--env.type=wmrl_maniskill",
-        '--env.cameras=["third_view", "wrist"]', "--num_episodes=9",
+        "--env.cameras=[third_view,wrist]", "--num_episodes=9",
     ]  # fmt: skip
 
 
