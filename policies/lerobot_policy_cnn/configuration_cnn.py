@@ -1,46 +1,38 @@
 """Configuration of the small image policy, `--policy.type=cnn`."""
 
 from dataclasses import dataclass, field
+from typing import Final
 
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.types import FeatureType, NormalizationMode, PolicyFeature
 from lerobot.utils.constants import ACTION, OBS_STATE
 
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.policy_configuration import ClonedConfig
+
+MIN_STD: Final = 0.05
+MAX_STD: Final = 1.0
+"""Bounds of the Gaussian's standard deviation, in normalised actions."""
 
 
 @PreTrainedConfig.register_subclass("cnn")
 @dataclass
 class CnnConfig(ClonedConfig):
-    """One action from one observation: images, `observation.state` if there is one, and the instruction.
+    """A policy that maps images, `observation.state` and the instruction to one action.
 
     Args:
-        use_state: feed `observation.state` when the dataset has it.
-        width: channels of the first convolution; the others have twice as many.
-        value_width: the same for the value's own, smaller encoder.
-        hidden_size: of the MLPs behind the encoders.
-        language_buckets, language_size: hashed character n-grams, and the embedding made of them.
-        max_shift: pixels by which images are shifted at random during cloning (0 = not at all).
-        initial_std, min_std, max_std: standard deviation of the Gaussian, in normalised actions: before
-            any training, and its bounds at all times.
-        std_lr_factor: learning rate of the standard deviation relative to the rest, during cloning.
-        min_state_std, min_action_std: floors of the dataset's standard deviations, in the dataset's units,
-            so that a component that hardly varies is not blown up by normalisation.
+        use_state: whether to use `observation.state` when the dataset has it.
+        width: channels of the first convolution; later ones have twice as many.
+        hidden_size: width of the MLPs behind the encoders.
+        max_shift: pixels by which images are shifted at random in supervised training; 0 for not at all.
+        initial_std: standard deviation of the Gaussian before any training, in normalised actions.
     """
 
     use_state: bool = True
     width: int = 16
-    value_width: int = 8
     hidden_size: int = 256
-    language_buckets: int = 256
-    language_size: int = 32
     max_shift: int = 2
     initial_std: float = 0.5
-    min_std: float = 0.05
-    max_std: float = 1.0
-    std_lr_factor: float = 20.0
-    min_state_std: float = 1e-2
-    min_action_std: float = 1e-4
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {
             "VISUAL": NormalizationMode.IDENTITY,
@@ -51,33 +43,35 @@ class CnnConfig(ClonedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0 < self.min_std <= self.initial_std <= self.max_std:
-            raise ValueError(
-                f"initial_std={self.initial_std}: must lie between min_std={self.min_std} (above 0) "
-                f"and max_std={self.max_std}"
-            )
+        check_std(self.initial_std)
 
     @property
     def state_feature(self) -> PolicyFeature | None:
-        """`observation.state` if the policy is fed with it."""
+        """`observation.state` if the policy uses it."""
         return (self.input_features or {}).get(OBS_STATE) if self.use_state else None
 
     def validate_features(self) -> None:
-        """ValueError unless there is a one-dimensional action and something to look at.
+        """Raise FieldError unless there is a one-dimensional action, and an image or a state.
 
-        Depth maps, pictures of one channel, are left out: environments do not show them.
+        Depth maps (images of one channel) are left out, since environments do not show them.
         """
         inputs = self.input_features or {}
         for key in [key for key, feature in inputs.items() if _is_depth(feature)]:
             del inputs[key]
         action = self.action_feature
         if action is None or len(action.shape) != 1:
-            raise ValueError(f"output_features={self.output_features}: needs `{ACTION}` with one dimension")
+            raise FieldError("output_features", self.output_features, f"needs {ACTION} with one dimension")
         if not self.image_features and self.state_feature is None:
-            raise ValueError(f"input_features={self.input_features}: needs an image or `{OBS_STATE}`")
+            raise FieldError("input_features", self.input_features, f"needs an image or {OBS_STATE}")
         for key, feature in self.image_features.items():
             if feature.type is FeatureType.VISUAL and (len(feature.shape) != 3 or feature.shape[0] != 3):
-                raise ValueError(f"input_features[{key}].shape={feature.shape}: needs (3, height, width)")
+                raise FieldError(f"input_features[{key}].shape", feature.shape, "needs (3, height, width)")
+
+
+def check_std(std: float) -> None:
+    """Raise FieldError unless a standard deviation lies within its bounds."""
+    if not MIN_STD <= std <= MAX_STD:
+        raise FieldError("initial_std", std, f"must be between {MIN_STD} and {MAX_STD}")
 
 
 def _is_depth(feature: PolicyFeature) -> bool:

@@ -1,4 +1,4 @@
-"""The small image policy: what lerobot-train clones, lerobot-eval runs and PPO improves."""
+"""The small image policy: lerobot-train fits it to demonstrations, PPO improves it."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -12,34 +12,41 @@ from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 from torch import Tensor, nn
 from torch.distributions import Normal
 
-from lerobot_policy_cnn.configuration_cnn import CnnConfig
+from lerobot_policy_cnn.configuration_cnn import MAX_STD, MIN_STD, CnnConfig, check_std
 from lerobot_policy_cnn.networks import Trunk, random_shift
 
 STATE_LIMIT = 10.0
-"""Normalised states are clamped here: a state far from the demonstrations must not drown the image."""
+"""Normalised states are clamped to ± this: a state far from the demonstrations must not drown the image."""
 
 CONSTANT_RANGE = 1e-3
-"""A component of the normalised action that varies less than this in the demonstrations is constant."""
+"""A component of the normalised action counts as constant if its range in the demonstrations is smaller."""
 
 STD_MARGIN = 0.01
-"""A standard deviation starts at least this share of the way from its bounds: at them it cannot learn."""
+"""Smallest distance of the initial standard deviation from its bounds, as a share of the way between them.
+At a bound its gradient vanishes."""
+
+STD_LR_FACTOR = 20.0
+"""Learning rate of the standard deviation relative to the rest, in supervised training."""
+
+VALUE_WIDTH = 8
+"""Channels of the first convolution of the critic's encoder."""
 
 UNKNOWN_POLICY = "This is a **cnn** policy trained with [LeRobot](https://github.com/huggingface/lerobot)."
-"""What LeRobot's card says of policies that are not its own."""
+"""The sentence on LeRobot's card of policies that are not its own, which SUMMARY replaces."""
 
 SUMMARY = (
-    "A small convolutional policy, fast enough for a CPU: pictures of one or several cameras, the robot's "
-    "state and the instruction in, a Gaussian of one action out. It is cloned by `lerobot-train`; the "
-    "Gaussian's spread is then that of cloning's residuals, and its value network is untrained until "
-    "`lerobot-wmrl-train` improves the policy by reinforcement learning, in a world model or in ManiSkill."
+    "A small convolutional policy, fast enough for a CPU. From images of one or several cameras, the robot's "
+    "state and the instruction it predicts a Gaussian of one action. `lerobot-train` fits it to "
+    "demonstrations; the Gaussian's standard deviation is then that of the residuals, and the value network "
+    "is untrained until `lerobot-wmrl-train` improves the policy by reinforcement learning, in a world model "
+    "or in ManiSkill."
 )
-"""What the card says instead."""
 
 Observation = dict[str, Any]
 
 
-class Sample(NamedTuple):
-    """What was sampled: unclipped actions and log-probs (B, K), values (B,)."""
+class GaussianSample(NamedTuple):
+    """Sampled actions before clipping (B, K) in normalised units, log-probabilities (B, K), values (B,)."""
 
     raw_action: Tensor
     log_prob: Tensor
@@ -47,10 +54,10 @@ class Sample(NamedTuple):
 
 
 class CnnPolicy(PreTrainedPolicy):
-    """π(a|o) = N(mean(o), std) in normalised actions, one std a component; and a value V(o).
+    """π(a|o) = N(mean(o), std) over K normalised action components, one std for each; and a value V(o).
 
-    Components that never varied in the demonstrations (rotations and gripper when pushing) are kept at
-    their constant: they are not sampled, and their log-probability is 0. K components in all.
+    Components that never varied in the demonstrations (rotations and gripper when pushing) keep their
+    constant value. They are not sampled, and their log-probability is 0.
     """
 
     config_class = CnnConfig
@@ -65,40 +72,41 @@ class CnnPolicy(PreTrainedPolicy):
         self.cameras = sorted(config.image_features)
         state = config.state_feature
         inputs = (len(self.cameras), state.shape[0] if state else 0)
-        sizes = (config.hidden_size, config.language_buckets, config.language_size)
         actions = config.action_feature.shape[0]
-        self.actor = Trunk(*inputs, config.width, *sizes, outputs=actions)
-        self.critic = Trunk(*inputs, config.value_width, *sizes, outputs=1)
+        self.actor = Trunk(*inputs, config.width, config.hidden_size, outputs=actions)
+        self.critic = Trunk(*inputs, VALUE_WIDTH, config.hidden_size, outputs=1)
         self.std_logit = nn.Parameter(torch.zeros(actions))
         self.set_std(config.initial_std)
         self.register_buffer("target_low", torch.full((actions,), torch.inf))
         self.register_buffer("target_high", torch.full((actions,), -torch.inf))
 
     def get_optim_params(self) -> list[dict[str, Any]]:
-        """What cloning trains: everything but the value. The standard deviation has its own rate."""
-        rate = self.config.optimizer_lr * self.config.std_lr_factor
+        """Return the parameters that lerobot-train trains: all but the critic's."""
+        rate = self.config.optimizer_lr * STD_LR_FACTOR
         return [
             {"params": list(self.actor.parameters())},
             {"params": [self.std_logit], "lr": rate, "weight_decay": 0.0},
         ]
 
     def value_parameters(self) -> Iterator[nn.Parameter]:
-        """The critic's own parameters: it shares nothing with the actor."""
+        """Return the critic's parameters, none of which the actor shares."""
         return self.critic.parameters()
 
     def reset(self) -> None:
-        """Nothing is kept between steps."""
+        """Do nothing: the policy has no state."""
 
     def generate_model_card(self, *args: Any, **kwargs: Any) -> ModelCard:
-        """LeRobot's card, which says what this policy is."""
+        """Return LeRobot's model card with a summary of this policy."""
         card = super().generate_model_card(*args, **kwargs)
         card.text = card.text.replace(UNKNOWN_POLICY, SUMMARY)
         return card
 
     def forward(self, batch: Observation, reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
-        """Cloning: Huber loss of the mean, and the Gaussian's log-likelihood for its std alone. → (), numbers
+        """Return the supervised loss: Huber loss of the mean, and the log-likelihood for the std alone.
 
-        `reduction="none"` gives one loss a row, (B,).
+        Args:
+            batch: preprocessed observations and `action`, (B, K) or (B, 1, K).
+            reduction: `mean` → (), `none` → (B,).
         """
         target = batch[ACTION].reshape(len(batch[ACTION]), -1)
         if self.training:
@@ -112,49 +120,47 @@ class CnnPolicy(PreTrainedPolicy):
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: Observation, **_: Any) -> Tensor:
-        """A chunk of one action, the mean. → (B, 1, K)"""
+        """Return a chunk of one action, the mean. → (B, 1, K)"""
         return self.select_action(batch)[:, None]
 
     @torch.no_grad()
     def select_action(self, batch: Observation, **_: Any) -> Tensor:
-        """The mean action. → (B, K)"""
+        """Return the mean action. → (B, K)"""
         self.eval()
         return self._mean(batch)
 
-    def sample(self, observation: Observation) -> Sample:
-        """Draw actions; `evaluate` gives these log-probs again."""
+    def sample(self, observation: Observation) -> GaussianSample:
+        """Sample actions from the distribution that `evaluate` measures."""
         mean = self._mean(observation)
         raw_action = torch.where(
             self.varies(), Normal(mean, self.std(), validate_args=False).sample(), mean
         ).detach()
-        return Sample(raw_action, self._log_prob(mean, raw_action), self.value(observation))
+        return GaussianSample(raw_action, self._log_prob(mean, raw_action), self.value(observation))
 
     def evaluate(self, observation: Observation, raw_action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """→ log-probs (B, K), entropies (B,), values (B,)"""
+        """Return log-probabilities (B, K) of actions (B, K), entropies (B,) and values (B,)."""
         mean = self._mean(observation)
         entropy = (Normal(mean, self.std(), validate_args=False).entropy() * self.varies()).sum(dim=1)
         return self._log_prob(mean, raw_action), entropy, self.value(observation)
 
     def value(self, observation: Observation) -> Tensor:
-        """V(o). → (B,)"""
+        """Return V(o). → (B,)"""
         return self.critic(*self._inputs(observation)).squeeze(1)
 
     def std(self) -> Tensor:
-        """Standard deviation in normalised actions, smoothly within its bounds. → (K,)"""
-        low, high = math.log(self.config.min_std), math.log(self.config.max_std)
+        """Return the standard deviation in normalised actions, within its bounds by a sigmoid. → (K,)"""
+        low, high = math.log(MIN_STD), math.log(MAX_STD)
         return (low + (high - low) * self.std_logit.sigmoid()).exp()
 
     @torch.no_grad()
     def set_std(self, std: float) -> None:
-        """Start exploration from `std` in every component. ValueError outside the bounds."""
-        low, high = self.config.min_std, self.config.max_std
-        if not low <= std <= high:
-            raise ValueError(f"initial_std={std}: must be between {low} and {high}, the policy's bounds")
-        share = math.log(std / low) / max(math.log(high / low), 1e-8)
+        """Set the standard deviation of every component. FieldError outside its bounds."""
+        check_std(std)
+        share = math.log(std / MIN_STD) / math.log(MAX_STD / MIN_STD)
         self.std_logit.copy_(torch.full_like(self.std_logit, share).logit(STD_MARGIN))
 
     def varies(self) -> Tensor:
-        """Components that the demonstrations vary; all of them before there were any. → (K,) bool"""
+        """Return which components vary in the demonstrations; all of them before training. → (K,) bool"""
         unseen = self.target_high < self.target_low
         return unseen | (self.target_high - self.target_low > CONSTANT_RANGE)
 
@@ -173,7 +179,7 @@ class CnnPolicy(PreTrainedPolicy):
         return Normal(mean, self.std(), validate_args=False).log_prob(raw_action) * self.varies()
 
     def _inputs(self, observation: Observation) -> tuple[list[Tensor], Tensor | None, Sequence[str]]:
-        """The observation after the preprocessor → images in [0, 1], clamped state, instructions."""
+        """Return images in [0, 1], the clamped state and instructions of a preprocessed observation."""
         missing = [camera for camera in self.cameras if camera not in observation]
         if missing:
             shown = ", ".join(name for name in observation if name.startswith(OBS_IMAGES)) or "none"

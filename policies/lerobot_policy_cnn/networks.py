@@ -1,4 +1,4 @@
-"""The policy's networks: plain torch, no LeRobot. B batch, C channels, H height, W width."""
+"""Networks of the small image policy, in plain torch. B batch, C channels, H height, W width."""
 
 import zlib
 from collections.abc import Sequence
@@ -9,36 +9,43 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 GRID = 8
-"""Cells a side of the pooled feature map."""
+"""Cells on each side of the pooled feature map."""
 
 GRID_CHANNELS = 16
+"""Channels of the pooled feature map."""
+
+LANGUAGE_BUCKETS = 256
+"""Buckets that character trigrams and words are hashed into."""
+
+LANGUAGE_SIZE = 32
+"""Width of an instruction's embedding."""
 
 
 def coordinates(height: int, width: int, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Row and column positions in [-1, 1]. → (H, W), (H, W)"""
+    """Return row and column positions in [-1, 1]. → (H, W), (H, W)"""
     rows = torch.linspace(-1, 1, height, device=like.device, dtype=like.dtype)
     columns = torch.linspace(-1, 1, width, device=like.device, dtype=like.dtype)
     return torch.meshgrid(rows, columns, indexing="ij")  # type: ignore[return-value]
 
 
 def soft_positions(maps: Tensor) -> Tensor:
-    """Spatial softmax: where each channel looks (Levine et al. 2016). (B, C, H, W) → (B, 2C)"""
+    """Return each channel's expected position (B, 2C) (spatial softmax, Levine et al. 2016). (B, C, H, W)"""
     rows, columns = coordinates(maps.shape[2], maps.shape[3], maps)
     attention = maps.flatten(2).softmax(dim=-1)
     return torch.cat([attention @ rows.flatten(), attention @ columns.flatten()], dim=1)
 
 
-def standardised(maps: Tensor) -> Tensor:
-    """Each channel of each image with mean 0 and variance 1. (B, C, H, W) → (B, C, H, W)
+def instance_norm(maps: Tensor) -> Tensor:
+    """Normalise each channel of each image to mean 0 and variance 1 (Ulyanov et al. 2016). (B, C, H, W)
 
-    Instance normalisation (Ulyanov et al. 2016), as a layer normalisation: on CPUs that of torch takes longer
-    than the convolutions where channels lie together in memory.
+    A layer normalisation computes it, because torch's instance normalisation takes longer on CPUs than the
+    convolutions when the memory format is channels_last.
     """
     return F.layer_norm(maps.contiguous(), maps.shape[2:])
 
 
 class ImageEncoder(nn.Module):
-    """An image of any size → features that keep where things are: soft positions and a coarse map."""
+    """Encode an image of any size as features that keep positions: a spatial softmax and a coarse map."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -56,67 +63,57 @@ class ImageEncoder(nn.Module):
                 nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
 
     def forward(self, images: Tensor) -> Tensor:
-        """Images in [0, 1]. (B, 3, H, W) → (B, self.size)"""
+        """Encode images in [0, 1]. (B, 3, H, W) → (B, self.size)"""
         position = torch.stack(coordinates(images.shape[2], images.shape[3], images))[None]
         centred = (4 * (images - 0.5)).contiguous(memory_format=torch.channels_last)
         x = F.relu_(self.stem(centred) + self.stem_position(position))
         x = F.relu_(self.down(x))
         fine = self.fine(x)
         coarse = self.grid(F.relu_(self.coarse(F.relu(fine))))
-        positions = soft_positions(self.sharpness * standardised(fine))
+        positions = soft_positions(self.sharpness * instance_norm(fine))
         return torch.cat([positions, F.adaptive_avg_pool2d(coarse, GRID).flatten(1)], dim=1)
 
 
 @lru_cache(maxsize=4096)
-def ngram_counts(text: str, buckets: int) -> tuple[float, ...]:
-    """Normalised counts of hashed words and character trigrams: defined for every string, no download."""
-    counts = [0.0] * buckets
+def ngram_counts(text: str) -> tuple[float, ...]:
+    """Return normalised counts of hashed words and character trigrams. No vocabulary is needed."""
+    counts = [0.0] * LANGUAGE_BUCKETS
     words = text.lower().split()
     for word in words:
         padded = f"<{word}>"
         for gram in (padded, *(padded[i : i + 3] for i in range(len(padded) - 2))):
-            counts[zlib.crc32(gram.encode()) % buckets] += 1.0
+            counts[zlib.crc32(gram.encode()) % LANGUAGE_BUCKETS] += 1.0
     norm = max(1.0, sum(count * count for count in counts) ** 0.5)
     return tuple(count / norm for count in counts)
 
 
 class InstructionEncoder(nn.Module):
-    """Instructions → embeddings."""
+    """Embed instructions by a linear layer on their n-gram counts."""
 
-    def __init__(self, buckets: int, size: int) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.buckets = buckets
-        self.project = nn.Linear(buckets, size)
+        self.project = nn.Linear(LANGUAGE_BUCKETS, LANGUAGE_SIZE)
 
     def forward(self, instructions: Sequence[str]) -> Tensor:
-        """B strings → (B, size). Each distinct string is encoded once."""
+        """Embed B strings, each distinct one once. → (B, LANGUAGE_SIZE)"""
         distinct = list(dict.fromkeys(instructions))
         device = self.project.weight.device
-        counts = torch.tensor([ngram_counts(text, self.buckets) for text in distinct], device=device)
+        counts = torch.tensor([ngram_counts(text) for text in distinct], device=device)
         row = {text: index for index, text in enumerate(distinct)}
         rows = torch.tensor([row[text] for text in instructions], device=device)
         return self.project(counts).tanh()[rows]
 
 
 class Trunk(nn.Module):
-    """Images, state and instruction → `outputs` numbers. Used once for the action and once for the value."""
+    """Map images, state and instruction to `outputs` values: the mean action, or the critic's value."""
 
-    def __init__(
-        self,
-        cameras: int,
-        state_size: int,
-        width: int,
-        hidden: int,
-        buckets: int,
-        language: int,
-        outputs: int,
-    ) -> None:
+    def __init__(self, cameras: int, state_size: int, width: int, hidden: int, outputs: int) -> None:
         super().__init__()
         self.encoders = nn.ModuleList(ImageEncoder(width) for _ in range(cameras))
-        self.instruction = InstructionEncoder(buckets, language)
+        self.instruction = InstructionEncoder()
         image_size = sum(encoder.size for encoder in self.encoders)  # type: ignore[misc]
         self.mix = nn.Sequential(
-            nn.Linear(image_size + state_size + language, hidden), nn.LayerNorm(hidden), nn.SiLU(),
+            nn.Linear(image_size + state_size + LANGUAGE_SIZE, hidden), nn.LayerNorm(hidden), nn.SiLU(),
             nn.Linear(hidden, hidden), nn.SiLU(),
         )  # fmt: skip
         self.head = nn.Linear(hidden, outputs)
@@ -124,14 +121,14 @@ class Trunk(nn.Module):
         nn.init.zeros_(self.head.bias)
 
     def forward(self, images: Sequence[Tensor], state: Tensor | None, instructions: Sequence[str]) -> Tensor:
-        """One (B, 3, H, W) a camera, (B, P) or None, B strings → (B, outputs)"""
-        seen = [encoder(image) for encoder, image in zip(self.encoders, images, strict=True)]
-        parts = [*seen, *([] if state is None else [state]), self.instruction(instructions)]
+        """images: (B, 3, H, W) for each camera; state (B, P) or None; B instructions → (B, outputs)"""
+        features = [encoder(image) for encoder, image in zip(self.encoders, images, strict=True)]
+        parts = [*features, *([] if state is None else [state]), self.instruction(instructions)]
         return self.head(self.mix(torch.cat(parts, dim=1)))
 
 
 def random_shift(images: Tensor, pixels: int) -> Tensor:
-    """Each image moved by up to `pixels` along both axes, edges repeated. (B, 3, H, W) → (B, 3, H, W)"""
+    """Shift each image by up to `pixels` along both axes, repeating its edges. (B, 3, H, W) → (B, 3, H, W)"""
     batch, _, height, width = images.shape
     padded = F.pad(images, (pixels,) * 4, mode="replicate")
     top, left = (torch.randint(0, 2 * pixels + 1, (batch, 1), device=images.device) for _ in range(2))

@@ -1,4 +1,4 @@
-"""Planning inside a world model (model-predictive control): what lerobot-eval runs, untrained."""
+"""Model-predictive control inside a world model, as a policy that lerobot-eval runs."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
 from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
-from lerobot_policy_wm_mpc.planning import Objective, best_knots, interpolated, longest_success
+from lerobot_policy_wm_mpc.planning import Objective, interpolate_knots, plan_knots, success_logit
 from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW
 from lerobot_wmrl.data.compatibility import check_same_tokenizer
 from lerobot_wmrl.data.frames import NO_CONTEXT, Context
@@ -21,9 +21,9 @@ Observation = dict[str, Any]
 
 
 class WmMpcPolicy(PreTrainedPolicy):
-    """Imagines action sequences from the present frame and carries out the beginning of the best one.
+    """Imagine action sequences from the present frame and execute the beginning of the best one.
 
-    The world models are no part of the checkpoint, which holds no weights at all.
+    The checkpoint holds no weights: the world models stay where `world_model_path` says.
     """
 
     config_class = WmMpcConfig
@@ -37,7 +37,7 @@ class WmMpcPolicy(PreTrainedPolicy):
         self._text_model = []
         if config.text_world_model_path:
             text_model = load_model(config.text_world_model_path, "text_world_model", device)
-            where = f"--policy.text_world_model_path={config.text_world_model_path}"
+            where = f"text_world_model_path={config.text_world_model_path}"
             check_same_tokenizer(self._model[0], text_model, where)
             self._text_model.append(text_model)
         self.register_buffer("low", torch.tensor(ACTION_LOW), persistent=False)
@@ -45,15 +45,15 @@ class WmMpcPolicy(PreTrainedPolicy):
         self.reset()
 
     def get_optim_params(self) -> dict[str, Any]:
-        """None: nothing is trained."""
+        """Return no parameters: nothing is trained."""
         return {}
 
     def forward(self, batch: Observation, **_: Any) -> tuple[Tensor, dict[str, Any]]:
-        """Nothing is trained."""
-        raise NotImplementedError("policy.type=wm_mpc plans; there is nothing to train")
+        """Raise NotImplementedError: nothing is trained."""
+        raise NotImplementedError("the policy wm_mpc plans; it has nothing to train")
 
     def reset(self) -> None:
-        """Episodes begin: what was planned and seen is forgotten."""
+        """Forget the plans and the first frame of the last episodes."""
         self._chunk: Tensor | None = None
         self._next = 0
         self._knots: Tensor | None = None
@@ -62,7 +62,7 @@ class WmMpcPolicy(PreTrainedPolicy):
 
     @torch.no_grad()
     def select_action(self, batch: Observation, **_: Any) -> Tensor:
-        """The next action of the plan, a new one after `execute` of them. → (B, A)"""
+        """Return the next action of the plan; plan again after `execute` actions. → (B, A)"""
         if self._chunk is None or self._next == self.config.execute:
             self._chunk, self._next = self.predict_action_chunk(batch), 0
         self._next += 1
@@ -70,35 +70,36 @@ class WmMpcPolicy(PreTrainedPolicy):
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: Observation, **_: Any) -> Tensor:
-        """Plan from images (B, 3, H, W), state (B, P) and instructions. → the whole plans (B, T, A)"""
+        """Plan from images (B, 3, H, W), state (B, P) and instructions. → (B, T, A)"""
         model, config = self._model[0], self.config
         images = stack_cameras(batch, model.config.tokenizer.camera_keys, model.config.tokenizer.image_size)
         if self._context is None:
             self._context = model.tokenizer.context(images)
         tokens = model.tokenizer.encode(images, self._context)
-        spread = torch.where(model.action_std == 1, 0.0, model.action_std)  # those of constants are set to 1
-        start = self._shifted() if self._knots is not None else None
+        # Statistics hold a std of 1 for components that never vary: these stay at their mean.
+        std = torch.where(model.action_std == 1, 0.0, model.action_std)
+        start = self._remaining_plans() if self._knots is not None else None
         plans = []
         for row in range(len(tokens)):
             mean = model.action_mean.expand(config.knots, -1) if start is None else start[row]
-            plans.append(best_knots(
-                self._objective(batch, tokens, row), mean, config.spread * spread, self.low, self.high,
+            plans.append(plan_knots(
+                self._objective(batch, tokens, row), mean, std, self.low, self.high,
                 horizon=config.horizon, samples=config.samples, elites=config.elites,
                 iterations=config.iterations, generator=self._generator,
             ))  # fmt: skip
         self._knots = torch.stack(plans)
-        return interpolated(self._knots, config.horizon)
+        return interpolate_knots(self._knots, config.horizon)
 
-    def _shifted(self) -> Tensor:
-        """What is left of the plans, its last action held: knots (B, N, A) to begin with."""
+    def _remaining_plans(self) -> Tensor:
+        """Return the knots of what is left of the plans, the last action held. → (B, N, A)"""
         assert self._knots is not None
         config = self.config
-        plans = interpolated(self._knots, config.horizon)
+        plans = interpolate_knots(self._knots, config.horizon)
         ahead = torch.linspace(config.execute, config.execute + config.horizon - 1, config.knots)
         return plans[:, ahead.round().long().clamp(max=config.horizon - 1)]
 
     def _objective(self, batch: Observation, tokens: Tensor, row: int) -> Objective:
-        """How good action sequences are in environment `row`."""
+        """Return the objective of action sequences in environment `row`."""
         model, config = self._model[0], self.config
         context = self._context[[row]] if self._context else NO_CONTEXT
         state = batch.get(OBS_STATE, tokens.new_zeros(len(tokens), 0, dtype=torch.float32))[[row]]
@@ -112,7 +113,7 @@ class WmMpcPolicy(PreTrainedPolicy):
             seen = context[every] if len(context) else NO_CONTEXT
             ahead = open_loop(model, tokens[[row] * len(actions)], state[every], actions, seen)
             if goal is None:
-                return longest_success(ahead.done_logit, config.done_frames)
+                return success_logit(ahead.done_logit, config.done_frames)
             features = [layer.repeat(len(actions), 1, 1, 1) for layer in goal.features]
             return similarity_to_goal(model.tokenizer, ahead.tokens, features, seen)
 

@@ -1,4 +1,4 @@
-"""Pre- and postprocessor of planning: LeRobot's own. Frames stay in [0, 1], actions in metres."""
+"""Pre- and postprocessor of the planning policy: LeRobot's own. Images stay in [0, 1], actions in metres."""
 
 from typing import Any
 
@@ -13,5 +13,5 @@ def make_wm_mpc_pre_post_processors(
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
     PolicyProcessorPipeline[PolicyAction, PolicyAction],
 ]:
-    """Nothing is normalised: the world model has its own statistics."""
+    """Return processors that normalise nothing: the world model has its own statistics."""
     return make_default_pre_post_processors(config, dataset_stats, normalizer_device=config.device)

@@ -13,9 +13,9 @@ from lerobot.policies.factory import make_policy, make_pre_post_processors
 from torch import nn
 from torch.distributions import Normal
 
-from lerobot_policy_cnn.configuration_cnn import CnnConfig
+from lerobot_policy_cnn.configuration_cnn import MAX_STD, MIN_STD, CnnConfig
 from lerobot_policy_cnn.modeling_cnn import SUMMARY, UNKNOWN_POLICY, CnnPolicy
-from lerobot_policy_cnn.networks import ImageEncoder, InstructionEncoder, random_shift, standardised
+from lerobot_policy_cnn.networks import ImageEncoder, InstructionEncoder, instance_norm, random_shift
 from lerobot_policy_cnn.processor_cnn import make_cnn_pre_post_processors
 from tests.hub_server import Hub
 
@@ -49,9 +49,9 @@ def observe(policy: CnnPolicy, batch: int = 6) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("layout", [torch.contiguous_format, torch.channels_last])
-def test_channels_are_standardised_as_by_instance_normalisation(layout: torch.memory_format) -> None:
+def test_channels_are_normalised_as_by_instance_normalisation(layout: torch.memory_format) -> None:
     maps = (3 + 5 * torch.randn(4, 6, 8, 12)).contiguous(memory_format=layout)
-    assert torch.allclose(standardised(maps), nn.functional.instance_norm(maps), atol=1e-5)
+    assert torch.allclose(instance_norm(maps), nn.functional.instance_norm(maps), atol=1e-5)
 
 
 @pytest.fixture(scope="module")
@@ -98,17 +98,17 @@ def test_samples_spread_as_the_std_says() -> None:
 
 
 def test_the_std_stays_within_its_bounds_and_can_leave_them() -> None:
-    policy = build(min_std=0.1, max_std=0.8)
+    policy = build()
     for logit in (-50.0, 50.0):
         nn.init.constant_(policy.std_logit, logit)
-        assert (policy.std() >= 0.0999).all()
-        assert (policy.std() <= 0.8001).all()
-    policy.set_std(0.8)
+        assert (policy.std() >= MIN_STD - 1e-4).all()
+        assert (policy.std() <= MAX_STD + 1e-4).all()
+    policy.set_std(MAX_STD)
     policy.std().sum().backward()
     assert policy.std_logit.grad is not None
     assert (policy.std_logit.grad > 0).all()
-    with pytest.raises(ValueError, match=r"initial_std=0\.05.*0\.1"):
-        policy.set_std(0.05)
+    with pytest.raises(ValueError, match=r"initial_std=0\.04.*0\.05"):
+        policy.set_std(0.04)
 
 
 def test_no_layer_depends_on_the_rest_of_the_batch() -> None:
@@ -143,7 +143,7 @@ def test_the_std_after_cloning_is_that_of_the_residuals(
     prepared = pre(dict(batch))
     residual = (policy.select_action(prepared) - prepared["action"])[:, policy.varies()]
     learnt = policy.std()[policy.varies()]
-    expected = residual.square().mean(dim=0).sqrt().clamp(policy.config.min_std, policy.config.max_std)
+    expected = residual.square().mean(dim=0).sqrt().clamp(MIN_STD, MAX_STD)
     assert (learnt < policy.config.initial_std).all()
     assert (learnt / expected).log().abs().max() < 0.7
 
@@ -201,7 +201,7 @@ def test_features_tell_where_something_is(size: int) -> None:
 
 
 def test_every_instruction_has_an_embedding_of_its_own() -> None:
-    encoder = InstructionEncoder(256, 16)
+    encoder = InstructionEncoder()
     texts = ["push the can forward", "pull the can back", "", "нечто новое", "push the can forward"]
     embedded = encoder(texts)
     assert torch.equal(embedded[0], embedded[4])
@@ -225,7 +225,7 @@ def test_a_random_shift_moves_images_by_whole_pixels() -> None:
 
 
 @pytest.mark.parametrize(("settings", "message"), [
-    ({"min_std": 0.9}, "initial_std"), ({"n_obs_steps": 2}, "n_obs_steps=2"),
+    ({"initial_std": 1.5}, "initial_std=1.5"), ({"n_obs_steps": 2}, "n_obs_steps=2"),
 ])  # fmt: skip
 def test_impossible_settings_are_named(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):

@@ -10,7 +10,7 @@ from lerobot.scripts import lerobot_eval
 
 from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
 from lerobot_policy_wm_mpc.modeling_wm_mpc import WmMpcPolicy
-from lerobot_policy_wm_mpc.planning import best_knots, interpolated, longest_success
+from lerobot_policy_wm_mpc.planning import interpolate_knots, plan_knots, success_logit
 from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW
 
 SMALL = {"horizon": 8, "execute": 3, "samples": 6, "elites": 2, "iterations": 2, "knots": 3, "device": "cpu"}
@@ -24,11 +24,11 @@ def test_the_planner_finds_the_sequence_that_is_wanted():
         return -(actions - wanted).square().sum((1, 2))
 
     low, high = torch.full((2,), -1.0), torch.ones(2)
-    found = best_knots(
+    found = plan_knots(
         value, torch.zeros(4, 2), torch.ones(2), low, high, horizon=12, samples=64, elites=8, iterations=12,
         generator=torch.Generator().manual_seed(0),
     )  # fmt: skip
-    assert (interpolated(found[None], 12)[0] - wanted).abs().max() < 0.1
+    assert (interpolate_knots(found[None], 12)[0] - wanted).abs().max() < 0.1
 
 
 def test_the_planner_keeps_to_the_box_and_never_returns_worse_than_it_was_given():
@@ -40,7 +40,7 @@ def test_the_planner_keeps_to_the_box_and_never_returns_worse_than_it_was_given(
         return ((actions - 0.1).abs() < 1e-6).all((1, 2)).float()
 
     mean = torch.full((3, 1), 0.1)
-    found = best_knots(
+    found = plan_knots(
         value, mean, torch.ones(1), low, high, horizon=6, samples=16, elites=4, iterations=3,
         generator=torch.Generator().manual_seed(0),
     )  # fmt: skip
@@ -51,7 +51,7 @@ def test_the_planner_keeps_to_the_box_and_never_returns_worse_than_it_was_given(
 
 def test_done_counts_as_long_as_it_holds():
     logits = torch.tensor([[9.0, -9, 9, -9, 9], [-9, 1, 2, 3, -9]])
-    assert longest_success(logits, 3).tolist() == [-9, 1]
+    assert success_logit(logits, 3).tolist() == [-9, 1]
 
 
 @pytest.fixture
@@ -113,13 +113,13 @@ def test_lerobot_eval_runs_it_in_imagination(config, trained_models, small_datas
 
 def test_bad_settings_name_the_field_and_the_remedy(trained_models):
     path = str(trained_models["action_world_model"])
-    with pytest.raises(ValueError, match=r"--policy\.world_model_path is missing"):
+    with pytest.raises(ValueError, match=r"^world_model_path=: is missing"):
         WmMpcPolicy(WmMpcConfig(device="cpu"))
-    with pytest.raises(ValueError, match=r"--policy\.text_world_model_path is missing.*objective=success"):
+    with pytest.raises(ValueError, match=r"^text_world_model_path=: .*`objective` to success"):
         WmMpcPolicy(WmMpcConfig(device="cpu", world_model_path=path, objective="goal"))
-    with pytest.raises(ValueError, match=r"--policy\.objective=reward: choose"):
+    with pytest.raises(ValueError, match=r"^objective=reward: choose"):
         WmMpcConfig(device="cpu", objective="reward")
-    with pytest.raises(ValueError, match=r"--policy\.elites=9: must be at most samples=4"):
+    with pytest.raises(ValueError, match=r"^elites=9: must be at most `samples`, 4"):
         WmMpcConfig(device="cpu", elites=9, samples=4)
-    with pytest.raises(ValueError, match=r"--policy\.knots=1: must be from 2"):
+    with pytest.raises(ValueError, match=r"^knots=1: must be from 2"):
         WmMpcConfig(device="cpu", knots=1)
