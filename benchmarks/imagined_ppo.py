@@ -31,7 +31,7 @@ from lerobot_wmrl.demo.pipeline import run_stages
 from lerobot_wmrl.demo.report.figures import COLOURS, tidy
 from lerobot_wmrl.demo.report.sources import outcomes
 from lerobot_wmrl.demo.stages import Stage, checkpoint
-from lerobot_wmrl.evaluation.tables import markdown_table
+from lerobot_wmrl.evaluation.report import markdown_table
 
 RESULTS: Final = Path(__file__).parents[1] / "docs" / "results" / "imagined_ppo.json"
 

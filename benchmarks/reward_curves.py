@@ -53,7 +53,7 @@ from lerobot_wmrl.envs.start_frames import chosen_episodes
 from lerobot_wmrl.envs.uncertainty import SIGNALS
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv, make_world_model_env
 from lerobot_wmrl.evaluation.gate import Outcomes
-from lerobot_wmrl.evaluation.tables import markdown_table
+from lerobot_wmrl.evaluation.report import markdown_table
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.world_models.checkpoint import load_model
 

@@ -30,7 +30,7 @@ from lerobot_wmrl.data.recorded_episodes import recorded_episodes
 from lerobot_wmrl.demo.pipeline import run_stages
 from lerobot_wmrl.demo.report.sources import outcomes
 from lerobot_wmrl.demo.stages import Stage, checkpoint, lerobot_train
-from lerobot_wmrl.evaluation.tables import markdown_table
+from lerobot_wmrl.evaluation.report import markdown_table
 from rl_comparison import POLICY
 
 RESULTS: Final = Path(__file__).parents[1] / "docs" / "results" / "synthetic_data.json"

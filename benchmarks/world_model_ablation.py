@@ -28,11 +28,9 @@ from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data.episode_table import choose_episodes, open_dataset, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames
 from lerobot_wmrl.evaluation.accuracy import EpisodeAccuracy, headline
-from lerobot_wmrl.evaluation.done import done_quality
-from lerobot_wmrl.evaluation.evaluate import evaluate
-from lerobot_wmrl.evaluation.gate import success_gate
-from lerobot_wmrl.evaluation.replay import Source
-from lerobot_wmrl.evaluation.tables import NAMES, markdown_table
+from lerobot_wmrl.evaluation.gate import done_accuracy, success_gate
+from lerobot_wmrl.evaluation.replay import Recording
+from lerobot_wmrl.evaluation.report import TITLES, evaluate, markdown_table
 from lerobot_wmrl.maniskill.scenes import scenes_of
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig, train_world_model
 from lerobot_wmrl.world_models.checkpoint import load_model
@@ -64,7 +62,7 @@ VARIANTS: Final[dict[str, Flags]] = {
 PSNR_STEPS: Final = (1, 10, 30)
 MEASURES: Final = {
     **{f"psnr_{step}": f"PSNR at step {step} (dB)" for step in PSNR_STEPS},
-    **{name: NAMES[name] for name in ("delta_psnr_15", "moving_psnr", "abs_rel", "done_f1")},
+    **{name: TITLES[name] for name in ("delta_psnr_15", "moving_psnr", "abs_rel", "done_f1")},
 }
 """Columns of the table, those of the gate beside them; one that nothing has is left out."""
 
@@ -98,10 +96,10 @@ def measure(given: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """One variant's row: estimates of held-out episodes, and the gate's counts."""
     model = load_model(folder, "action_world_model", given.device)
     table = read_episodes(open_dataset(given.dataset_root))
-    source = Source(table, cached_frames(table.dataset, model.config.tokenizer.camera_keys))
+    source = Recording(table, cached_frames(table.dataset, model.config.tokenizer.camera_keys))
     unseen = {scene.index for scene in scenes_of("ood")}
     evaluation = evaluate(model, source, choose_episodes(table, given.split, given.max_episodes, unseen))
-    estimates = headline(evaluation.accuracy) | done_quality(evaluation.outcomes, threshold=0.5, frames=3)
+    estimates = headline(evaluation.accuracy) | done_accuracy(evaluation.outcomes, threshold=0.5, frames=3)
     estimates |= {f"psnr_{step}": psnr_at(evaluation.accuracy, step) for step in PSNR_STEPS}
     config, speed = json.loads((folder / CONFIG_FILE).read_text()), read_metrics(folder)[-1]["steps_per_s"]
     chosen = config["dataset"]["episodes"]

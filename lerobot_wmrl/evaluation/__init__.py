@@ -1,1 +1,1 @@
-"""How far a world model can be trusted: real episodes replayed open loop, measured, and drawn."""
+"""Evaluation of world models on recorded episodes: open-loop replay, the gate, goal frames, policies."""

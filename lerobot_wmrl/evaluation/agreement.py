@@ -1,30 +1,102 @@
-"""The world model as an evaluator of policies: does what succeeds in it succeed in reality?"""
+"""The world model as an evaluator of policies: success in imagination beside success in an environment."""
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from matplotlib.figure import Figure
+import gymnasium as gym
+import torch
+from lerobot.envs import make_env_pre_post_processors
+from lerobot.envs.configs import EnvConfig
+from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.scripts.lerobot_eval import eval_policy, eval_policy_all
+from lerobot.utils.constants import CHECKPOINTS_DIR
 from scipy.stats import pearsonr
 
+from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.policy_checkpoints import load_policy, load_processors, read_policy_config
 from lerobot_wmrl.common.statistics import Proportion
-from lerobot_wmrl.evaluation.tables import markdown_table
+from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter, StepCounter
 
-FEWEST = 3
-"""Policies, of which a correlation says something."""
+MIN_POLICIES = 3
+"""Policies that a correlation needs."""
+
+
+class Evaluated(NamedTuple):
+    """Success of each episode, in the order of their seeds, and the steps of all of them together."""
+
+    successes: list[bool]
+    steps: int
+
+
+def policy_checkpoints(paths: Sequence[str]) -> list[Path]:
+    """List the checkpoints among `paths`, and every checkpoint of the trainings among them in order of steps.
+
+    Raises:
+        FieldError: there is none.
+    """
+    found = []
+    for path in map(Path, paths):
+        steps = [each for each in (path / CHECKPOINTS_DIR).glob("*") if each.name.isdigit()]
+        found += sorted(steps, key=lambda each: int(each.name)) or [path]
+    if not found:
+        raise FieldError("policies", list(paths), "none", "give checkpoints, or output folders of trainings")
+    return found
+
+
+def policy_outcomes(env: EnvConfig, path: Path, episodes: int, seed: int, num_envs: int) -> list[bool]:
+    """Evaluate a policy's checkpoint; return the success of each episode in the order of their seeds."""
+    config = read_policy_config(str(path), [])
+    processors = load_processors(config)
+    return evaluate_policy(env, load_policy(config), processors, episodes, seed, num_envs).successes
+
+
+@torch.no_grad()
+def evaluate_policy(
+    env: EnvConfig, policy: PreTrainedPolicy, processors: tuple[Any, Any], episodes: int, seed: int,
+    num_envs: int,
+) -> Evaluated:  # fmt: skip
+    """Run LeRobot's evaluation of a policy in `num_envs` environments made for it.
+
+    Args:
+        processors: the policy's pre- and postprocessor.
+        seed: of the first episode; each further one adds one.
+    """
+    made: Any = env.create_envs(min(num_envs, episodes), use_async_envs=True)
+    envs = {suite: {task: StepCounter(one) for task, one in tasks.items()} for suite, tasks in made.items()}
+    info = eval_policy_all(
+        envs, policy, *make_env_pre_post_processors(env, policy.config), *processors,
+        n_episodes=episodes, start_seed=seed,
+    )  # fmt: skip
+    successes = [bool(success) for task in info["per_task"] for success in task["metrics"]["successes"]]
+    return Evaluated(successes, sum(one.steps for tasks in envs.values() for one in tasks.values()))
+
+
+@torch.no_grad()
+def evaluate_within(
+    env: gym.vector.VectorEnv, config: EnvConfig, policy: PreTrainedPolicy, processors: tuple[Any, Any],
+    episodes: int, seed: int,
+) -> Evaluated:  # fmt: skip
+    """Run LeRobot's evaluation in an existing tensor environment of this configuration, which stays open."""
+    counted: Any = StepCounter(EvaluationAdapter(env))
+    info = eval_policy(
+        counted, policy, *make_env_pre_post_processors(config, policy.config), *processors,
+        n_episodes=episodes, start_seed=seed,
+    )  # fmt: skip
+    return Evaluated([bool(episode["success"]) for episode in info["per_episode"]], counted.steps)
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """Success of each policy in imagination and in reality, (imagined, real) by name."""
+    """Success of each policy by name, (imagined, real): in the world model and in the other environment."""
 
     policies: Mapping[str, tuple[Proportion, Proportion]]
 
     @classmethod
-    def of(cls, outcomes: Mapping[str, tuple[Sequence[bool], Sequence[bool]]]) -> "Agreement":
-        """From every policy's episodes, imagined ones and real ones."""
+    def of_outcomes(cls, outcomes: Mapping[str, tuple[Sequence[bool], Sequence[bool]]]) -> "Agreement":
+        """Count the successes of each policy's episodes, imagined and real."""
 
         def share(successes: Sequence[bool]) -> Proportion:
             return Proportion(sum(successes), len(successes))
@@ -32,9 +104,9 @@ class Agreement:
         return cls({name: (share(imagined), share(real)) for name, (imagined, real) in outcomes.items()})
 
     def correlation(self) -> tuple[float, float, float]:
-        """Pearson's r over policies with its 95 % interval (Fisher's); NaN where it is not defined."""
+        """Return Pearson's r over policies with its 95 % interval (Fisher's); NaN where it is not defined."""
         imagined, real = ([pair[side].share for pair in self.policies.values()] for side in (0, 1))
-        if len(self.policies) < FEWEST or len(set(imagined)) == 1 or len(set(real)) == 1:
+        if len(self.policies) < MIN_POLICIES or len(set(imagined)) == 1 or len(set(real)) == 1:
             return (math.nan,) * 3
         found = pearsonr(imagined, real)
         interval = found.confidence_interval(0.95)
@@ -51,23 +123,3 @@ class Agreement:
             "pearson": {"value": r, "fisher_95": [low, high]},
             "r_squared": None if r is None else r * r,
         }
-
-    def table(self) -> str:
-        """In Markdown."""
-        rows = [[name, str(imagined), str(real)] for name, (imagined, real) in self.policies.items()]
-        r, low, high = self.correlation()
-        verdict = f"Pearson {r:.2f} ({low:.2f} to {high:.2f}), R² {r * r:.2f}"
-        if math.isnan(r):
-            verdict = f"No correlation: it takes {FEWEST} policies, of which some succeed more often."
-        return f"{markdown_table(['policy', 'imagined success', 'real success'], rows)}\n\n{verdict}"
-
-    def draw(self, path: Path) -> None:
-        """A point a policy, with Wilson intervals, beside the diagonal."""
-        figure = Figure(figsize=(4.2, 4), layout="constrained")
-        axes = figure.subplots()
-        axes.plot((0, 1), (0, 1), color="#999", linewidth=1, linestyle="--")
-        for imagined, real in self.policies.values():
-            x, y = ([[abs(each.share - bound)] for bound in each.interval] for each in (imagined, real))
-            axes.errorbar(imagined.share, real.share, y, x, color="#2b6cb0", marker="o", capsize=2)
-        axes.set(xlim=(0, 1), ylim=(0, 1), xlabel="success in the world model", ylabel="success in reality")
-        figure.savefig(path, dpi=130)

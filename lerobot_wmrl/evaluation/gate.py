@@ -1,40 +1,42 @@
-"""The gate: of episodes that failed in reality, how many does the model, replayed open loop, believe in?
+"""The gate: does the world model, replayed open loop, tell failed from successful episodes?
 
-It decides whether a policy may be trained inside the model, and is meant for real rollouts of policies that
-the model was not trained on.
+It decides whether a policy may be trained inside the model, and is meant for rollouts of policies that the
+model was not trained on. A false positive is a recorded failure that the model predicts as a success.
 """
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from scipy.stats import mannwhitneyu
 from torch import Tensor
 
 from lerobot_wmrl.common.constants import KINDS, PLAY, TASKS
-from lerobot_wmrl.common.statistics import Proportion
+from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.statistics import Estimate, Proportion
 from lerobot_wmrl.data.compatibility import check_dataset
 from lerobot_wmrl.data.episode_table import EpisodeTable, open_dataset, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames
-from lerobot_wmrl.evaluation.replay import LONGEST, EpisodeReplay, Source, in_batches
+from lerobot_wmrl.evaluation.replay import MAX_ACTIONS, EpisodeReplay, Recording, in_batches
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 from lerobot_wmrl.world_models.open_loop import open_loop
 
-MOST_FALSE = 0.05
-"""Share of the failures that may be called successes."""
-
-FEWEST_RECOGNISED = 0.9
-"""Share of the successes that must be found."""
+MAX_FALSE_POSITIVE_RATE: Final = 0.05
+MIN_RECALL: Final = 0.9
+"""What it takes to pass the gate."""
 
 SWEEP_THRESHOLDS = tuple(round(0.3 + 0.05 * step, 2) for step in range(14))
 SWEEP_FRAMES = tuple(range(1, 7))
 
+MIN_PROBABILITY: Final = 1e-6
+"""Keeps the log loss of an event finite that was predicted as impossible."""
 
-class Judged(NamedTuple):
-    """An episode of T actions: done_probability (T,) as the model has it, done (T,) really."""
+
+class PredictedDone(NamedTuple):
+    """One episode of T actions: predicted done_probability (T,) and recorded done (T,)."""
 
     episode: int
     done_probability: Tensor
@@ -43,9 +45,12 @@ class Judged(NamedTuple):
 
 @dataclass(frozen=True)
 class Outcomes:
-    """E real episodes as a model sees them.
+    """Predicted and recorded success of E episodes.
 
-    episodes (E,); probability (E, T) of success after each action, NaN after the end; done (E, T), real.
+    Args:
+        episodes: their indices (E,).
+        probability: predicted done probability after each action (E, T), NaN after the end.
+        done: recorded success after each action (E, T).
     """
 
     episodes: np.ndarray
@@ -53,45 +58,49 @@ class Outcomes:
     done: np.ndarray
 
     @classmethod
-    def of(cls, judged: Iterable[EpisodeReplay | Judged]) -> "Outcomes":
-        """From replays or verdicts, by episode."""
-        runs = sorted(judged, key=lambda run: run.episode)
-        shape = len(runs), max(len(run.done) for run in runs)
+    def stack(cls, predictions: Iterable[EpisodeReplay | PredictedDone]) -> "Outcomes":
+        """Stack predictions of single episodes, in the order of the episodes."""
+        rows = sorted(predictions, key=lambda each: each.episode)
+        shape = len(rows), max(len(each.done) for each in rows)
         probability, done = np.full(shape, np.nan), np.zeros(shape, bool)
-        for row, run in enumerate(runs):
-            probability[row, : len(run.done)] = run.done_probability.cpu().numpy()
-            done[row, : len(run.done)] = run.done
-        return cls(np.array([run.episode for run in runs]), probability, done)
+        for row, each in enumerate(rows):
+            probability[row, : len(each.done)] = each.done_probability.cpu().numpy()
+            done[row, : len(each.done)] = each.done
+        return cls(np.array([each.episode for each in rows]), probability, done)
 
     def attempts(self, table: EpisodeTable) -> "Outcomes":
-        """Without play, which attempts nothing; all of them, if there is nothing else."""
+        """Leave out play, which attempts no task, unless there is nothing else."""
         kept = table.kind[self.episodes] != KINDS.index(PLAY)
         return self.where(kept) if kept.any() else self
 
     def where(self, kept: np.ndarray) -> "Outcomes":
-        """Some of the episodes: kept (E,)."""
+        """Return the episodes where `kept` (E,) is True."""
         return Outcomes(self.episodes[kept], self.probability[kept], self.done[kept])
 
     @property
     def success(self) -> np.ndarray:
-        """Really. (E,)"""
+        """Recorded success of each episode, (E,) bool."""
         return np.any(self.done, axis=1)
 
     def first_predicted_success(self, threshold: float, frames: int) -> np.ndarray:
-        """Where the model first sees success, as the environment would end an episode: the first of `frames`
-        consecutive frames at `threshold`, −1 if there is none. (E,)"""
+        """Return the step at which the model first predicts success, −1 if never. (E,)
+
+        As in the environment, `frames` consecutive frames must reach `threshold`; it is the first of them.
+        """
         return first_run(self.probability >= threshold, frames)
 
     def scores(self, frames: int) -> np.ndarray:
-        """The highest threshold at which the model sees success for `frames` frames in a row. (E,)"""
+        """Return the highest threshold at which the model predicts success for `frames` frames. (E,)"""
         probability = np.nan_to_num(self.probability)
         if probability.shape[1] < frames:
             return np.zeros(len(probability))
         return np.lib.stride_tricks.sliding_window_view(probability, frames, axis=1).min(-1).max(1)
 
     def auc(self, frames: int) -> float:
-        """Probability that a success scores higher than a failure, 0.5 by chance, whatever the threshold.
-        NaN without both."""
+        """Return the area under the ROC curve: how often a success scores higher than a failure.
+
+        0.5 is chance; NaN without both successes and failures.
+        """
         scores, success = self.scores(frames), self.success
         if success.all() or not success.any():
             return math.nan
@@ -101,9 +110,16 @@ class Outcomes:
 
 @dataclass(frozen=True)
 class Gate:
-    """False successes among the failures, and successes that were recognised, at one operating point; and
-    how well the two are told apart at any threshold, `Outcomes.auc`. Successes cut short were recorded for
-    fewer than `frames` frames: nobody can recognise them here."""
+    """The gate at one operating point.
+
+    Args:
+        threshold: done probability that counts as done.
+        frames: consecutive frames for which it must be reached.
+        false_positives: of the recorded failures, those predicted as successes.
+        recall: of the recorded successes, those predicted as successes.
+        cut_short: successes recorded for fewer than `frames` frames, which no model can predict here.
+        auc: area under the ROC curve over all thresholds, `Outcomes.auc`.
+    """
 
     threshold: float
     frames: int
@@ -114,8 +130,8 @@ class Gate:
 
     @property
     def passed(self) -> bool:
-        """At most 5 % of the failures called success, at least 90 % of the successes found."""
-        return self.false_positives.share <= MOST_FALSE and self.recall.share >= FEWEST_RECOGNISED
+        """Whether at most 5 % are false positives and recall is at least 90 %."""
+        return self.false_positives.share <= MAX_FALSE_POSITIVE_RATE and self.recall.share >= MIN_RECALL
 
     def as_json(self) -> dict[str, Any]:
         return {
@@ -132,56 +148,64 @@ class Gate:
 def success_gate(
     model: ActionWorldModelRewardModel, dataset_root: str | Path, threshold: float = 0.5, frames: int = 3
 ) -> Gate:
-    """Replay every episode of a dataset of real rollouts and count. ValueError if the model cannot."""
-    return gate_at(attempted(model, rollouts_for(model, dataset_root)), threshold, frames)
+    """Replay every episode of a dataset of rollouts open loop and count false positives and recall.
+
+    Raises:
+        FieldError: the model cannot replay the dataset, or its episodes have no labels of success.
+    """
+    return gate_at(predict_outcomes(model, labelled_recording(model, dataset_root)), threshold, frames)
 
 
-def rollouts_for(model: ActionWorldModelRewardModel, dataset_root: str | Path) -> Source:
-    """A dataset of real rollouts to ask the model about. ValueError if it cannot replay them, or nobody knows
-    which of them succeeded."""
+def labelled_recording(model: ActionWorldModelRewardModel, dataset_root: str | Path) -> Recording:
+    """Open a dataset of rollouts that the model can replay and whose success is recorded.
+
+    Raises:
+        FieldError: the dataset does not fit the model, or has no labels of success.
+    """
     table = read_episodes(open_dataset(dataset_root))
     check_dataset(model.config, table.dataset.features)
     if not table.done_known:
-        raise ValueError(
-            f"dataset.root={dataset_root}: has neither next.success nor next.done, which say whether success "
-            "holds; use rollouts with labels"
-        )
-    return Source(table, cached_frames(table.dataset, model.config.tokenizer.camera_keys))
+        raise FieldError(
+            "dataset.root", dataset_root,
+            "has neither next.success nor next.done, which say whether success holds",
+            "use rollouts with labels",
+        )  # fmt: skip
+    return Recording(table, cached_frames(table.dataset, model.config.tokenizer.camera_keys))
 
 
-def attempted(model: ActionWorldModelRewardModel, source: Source) -> Outcomes:
-    """What the model makes of all episodes but play."""
-    return Outcomes.of(judged_episodes(model, source)).attempts(source.table)
+def predict_outcomes(model: ActionWorldModelRewardModel, recording: Recording) -> Outcomes:
+    """Predict the outcome of every episode but play, open loop."""
+    return Outcomes.stack(predict_done(model, recording)).attempts(recording.table)
 
 
-def judged_episodes(model: ActionWorldModelRewardModel, source: Source) -> Iterator[Judged]:
-    """All episodes open loop, without pictures, short ones first."""
-    device, length = model.state_mean.device, source.table.length
+def predict_done(model: ActionWorldModelRewardModel, recording: Recording) -> Iterator[PredictedDone]:
+    """Predict done for all episodes open loop, short ones first, without drawing frames."""
+    device, length = model.state_mean.device, recording.table.length
     for batch in in_batches(np.argsort(length, kind="stable")):
-        tokens, context = source.starts(batch, model.tokenizer)
-        state, depth = source.first_state(batch, device), source.first_depth(model, batch)
-        actions = source.actions(batch, min(int(length[batch].max()), LONGEST), device)
+        tokens, context = recording.first_frames(batch, model.tokenizer)
+        state, depth = recording.first_state(batch, device), recording.first_depth(model, batch)
+        actions = recording.actions(batch, min(int(length[batch].max()), MAX_ACTIONS), device)
         probability = open_loop(model, tokens, state, actions, context, depth).done_logit.sigmoid()
         for row, episode in enumerate(batch.tolist()):
-            done = source.table.done[source.rows(episode)]
-            yield Judged(episode, probability[row, : len(done)], done)
+            done = recording.table.done[recording.rows(episode)]
+            yield PredictedDone(episode, probability[row, : len(done)], done)
 
 
 def gate_at(outcomes: Outcomes, threshold: float, frames: int) -> Gate:
-    """Count at one operating point."""
-    called, real = outcomes.first_predicted_success(threshold, frames) >= 0, outcomes.success
+    """Count false positives and recall at one operating point."""
+    predicted, success = outcomes.first_predicted_success(threshold, frames) >= 0, outcomes.success
     return Gate(
         threshold,
         frames,
-        Proportion(int((called & ~real).sum()), int((~real).sum())),
-        Proportion(int((called & real).sum()), int(real.sum())),
-        int((real & (first_run(outcomes.done, frames) < 0)).sum()),
+        Proportion(int((predicted & ~success).sum()), int((~success).sum())),
+        Proportion(int((predicted & success).sum()), int(success.sum())),
+        int((success & (first_run(outcomes.done, frames) < 0)).sum()),
         outcomes.auc(frames),
     )
 
 
 def gates_by_task(outcomes: Outcomes, table: EpisodeTable, threshold: float, frames: int) -> dict[str, Gate]:
-    """The gate of each task in the dataset, from the same replay; none if it does not say."""
+    """Return the gate of each task in the dataset; none if the dataset does not name tasks."""
     tasks = table.task[outcomes.episodes]
     return {
         TASKS[task]: gate_at(outcomes.where(tasks == task), threshold, frames)
@@ -190,25 +214,27 @@ def gates_by_task(outcomes: Outcomes, table: EpisodeTable, threshold: float, fra
 
 
 def sweep(outcomes: Outcomes) -> list[Gate]:
-    """The gate at every operating point, from the same replay."""
+    """Return the gate at every operating point, from the same replay."""
     return [gate_at(outcomes, at, frames) for frames in SWEEP_FRAMES for at in SWEEP_THRESHOLDS]
 
 
 def best_operating_point(gates: Sequence[Gate]) -> Gate | None:
-    """Of those with at most 5 % false successes the one that recognises most; None if there is none.
+    """Return the operating point of highest recall with at most 5 % false positives, None if there is none.
 
-    Among equals the fewest false successes, then the strictest.
+    Ties go to the fewest false positives, then to the strictest point.
     """
 
     def merit(gate: Gate) -> tuple[float, ...]:
         return gate.recall.k, -gate.false_positives.k, gate.threshold, gate.frames
 
-    tolerable = [gate for gate in gates if gate.false_positives.share <= MOST_FALSE and gate.recall.n]
-    return max(tolerable, key=merit, default=None)
+    allowed = [
+        gate for gate in gates if gate.false_positives.share <= MAX_FALSE_POSITIVE_RATE and gate.recall.n
+    ]
+    return max(allowed, key=merit, default=None)
 
 
-def success_agreement(outcomes: Outcomes, threshold: float, frames: int) -> dict[str, Any]:
-    """The gate at one operating point, in detail: counts, rates, and every episode's verdict."""
+def gate_details(outcomes: Outcomes, threshold: float, frames: int) -> dict[str, Any]:
+    """Return the gate at one operating point for metrics.json: counts, rates and every episode's outcome."""
     gate = gate_at(outcomes, threshold, frames)
     return {
         "failures": gate.false_positives.n,
@@ -223,9 +249,50 @@ def success_agreement(outcomes: Outcomes, threshold: float, frames: int) -> dict
 
 
 def first_run(fired: np.ndarray, frames: int) -> np.ndarray:
-    """Where the first run of `frames` consecutive True begins, −1 if there is none. (E, T) → (E,)"""
+    """Return where the first run of `frames` consecutive True begins, −1 if there is none. (E, T) → (E,)"""
     count, begin = np.zeros(fired.shape[0], int), np.full(fired.shape[0], -1)
     for step, column in enumerate(fired.T):
         count = np.where(column, count + 1, 0)
         begin = np.where((begin < 0) & (count >= frames), step - frames + 1, begin)
     return begin
+
+
+def precision_recall_f1(predicted: np.ndarray, target: np.ndarray) -> dict[str, Estimate]:
+    """Pool (E, …) bool over everything; the intervals resample episodes."""
+    axes = tuple(range(1, predicted.ndim))
+    hits, positives, targets = (mask.sum(axes) for mask in (predicted & target, predicted, target))
+    return {
+        "precision": Estimate.ratio(hits, positives),
+        "recall": Estimate.ratio(hits, targets),
+        "f1": Estimate.ratio(2 * hits, positives + targets),
+    }
+
+
+def done_delay(outcomes: Outcomes, threshold: float, frames: int) -> np.ndarray:
+    """Return the frames from the recorded to the predicted first success, NaN unless both exist. (E,)"""
+    begin = outcomes.first_predicted_success(threshold, frames)
+    return np.where((begin >= 0) & outcomes.success, begin - outcomes.done.argmax(1), np.nan)
+
+
+def done_log_loss(outcomes: Outcomes) -> Estimate:
+    """Return the mean negative log-likelihood of the recorded outcome in nats a frame, at no threshold."""
+    frames = ~np.isnan(outcomes.probability)
+    likelihood = np.where(outcomes.done, outcomes.probability, 1 - outcomes.probability)
+    losses = np.where(frames, -np.log(np.clip(likelihood, MIN_PROBABILITY, 1)), 0)
+    return Estimate.ratio(losses.sum(1), frames.sum(1))
+
+
+def done_accuracy(outcomes: Outcomes, threshold: float, frames: int) -> dict[str, Estimate]:
+    """Measure the done signal: `done_*` over frames, `episode_*` as the environment ends episodes, delay."""
+    fired = outcomes.probability >= threshold
+    predicted = outcomes.first_predicted_success(threshold, frames) >= 0
+    per_frame = precision_recall_f1(fired, outcomes.done)
+    per_episode = precision_recall_f1(predicted, outcomes.success)
+    delay = done_delay(outcomes, threshold, frames)
+    return {
+        **{f"done_{name}": estimate for name, estimate in per_frame.items()},
+        **{f"episode_{name}": estimate for name, estimate in per_episode.items()},
+        "done_log_loss": done_log_loss(outcomes),
+        "done_delay_frames": Estimate.mean(delay),
+        "done_distance_frames": Estimate.mean(np.abs(delay)),
+    }

@@ -1,4 +1,9 @@
-"""How good the text model's goal frames are: near to a true final frame, and is the task done in them?"""
+"""Goal frames of the text world model: distance to recorded final frames, and whether success holds in them.
+
+The second question is answered by a success probe: a small CNN trained on recorded frames, labelled by the
+dataset's own `next.success`. It sees every frame as the tokenizer decodes it, because goal frames exist only
+decoded, and beside its episode's first frame, because success can depend on where things were.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,24 +11,43 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn import functional as F
+from tqdm import trange
 
 from lerobot_wmrl.common.statistics import Estimate, Proportion
 from lerobot_wmrl.data.frame_cache import frames_to_tensor
 from lerobot_wmrl.evaluation.image_metrics import psnr
-from lerobot_wmrl.evaluation.replay import Source
-from lerobot_wmrl.evaluation.success_probe import TrainedProbe, is_held_out
+from lerobot_wmrl.evaluation.replay import Recording
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer, feature_distance
 from lerobot_wmrl.world_models.goal import imagine_goal
 from lerobot_wmrl.world_models.modeling_world_model import TextWorldModelRewardModel
 
-MOST_GOALS = 64
-MOST_FINALS = 200
+MAX_GOALS = 64
+MAX_FINALS = 200
+
+PROBE_VALIDATION_EVERY = 5
+"""Every fifth episode is held out from the probe's training, those that world models hold out among them."""
+
+MAX_PROBE_FRAMES = 1500
+"""Frames of each class in the probe's training, and of each in its validation."""
+
+PROBE_SIZE = 64
+PROBE_EPOCHS = 10
+PROBE_BATCH = 64
+PROBE_LEARNING_RATE = 1e-3
+ENCODE_BATCH = 128
 
 
 class Finals(NamedTuple):
-    """True final frames: F successful episodes (F,), where success begins in them and how they began, both
-    decoded (F, N, 3, H, W), and the features of the former."""
+    """Recorded final frames of F successful episodes.
+
+    Attributes:
+        episodes: their indices (F,).
+        images: the frames in which success begins, decoded (F, N, 3, H, W).
+        starts: the first frames of those episodes, decoded (F, N, 3, H, W).
+        features: decoder features of `images`.
+    """
 
     episodes: np.ndarray
     images: Tensor
@@ -33,11 +57,16 @@ class Finals(NamedTuple):
 
 @dataclass(frozen=True)
 class Goals:
-    """G goal frames beside true final frames; pictures are decoded, (G, N, 3, H, W) in [0, 1].
+    """Goal frames of G episodes beside recorded final frames; images are decoded, (G, N, 3, H, W) in [0, 1].
 
-    episodes (G,), whose starts they are; start, goal; reached (G,), whether θ was reached; finals, None
-    without a success; nearest (G,): of the finals with the same instruction the one with the least feature
-    distance to the goal, −1 without one; distance, start_distance (G,): least ones to the goal, to the start.
+    Args:
+        episodes: the episodes (G,) from whose first frames the goals are imagined.
+        start, goal: the first frames and the goal frames.
+        reached: whether the done threshold was reached, (G,).
+        finals: recorded final frames, None without a success.
+        nearest: index into `finals` of the nearest one with the same instruction by feature distance, −1
+            without one, (G,).
+        distance, start_distance: least feature distance of the goal and of the start, (G,).
     """
 
     episodes: np.ndarray
@@ -51,15 +80,15 @@ class Goals:
 
 
 @torch.no_grad()
-def imagine_goals(model: TextWorldModelRewardModel, source: Source, episodes: np.ndarray) -> Goals:
-    """Imagine a goal from the start of each of at most `MOST_GOALS` episodes and look for its like."""
-    table, device, tokenizer = source.table, model.state_mean.device, model.tokenizer
-    starts = episodes[:MOST_GOALS]
-    tokens, context = source.starts(starts, tokenizer)
+def imagine_goals(model: TextWorldModelRewardModel, recording: Recording, episodes: np.ndarray) -> Goals:
+    """Imagine goals from the first frames of at most `MAX_GOALS` episodes and find the nearest finals."""
+    table, device, tokenizer = recording.table, model.state_mean.device, model.tokenizer
+    starts = episodes[:MAX_GOALS]
+    tokens, context = recording.first_frames(starts, tokenizer)
     instructions = [table.instructions[episode] for episode in starts]
-    state, depth = source.first_state(starts, device), source.first_depth(model, starts)
+    state, depth = recording.first_state(starts, device), recording.first_depth(model, starts)
     goal = imagine_goal(model, tokens, state, instructions, context, depth)
-    start, finals = tokenizer.decode_with_features(tokens, context), true_finals(tokenizer, source, device)
+    start, finals = tokenizer.decode_with_features(tokens, context), final_frames(tokenizer, recording)
     nearest, distance = np.full(len(starts), -1), np.full(len(starts), np.nan)
     start_distance = distance
     if finals is not None:
@@ -74,8 +103,8 @@ def imagine_goals(model: TextWorldModelRewardModel, source: Source, episodes: np
     )  # fmt: skip
 
 
-def goal_quality(goals: Goals, probe: TrainedProbe | None) -> dict[str, Any]:
-    """Distances to the nearest true final frame, those of the start frame, and the probe's verdict."""
+def goal_quality(goals: Goals, probe: "TrainedProbe | None") -> dict[str, Any]:
+    """Return the distances of goals and starts to the nearest finals, and the probe's share of successes."""
     result = {
         "goals": len(goals.episodes),
         "goal_reached": Proportion(int(goals.reached.sum()), len(goals.reached)).as_json(),
@@ -84,7 +113,7 @@ def goal_quality(goals: Goals, probe: TrainedProbe | None) -> dict[str, Any]:
         "nearest_final_psnr": Estimate.mean(nearest_psnr(goals)).as_json(),
     }
     if probe is not None and goals.finals is not None:
-        unseen = is_held_out(goals.finals.episodes)
+        unseen = held_out_from_probe(goals.finals.episodes)
         result["success_holds"] = probe.success(goals.start, goals.goal).as_json()
         result["success_holds_in_finals"] = probe.success(
             goals.finals.starts[unseen], goals.finals.images[unseen]
@@ -94,30 +123,30 @@ def goal_quality(goals: Goals, probe: TrainedProbe | None) -> dict[str, Any]:
 
 
 def nearest_psnr(goals: Goals) -> np.ndarray:
-    """dB between each goal and the final nearest to it, of those that have one."""
+    """PSNR in dB between each goal and the final nearest to it, for the goals that have one."""
     if goals.finals is None:
         return np.empty(0)
     known = goals.nearest >= 0
     return psnr(goals.goal[known], goals.finals.images[goals.nearest[known]]).cpu().numpy()
 
 
-def true_finals(tokenizer: FrameTokenizer, source: Source, device: torch.device) -> Finals | None:
-    """None if no episode succeeds."""
-    episodes, rows = final_rows(source)
+def final_frames(tokenizer: FrameTokenizer, recording: Recording) -> Finals | None:
+    """Decode the recorded final frames, None if no episode succeeds."""
+    episodes, rows = final_rows(recording)
     if not len(episodes):
         return None
-    first, context = source.starts(episodes, tokenizer)
-    images = frames_to_tensor(source.frames[rows]).to(device)
+    first, context = recording.first_frames(episodes, tokenizer)
+    images = frames_to_tensor(recording.frames[rows]).to(first.device)
     tokens = first, tokenizer.encode(images, context)
     starts, decoded = (tokenizer.decode_with_features(each, context) for each in tokens)
     return Finals(episodes, decoded.images, starts.images, decoded.features)
 
 
-def final_rows(source: Source) -> tuple[np.ndarray, np.ndarray]:
-    """At most `MOST_FINALS` successful episodes and the rows of their first frames in which success holds."""
-    table = source.table
+def final_rows(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
+    """Return at most `MAX_FINALS` successful episodes and the rows of their first frames with success."""
+    table = recording.table
     episodes = table.success.nonzero()[0]
-    episodes = episodes[np.linspace(0, len(episodes) - 1, min(len(episodes), MOST_FINALS)).astype(int)]
+    episodes = episodes[np.linspace(0, len(episodes) - 1, min(len(episodes), MAX_FINALS)).astype(int)]
     rows = [
         start + min(int(table.done[start : start + n].argmax()) + 1, n - 1)
         for start, n in zip(table.start[episodes], table.length[episodes], strict=True)
@@ -126,8 +155,10 @@ def final_rows(source: Source) -> tuple[np.ndarray, np.ndarray]:
 
 
 def feature_distances(goals: Sequence[Tensor], finals: Sequence[Tensor], num_cameras: int) -> np.ndarray:
-    """LPIPS's formula on tokenizer features for every pair, over N cameras: [(G·N, C, h, w)] and
-    [(F·N, C, h, w)] → (G, F)."""
+    """LPIPS's formula on tokenizer features for every pair, averaged over N cameras.
+
+    [(G·N, C, h, w)] and [(F·N, C, h, w)] → (G, F).
+    """
     count = len(finals[0]) // num_cameras
     rows = []
     for goal in zip(*(layer.split(num_cameras) for layer in goals), strict=True):
@@ -137,7 +168,142 @@ def feature_distances(goals: Sequence[Tensor], finals: Sequence[Tensor], num_cam
 
 
 def least(distance: np.ndarray, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of the allowed columns the least value of each row and its index; NaN and −1 where none is. (G, F)"""
+    """Return each row's least allowed value and its column; NaN and −1 where none is allowed. (G, F)"""
     masked = np.where(allowed, distance, np.inf)
     index, some = masked.argmin(1), allowed.any(1)
     return np.where(some, masked.min(1), np.nan), np.where(some, index, -1)
+
+
+class SuccessProbe(nn.Module):
+    """First frame and frame (B, N, 3, H, W) in [0, 1], both decoded → the logit of success (B,)."""
+
+    def __init__(self, num_cameras: int) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Conv2d(6 * num_cameras, 32, 5, stride=2, padding=2), nn.ReLU(),
+            nn.Conv2d(32, 48, 3, stride=2, padding=1), nn.ReLU(),
+            nn.Conv2d(48, 64, 3, stride=2, padding=1), nn.ReLU(),
+            nn.Flatten(), nn.Dropout(0.2), nn.Linear(64 * (PROBE_SIZE // 8) ** 2, 64), nn.ReLU(),
+            nn.Linear(64, 1),
+        )  # fmt: skip
+
+    def forward(self, first: Tensor, images: Tensor) -> Tensor:
+        return self.layers(torch.cat([_small(first), _small(images)], 1) - 0.5)[:, 0]
+
+
+@dataclass(frozen=True)
+class TrainedProbe:
+    """A probe and its balanced accuracy on episodes it has not seen, NaN without any."""
+
+    network: SuccessProbe
+    balanced_accuracy: float
+    frames: int
+    held_out_frames: int
+
+    @torch.no_grad()
+    def success(self, first: Tensor, images: Tensor) -> Proportion:
+        """Return the share of decoded frames (F, N, 3, H, W) in which success holds."""
+        holds = self.network(first, images) > 0
+        return Proportion(int(holds.sum()), len(holds))
+
+    def as_json(self) -> dict[str, Any]:
+        known = np.isfinite(self.balanced_accuracy)
+        return {
+            "balanced_accuracy": self.balanced_accuracy if known else None,
+            "frames": self.frames,
+            "held_out_frames": self.held_out_frames,
+        }
+
+
+@dataclass(frozen=True)
+class LabelledFrames:
+    """first, images (F, N, 3, H, W), decoded; success (F,) bool."""
+
+    first: Tensor
+    images: Tensor
+    success: Tensor
+
+
+def train_probe(tokenizer: FrameTokenizer, recording: Recording) -> TrainedProbe | None:
+    """Train on as many frames with success as without, with a fixed seed. None if a class is empty."""
+    held_out = held_out_from_probe(np.arange(len(recording.table.start)))
+    rng = np.random.default_rng(0)
+    training, test = (labelled_frames(tokenizer, recording, part, rng) for part in (~held_out, held_out))
+    if training is None:
+        return None
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        network = fit(SuccessProbe(tokenizer.num_cameras).to(training.images.device), training, rng)
+    accuracy = balanced_accuracy(network, test) if test is not None else np.nan
+    return TrainedProbe(network, accuracy, len(training.success), 0 if test is None else len(test.success))
+
+
+def held_out_from_probe(episodes: np.ndarray) -> np.ndarray:
+    """Whether the probe does not train on each episode. (E,) → (E,) bool"""
+    return episodes % PROBE_VALIDATION_EVERY == PROBE_VALIDATION_EVERY - 1
+
+
+def fit(network: SuccessProbe, data: LabelledFrames, rng: np.random.Generator) -> SuccessProbe:
+    """Minimise the binary cross-entropy over `PROBE_EPOCHS` passes."""
+    optimizer = torch.optim.AdamW(network.parameters(), PROBE_LEARNING_RATE, weight_decay=0.01)
+    for _ in trange(PROBE_EPOCHS, desc="Training the success probe", unit="epoch"):
+        for index in torch.from_numpy(rng.permutation(len(data.success))).split(PROBE_BATCH):
+            logit = network(data.first[index], data.images[index])
+            loss = F.binary_cross_entropy_with_logits(logit, data.success[index].float())
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+    return network.eval()
+
+
+@torch.no_grad()
+def balanced_accuracy(network: SuccessProbe, data: LabelledFrames) -> float:
+    """Return the mean of the accuracies on frames with and without success."""
+    right = (network(data.first, data.images) > 0) == data.success
+    return float((right[data.success].float().mean() + right[~data.success].float().mean()) / 2)
+
+
+def labelled_frames(
+    tokenizer: FrameTokenizer, recording: Recording, chosen: np.ndarray, rng: np.random.Generator
+) -> LabelledFrames | None:
+    """Draw as many frames with success as without from the episodes in `chosen` (E,); None if one is missing.
+
+    The `next.success` of a row speaks of the frame its action led to, which is the next row's.
+    """
+    table = recording.table
+    episodes = np.repeat(np.arange(len(table.start)), table.length - 1)
+    rows = np.concatenate(
+        [start + np.arange(1, n) for start, n in zip(table.start, table.length, strict=True)]
+    )
+    success = table.done[rows - 1]
+    classes = [np.flatnonzero(chosen[episodes] & (success == wanted)) for wanted in (True, False)]
+    count = min(*map(len, classes), MAX_PROBE_FRAMES)
+    if not count:
+        return None
+    index = np.concatenate([rng.choice(of_class, count, replace=False) for of_class in classes])
+    starts = table.start[episodes[index]]
+    first, images = (decoded(tokenizer, recording.frames, which, starts) for which in (starts, rows[index]))
+    return LabelledFrames(first, images, torch.from_numpy(success[index]).to(images.device))
+
+
+@torch.no_grad()
+def decoded(tokenizer: FrameTokenizer, frames: np.ndarray, rows: np.ndarray, starts: np.ndarray) -> Tensor:
+    """Encode and decode recorded frames, at the probe's size: rows (R,) → (R, N, 3, h, w).
+
+    starts (R,): the first rows of their episodes.
+    """
+    device, parts = next(tokenizer.parameters()).device, []
+    for begin in range(0, len(rows), ENCODE_BATCH):
+        part = slice(begin, begin + ENCODE_BATCH)
+        images, first = (frames_to_tensor(frames[which[part]]).to(device) for which in (rows, starts))
+        context = tokenizer.context(first)
+        parts.append(_small(tokenizer.decode(tokenizer.encode(images, context), context)))
+    return torch.cat(parts).unflatten(1, (-1, 3))
+
+
+def _small(images: Tensor) -> Tensor:
+    """(B, N, 3, H, W) → (B, 3N, PROBE_SIZE, PROBE_SIZE)"""
+    flat = images.flatten(1, 2)
+    return (
+        flat if flat.shape[-1] == PROBE_SIZE else F.interpolate(flat, (PROBE_SIZE, PROBE_SIZE), mode="area")
+    )

@@ -1,4 +1,4 @@
-"""Pictures of what a world model imagines, beside what happened."""
+"""Pictures of an evaluation: recorded beside imagined frames, goal frames, and measures by step."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,9 +13,10 @@ import torch
 from torch import Tensor
 
 from lerobot_wmrl.common.frame_strips import GAP, enlarged, evenly_spaced, in_a_row
+from lerobot_wmrl.evaluation.agreement import Agreement
 from lerobot_wmrl.evaluation.gate import SWEEP_FRAMES, SWEEP_THRESHOLDS, Gate
 from lerobot_wmrl.evaluation.goals import Goals
-from lerobot_wmrl.evaluation.replay import EpisodeReplay, Source
+from lerobot_wmrl.evaluation.replay import EpisodeReplay, Recording
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 
 SCALE = 3
@@ -24,39 +25,41 @@ SHOWN_GOALS = 8
 
 
 @torch.no_grad()
-def side_by_side(model: ActionWorldModelRewardModel, source: Source, run: EpisodeReplay) -> np.ndarray:
-    """One episode: real frames above, imagined ones below. → (T, 2H + gap, N·W, 3) uint8"""
-    real = source.frames[source.rows(run.episode)]
-    first, context = source.starts(np.array([run.episode]), model.tokenizer)
-    tokens = torch.cat([first, run.tokens[: len(real) - 1]])
+def side_by_side(
+    model: ActionWorldModelRewardModel, recording: Recording, replay: EpisodeReplay
+) -> np.ndarray:
+    """Show one episode, recorded frames above imagined ones. → (T, 2H + gap, N·W, 3) uint8"""
+    recorded = recording.frames[recording.rows(replay.episode)]
+    first, context = recording.first_frames(np.array([replay.episode]), model.tokenizer)
+    tokens = torch.cat([first, replay.tokens[: len(recorded) - 1]])
     imagined = to_uint8(model.tokenizer.decode(tokens, context[[0] * len(tokens)]))
-    rows = [np.concatenate(list(cameras.swapaxes(0, 1)), 2) for cameras in (real, imagined)]
-    gap = np.full((len(real), GAP, *rows[0].shape[2:]), 255, np.uint8)
+    rows = [np.concatenate(list(cameras.swapaxes(0, 1)), 2) for cameras in (recorded, imagined)]
+    gap = np.full((len(recorded), GAP, *rows[0].shape[2:]), 255, np.uint8)
     return np.concatenate([rows[0], gap, rows[1]], 1)
 
 
 def to_uint8(images: Tensor) -> np.ndarray:
-    """(T, N, 3, H, W) in [0, 1] → (T, N, H, W, 3)"""
+    """(T, N, 3, H, W) in [0, 1] → (T, N, H, W, 3) uint8"""
     return (images * 255).round().byte().permute(0, 1, 3, 4, 2).cpu().numpy()
 
 
 def save_animation(frames: np.ndarray, path: Path) -> None:
-    """(T, H, W, 3) uint8 as a GIF at 10 frames a second."""
+    """Save (T, H, W, 3) uint8 as a GIF at 10 frames a second."""
     images = [enlarged(frame, SCALE) for frame in frames]
     images[0].save(path, save_all=True, append_images=images[1:], duration=100, loop=0)
 
 
 def save_strip(frames: np.ndarray, path: Path) -> None:
-    """A few evenly spaced frames of (T, H, W, 3) in one row."""
+    """Save a few evenly spaced frames of (T, H, W, 3) in one row."""
     enlarged(in_a_row(frames[evenly_spaced(len(frames), STRIP_FRAMES)]), SCALE).save(path)
 
 
 def save_goals(goals: Goals, path: Path) -> None:
-    """A contact sheet: start, imagined goal, and the nearest real frame of a success, for some episodes."""
+    """Save a sheet of start, goal frame and nearest recorded final frame for some episodes."""
     shown = evenly_spaced(len(goals.episodes), SHOWN_GOALS)
     rows = {"start": goals.start[shown], "goal": goals.goal[shown]}
     if goals.finals is not None and (goals.nearest >= 0).all():
-        rows["nearest end"] = goals.finals.images[goals.nearest[shown]]
+        rows["nearest final"] = goals.finals.images[goals.nearest[shown]]
     pictures = {title: to_uint8(images) for title, images in rows.items()}
     size = 1.5 * len(shown), 1.7 * len(pictures)
     figure, axes = plt.subplots(len(pictures), len(shown), figsize=size, squeeze=False)
@@ -71,7 +74,7 @@ def save_goals(goals: Goals, path: Path) -> None:
 
 
 def save_reward_curves(curves: dict[str, dict[str, Any]], path: Path) -> None:
-    """The general reward, summed so far, and its two parts along real episodes."""
+    """Plot the return of the general reward and its two parts along recorded episodes."""
     panels = (
         ("done_probability", "done probability"),
         ("similarity", "similarity to the goal"),
@@ -89,14 +92,14 @@ def save_reward_curves(curves: dict[str, dict[str, Any]], path: Path) -> None:
 
 ACCURACY_PANELS = {
     "PSNR (dB) by imagined frame": {"psnr": "prediction", "psnr_ceiling": "tokenizer alone"},
-    "of what moved": {"moving_psnr": "prediction", "moving_psnr_ceiling": "tokenizer alone"},
+    "of moved pixels": {"moving_psnr": "prediction", "moving_psnr_ceiling": "tokenizer alone"},
     "token accuracy": {"token_accuracy": ""},
     "error of the imagined TCP (mm)": {"tcp_error_mm": ""},
 }
 
 
 def save_accuracy(by_step: Mapping[str, Any], path: Path) -> None:
-    """Means by step with 95 % bands, beside what the tokenizer can at best draw."""
+    """Plot means by step with 95 % bands, beside the tokenizer alone, which bounds the prediction."""
     panels = {
         title: lines
         for title, lines in ACCURACY_PANELS.items()
@@ -118,10 +121,10 @@ def save_accuracy(by_step: Mapping[str, Any], path: Path) -> None:
 
 
 def save_sweep(gates: Sequence[Gate], path: Path) -> None:
-    """False successes and recognised successes by threshold, a line for each number of frames."""
+    """Plot false positives and recall by threshold, a line for each number of frames."""
     figure, axes = plt.subplots(1, 2, figsize=(8, 2.8))
-    titles = {"false_positives": "failures called successes (%)", "recall": "successes recognised (%)"}
-    for axis, (name, title), limit in zip(axes, titles.items(), (5, 90), strict=True):
+    panels = {"false_positives": ("false positives (%)", 5), "recall": ("recall (%)", 90)}
+    for axis, (name, (title, limit)) in zip(axes, panels.items(), strict=True):
         for frames in SWEEP_FRAMES:
             shares = [100 * getattr(gate, name).share for gate in gates if gate.frames == frames]
             axis.plot(SWEEP_THRESHOLDS, shares, label=f"k = {frames}")
@@ -129,6 +132,17 @@ def save_sweep(gates: Sequence[Gate], path: Path) -> None:
         axis.set_title(title, fontsize=10)
         axis.set_xlabel("threshold")
     axes[1].legend(fontsize=6)
+    _save(figure, path)
+
+
+def save_agreement(agreement: Agreement, path: Path) -> None:
+    """Plot a point a policy with Wilson intervals, beside the diagonal."""
+    figure, axes = plt.subplots(figsize=(4.2, 4))
+    axes.plot((0, 1), (0, 1), color="#999", linewidth=1, linestyle="--")
+    for imagined, real in agreement.policies.values():
+        x, y = ([[abs(each.share - bound)] for bound in each.interval] for each in (imagined, real))
+        axes.errorbar(imagined.share, real.share, y, x, color="#2b6cb0", marker="o", capsize=2)
+    axes.set(xlim=(0, 1), ylim=(0, 1), xlabel="success in the world model", ylabel="success in real_env")
     _save(figure, path)
 
 

@@ -1,24 +1,41 @@
-"""What the evaluation leaves: the numbers for metrics.json, tables for people, and pictures."""
+"""Evaluation of a world model on recorded episodes: one pass over them, then metrics, tables, pictures."""
 
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from lerobot_wmrl.common.constants import KINDS, PLAY
-from lerobot_wmrl.evaluation import pictures, tables
-from lerobot_wmrl.evaluation.accuracy import HORIZON, by_step, headline
-from lerobot_wmrl.evaluation.done import done_quality
-from lerobot_wmrl.evaluation.evaluate import Evaluation
-from lerobot_wmrl.evaluation.extreme_actions import robustness
+from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.statistics import Estimate
+from lerobot_wmrl.data.frames import NO_CONTEXT
+from lerobot_wmrl.evaluation import pictures
+from lerobot_wmrl.evaluation.accuracy import (
+    HORIZON,
+    EpisodeAccuracy,
+    by_step,
+    headline,
+    measure,
+    robustness,
+)
+from lerobot_wmrl.evaluation.agreement import MIN_POLICIES, Agreement
 from lerobot_wmrl.evaluation.gate import (
+    SWEEP_FRAMES,
+    SWEEP_THRESHOLDS,
+    Gate,
+    Outcomes,
     best_operating_point,
+    done_accuracy,
     gate_at,
+    gate_details,
     gates_by_task,
-    success_agreement,
     sweep,
 )
-from lerobot_wmrl.evaluation.goals import goal_quality, imagine_goals
-from lerobot_wmrl.evaluation.replay import LONGEST, Source
-from lerobot_wmrl.evaluation.success_probe import train_probe
+from lerobot_wmrl.evaluation.goals import goal_quality, imagine_goals, train_probe
+from lerobot_wmrl.evaluation.image_metrics import cached_lpips
+from lerobot_wmrl.evaluation.replay import MAX_ACTIONS, EpisodeReplay, Recording, replay_episodes
 from lerobot_wmrl.world_models.modeling_world_model import (
     ActionWorldModelRewardModel,
     TextWorldModelRewardModel,
@@ -27,32 +44,108 @@ from lerobot_wmrl.world_models.modeling_world_model import (
 TOP_LEVEL = ("delta_psnr_15", "done_delay_frames")
 """Headline numbers that metrics.json also holds without their intervals."""
 
+TITLES = {
+    "psnr": "PSNR (dB)",
+    "psnr_ceiling": "PSNR of the tokenizer alone (dB)",
+    "psnr_30": "PSNR at step 30 (dB)",
+    "psnr_ceiling_30": "PSNR of the tokenizer alone at step 30 (dB)",
+    "psnr_below_ceiling_30": "below the tokenizer at step 30 (dB)",
+    "moving_psnr": "PSNR of moved pixels (dB)",
+    "moving_psnr_ceiling": "PSNR of moved pixels, tokenizer alone (dB)",
+    "delta_psnr_15": "delta-PSNR at step 15 (dB)",
+    "ssim": "SSIM",
+    "tokenizer_lpips": "LPIPS's formula on tokenizer features",
+    "lpips_alex": "LPIPS (AlexNet)",
+    "token_accuracy": "token accuracy",
+    "tcp_error_mm": "error of the TCP (mm)",
+    "abs_rel": "AbsRel",
+    "delta_1": "depth δ1",
+    "delta_2": "depth δ2",
+    "spatial_iou": "spatial IoU",
+    "spatiotemporal_iou": "spatiotemporal IoU",
+    "weighted_spatial_iou": "weighted spatial IoU",
+    "mse": "MSE",
+    "done_precision": "done precision, by frame",
+    "done_recall": "done recall, by frame",
+    "done_f1": "done F1, by frame",
+    "done_log_loss": "done log loss (nats a frame)",
+    "episode_precision": "success precision, by episode",
+    "episode_recall": "success recall, by episode",
+    "episode_f1": "success F1, by episode",
+    "done_delay_frames": "delay of done (frames)",
+    "done_distance_frames": "delay of done, early or late (frames)",
+}
+"""Titles of the measures in metrics.json, in the order of the table."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What one pass over recorded episodes leaves.
+
+    Args:
+        accuracy: of every episode, in order.
+        attempts: the episodes that attempt a task.
+        outcomes: of these; none if success was not recorded.
+        shown: replays of the shortest success and the shortest failure, by name.
+    """
+
+    accuracy: list[EpisodeAccuracy]
+    attempts: np.ndarray
+    outcomes: Outcomes
+    shown: dict[str, EpisodeReplay]
+
 
 class Report(NamedTuple):
-    """`numbers` for metrics.json and `page` in Markdown."""
+    """`metrics` for metrics.json, and `page` in Markdown."""
 
-    numbers: dict[str, Any]
+    metrics: dict[str, Any]
     page: str
 
 
+def evaluate(model: ActionWorldModelRewardModel, recording: Recording, episodes: np.ndarray) -> Evaluation:
+    """Replay and measure the episodes, keeping the measures and only two replays' frames.
+
+    Raises:
+        FieldError: there is nothing to predict, because every episode has a single frame.
+    """
+    if recording.table.length[episodes].max() < 2:
+        raise FieldError(
+            "dataset.root", recording.table.dataset.root,
+            "every chosen episode has a single frame: there is nothing to predict",
+            "use a dataset with longer episodes",
+        )  # fmt: skip
+    lpips = cached_lpips(model.state_mean.device)
+    accuracy, replays = [], []
+    shown: dict[str, EpisodeReplay] = {}
+    for run in replay_episodes(model, recording, episodes):
+        accuracy.append(measure(model, recording, run, lpips))
+        replays.append(replace(run, tokens=run.tokens.new_empty(0), context=NO_CONTEXT))
+        if recording.table.kind[run.episode] != KINDS.index(PLAY) and len(run.done) > 1:
+            shown.setdefault("success" if run.done.any() else "failure", run)
+    accuracy.sort(key=lambda each: each.episode)
+    outcomes = Outcomes.stack(replays).attempts(recording.table)
+    known = outcomes.where(np.full(len(outcomes.episodes), recording.table.done_known))
+    return Evaluation(accuracy, outcomes.episodes, known, shown)
+
+
 def report_action_model(
-    model: ActionWorldModelRewardModel, source: Source, evaluation: Evaluation,
+    model: ActionWorldModelRewardModel, recording: Recording, evaluation: Evaluation,
     threshold: float, frames: int, folder: Path,
 ) -> Report:  # fmt: skip
-    """Accuracy, done, gate and robustness; accuracy.png, gate_sweep.png and comparisons in `folder`."""
+    """Report accuracy, done, gate and robustness, and save their pictures in `folder`."""
     outcomes = evaluation.outcomes
-    estimates = headline(evaluation.accuracy) | done_quality(outcomes, threshold, frames)
-    play = [e for e in evaluation.accuracy if source.table.kind[e.episode] == KINDS.index(PLAY)]
-    steps, gates = by_step(evaluation.accuracy, HORIZON), sweep(outcomes)
+    estimates = headline(evaluation.accuracy) | done_accuracy(outcomes, threshold, frames)
+    play = [e for e in evaluation.accuracy if recording.table.kind[e.episode] == KINDS.index(PLAY)]
+    steps, play_steps = by_step(evaluation.accuracy, HORIZON), by_step(play, MAX_ACTIONS)
+    gates, by_task = sweep(outcomes), gates_by_task(outcomes, recording.table, threshold, frames)
     best = best_operating_point(gates)
-    by_task = gates_by_task(outcomes, source.table, threshold, frames)
-    extremes = robustness(model, source, evaluation.attempts, threshold, frames)
-    numbers = {
-        **success_agreement(outcomes, threshold, frames),
+    extremes = robustness(model, recording, evaluation.attempts, threshold, frames)
+    metrics = {
+        **gate_details(outcomes, threshold, frames),
         **{name: estimates[name].as_json()["value"] if name in estimates else None for name in TOP_LEVEL},
         "headline": {name: estimate.as_json() for name, estimate in estimates.items()},
         **steps,
-        "play": {"episodes": len(play), **by_step(play, LONGEST)},
+        "play": {"episodes": len(play), **play_steps},
         "operating_point": best.as_json() if best else None,
         "gate_by_task": {task: gate.as_json() for task, gate in by_task.items()},
         "gate_sweep": [gate.as_json() for gate in gates],
@@ -60,28 +153,151 @@ def report_action_model(
     }
     pictures.save_accuracy(steps, folder / "accuracy.png")
     if play:
-        pictures.save_accuracy(numbers["play"], folder / "accuracy_play.png")
+        pictures.save_accuracy(play_steps, folder / "accuracy_play.png")
     pictures.save_sweep(gates, folder / "gate_sweep.png")
     for name, run in evaluation.shown.items():
-        shown = pictures.side_by_side(model, source, run)
+        shown = pictures.side_by_side(model, recording, run)
         pictures.save_animation(shown, folder / f"comparison_{name}.gif")
         pictures.save_strip(shown, folder / f"comparison_{name}_strip.png")
     page = [
-        tables.headline_table(estimates),
-        tables.gate_lines(gate_at(outcomes, threshold, frames), best),
-        *([tables.task_table(by_task)] if by_task else []),
-        "Failures called successes / successes recognised, in percent:",
-        tables.sweep_table(gates),
-        tables.robustness_table(extremes),
+        headline_table(estimates),
+        gate_lines(gate_at(outcomes, threshold, frames), best),
+        *([task_table(by_task)] if by_task else []),
+        "False positives / recall, in percent:",
+        sweep_table(gates),
+        robustness_table(extremes),
     ]
-    return Report(numbers, "\n\n".join(page))
+    return Report(metrics, "\n\n".join(page))
 
 
 def report_goals(
-    text_model: TextWorldModelRewardModel, source: Source, evaluation: Evaluation, folder: Path
+    text_model: TextWorldModelRewardModel, recording: Recording, evaluation: Evaluation, folder: Path
 ) -> Report:
-    """Goal frames from the starts of the evaluated episodes; goal_frames.png in `folder`."""
-    goals = imagine_goals(text_model, source, evaluation.attempts)
-    quality = goal_quality(goals, train_probe(text_model.tokenizer, source))
+    """Report goal frames from the starts of the evaluated episodes, and save goal_frames.png in `folder`."""
+    goals = imagine_goals(text_model, recording, evaluation.attempts)
+    quality = goal_quality(goals, train_probe(text_model.tokenizer, recording))
     pictures.save_goals(goals, folder / "goal_frames.png")
-    return Report({"goal_frames": quality}, tables.goal_table(quality))
+    return Report({"goal_frames": quality}, goal_table(quality))
+
+
+def report_agreement(agreement: Agreement, folder: Path) -> Report:
+    """Report how far policies succeed alike in both environments, and save policies.png in `folder`."""
+    pictures.save_agreement(agreement, folder / "policies.png")
+    return Report({"policies": agreement.as_json()}, agreement_table(agreement))
+
+
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Format head and rows, one a line."""
+    cells = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(str(cell) for cell in row)} |" for row in cells)
+
+
+def headline_table(estimates: Mapping[str, Estimate]) -> str:
+    """List every measure with its interval, in the order of `TITLES`."""
+    rows = [
+        (title, str(estimates[name]), estimates[name].n)
+        for name, title in TITLES.items()
+        if name in estimates
+    ]
+    return markdown_table(("measure", "mean (bootstrap 95 %)", "episodes"), rows)
+
+
+def gate_lines(gate: Gate, best: Gate | None) -> str:
+    """Describe the gate at the chosen operating point, and the best one."""
+    lines = [
+        f"Gate at done_threshold={gate.threshold} and done_frames={gate.frames}: "
+        f"{'passed' if gate.passed else 'not passed'}.",
+        f"False positives (failures predicted as successes): {gate.false_positives}.",
+        f"Recall (successes predicted as successes): {gate.recall}.",
+        f"AUC of successes against failures, over all thresholds: {gate.auc:.2f} (0.5 is chance).",
+    ]
+    if gate.cut_short:
+        lines.append(
+            f"{gate.cut_short} of the successes were recorded for fewer than {gate.frames} frames of success "
+            "and cannot be predicted; lower done_frames, or record on after success."
+        )
+    if best is None:
+        lines.append("No operating point has at most 5 % false positives and any recall.")
+    else:
+        lines.append(
+            f"Best with at most 5 % false positives: done_threshold={best.threshold} and "
+            f"done_frames={best.frames}; false positives {best.false_positives}; recall {best.recall}."
+        )
+    return "\n".join(lines)
+
+
+def task_table(gates: Mapping[str, Gate]) -> str:
+    """List the gate of each task, at one operating point."""
+    rows = [
+        (task, gate.false_positives, gate.recall, f"{gate.auc:.2f}", "yes" if gate.passed else "no")
+        for task, gate in gates.items()
+    ]
+    return markdown_table(("task", "false positives", "recall", "AUC", "passed"), rows)
+
+
+def sweep_table(gates: Sequence[Gate]) -> str:
+    """Tabulate false positives / recall in percent by threshold and frames."""
+    at = {(gate.threshold, gate.frames): gate for gate in gates}
+    rows = [
+        (threshold, *(_percentages(at[threshold, frames]) for frames in SWEEP_FRAMES))
+        for threshold in SWEEP_THRESHOLDS
+    ]
+    return markdown_table(("threshold", *(f"k = {frames}" for frames in SWEEP_FRAMES)), rows)
+
+
+def robustness_table(result: Mapping[str, Any]) -> str:
+    """Tabulate predicted successes and the PSNR to the start under extreme actions."""
+    rows = [
+        (name, _share(row["predicted_success"]), _value(row["psnr_to_start"]))
+        for name, row in result.items()
+        if isinstance(row, Mapping)
+    ]
+    return markdown_table(("actions", "predicted success", "PSNR to the start (dB)"), rows)
+
+
+def goal_table(quality: Mapping[str, Any]) -> str:
+    """Tabulate the quality of the text model's goal frames."""
+    rows = [
+        ("goals that reach the done threshold", _share(quality["goal_reached"])),
+        ("distance to the nearest recorded final frame", _value(quality["nearest_final_tokenizer_lpips"])),
+        ("the same distance of the start frame", _value(quality["start_to_final_tokenizer_lpips"])),
+        ("PSNR to the nearest recorded final frame (dB)", _value(quality["nearest_final_psnr"])),
+    ]
+    if "probe" in quality:
+        accuracy = quality["probe"]["balanced_accuracy"]
+        rows.append(("goals in which success holds, by the success probe", _share(quality["success_holds"])))
+        rows.append(
+            ("the same of recorded final frames it has not seen", _share(quality["success_holds_in_finals"]))
+        )
+        rows.append(
+            ("balanced accuracy of the success probe", "unknown" if accuracy is None else f"{accuracy:.3f}")
+        )
+    return markdown_table(("goal frames", "value"), rows)
+
+
+def agreement_table(agreement: Agreement) -> str:
+    """Tabulate the success of policies in both environments, and their correlation."""
+    rows = [[name, str(imagined), str(real)] for name, (imagined, real) in agreement.policies.items()]
+    r, low, high = agreement.correlation()
+    verdict = f"Pearson's r {r:.2f} ({low:.2f} to {high:.2f}), R² {r * r:.2f}"
+    if np.isnan(r):
+        verdict = f"No correlation: it takes {MIN_POLICIES} policies, of which some succeed more often."
+    head = ["policy", "success in the world model", "success in `real_env`"]
+    return f"{markdown_table(head, rows)}\n\n{verdict}"
+
+
+def _percentages(gate: Gate) -> str:
+    return " / ".join(
+        f"{100 * rate.share:.0f}" if rate.n else "–" for rate in (gate.false_positives, gate.recall)
+    )
+
+
+def _share(rate: Mapping[str, Any]) -> str:
+    return f"{rate['k']} of {rate['n']}"
+
+
+def _value(estimate: Mapping[str, Any]) -> str:
+    if estimate["value"] is None:
+        return "not measured"
+    low, high = estimate["bootstrap_95"]
+    return f"{estimate['value']:.3g} ({low:.3g} to {high:.3g})"

@@ -1,14 +1,15 @@
-"""The general reward along real episodes: what a policy would have been paid for them, frame by frame."""
+"""The general reward along recorded episodes: what a policy would have been paid for them, frame by frame."""
 
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from lerobot_wmrl.data.clip import Clip
 from lerobot_wmrl.data.depth_maps import depth_at
-from lerobot_wmrl.data.episode_table import EpisodeTable
 from lerobot_wmrl.data.frame_cache import frames_to_tensor
+from lerobot_wmrl.evaluation.replay import Recording
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rewards.general import consecutive_count, general_reward, sparse_reward
 from lerobot_wmrl.rewards.similarity import make_similarity, select_features
@@ -22,16 +23,21 @@ from lerobot_wmrl.world_models.modeling_world_model import (
 @torch.no_grad()
 def reward_along_episode(
     model: ActionWorldModelRewardModel, text_model: TextWorldModelRewardModel, reward: GeneralConfig,
-    table: EpisodeTable, frame_store: np.ndarray, episode: int, *, threshold: float, frames: int,
+    recording: Recording, episode: int, *, threshold: float, frames: int,
 ) -> dict[str, Any]:  # fmt: skip
-    """Eqs. 5-8 on the real frames of one episode, teacher-forced.
+    """Compute eqs. 5-8 on the recorded frames of one episode, teacher-forced.
 
-    Returns lists over the frames after the start (done_probability, similarity, return), the imagined
-    goal_frame and the real final_frame (N, H, W, 3) uint8, and goal_reached.
+    Args:
+        threshold: done probability that counts as done.
+        frames: consecutive frames for which it must be reached.
+
+    Returns:
+        Lists over the frames after the first (done_probability, similarity, return), the imagined goal_frame
+        and the recorded final_frame (N, H, W, 3) uint8, and goal_reached.
     """
+    table, device = recording.table, model.state_mean.device
     rows = slice(table.start[episode], table.start[episode] + table.length[episode])
-    device = model.state_mean.device
-    images = frames_to_tensor(frame_store[rows]).to(device)
+    images = frames_to_tensor(recording.frames[rows]).to(device)
     start = model.tokenizer.context(images[:1])
     context = start[[0] * len(images)]
     tokens = model.tokenizer.encode(images, context)
@@ -61,12 +67,12 @@ def reward_along_episode(
         "return": earned.cumsum(0).tolist(),
         "goal_reached": bool(goal.reached[0]),
         "goal_frame": (picture * 255).round().byte().cpu().numpy(),
-        "final_frame": np.asarray(frame_store[rows][-1]),
+        "final_frame": np.asarray(recording.frames[rows][-1]),
     }
 
 
-def success_once(done_logit: torch.Tensor, threshold: float, frames: int) -> torch.Tensor:
-    """1 on the frame that completes the first run of `frames` done frames, else 0. (T,) → (T,)"""
+def success_once(done_logit: Tensor, threshold: float, frames: int) -> Tensor:
+    """Return 1 on the frame that completes the first run of `frames` done frames, else 0. (T,) → (T,)"""
     count, paid = done_logit.new_zeros((), dtype=torch.long), torch.zeros_like(done_logit)
     for step, logit in enumerate(done_logit):
         count = consecutive_count(count, sparse_reward(logit, threshold) > 0)

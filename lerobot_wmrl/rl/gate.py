@@ -16,9 +16,9 @@ from termcolor import colored
 
 from lerobot_wmrl.common.constants import GATE_SEED
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
-from lerobot_wmrl.evaluation.gate import Gate, Outcomes, attempted, gate_at, rollouts_for
+from lerobot_wmrl.evaluation.gate import Gate, Outcomes, gate_at, labelled_recording, predict_outcomes
 from lerobot_wmrl.evaluation.pictures import save_strip, side_by_side
-from lerobot_wmrl.evaluation.replay import Source, replay_episodes
+from lerobot_wmrl.evaluation.replay import Recording, replay_episodes
 from lerobot_wmrl.rl.callbacks import REAL_STEPS, Record
 from lerobot_wmrl.rl.configuration_callbacks import GateConfig
 from lerobot_wmrl.rl.policy_gradient import TrainingStopped
@@ -65,14 +65,14 @@ class SuccessGate:
 
     def run(self, iteration: int, checkpoint: Path, folder: Path) -> Record:
         """Each verdict as of lerobot-wmrl-eval-world-model, and a warning if one is not as it should be."""
-        asked: dict[str, Source] = {}
+        asked: dict[str, Recording] = {}
         if self.config.dataset.root and self._new_model(iteration):
-            asked[LABELLED] = rollouts_for(self.env.model, self.config.dataset.root)
+            asked[LABELLED] = labelled_recording(self.env.model, self.config.dataset.root)
         if self.recorder is not None:
             asked[FRESH] = self._fresh(self.recorder, iteration, checkpoint, folder / "rollouts")
         verdicts = {}
         for place, source in asked.items():
-            outcomes = attempted(self.env.model, source)
+            outcomes = predict_outcomes(self.env.model, source)
             verdicts[place] = gate_at(outcomes, self.env.config.done_threshold, self.env.config.done_frames)
             save_strips(self.env, source, outcomes, folder, place)
         shutil.rmtree(folder / "rollouts.cache", ignore_errors=True)
@@ -95,12 +95,12 @@ class SuccessGate:
     def _new_model(self, iteration: int) -> bool:
         return iteration == 0 or iteration in self.refreshed
 
-    def _fresh(self, recorder: RolloutRecorder, iteration: int, checkpoint: Path, folder: Path) -> Source:
+    def _fresh(self, recorder: RolloutRecorder, iteration: int, checkpoint: Path, folder: Path) -> Recording:
         """Rollouts of the policy as it is, from seeds that no earlier ones had."""
         episodes = self.config.n_episodes
         first = GATE_SEED + iteration * episodes % (SEEDS - episodes)
         recorder.record(checkpoint, episodes, first, folder)
-        return rollouts_for(self.env.model, folder)
+        return labelled_recording(self.env.model, folder)
 
     def _above(self, verdict: Gate) -> bool:
         return verdict.false_positives.share > self.config.limit
@@ -126,7 +126,7 @@ class SuccessGate:
 
 
 def save_strips(
-    env: WorldModelVectorEnv, source: Source, outcomes: Outcomes, folder: Path, place: str
+    env: WorldModelVectorEnv, source: Recording, outcomes: Outcomes, folder: Path, place: str
 ) -> None:
     """Two short episodes as they happened, above, and as they are imagined, below: a success and a failure,
     one that the model believes in if there is one."""

@@ -10,7 +10,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot_wmrl.common.constants import SELECTION_SEED
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv, make_success_env
-from lerobot_wmrl.evaluation.policy_success import evaluate_policy, evaluate_within
+from lerobot_wmrl.evaluation.agreement import evaluate_policy, evaluate_within
 from lerobot_wmrl.rl.callbacks import Callback
 from lerobot_wmrl.rl.configuration_callbacks import CallbackSettings
 from lerobot_wmrl.rl.dyna import DynaRounds, round_iterations

@@ -9,7 +9,7 @@ from lerobot.common.train_utils import get_step_checkpoint_dir
 from lerobot_wmrl.common.checkpoints import BEST_CHECKPOINT_LINK, link_checkpoint
 from lerobot_wmrl.common.distributed import rank_and_size
 from lerobot_wmrl.common.statistics import Proportion
-from lerobot_wmrl.evaluation.policy_success import Evaluated
+from lerobot_wmrl.evaluation.agreement import Evaluated
 from lerobot_wmrl.rl.callbacks import REAL_STEPS, Record
 from lerobot_wmrl.rl.policy_gradient import TrainingStopped
 

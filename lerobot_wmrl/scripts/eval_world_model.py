@@ -1,34 +1,36 @@
-"""lerobot-wmrl-eval-world-model: replay real episodes in a world model and measure how far it can be trusted.
+"""lerobot-wmrl-eval-world-model: replay recorded episodes in a world model and measure how far to trust it.
 
     lerobot-wmrl-eval-world-model --model.path=outputs/action_world_model --dataset.root=D \\
         --output_dir=outputs/check
 
-Each episode is imagined from its first frame with its own actions. `metrics.json` and `metrics.md` get the
-accuracy by step and the gate: of the episodes that failed in reality, how many the model believes in.
-Add `--text_model.path=…` for goal frames and the reward along a successful and a failed episode, and
-`--policies=[outputs/rl] --real_env.type=wmrl_maniskill …` to see whether policies succeed as in reality.
-docs/world_models.md explains every number.
+Each episode is imagined open loop: from its first frame, with its own actions. The command measures how close
+the imagined frames are to the recorded ones step by step, and whether the model tells failed episodes from
+successful ones (the gate: at most 5 % false positives, at least 90 % recall).
+
+Add `--text_model.path=…` for goal frames and the reward along a successful and a failed episode.
+Add `--policies=[outputs/rl] --real_env.type=wmrl_maniskill …` to compare the success of policies in the world
+model with their success in that environment.
 """
 
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import draccus
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_wmrl.common.command_line import RunConfig, claim_output_dir, run_command
 from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.errors import FieldError, require_at_least
 from lerobot_wmrl.common.presets import expand_preset
 from lerobot_wmrl.data.dataset_source import DatasetSource
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 
 if TYPE_CHECKING:
     from lerobot_wmrl.evaluation.agreement import Agreement
-    from lerobot_wmrl.evaluation.evaluate import Evaluation
-    from lerobot_wmrl.evaluation.replay import Source
-    from lerobot_wmrl.evaluation.report import Report
+    from lerobot_wmrl.evaluation.replay import Recording
+    from lerobot_wmrl.evaluation.report import Evaluation, Report
     from lerobot_wmrl.world_models.modeling_world_model import (
         ActionWorldModelRewardModel,
         TextWorldModelRewardModel,
@@ -41,30 +43,38 @@ IMAGINED_AT_ONCE, REAL_AT_ONCE = 50, 2
 
 @dataclass
 class Checkpoint:
-    """A trained model: the output folder of its training, or one of its checkpoints."""
+    """A trained model.
+
+    Args:
+        path: the output folder of its training, or one of its checkpoints.
+    """
 
     path: str = ""
 
 
 @dataclass
 class EvalWorldModelConfig(RunConfig):
-    """Replay real episodes in a world model.
+    """Replay recorded episodes in a world model and measure how far to trust it.
 
+    Needed are `--model.path` and `--dataset.root`. Use episodes that the model was not trained on:
+    `--split=validation` of its own dataset, or rollouts of a policy, labelled with their success.
     `--preset=tiny` or `--preset=demo` stands for the flags of that size; flags further right override it.
 
     Args:
         model: `--model.path=…`, an action world model.
-        text_model: `--text_model.path=…`, for goal frames and reward curves.
-        dataset: real episodes.
-        split: `all`; `train` or `validation` of the dataset the model was trained on; `ind` or `ood`, scenes
-            that training may see and those held out. Joined by a comma, `validation,ind`: what is in both.
-        max_episodes: at most so many, evenly spread.
-        done_threshold, done_frames: when an imagined episode counts as a success; as in the environment.
-        reward: the general reward of the curves (--reward.alpha …); as in the environment.
-        policies: checkpoints, or output folders of trainings, of which every checkpoint counts: their success
-            in the world model, from the dataset's start frames, beside that in `real_env`, in episodes of
-            the same length.
-        policy_episodes: of each of them, in either place.
+        text_model: `--text_model.path=…`, a text world model, for goal frames and reward curves.
+        dataset: `--dataset.root=…`, the recorded episodes.
+        split: `all`; `train` or `validation` of the dataset that the model was trained on; `ind` or `ood`,
+            scenes that training may see and those held out. A comma joins them: `validation,ind` is what is
+            in both.
+        max_episodes: at most so many episodes, evenly spread.
+        done_threshold: done probability at which an imagined frame counts as done; as in the environment.
+        done_frames: consecutive done frames that make an imagined success; as in the environment.
+        reward: the general reward of the curves (`--reward.alpha=…`); as in the environment.
+        policies: checkpoints of policies, or output folders of trainings, of which every checkpoint counts.
+            Their success in the world model, from the dataset's first frames, is compared with that in
+            `real_env`, in episodes of the same length.
+        policy_episodes: episodes of each policy in each environment.
         real_env: `--real_env.type=wmrl_maniskill` and its settings.
         device: where the models run; the best there is by default.
         output_dir: where metrics.json, metrics.md and the pictures go.
@@ -84,35 +94,32 @@ class EvalWorldModelConfig(RunConfig):
     device: str | None = None
     output_dir: Path = Path("outputs/eval_world_model")
 
-
-def check_config(cfg: EvalWorldModelConfig) -> None:
-    """ValueError names the setting that cannot be."""
-    for name in ("max_episodes", "done_frames", "policy_episodes"):
-        if getattr(cfg, name) < 1:
-            raise ValueError(f"--{name}={getattr(cfg, name)}: must be at least 1")
-    if not 0 < cfg.done_threshold < 1:
-        raise ValueError(f"--done_threshold={cfg.done_threshold}: must be a probability between 0 and 1")
-    if cfg.policies and cfg.real_env is None:
-        raise ValueError(
-            "--real_env.type is missing: success in the world model is compared with success in an "
-            "environment; give --real_env.type=wmrl_maniskill and its settings, or leave out --policies"
-        )
+    def check(self) -> None:
+        """Raise FieldError for a setting that cannot be."""
+        require_at_least(self, 1, "max_episodes", "done_frames", "policy_episodes")
+        if not 0 < self.done_threshold < 1:
+            raise FieldError("done_threshold", self.done_threshold, "must be a probability between 0 and 1")
+        if self.policies and self.real_env is None:
+            raise FieldError(
+                "real_env.type", None,
+                "is missing: success in the world model is compared with success in an environment",
+                "set it to wmrl_maniskill, with its settings, or leave out `policies`",
+            )  # fmt: skip
 
 
 def eval_world_model(cfg: EvalWorldModelConfig) -> None:
-    """Replay, measure, write."""
+    """Replay, measure, and write metrics.json, metrics.md and the pictures."""
     from lerobot_wmrl.common.files import write_json, write_text
     from lerobot_wmrl.data.compatibility import check_dataset
     from lerobot_wmrl.data.episode_table import choose_episodes, open_dataset, read_episodes
     from lerobot_wmrl.data.frame_cache import cached_frames
-    from lerobot_wmrl.evaluation.evaluate import evaluate
     from lerobot_wmrl.evaluation.reconstruction import reconstruction_metrics
-    from lerobot_wmrl.evaluation.replay import Source
-    from lerobot_wmrl.evaluation.report import report_action_model
+    from lerobot_wmrl.evaluation.replay import Recording
+    from lerobot_wmrl.evaluation.report import evaluate, report_action_model, report_agreement
     from lerobot_wmrl.maniskill.scenes import scenes_of
     from lerobot_wmrl.world_models.checkpoint import load_model
 
-    check_config(cfg)
+    cfg.check()
     model = load_model(cfg.model.path, "action_world_model", cfg.device)
     table = read_episodes(open_dataset(cfg.dataset.root, cfg.dataset.repo_id))
     check_dataset(model.config, table.dataset.features)
@@ -120,28 +127,54 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     unseen = {scene.index for scene in scenes_of("ood")}
     episodes = choose_episodes(table, cfg.split, cfg.max_episodes, unseen)
     claim_output_dir(cfg.output_dir, draccus.encode(cfg))
-    source = Source(table, cached_frames(table.dataset, model.config.tokenizer.camera_keys))
-    evaluation = evaluate(model, source, episodes)
-    numbers, page = report_action_model(
-        model, source, evaluation, cfg.done_threshold, cfg.done_frames, cfg.output_dir
-    )
+    recording = Recording(table, cached_frames(table.dataset, model.config.tokenizer.camera_keys))
+    evaluation = evaluate(model, recording, episodes)
+    reports = [
+        report_action_model(model, recording, evaluation, cfg.done_threshold, cfg.done_frames, cfg.output_dir)
+    ]
     if text_model is not None:
-        goals, goal_page = report_text_model(cfg, model, text_model, source, evaluation)
-        numbers, page = numbers | goals, f"{page}\n\n{goal_page}"
+        reports.append(report_text_model(cfg, model, text_model, recording, evaluation))
     if cfg.policies:
-        agreement = policy_agreement(cfg)
-        agreement.draw(cfg.output_dir / "policies.png")
-        numbers["policies"], page = agreement.as_json(), f"{page}\n\n{agreement.table()}"
-    numbers["tokenizer"] = reconstruction_metrics(model, table, source.frames, episodes)
-    write_json(cfg.output_dir / "metrics.json", {**numbers, "dataset": cfg.dataset.root, "split": cfg.split})
+        reports.append(report_agreement(policy_agreement(cfg), cfg.output_dir))
+    metrics = {name: value for report in reports for name, value in report.metrics.items()}
+    metrics["tokenizer"] = reconstruction_metrics(model, table, recording.frames, episodes)
+    metrics |= {"dataset": cfg.dataset.root, "split": cfg.split}
+    page = "\n\n".join(report.page for report in reports)
+    write_json(cfg.output_dir / "metrics.json", metrics)
     write_text(cfg.output_dir / "metrics.md", f"{page}\n")
-    print(f"{page}\n\n{len(episodes)} real episodes replayed. Written to {cfg.output_dir}")
+    print(f"{page}\n\n{conclusion(cfg, len(episodes), reports[0])}")
+
+
+def conclusion(cfg: EvalWorldModelConfig, episodes: int, report: "Report") -> str:
+    """Say in a few lines what was found, where it is, and what comes next."""
+    metrics = report.metrics
+    psnr, ceiling = (metrics["headline"][name]["value"] for name in ("psnr", "psnr_ceiling"))
+    found = (
+        f"Replayed {episodes} recorded episodes of {cfg.dataset.root} open loop: PSNR {psnr:.1f} dB "
+        f"(the tokenizer alone {ceiling:.1f} dB); false positives: {metrics['false_positives']} of "
+        f"{metrics['failures']} failures; recall: {metrics['true_positives']} of {metrics['successes']} "
+        "successes."
+    )
+    if not metrics["failures"] and not metrics["successes"]:
+        verdict = "Nothing says which episodes succeeded, so the gate says nothing: use labelled rollouts."
+    elif metrics["passed"]:
+        verdict = (
+            "The gate is passed. Next: train a policy in it, "
+            f"lerobot-wmrl-train --env.type=world_model --env.world_model_path={cfg.model.path} …"
+        )
+    else:
+        verdict = (
+            "The gate is not passed: a policy trained in this model may exploit its false positives. Next: "
+            "record more failures near success and train it longer, or judge success more strictly "
+            "(--done_threshold, --done_frames; the table above has the best values)."
+        )
+    return f"{found}\n{verdict}\nmetrics.json, metrics.md and pictures are in {cfg.output_dir}"
 
 
 def load_text_model(
     cfg: EvalWorldModelConfig, model: "ActionWorldModelRewardModel"
 ) -> "TextWorldModelRewardModel | None":
-    """The one that is named. ValueError if it speaks of frames in other tokens."""
+    """Load the text world model if one is named. ValueError if its tokens are another tokenizer's."""
     from lerobot_wmrl.data.compatibility import check_same_tokenizer
     from lerobot_wmrl.world_models.checkpoint import load_model
 
@@ -153,53 +186,53 @@ def load_text_model(
 
 
 def policy_agreement(cfg: EvalWorldModelConfig) -> "Agreement":
-    """Every policy's success in the world model and in `real_env`."""
+    """Evaluate every policy in the world model and in `real_env`."""
     from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
-    from lerobot_wmrl.evaluation.agreement import Agreement
-    from lerobot_wmrl.evaluation.policy_success import policy_checkpoints, policy_outcomes
+    from lerobot_wmrl.evaluation.agreement import Agreement, policy_checkpoints, policy_outcomes
 
-    real: Any = cfg.real_env
-    longest = getattr(real, "horizon", None) or getattr(real, "episode_length", None)
+    assert cfg.real_env is not None
+    longest = getattr(cfg.real_env, "horizon", None) or getattr(cfg.real_env, "episode_length", None)
     imagination = WorldModelEnv(
         world_model_path=cfg.model.path, reward=GeneralConfig(alpha=1.0), device=cfg.device,
         episode_length=longest or WorldModelEnv.episode_length,
         dataset=StartFrames(cfg.dataset.root, cfg.dataset.repo_id, split=cfg.split),
         done_threshold=cfg.done_threshold, done_frames=cfg.done_frames,
     )  # fmt: skip
-    places = ((imagination, IMAGINED_AT_ONCE), (cfg.real_env, REAL_AT_ONCE))
-
-    def outcomes(path: Path) -> Any:
-        count = cfg.policy_episodes
-        return tuple(policy_outcomes(env, path, count, EVALUATION_SEED, at_once) for env, at_once in places)
-
-    return Agreement.of({str(path): outcomes(path) for path in policy_checkpoints(cfg.policies)})
+    outcomes = {
+        str(path): (
+            policy_outcomes(imagination, path, cfg.policy_episodes, EVALUATION_SEED, IMAGINED_AT_ONCE),
+            policy_outcomes(cfg.real_env, path, cfg.policy_episodes, EVALUATION_SEED, REAL_AT_ONCE),
+        )
+        for path in policy_checkpoints(cfg.policies)
+    }
+    return Agreement.of_outcomes(outcomes)
 
 
 def report_text_model(
     cfg: EvalWorldModelConfig,
     model: "ActionWorldModelRewardModel",
     text_model: "TextWorldModelRewardModel",
-    source: "Source",
+    recording: "Recording",
     evaluation: "Evaluation",
 ) -> "Report":
-    """Goal frames, and the reward along the shown episodes."""
+    """Report goal frames, and draw the reward along the shown episodes."""
     from lerobot_wmrl.evaluation.pictures import save_reward_curves
     from lerobot_wmrl.evaluation.report import report_goals
     from lerobot_wmrl.evaluation.reward_curves import reward_along_episode
 
     curves = {
         name: reward_along_episode(
-            model, text_model, cfg.reward, source.table, source.frames, run.episode,
+            model, text_model, cfg.reward, recording, replay.episode,
             threshold=cfg.done_threshold, frames=cfg.done_frames,
         )
-        for name, run in evaluation.shown.items()
+        for name, replay in evaluation.shown.items()
     }  # fmt: skip
     save_reward_curves(curves, cfg.output_dir / "reward_along_episodes.png")
-    return report_goals(text_model, source, evaluation, cfg.output_dir)
+    return report_goals(text_model, recording, evaluation, cfg.output_dir)
 
 
 def main() -> None:
-    """Entry point of the console command."""
+    """Run the console command."""
     run_command(eval_world_model, EvalWorldModelConfig, partial(expand_preset, command="eval-world-model"))
 
 

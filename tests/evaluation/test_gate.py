@@ -8,17 +8,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lerobot_wmrl.evaluation.done import done_delay, done_log_loss, done_quality
 from lerobot_wmrl.evaluation.gate import (
     Outcomes,
     best_operating_point,
+    done_accuracy,
+    done_delay,
+    done_log_loss,
     first_run,
     gate_at,
+    gate_details,
     gates_by_task,
-    success_agreement,
     sweep,
 )
-from lerobot_wmrl.evaluation.tables import gate_lines
+from lerobot_wmrl.evaluation.report import gate_lines
 
 
 @pytest.fixture
@@ -82,7 +84,7 @@ def test_the_best_operating_point_is_tolerable_and_recognises_most(outcomes):
 
 
 def test_verdicts_of_every_episode_are_reported_as_json(outcomes):
-    agreement = json.loads(json.dumps(success_agreement(outcomes, 0.5, 3)))
+    agreement = json.loads(json.dumps(gate_details(outcomes, 0.5, 3)))
     assert agreement["predicted_success"] == [True, True, False, True, False]
     assert agreement["recorded_success"] == [True, True, True, False, False]
     assert (agreement["failures"], agreement["true_positives"]) == (2, 2)
@@ -90,7 +92,7 @@ def test_verdicts_of_every_episode_are_reported_as_json(outcomes):
 
 def test_done_by_frame_by_episode_and_how_late(outcomes):
     """By frame: 5 + 3 of 5 + 5 + 2 true ones called, and 3 + 1 false ones."""
-    quality = {name: estimate.value for name, estimate in done_quality(outcomes, 0.5, 3).items()}
+    quality = {name: estimate.value for name, estimate in done_accuracy(outcomes, 0.5, 3).items()}
     assert quality["done_precision"] == pytest.approx(8 / 12)
     assert quality["done_recall"] == pytest.approx(8 / 12)
     assert quality["done_f1"] == pytest.approx(8 / 12)
@@ -112,15 +114,15 @@ def test_done_is_scored_without_a_threshold_too():
 
 def test_early_and_late_calls_do_not_cancel(outcomes):
     outcomes.done[0, 1] = False
-    quality = {name: estimate.value for name, estimate in done_quality(outcomes, 0.5, 3).items()}
+    quality = {name: estimate.value for name, estimate in done_accuracy(outcomes, 0.5, 3).items()}
     assert quality["done_delay_frames"] == pytest.approx((-1 + 2) / 2)
     assert quality["done_distance_frames"] == pytest.approx((1 + 2) / 2)
 
 
 def test_without_any_success_rates_are_no_numbers():
     never = Outcomes(np.arange(3), np.zeros((3, 4)), np.zeros((3, 4), bool))
-    assert math.isnan(done_quality(never, 0.5, 3)["done_f1"].value)
-    assert success_agreement(never, 0.5, 3)["recall"]["share"] is None
+    assert math.isnan(done_accuracy(never, 0.5, 3)["done_f1"].value)
+    assert gate_details(never, 0.5, 3)["recall"]["share"] is None
     assert not gate_at(never, 0.5, 3).passed
 
 

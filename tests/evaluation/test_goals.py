@@ -9,12 +9,14 @@ from lerobot_wmrl.evaluation.goals import (
     feature_distances,
     final_rows,
     goal_quality,
+    held_out_from_probe,
     imagine_goals,
+    labelled_frames,
     least,
+    train_probe,
 )
 from lerobot_wmrl.evaluation.pictures import save_goals
-from lerobot_wmrl.evaluation.replay import Source
-from lerobot_wmrl.evaluation.success_probe import is_held_out, labelled_frames, train_probe
+from lerobot_wmrl.evaluation.replay import Recording
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer, feature_distance
@@ -44,8 +46,8 @@ def text_model(trained_models):
     return load_model(trained_models["text_world_model"], "text_world_model")
 
 
-def source_of(dataset, keys) -> Source:
-    return Source(read_episodes(dataset), cached_frames(dataset, keys))
+def source_of(dataset, keys) -> Recording:
+    return Recording(read_episodes(dataset), cached_frames(dataset, keys))
 
 
 def test_the_least_allowed_distance_counts():
@@ -85,7 +87,7 @@ def test_goals_are_compared_with_real_successes(small_dataset, text_model):
     quality = goal_quality(goals, train_probe(text_model.tokenizer, source))
     assert quality["nearest_final_tokenizer_lpips"]["episodes"] == 6
     assert quality["success_holds"]["n"] == 6
-    assert quality["success_holds_in_finals"]["n"] == is_held_out(goals.finals.episodes).sum() == 1
+    assert quality["success_holds_in_finals"]["n"] == held_out_from_probe(goals.finals.episodes).sum() == 1
 
 
 def test_without_a_real_success_there_is_no_distance_and_no_probe(small_dataset, text_model, tmp_path):

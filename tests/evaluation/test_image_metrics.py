@@ -7,11 +7,14 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
-from lerobot_wmrl.evaluation.depth import depth_accuracy
-from lerobot_wmrl.evaluation.image_metrics import masked_psnr, motion_mask, psnr, ssim
-from lerobot_wmrl.evaluation.motion import (
+from lerobot_wmrl.evaluation.image_metrics import (
+    depth_accuracy,
+    masked_psnr,
+    motion_mask,
+    psnr,
     spatial_iou,
     spatiotemporal_iou,
+    ssim,
     weighted_spatial_iou,
 )
 

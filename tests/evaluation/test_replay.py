@@ -15,11 +15,17 @@ from lerobot_wmrl.data.episode_table import choose_episodes, open_dataset, read_
 from lerobot_wmrl.data.frame_cache import cached_frames
 from lerobot_wmrl.data.frames import NO_CONTEXT
 from lerobot_wmrl.evaluation import replay as replay_module
-from lerobot_wmrl.evaluation.accuracy import EpisodeAccuracy, by_step, episode_numbers, measure
-from lerobot_wmrl.evaluation.evaluate import evaluate
-from lerobot_wmrl.evaluation.extreme_actions import extreme_actions, robustness
+from lerobot_wmrl.evaluation.accuracy import (
+    EpisodeAccuracy,
+    by_step,
+    episode_means,
+    extreme_actions,
+    measure,
+    robustness,
+)
 from lerobot_wmrl.evaluation.gate import Outcomes, gate_at, success_gate
-from lerobot_wmrl.evaluation.replay import EpisodeReplay, Source, replay_episodes
+from lerobot_wmrl.evaluation.replay import EpisodeReplay, Recording, replay_episodes
+from lerobot_wmrl.evaluation.report import evaluate
 from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
 from lerobot_wmrl.world_models.checkpoint import load_model
 from tests.relabelled import UNLABELLED, relabelled
@@ -31,13 +37,13 @@ def model(trained_models):
 
 
 @pytest.fixture
-def source(small_dataset, model) -> Source:
-    return Source(
+def source(small_dataset, model) -> Recording:
+    return Recording(
         read_episodes(small_dataset), cached_frames(small_dataset, model.config.tokenizer.camera_keys)
     )
 
 
-def perfect(source: Source, model, episode: int) -> EpisodeReplay:
+def perfect(source: Recording, model, episode: int) -> EpisodeReplay:
     """The replay of an episode by a model that imagines exactly what happened."""
     rows = source.rows(episode)
     following = torch.cat([model.tokenizer.encode(source.images(episode, torch.device("cpu")))[1:]] * 2)
@@ -56,7 +62,7 @@ def test_a_perfect_model_reaches_the_ceiling_and_passes_the_gate(source, model):
     assert (measured.steps["token_accuracy"] == 1).all()
     assert (measured.steps["tcp_error_mm"] == 0).all()
     np.testing.assert_allclose(measured.steps["tokenizer_lpips"], 0, atol=1e-6)
-    gate = gate_at(Outcomes.of(runs), 0.5, 3)
+    gate = gate_at(Outcomes.stack(runs), 0.5, 3)
     assert gate.passed
     assert (gate.false_positives.n, gate.recall.n) == (2, 4)
 
@@ -102,10 +108,10 @@ def test_steps_are_averaged_over_the_episodes_that_last_so_long():
 
 def test_step_30_is_compared_with_the_tokenizer():
     steps = {"psnr": np.arange(40.0), "psnr_ceiling": np.full(40, 50.0)}
-    numbers = episode_numbers(EpisodeAccuracy(0, steps, {}))
+    numbers = episode_means(EpisodeAccuracy(0, steps, {}))
     assert (numbers["psnr_30"], numbers["psnr_below_ceiling_30"]) == (29, 21)
     short = {name: values[:29] for name, values in steps.items()}
-    assert "psnr_30" not in episode_numbers(EpisodeAccuracy(0, short, {}))
+    assert "psnr_30" not in episode_means(EpisodeAccuracy(0, short, {}))
 
 
 def test_extreme_actions_are_what_they_are_called(source, model):
@@ -136,13 +142,13 @@ def test_splits_compose(small_dataset):
 def test_play_is_no_attempt(source, model):
     runs = [perfect(source, model, episode) for episode in range(6)]
     kind = np.array([KINDS.index("play")] * 2 + [KINDS.index("optimal")] * 4)
-    assert Outcomes.of(runs).attempts(replace(source.table, kind=kind)).episodes.tolist() == [2, 3, 4, 5]
+    assert Outcomes.stack(runs).attempts(replace(source.table, kind=kind)).episodes.tolist() == [2, 3, 4, 5]
 
 
 def test_episodes_of_one_frame_are_named(source, model):
     table = replace(source.table, length=np.ones(6, int))
     with pytest.raises(ValueError, match="every chosen episode has a single frame"):
-        evaluate(model, Source(table, source.frames), np.arange(6))
+        evaluate(model, Recording(table, source.frames), np.arange(6))
 
 
 def test_the_gate_is_one_call(small_dataset, model):

@@ -12,7 +12,7 @@ from torch.distributions import Normal
 
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
-from lerobot_wmrl.evaluation.policy_success import policy_outcomes
+from lerobot_wmrl.evaluation.agreement import policy_outcomes
 from lerobot_wmrl.rl.act_adapter import INITIAL_STD, ActAdapter
 from lerobot_wmrl.rl.configuration_ppo import PPOConfig
 from lerobot_wmrl.rl.minibatches import read_steps

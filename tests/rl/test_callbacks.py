@@ -17,7 +17,7 @@ from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_wmrl.common.constants import EVALUATION_SEED, GATE_SEED, SELECTION_SEED
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
-from lerobot_wmrl.evaluation.policy_success import evaluate_within
+from lerobot_wmrl.evaluation.agreement import evaluate_within
 from lerobot_wmrl.rl import gate
 from lerobot_wmrl.rl.callbacks import Callback, Record
 from lerobot_wmrl.rl.configuration_callbacks import DYNA_SEEDS

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from lerobot_wmrl.common.statistics import Proportion
-from lerobot_wmrl.evaluation.policy_success import Evaluated
+from lerobot_wmrl.evaluation.agreement import Evaluated
 from lerobot_wmrl.rl.callbacks import Record
 from lerobot_wmrl.rl.policy_gradient import TrainingStopped
 from lerobot_wmrl.rl.selection import Measure, Selection, best_iteration, parted

@@ -12,7 +12,7 @@ from lerobot_wmrl.data.frame_cache import cached_frames, cached_tokens, frames_t
 from lerobot_wmrl.data.frames import NO_CONTEXT
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.evaluation.pictures import side_by_side, to_uint8
-from lerobot_wmrl.evaluation.replay import Source, replay_episodes
+from lerobot_wmrl.evaluation.replay import Recording, replay_episodes
 from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.context import Fusion
@@ -174,7 +174,7 @@ def test_environments_decode_beside_their_own_start_also_after_a_restart(models,
 
 def test_evaluation_decodes_beside_the_start_and_runs_whole(models, small_dataset, table, frames, tmp_path):
     model = load_model(models["action_world_model"], "action_world_model")
-    source = Source(table, frames)
+    source = Recording(table, frames)
     for run in replay_episodes(model, source, np.array([3, 1])):
         context = model.tokenizer.context(frames_to_tensor(frames[table.start[[run.episode]]]))
         expected = to_uint8(model.tokenizer.decode(run.tokens[:1], context).detach())[0, 0]

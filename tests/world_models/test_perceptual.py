@@ -7,7 +7,7 @@ import torch
 from lpips import LPIPS
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.evaluation.alexnet_lpips import image_distance
+from lerobot_wmrl.evaluation.image_metrics import image_distance
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
 from lerobot_wmrl.world_models.perceptual import PerceptualLoss

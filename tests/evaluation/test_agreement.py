@@ -11,9 +11,9 @@ from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.data.dataset_source import DatasetSource
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
-from lerobot_wmrl.evaluation import policy_success
-from lerobot_wmrl.evaluation.agreement import Agreement
-from lerobot_wmrl.evaluation.policy_success import policy_checkpoints, policy_outcomes
+from lerobot_wmrl.evaluation import agreement as agreement_module
+from lerobot_wmrl.evaluation.agreement import Agreement, policy_checkpoints, policy_outcomes
+from lerobot_wmrl.evaluation.report import agreement_table
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.scripts.eval_world_model import (
     Checkpoint,
@@ -38,7 +38,7 @@ def test_every_checkpoint_of_a_training_counts_in_order(tmp_path):
         (tmp_path / "rl" / "checkpoints" / step).mkdir(parents=True)
     found = policy_checkpoints([str(tmp_path / "rl"), str(tmp_path / "one")])
     assert [path.name for path in found] == ["000002", "000010", "one"]
-    with pytest.raises(ValueError, match="--policies"):
+    with pytest.raises(ValueError, match="policies="):
         policy_checkpoints([])
 
 
@@ -58,7 +58,7 @@ def test_the_evaluation_reports_policies_beside_reality(imagination, small_datas
         output_dir=tmp_path / "check", device="cpu", policies=[str(policy)], policy_episodes=4,
         done_threshold=0.0001, done_frames=1,
     )  # fmt: skip
-    with pytest.raises(ValueError, match=r"--real_env\.type is missing"):
+    with pytest.raises(ValueError, match=r"real_env\.type=None: is missing"):
         eval_world_model(cfg)
     assert not cfg.output_dir.exists()
     cfg.real_env = imagination
@@ -67,14 +67,16 @@ def test_the_evaluation_reports_policies_beside_reality(imagination, small_datas
     assert found["policies"][str(policy)]["real"]["k"] == 4
     assert found["policies"][str(policy)]["imagined"]["k"] == 4
     assert found["pearson"]["value"] is None
-    assert "real success" in (cfg.output_dir / "metrics.md").read_text()
+    assert "success in `real_env`" in (cfg.output_dir / "metrics.md").read_text()
     assert (cfg.output_dir / "policies.png").is_file()
 
 
 def test_imagined_episodes_are_as_long_as_real_ones(imagination, monkeypatch):
     """Those of a simulator's task, or of another environment."""
     asked = []
-    monkeypatch.setattr(policy_success, "policy_outcomes", lambda env, *_: asked.append(env) or [True, False])
+    monkeypatch.setattr(
+        agreement_module, "policy_outcomes", lambda env, *_: asked.append(env) or [True, False]
+    )
     for real in (WmrlManiSkillEnv(task="pick_place"), imagination):
         policy_agreement(EvalWorldModelConfig(
             model=Checkpoint(imagination.world_model_path), policies=["policy"], real_env=real, device="cpu"
@@ -96,4 +98,4 @@ def test_agreement_is_pearsons_correlation_with_fishers_interval():
     assert agreement.as_json()["r_squared"] == pytest.approx(r * r)
     equal = Agreement({str(i): (Proportion(5, 10), Proportion(i, 10)) for i in range(4)})
     assert equal.as_json()["pearson"]["value"] is None
-    assert "No correlation" in equal.table()
+    assert "No correlation" in agreement_table(equal)
