@@ -39,8 +39,8 @@ class Context:
             )
         )
 
-    def offers(self) -> list[Tensor]:
-        """What the fusions add, [(B·N, C, h, w), …], cameras as rows of the batch."""
+    def projections(self) -> list[Tensor]:
+        """What the fusions of the tokenizer add, [(B·N, C, h, w), …], cameras as rows of the batch."""
         return [each.flatten(0, 1) for each in self.maps[1:]]
 
 

@@ -98,7 +98,7 @@ def code_use(codebook: CodeBook, tokens: Tensor) -> dict[str, Any]:
 
     A large code book is not filled by a few thousand frames; its factors are more telling.
     """
-    factors = codebook.digits(tokens.flatten()).unbind(-1)
+    factors = codebook.codes(tokens.flatten()).unbind(-1)
     sizes = codebook.level_counts
     return {
         "codes": _use(tokens.flatten(), int(np.prod(sizes))),

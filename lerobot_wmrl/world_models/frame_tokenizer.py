@@ -1,7 +1,7 @@
 """Frame tokenizer: RGB frames to a grid of discrete tokens and back (MAGVIT-2's role).
 
 A token is the index of one quantised vector (`quantizer.py`). Several cameras share the weights; their grids
-are concatenated. As an option both directions are given the episode's first frame (`context.py`).
+are concatenated. As an option both directions are given the episode's first frame (`autoencoder.py`).
 """
 
 from collections.abc import Callable, Sequence
@@ -12,10 +12,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lerobot_wmrl.data.frames import NO_CONTEXT, Context
-from lerobot_wmrl.world_models.autoencoder import Decoder, Encoder
+from lerobot_wmrl.world_models.autoencoder import ContextEncoder, Decoder, Encoder
 from lerobot_wmrl.world_models.codebook import make_codebook
-from lerobot_wmrl.world_models.configuration_frame_tokenizer import PATCH, TokenizerConfig
-from lerobot_wmrl.world_models.context import ContextEncoder
+from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 from lerobot_wmrl.world_models.quantizer import make_quantizer
 
 MOTION_THRESHOLD = 0.08
@@ -36,9 +35,10 @@ class Decoded(NamedTuple):
 
 
 class FrameTokenizer(nn.Module):
-    """Encode and decode are a pure pair: `decode(encode(images, c), c)` is the reconstruction.
+    """Encode frames as tokens and decode them: `decode(encode(images, c), c)` is the reconstruction.
 
-    With the option `context`, c is `context` of the first frames of their episodes; else it is left out.
+    With the option `context`, c is what the method `context` returns for the first frames of the episodes;
+    without it, c is left out.
 
     Args:
         config: cameras, sizes, quantizer and levels, and whether tokens are conditioned on the first frame.
@@ -53,10 +53,8 @@ class FrameTokenizer(nn.Module):
         self.encoder = Encoder(widths, channels, context)
         self.decoder = Decoder(widths, channels, context)
         self.quantizer = make_quantizer(config.quantizer, config.levels)
-        self.whiten = nn.ModuleList(
-            nn.BatchNorm2d(channels, affine=False) for channels in (widths[-1], widths[0])
-        )
-        self.context_encoder = ContextEncoder(widths, PATCH) if context else None
+        self.whiten = nn.ModuleList(nn.BatchNorm2d(width, affine=False) for width in (widths[-1], widths[0]))
+        self.context_encoder = ContextEncoder(widths) if context else None
 
     @property
     def tokens_per_frame(self) -> int:
@@ -64,26 +62,26 @@ class FrameTokenizer(nn.Module):
         return self.num_cameras * self.grid**2
 
     def context(self, images: Tensor) -> Context:
-        """First frames (B, N, 3, H, W) in [0, 1] → their context, empty without the option."""
+        """Return the context of first frames (B, N, 3, H, W) in [0, 1], empty without the option."""
         self._check_images(images)
         if self.context_encoder is None:
             return NO_CONTEXT
         scales = self.context_encoder(images.flatten(0, 1) * 2 - 1)
-        maps = (scales[0], *self.encoder.offers(scales), *self.decoder.offers(scales))
+        maps = (scales[0], *self.encoder.project(scales), *self.decoder.project(scales))
         return Context(tuple(each.unflatten(0, images.shape[:2]) for each in maps))
 
     def encode(self, images: Tensor, context: Context = NO_CONTEXT) -> Tensor:
         """Images (B, N, 3, H, W) in [0, 1] → tokens (B, S) int64. ValueError for other cameras or sizes."""
         self._check_images(images)
         self._check_context(context, len(images))
-        vectors = self.encoder(images.flatten(0, 1) * 2 - 1, context.offers()[:1])
+        vectors = self.encoder(images.flatten(0, 1) * 2 - 1, context.projections()[:1])
         return self.quantizer(vectors).tokens.reshape(len(images), -1)
 
     def decode_with_features(self, tokens: Tensor, context: Context = NO_CONTEXT) -> Decoded:
         """Tokens (B, S) → images and the whitened feature maps from which similarity is measured."""
         self._check_context(context, len(tokens))
-        codes = self.quantizer.codes(tokens.reshape(-1, self.grid, self.grid))
-        pixels, features = self.decoder(codes, context.offers()[1:])
+        values = self.quantizer.values(tokens.reshape(-1, self.grid, self.grid))
+        pixels, features = self.decoder(values, context.projections()[1:])
         images = ((pixels + 1) / 2).clamp(0, 1).unflatten(0, (len(tokens), self.num_cameras))
         return Decoded(images, self._whitened(features))
 
@@ -108,8 +106,11 @@ class FrameTokenizer(nn.Module):
             )
 
     def _whitened(self, features: list[Tensor]) -> list[Tensor]:
-        """Zero mean and unit variance a channel over the training frames: without it what all frames share
-        hides how they differ. The statistics are learnt in training and fixed afterwards."""
+        """Bring every channel to zero mean and unit variance over the training frames.
+
+        Without it, what all frames share hides how they differ. The statistics are learnt in training and fixed
+        afterwards.
+        """
         return [whiten(feature) for whiten, feature in zip(self.whiten, features, strict=True)]
 
     def forward(
@@ -119,15 +120,22 @@ class FrameTokenizer(nn.Module):
         perceptual: ImageLoss | None = None,
         context: Context = NO_CONTEXT,
     ) -> tuple[Tensor, dict[str, float]]:
-        """Reconstruction loss: weighted L1 plus L2, plus the quantizer's and the perceptual one.
+        """Compute the reconstruction loss: weighted L1 plus L2, the quantizer's and the perceptual one.
 
-        images (B, N, 3, H, W) in [0, 1], weight (B, N, 1, H, W).
+        Args:
+            images: (B, N, 3, H, W) in [0, 1].
+            weight: (B, N, 1, H, W), what each pixel counts; 1 by default.
+            perceptual: a further loss on reconstructions and images.
+            context: of the episodes' first frames, with the option `context`.
+
+        Returns:
+            The loss () and metrics, among them the PSNR in dB.
         """
         self._check_images(images)
         self._check_context(context, len(images))
-        flat, offers = images.flatten(0, 1) * 2 - 1, context.offers()
-        quantized = self.quantizer(self.encoder(flat, offers[:1]))
-        pixels, features = self.decoder(quantized.codes, offers[1:])
+        flat, projections = images.flatten(0, 1) * 2 - 1, context.projections()
+        quantized = self.quantizer(self.encoder(flat, projections[:1]))
+        pixels, features = self.decoder(quantized.values, projections[1:])
         if self.training:
             self._whitened([feature.detach() for feature in features])
         error = pixels - flat
@@ -143,10 +151,16 @@ class FrameTokenizer(nn.Module):
 
 
 def motion_weight(images: Tensor, reference: Tensor) -> Tensor:
-    """1 on the static background, up to 1 + MOTION_WEIGHT where a frame differs from its episode's start.
+    """Weigh pixels by 1 on the static background and by 1 + MOTION_WEIGHT where something has moved.
 
-    A static background otherwise dominates the mean error and hides what decides success. All images
-    (B, N, 3, H, W) in [0, 1] → (B, N, 1, H, W).
+    A static background otherwise dominates the mean error and hides what decides success.
+
+    Args:
+        images: (B, N, 3, H, W) in [0, 1].
+        reference: their episodes' first frames, of the same shape.
+
+    Returns:
+        (B, N, 1, H, W).
     """
     change = (images - reference).abs().amax(dim=2, keepdim=True)
     moved = F.max_pool2d((change.flatten(0, 1) > MOTION_THRESHOLD).float(), 5, stride=1, padding=2)
@@ -154,7 +168,7 @@ def motion_weight(images: Tensor, reference: Tensor) -> Tensor:
 
 
 def feature_distance(features: Sequence[Tensor], goal: Sequence[Tensor]) -> Tensor:
-    """LPIPS's formula (Zhang et al. 2018, eq. 1, unit weights) on tokenizer features: [(F, C, h, w)] → (F,).
+    """Apply LPIPS's formula (Zhang et al. 2018, eq. 1, unit weights) to features: [(F, C, h, w)] twice → (F,).
 
     Each map is normalised over channels at every position; squared differences are summed over channels,
     averaged over positions and layers.

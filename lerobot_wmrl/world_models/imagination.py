@@ -83,7 +83,7 @@ class Imagination:
         dtype = dtype or imagination_dtype(device, batch)
         cache = self.network.make_cache(batch, device, dtype)
         condition = self.encode_instructions(instructions, batch) if instructions is not None else None
-        digits = self.network.codebook.digits(tokens)[:, None]
+        digits = self.network.codebook.codes(tokens)[:, None]
         first, depth = self.normalize_state(proprioception), self.network.depth.normalize(depth, tokens)
         return ImaginationState(digits, first[:, None], depth[:, None], cache, condition, context)
 
@@ -101,7 +101,7 @@ class Imagination:
         depth: Tensor | None = None,
     ) -> None:  # fmt: skip
         """Let the environments in `mask` (B,) go on from frames (as in `start`) instead of imagined ones."""
-        digits = self.network.codebook.digits(tokens)[:, None]
+        digits = self.network.codebook.codes(tokens)[:, None]
         first = self.normalize_state(proprioception)[:, None]
         state.digits.copy_(torch.where(mask[:, None, None, None], digits, state.digits))
         state.proprioception.copy_(torch.where(mask[:, None, None], first, state.proprioception))

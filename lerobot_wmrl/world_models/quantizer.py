@@ -1,4 +1,4 @@
-"""Quantisers of the frame tokenizer: vectors to codes and tokens, without a table of learnt codes.
+"""Quantizers of the frame tokenizer: vectors to tokens and the values they stand for, without a learnt table.
 
 FSQ (Mentzer et al. 2023, eq. 1) rounds every factor to its levels: no auxiliary losses and no dead codes. LFQ
 (MAGVIT-2, Yu et al. 2024, eqs. 3-5) keeps the signs, and pays for undecided vectors and unused codes.
@@ -22,34 +22,43 @@ COMMITMENT_WEIGHT: Final = 0.25
 
 
 class Quantized(NamedTuple):
-    """Of F vector grids: codes (F, K, g, g), through which gradients pass as if nothing was rounded; tokens
-    (F, g, g) int64; loss (), 0 outside training; metrics to log in training."""
+    """What F grids of vectors become.
 
-    codes: Tensor
+    Args:
+        values: (F, K, g, g), through which gradients pass as if nothing was rounded.
+        tokens: (F, g, g) int64.
+        loss: (), 0 outside training.
+        metrics: to log in training.
+    """
+
+    values: Tensor
     tokens: Tensor
     loss: Tensor
     metrics: dict[str, float]
 
 
 class FiniteScalarQuantizer(nn.Module):
-    """FSQ: one channel a factor."""
+    """Finite scalar quantisation: one channel a factor."""
 
     def __init__(self, levels: Sequence[int]) -> None:
         super().__init__()
         self.fsq = FSQ(list(levels))
 
     def forward(self, vectors: Tensor) -> Quantized:
-        """Vectors (F, K, g, g) → their codes and tokens."""
-        codes, tokens = self.fsq(vectors)
-        return Quantized(codes, tokens.long(), codes.new_zeros(()), {})
+        """Vectors (F, K, g, g) → their values and tokens."""
+        values, tokens = self.fsq(vectors)
+        return Quantized(values, tokens.long(), values.new_zeros(()), {})
 
-    def codes(self, tokens: Tensor) -> Tensor:
-        """Tokens (F, g, g) → codes (F, K, g, g)."""
+    def values(self, tokens: Tensor) -> Tensor:
+        """Tokens (F, g, g) → values (F, K, g, g)."""
         return self.fsq.indices_to_codes(tokens)
 
 
 class LookupFreeQuantizer(nn.Module):
-    """LFQ: a factor of 2^b codes takes b channels; entropies are those of a factor, not of whole tokens."""
+    """Lookup-free quantisation: a factor of 2^b codes takes b channels.
+
+    Entropies are those of a factor's codes, not of whole tokens.
+    """
 
     def __init__(self, levels: Sequence[int]) -> None:
         super().__init__()
@@ -60,22 +69,22 @@ class LookupFreeQuantizer(nn.Module):
         )  # fmt: skip
 
     def forward(self, vectors: Tensor) -> Quantized:
-        """Vectors (F, K, g, g) → their codes and tokens; in training also the loss (eqs. 4, 5) in nats."""
+        """Vectors (F, K, g, g) → their values and tokens; in training also the loss (eqs. 4, 5) in nats."""
         with compute_in(torch.float32, vectors.device):
-            (codes, digits, loss), parts = self.lfq(vectors.float(), return_loss_breakdown=True)
+            (values, codes, loss), parts = self.lfq(vectors.float(), return_loss_breakdown=True)
         metrics = {
             "quantizer_loss": loss.item(),
             "token_entropy": parts.per_sample_entropy.item(),
             "code_entropy": parts.batch_entropy.item(),
             "commitment_loss": parts.commitment.item(),
         }
-        return Quantized(codes, self.codebook.tokens(digits.long()), loss, metrics if self.training else {})
+        return Quantized(values, self.codebook.tokens(codes.long()), loss, metrics if self.training else {})
 
-    def codes(self, tokens: Tensor) -> Tensor:
-        """Tokens (F, g, g) → codes (F, K, g, g)."""
-        return self.lfq.indices_to_codes(self.codebook.digits(tokens))
+    def values(self, tokens: Tensor) -> Tensor:
+        """Tokens (F, g, g) → values (F, K, g, g)."""
+        return self.lfq.indices_to_codes(self.codebook.codes(tokens))
 
 
 def make_quantizer(name: str, levels: Sequence[int]) -> FiniteScalarQuantizer | LookupFreeQuantizer:
-    """Return the quantiser `fsq` or `lfq`."""
+    """Return the quantizer `fsq` or `lfq`."""
     return FiniteScalarQuantizer(levels) if name == "fsq" else LookupFreeQuantizer(levels)

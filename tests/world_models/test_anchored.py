@@ -215,8 +215,8 @@ def test_tokens_that_are_not_as_at_the_start_count_more_and_padding_nothing():
     tokens = clip.tokens.clone()
     tokens[0, 3] = tokens[0, 0]
     clip = clip._replace(tokens=tokens, valid=valid)
-    frames = frames_since_start(codebook, codebook.digits(tokens), clip, 2.0, torch.tensor([[2], [1], [0]]))
-    assert torch.equal(frames.digits[0], codebook.digits(tokens[0, 3:4]))
+    frames = frames_since_start(codebook, codebook.codes(tokens), clip, 2.0, torch.tensor([[2], [1], [0]]))
+    assert torch.equal(frames.digits[0], codebook.codes(tokens[0, 3:4]))
     assert torch.equal(frames.weight[0], torch.ones(1, TOKENS))
     assert torch.equal(frames.weight[1], torch.zeros(1, TOKENS))
     assert set(frames.weight[2].unique().tolist()) == {1.0, 3.0}

@@ -14,8 +14,8 @@ from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelE
 from lerobot_wmrl.evaluation.pictures import side_by_side, to_uint8
 from lerobot_wmrl.evaluation.replay import Recording, replay_episodes
 from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
+from lerobot_wmrl.world_models.autoencoder import Fusion
 from lerobot_wmrl.world_models.checkpoint import load_model
-from lerobot_wmrl.world_models.context import Fusion
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
 from lerobot_wmrl.world_models.training import make_sampler
 from tests.trained import action_config, run_training, small_tokenizer, text_config, tokenizer_config
@@ -62,7 +62,7 @@ def test_a_fusion_convolves_features_and_context_side_by_side() -> None:
     """What it computes beforehand on behalf of the context changes nothing of that."""
     fusion, (x, context) = Fusion(8), torch.randn(2, 3, 8, 4, 4, generator=torch.Generator().manual_seed(0))
     expected = x + fusion.mix(torch.nn.functional.silu(torch.cat([x, context], 1)))
-    torch.testing.assert_close(fusion(x, fusion.offer(context)), expected)
+    torch.testing.assert_close(fusion(x, fusion.project(context)), expected)
 
 
 @torch.no_grad()

@@ -60,7 +60,7 @@ def changed_frames(before: Tensor, after: Tensor) -> list[int]:
 def test_cached_steps_equal_one_long_pass_also_after_the_ring_wraps():
     model, clip = random_model(), random_clip()
     cache = model.network.make_cache(BATCH, clip.tokens.device, torch.float32)
-    digits, state = model.network.codebook.digits(clip.tokens), model.normalize_state(clip.state)
+    digits, state = model.network.codebook.codes(clip.tokens), model.normalize_state(clip.state)
     depth, (condition, mask) = model.network.depth.normalize(clip.depth, clip.tokens), model.condition(clip)
     steps = []
     for t in range(FRAMES):
@@ -173,7 +173,7 @@ def test_depth_that_is_missing_or_on_another_grid_is_named():
 def test_rollouts_in_training_show_the_depth_that_was_imagined():
     model, clip = random_model(self_rollout=1.0, self_forcing=0.0), random_clip()
     depth = model.network.depth.normalize(clip.depth, clip.tokens)
-    digits, state = model.network.codebook.digits(clip.tokens), model.normalize_state(clip.state)
+    digits, state = model.network.codebook.codes(clip.tokens), model.normalize_state(clip.state)
     _, _, seen = model.dynamics.inputs(model, clip, model.condition(clip), digits, state, depth)
     imagination = model.start(clip.tokens[:, 0], clip.state[:, 0], depth=clip.depth[:, 0])
     imagined = model.step(imagination, clip.action[:, 0]).depth

@@ -116,7 +116,7 @@ def test_the_loss_pulls_along_the_track_only():
 @pytest.mark.parametrize(("quantizer", "levels"), [("fsq", (5, 4)), ("lfq", (8, 8))])
 def test_expected_values_are_those_of_a_sure_prediction_and_even_out_when_unsure(quantizer, levels):
     codebook = make_codebook(quantizer, levels)
-    digits = codebook.digits(torch.arange(20))
+    digits = codebook.codes(torch.arange(20))
     sure_of = codebook.expected_values(100 * codebook.one_hot(digits))
     torch.testing.assert_close(sure_of, codebook.values(digits).float())
     unsure = codebook.expected_values(torch.zeros(3, sum(levels)))

@@ -28,7 +28,7 @@ def clip_and_prediction(valid: torch.Tensor) -> tuple[Clip, Prediction, torch.Te
         torch.zeros(2, 5, 8),
         torch.randn(2, 5, 6),
     )
-    return clip, prediction, CODEBOOK.digits(tokens)
+    return clip, prediction, CODEBOOK.codes(tokens)
 
 
 def loss_of(

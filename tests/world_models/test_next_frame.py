@@ -19,7 +19,7 @@ def network() -> NextFrameNetwork:
 def test_digits_are_those_of_the_quantizer_and_make_the_token_again():
     codebook, quantizer = CodeBook(LEVELS), FSQ(list(LEVELS))
     tokens = torch.arange(8 * 5 * 3)
-    digits = codebook.digits(tokens)
+    digits = codebook.codes(tokens)
     assert torch.equal(digits, quantizer.indices_to_level_indices(tokens).long())
     assert torch.equal(codebook.tokens(digits), tokens)
 
@@ -28,7 +28,7 @@ def test_factorised_cross_entropy_equals_that_of_the_product_distribution():
     codebook = CodeBook(LEVELS)
     tokens = torch.arange(8 * 5 * 3)
     logits = torch.randn(1, sum(LEVELS), dtype=torch.float64).expand(len(tokens), -1)
-    every = codebook.cross_entropy(logits, codebook.digits(tokens))
+    every = codebook.cross_entropy(logits, codebook.codes(tokens))
     torch.testing.assert_close(every.neg().exp().sum(), torch.ones((), dtype=torch.float64))
     first = F.log_softmax(logits[0, :8], 0)[3] + F.log_softmax(logits[0, 8:13], 0)[1]
     first = first + F.log_softmax(logits[0, 13:], 0)[2]
@@ -47,7 +47,7 @@ def test_sampling_follows_the_distribution_at_the_temperature():
 
 def test_an_untrained_network_prefers_to_leave_the_frame_as_it_is():
     model = network()
-    digits = model.codebook.digits(torch.randint(0, 8 * 5 * 3, (2, 3, 32)))
+    digits = model.codebook.codes(torch.randint(0, 8 * 5 * 3, (2, 3, 32)))
     prediction = model(digits, torch.zeros(2, 3, 3), torch.zeros(2, 3, 1, 16))
     kept = model.codebook.sample(prediction.logits, 0.0, None) == digits
     assert kept.float().mean() > 0.6
@@ -59,7 +59,7 @@ def test_every_input_reaches_the_prediction():
         torch.nn.init.normal_(parameter, std=0.3)
     state = torch.randn(1, 2, 3, requires_grad=True)
     condition = torch.randn(1, 2, 1, 16, requires_grad=True)
-    prediction = model(model.codebook.digits(torch.randint(0, 120, (1, 2, 32))), state, condition)
+    prediction = model(model.codebook.codes(torch.randint(0, 120, (1, 2, 32))), state, condition)
     for output in (prediction.logits, prediction.done_logit, prediction.proprioception):
         gradients = torch.autograd.grad(output[:, 1].sum(), (state, condition), retain_graph=True)
         assert all(gradient[:, 0].abs().sum() > 0 for gradient in gradients)

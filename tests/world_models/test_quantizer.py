@@ -23,20 +23,20 @@ def test_lfq_keeps_the_signs_and_its_tokens_name_them():
     quantizer, codebook = LookupFreeQuantizer(LEVELS).eval(), BinaryCodeBook(LEVELS)
     vectors = torch.randn(2, 12, 4, 4)
     quantized = quantizer(vectors)
-    assert torch.equal(quantized.codes, vectors.sign())
-    assert torch.equal(quantizer.codes(quantized.tokens), vectors.sign())
-    values = codebook.values(codebook.digits(quantized.tokens))
+    assert torch.equal(quantized.values, vectors.sign())
+    assert torch.equal(quantizer.values(quantized.tokens), vectors.sign())
+    values = codebook.values(codebook.codes(quantized.tokens))
     assert torch.equal(values.permute(0, 3, 1, 2), vectors.sign())
     assert quantized.loss == 0
 
 
-def test_every_token_is_its_digits_and_every_digit_other_signs():
+def test_every_token_is_its_codes_and_every_code_other_signs():
     codebook = BinaryCodeBook((8, 8))
     tokens = torch.arange(64)
-    digits = codebook.digits(tokens)
-    assert torch.equal(codebook.tokens(digits), tokens)
+    codes = codebook.codes(tokens)
+    assert torch.equal(codebook.tokens(codes), tokens)
     assert codebook.channels == 6
-    assert len(codebook.values(digits).unique(dim=0)) == 64
+    assert len(codebook.values(codes).unique(dim=0)) == 64
 
 
 def test_the_loss_is_eq_4_and_5_of_magvit_2():
@@ -57,19 +57,19 @@ def test_the_loss_is_eq_4_and_5_of_magvit_2():
 
 @pytest.mark.parametrize("codebook", [CodeBook((8, 5, 3)), BinaryCodeBook((8, 8, 8))])
 def test_neighbors_are_one_step_away(codebook):
-    digits = codebook.digits(torch.randint(0, 120, (4000,)))
-    neighbors = codebook.neighbors(digits)
+    codes = codebook.codes(torch.randint(0, 120, (4000,)))
+    neighbors = codebook.neighbors(codes)
     factors = len(codebook.level_counts)
-    alone = torch.where(torch.eye(factors, dtype=torch.bool)[:, None], neighbors, digits)
-    steps = codebook.distance(alone, digits)
+    alone = torch.where(torch.eye(factors, dtype=torch.bool)[:, None], neighbors, codes)
+    steps = codebook.distance(alone, codes)
     assert steps.max() == 1
-    assert codebook.distance(neighbors, digits).le(factors).all()
-    assert 0.4 < (corrupt_digits(digits, codebook, 0.5) != digits).float().mean() / steps.float().mean() < 0.6
+    assert codebook.distance(neighbors, codes).le(factors).all()
+    assert 0.4 < (corrupt_digits(codes, codebook, 0.5) != codes).float().mean() / steps.float().mean() < 0.6
 
 
 def test_lfq_neighbors_flip_every_sign_as_often():
-    codebook, digits = BinaryCodeBook((8,)), torch.full((6000, 1), 5)
-    flipped = codebook.values(digits) != codebook.values(codebook.neighbors(digits))
+    codebook, codes = BinaryCodeBook((8,)), torch.full((6000, 1), 5)
+    flipped = codebook.values(codes) != codebook.values(codebook.neighbors(codes))
     assert torch.equal(flipped.sum(-1), torch.ones(6000, dtype=torch.long))
     torch.testing.assert_close(flipped.float().mean(0), torch.full((3,), 1 / 3), atol=0.03, rtol=0)
 
@@ -81,12 +81,12 @@ def test_the_copy_bias_is_that_of_the_present_code():
         code_width=8, quantizer="lfq",
     )  # fmt: skip
     torch.nn.init.zeros_(model.head.out.weight)
-    digits = model.codebook.digits(torch.randint(0, 16**3, (2, 3, 16)))
-    prediction = model(digits, torch.zeros(2, 3, 0), torch.zeros(2, 3, 1, 16))
+    codes = model.codebook.codes(torch.randint(0, 16**3, (2, 3, 16)))
+    prediction = model(codes, torch.zeros(2, 3, 0), torch.zeros(2, 3, 1, 16))
     bias = model.head.out.bias
     present = prediction.logits - bias[: 3 * 16]
     gate = F.softplus(bias[3 * 16 :])
-    expected = model.codebook.one_hot(digits) * gate[model.codebook.factor_of_logit]
+    expected = model.codebook.one_hot(codes) * gate[model.codebook.factor_of_logit]
     torch.testing.assert_close(present, expected)
 
 

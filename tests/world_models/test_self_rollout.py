@@ -40,7 +40,7 @@ def model_and_clip(name: str, trained_models, dataset, **settings) -> tuple[Worl
 
 
 def seen_by(model: WorldModelRewardModel, clip: Clip) -> tuple[torch.Tensor, torch.Tensor]:
-    digits, state = model.network.codebook.digits(clip.tokens), model.normalize_state(clip.state)
+    digits, state = model.network.codebook.codes(clip.tokens), model.normalize_state(clip.state)
     depth = model.network.depth.normalize(clip.depth, clip.tokens)
     return model.dynamics.inputs(model, clip, model.condition(clip), digits, state, depth)[:2]
 
@@ -66,7 +66,7 @@ def test_clips_show_what_the_model_imagines_of_them(name, trained_models, small_
 def test_the_real_frames_are_still_what_is_to_be_predicted(name, trained_models, small_dataset):
     model, clip = model_and_clip(name, trained_models, small_dataset, self_rollout=1.0)
     loss, _ = model.loss(clip)
-    real, state = model.network.codebook.digits(clip.tokens), model.normalize_state(clip.state)
+    real, state = model.network.codebook.codes(clip.tokens), model.normalize_state(clip.state)
     prediction = model.network(*seen_by(model, clip), *model.condition(clip))
     codebook = model.network.codebook
     frames = next_frames(codebook, real, clip, model.config.motion_weight)
@@ -77,7 +77,7 @@ def test_the_real_frames_are_still_what_is_to_be_predicted(name, trained_models,
 @torch.no_grad()
 def test_a_share_of_the_clips_and_only_late_in_training(trained_models, small_dataset):
     model, clip = model_and_clip("action_world_model", trained_models, small_dataset, self_rollout=0.5)
-    real = model.network.codebook.digits(clip.tokens)
+    real = model.network.codebook.codes(clip.tokens)
     model.training_progress = SELF_ROLLOUT_FROM - 0.01
     assert torch.equal(seen_by(model, clip)[0], real)
     model.training_progress = SELF_ROLLOUT_FROM

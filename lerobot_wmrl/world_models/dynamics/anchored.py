@@ -35,7 +35,7 @@ class AnchoredDynamics:
     def loss(self, model: Any, clip: Clip) -> tuple[Tensor, dict[str, float]]:
         """Eqs. 2-4: of some frames of a clip the tokens, of all of them done and the state."""
         network, config = model.network, self.config
-        digits, state = network.codebook.digits(clip.tokens), model.normalize_state(clip.state)
+        digits, state = network.codebook.codes(clip.tokens), model.normalize_state(clip.state)
         rows = draw_rows(clip.valid, config.drawn_frames)
         first = corrupt_digits(digits[:, :1], network.codebook, config.token_noise)
         prediction = network(
@@ -48,7 +48,7 @@ class AnchoredDynamics:
     @torch.no_grad()
     def predict(self, model: Any, clip: Clip, drawn: bool) -> Prediction:
         """Given the first frame and all actions until then."""
-        digits = model.network.codebook.digits(clip.tokens[:, :1])
+        digits = model.network.codebook.codes(clip.tokens[:, :1])
         state = model.normalize_state(clip.state[:, :1])
         none = torch.empty(len(digits), 0, dtype=torch.long, device=digits.device)
         prediction: Prediction = model.network(
@@ -65,7 +65,7 @@ class AnchoredDynamics:
         network, length = model.network, actions.shape[1]
         if length > self.config.clip_length:
             return open_loop_stepwise(model, tokens, state, actions, context, depth, generator)
-        digits, first = network.codebook.digits(tokens), model.normalize_state(state)
+        digits, first = network.codebook.codes(tokens), model.normalize_state(state)
         last = torch.full((len(tokens), 1), length - 1, device=tokens.device)
         with compute_in(imagination_dtype(tokens.device, len(tokens)), tokens.device):
             prediction = network(

@@ -61,7 +61,7 @@ class AutoregressiveDynamics:
         """Eqs. 2-4 on a clip of tokens, with part of the inputs replaced by the model's own predictions."""
         network, config = model.network, self.config
         condition = model.condition(clip)
-        digits, state = network.codebook.digits(clip.tokens), model.normalize_state(clip.state)
+        digits, state = network.codebook.codes(clip.tokens), model.normalize_state(clip.state)
         depth = network.depth.normalize(clip.depth, clip.tokens)
         seen, seen_state, seen_depth = self.inputs(model, clip, condition, digits, state, depth)
         torch.clear_autocast_cache()  # older torch keeps the casts made without gradients
@@ -126,7 +126,7 @@ class AutoregressiveDynamics:
     def predict(self, model: Any, clip: Clip, drawn: bool) -> Prediction:
         """Given the real frames until then; the logits cost next to nothing."""
         network = model.network
-        digits, depth = network.codebook.digits(clip.tokens), network.depth.normalize(clip.depth, clip.tokens)
+        digits, depth = network.codebook.codes(clip.tokens), network.depth.normalize(clip.depth, clip.tokens)
         prediction: Prediction = network(
             digits, model.normalize_state(clip.state), *model.condition(clip), depth=depth
         )
