@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
-from lerobot.common.train_utils import get_step_checkpoint_dir
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
 from safetensors import SafetensorError
 from safetensors.torch import load_file
+
+from lerobot_wmrl.common.lerobot_compat import checkpoint_dir
 
 ADAPTERS_FILE = "adapter_model.safetensors"
 """PEFT's: where a policy has adapters, its checkpoints hold them alone."""
@@ -31,7 +32,7 @@ def resolve_checkpoint(path: str | Path) -> Path:
 
 def write_checkpoint(output_dir: Path, total_steps: int, step: int, write: Callable[[Path], None]) -> Path:
     """Let `write` fill a temporary folder, then move it to `checkpoints/<step>` and point `last` at it."""
-    target = get_step_checkpoint_dir(output_dir, total_steps, step)
+    target = checkpoint_dir(output_dir, step, total_steps)
     partial = target.with_name(f".{target.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     write(partial)

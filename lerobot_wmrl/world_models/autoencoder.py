@@ -93,7 +93,7 @@ class Encoder(nn.Module):
 class Decoder(nn.Module):
     """Values (F, K, g, g) → images (F, 3, H, W): the encoder's mirror image, with sub-pixel upsampling.
 
-    With a context it also takes the context's projections, one a scale, [(F, c, h, w), …] from coarse to fine.
+    With a context it also takes the context's projections [(F, c, h, w), …], one a scale from coarse to fine.
     """
 
     def __init__(self, widths: Sequence[int], channels: int, context: bool) -> None:

@@ -2,7 +2,7 @@
 
 A token has one code for each of its C factors. Networks predict it factor by factor: a token of FSQ levels
 (8, 5, 5, 5) costs 23 logits instead of 1000, one of 18 LFQ bits as two factors of 512 costs 1024 instead of
-262,144. Networks read the values and not the index, so near misses of a code are near misses of its embedding.
+262,144. Networks read the values and not the index: near misses of a code are near misses of its embedding.
 """
 
 from collections.abc import Sequence

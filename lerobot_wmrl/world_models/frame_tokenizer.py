@@ -108,8 +108,8 @@ class FrameTokenizer(nn.Module):
     def _whitened(self, features: list[Tensor]) -> list[Tensor]:
         """Bring every channel to zero mean and unit variance over the training frames.
 
-        Without it, what all frames share hides how they differ. The statistics are learnt in training and fixed
-        afterwards.
+        Without it, what all frames share hides how they differ. The statistics are learnt in training and
+        fixed afterwards.
         """
         return [whiten(feature) for whiten, feature in zip(self.whiten, features, strict=True)]
 
@@ -168,7 +168,7 @@ def motion_weight(images: Tensor, reference: Tensor) -> Tensor:
 
 
 def feature_distance(features: Sequence[Tensor], goal: Sequence[Tensor]) -> Tensor:
-    """Apply LPIPS's formula (Zhang et al. 2018, eq. 1, unit weights) to features: [(F, C, h, w)] twice → (F,).
+    """Apply LPIPS's formula (Zhang et al. 2018, eq. 1, unit weights) to two lists [(F, C, h, w), …] → (F,).
 
     Each map is normalised over channels at every position; squared differences are summed over channels,
     averaged over positions and layers.

@@ -13,12 +13,6 @@ from typing import Any
 
 import torch
 from accelerate import PartialState
-from lerobot.common.train_utils import (
-    load_training_num_processes,
-    load_training_state,
-    save_training_state,
-    should_save_checkpoint,
-)
 from lerobot.configs.rewards import RewardModelConfig
 from lerobot.rewards.factory import make_reward_model
 from lerobot.rewards.pretrained import PreTrainedRewardModel
@@ -27,11 +21,16 @@ from lerobot.utils.random_utils import set_seed
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 from torch.optim import Optimizer
-from torch.optim.lr_scheduler import LRScheduler
 from tqdm import tqdm
 
 from lerobot_wmrl.common.checkpoints import latest_checkpoint, write_checkpoint
 from lerobot_wmrl.common.distributed import mean_over_processes
+from lerobot_wmrl.common.lerobot_compat import (
+    gather_random_states,
+    load_training_state,
+    save_training_state,
+    should_save_checkpoint,
+)
 from lerobot_wmrl.common.precision import compute_in, training_dtype
 from lerobot_wmrl.common.tracking import append_metrics
 from lerobot_wmrl.data.compatibility import check_dataset
@@ -127,23 +126,6 @@ def make_joint_sampler(
     return InTurn(first, others) if others else first
 
 
-def load_progress(output_dir: Path, optimizer: Optimizer, scheduler: LRScheduler, state: PartialState) -> int:
-    """Restore optimiser, schedule and random numbers from the last checkpoint. → its step, 0 without one.
-
-    ValueError if another number of processes wrote it: the batches that follow would be of another size.
-    """
-    checkpoint = latest_checkpoint(output_dir)
-    if checkpoint is None:
-        return 0
-    began_with = load_training_num_processes(checkpoint) or 1
-    if began_with != state.num_processes:
-        raise ValueError(
-            f"--output_dir={output_dir}: this run began with {began_with} processes, here are "
-            f"{state.num_processes}; continue it with torchrun --nproc_per_node={began_with}"
-        )
-    return load_training_state(checkpoint, optimizer, scheduler)[0]
-
-
 def train(
     model: PreTrainedRewardModel,
     sampler: ClipSampler | FrameSampler | InTurn,
@@ -156,7 +138,8 @@ def train(
     preset: Any = model.config.get_optimizer_preset()
     optimizer = preset.build([p for p in model.parameters() if p.requires_grad])
     scheduler = cosine_schedule(preset.lr, cfg.steps).build(optimizer, cfg.steps)
-    first = load_progress(cfg.output_dir, optimizer, scheduler, processes)
+    checkpoint = latest_checkpoint(cfg.output_dir)
+    first = 0 if checkpoint is None else load_training_state(checkpoint, optimizer, scheduler)
     network = DistributedDataParallel(model) if processes.num_processes > 1 else model
     device: str = model.config.device
     dtype = training_dtype(cfg.precision, device)
@@ -164,7 +147,7 @@ def train(
     def save(folder: Path) -> None:
         model.save_pretrained(folder / PRETRAINED_MODEL_DIR)
         save_config(folder / PRETRAINED_MODEL_DIR)
-        save_training_state(folder, step, optimizer, scheduler, processes.num_processes, cfg.batch_size)
+        save_training_state(folder, step, random_states, optimizer, scheduler)
 
     model.train()
     began = time.monotonic()
@@ -180,8 +163,10 @@ def train(
             metrics = mean_over_processes(metrics, device)
             metrics["steps_per_s"] = (step - first) / (time.monotonic() - began)
             log(cfg.output_dir, step, metrics, progress)
-        if processes.is_main_process and should_save_checkpoint(step, cfg.save_freq, cfg.steps):
-            write_checkpoint(cfg.output_dir, cfg.steps, step, save)
+        if should_save_checkpoint(step, cfg.save_freq, cfg.steps):
+            random_states = gather_random_states()
+            if processes.is_main_process:
+                write_checkpoint(cfg.output_dir, cfg.steps, step, save)
         progress.update()
     progress.close()
 
