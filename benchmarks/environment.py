@@ -101,16 +101,20 @@ def measure(config: WorldModelEnv, models: WorldModels, count: int) -> dict[str,
     }
 
 
-def main() -> None:
-    """Measure everything, print it, write it."""
-    register_third_party_plugins()
+def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add_world_models(parser)
     parser.add_argument("--numbers", type=int, nargs="+", default=NUMBERS, help="of environments")
     parser.add_argument("--output", type=Path, default=RESULTS, help="JSON file")
-    given = parser.parse_args()
+    return parser
+
+
+def main() -> None:
+    """Measure everything, print it, write it."""
+    register_third_party_plugins()
+    given = make_parser().parse_args()
     config = world_model_env(given, device="cpu")
     models = load_world_models(config, config.device)
     figures: Mapping[str, Any] = {

@@ -128,9 +128,7 @@ def measure(env: Any, steps: int, iterations: int, device: str) -> dict[str, Any
     }
 
 
-def main() -> None:
-    """Measure both worlds, print them, write them."""
-    register_third_party_plugins()
+def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -141,7 +139,13 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, default=5, help="that count")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--output", type=Path, default=RESULTS, help="JSON file")
-    given = parser.parse_args()
+    return parser
+
+
+def main() -> None:
+    """Measure both worlds, print them, write them."""
+    register_third_party_plugins()
+    given = make_parser().parse_args()
     imagination = world_model_env(given, episode_length=given.steps, device=given.device)
     worlds: dict[str, tuple[Any, int]] = {"world_model": (imagination, given.num_envs)}
     if given.simulators:

@@ -66,15 +66,19 @@ def worker_rate(workers: int, episodes: int) -> float:
     return 60 * (len(paced) - 1) / (paced[-1] - paced[0])
 
 
-def main() -> None:
-    """Measure, print, write."""
+def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--episodes", type=int, default=12, help="of each kind; play has a quarter of them")
     parser.add_argument("--worker_episodes", type=int, default=40, help="for each number of processes")
     parser.add_argument("--output", type=Path, default=RESULTS / "recording_rate.json", help="JSON file")
-    given = parser.parse_args()
+    return parser
+
+
+def main() -> None:
+    """Measure, print, write."""
+    given = make_parser().parse_args()
     silence_libraries()
     kinds = [kind for kind in KINDS if kind != "policy"]
     rates = {

@@ -77,15 +77,19 @@ def our_step(image_size: int, steps: int, robot_mesh_detail: float) -> float:
     return cost
 
 
-def main() -> None:
-    """Measure, print, write."""
+def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--image_size", type=int, default=128, help="pixels a side")
     parser.add_argument("--steps", type=int, default=40, help="steps a repetition")
     parser.add_argument("--output", type=Path, default=RESULTS / "recording_speed.json", help="JSON file")
-    given = parser.parse_args()
+    return parser
+
+
+def main() -> None:
+    """Measure, print, write."""
+    given = make_parser().parse_args()
     light = our_step(given.image_size, given.steps, ROBOT_MESH_DETAIL)
     full = our_step(given.image_size, given.steps, 1.0)
     stock = stock_step(given.image_size, given.steps)

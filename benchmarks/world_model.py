@@ -128,10 +128,7 @@ def preset_config(preset: str, kind: str, flags: Sequence[str]) -> Any:
     return draccus.parse(TrainWorldModelConfig, args=given).model
 
 
-def main() -> None:
-    """Measure everything, print it, write it."""
-    keep_freed_memory()
-    register_third_party_plugins()
+def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -143,6 +140,14 @@ def main() -> None:
     parser.add_argument("--device", help="cpu or cuda; by default CUDA if there is any")
     parser.add_argument("--no_maniskill", action="store_true", help="leave the simulator out")
     parser.add_argument("--output", type=Path, default=RESULTS / "world_model_speed.json", help="JSON file")
+    return parser
+
+
+def main() -> None:
+    """Measure everything, print it, write it."""
+    keep_freed_memory()
+    register_third_party_plugins()
+    parser = make_parser()
     given, flags = parser.parse_known_args()
     if flags and given.world_model:
         parser.error(f"{' '.join(flags)}: a checkpoint's model is as it was trained; flags need --sizes")

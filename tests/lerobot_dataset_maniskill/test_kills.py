@@ -1,7 +1,6 @@
 """`kill -9` at any instant costs no finished part, and no episode is torn or doubled.
 
-Frames are made up here, for what is tested is how files come to be; `benchmarks/kill_campaign.py` kills the
-whole command, simulator and all, as often as you like.
+Frames are made up here, for what is tested is how files come to be.
 """
 
 import random

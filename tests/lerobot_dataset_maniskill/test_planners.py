@@ -172,7 +172,7 @@ def succeeds(simulation: Simulation, kind: str, seed: int, planner: str = "carte
 
 
 def test_optimal_plans_succeed_and_near_misses_mostly_fail(blind: Simulation) -> None:
-    """`benchmarks/planner_success.py` counts more of them."""
+    """`experiments/planners.py` counts more of them."""
     optimal = sum(succeeds(blind, "optimal", seed) for seed in range(40))
     near_misses = sum(succeeds(blind, "near_miss", seed) for seed in range(30))
     assert optimal >= 39

@@ -1,4 +1,4 @@
-"""A known control task by the trainer itself: `benchmarks/control.py`, shortened."""
+"""A known control task by the trainer itself: `experiments/control.py`, shortened."""
 
 import json
 import subprocess
@@ -13,7 +13,7 @@ def test_ppo_learns_to_balance_a_pole(tmp_path: Path) -> None:
     output = tmp_path / "control.json"
     flags = ["--trainings", "cartpole-ppo", "--seeds", "0", "--iterations", "8", "--output", str(output)]
     result = subprocess.run(
-        [sys.executable, str(ROOT / "benchmarks" / "control.py"), *flags], capture_output=True, text=True
+        [sys.executable, "-m", "experiments.control", *flags], capture_output=True, text=True
     )
     assert result.returncode == 0, result.stderr[-3000:]
     assert json.loads(output.read_text())["cartpole-ppo"]["seeds"][0]["score"] > 400

@@ -1,15 +1,14 @@
 """Success of the planners by task and kind of trajectory, how long they think, and where their episodes go.
 
-    python benchmarks/planner_success.py --planner=cartesian --episodes=200
+    python -m experiments.planners --planner=cartesian --episodes=200 --output_dir=outputs/planners
 
-Episodes take place in random scenes of both splits, without pictures. Writes docs/results/planners.json, and
-docs/images/workspace.png: where the gripper and the object have been, optimal episodes against the others.
-With --planner=mplib these are planners_mplib.json and workspace_mplib.png.
+Episodes take place in random scenes of both splits, without pictures. Writes planners.json and workspace.png:
+where the gripper and the object have been, optimal episodes against the others. With --planner=mplib these
+are planners_mplib.json and workspace_mplib.png.
 """
 
 import argparse
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,6 @@ from lerobot_wmrl.maniskill.scenes import SCENES
 from lerobot_wmrl.maniskill.simulation import Simulation
 from lerobot_wmrl.maniskill.tasks import TASKS
 
-DOCS = Path(__file__).parents[1] / "docs"
 FIRST_SEED = 2_000_000
 """Neither recorded nor evaluated on."""
 
@@ -97,21 +95,25 @@ def draw(measured: dict[str, dict[str, Measured]], path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point."""
+def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--planner", choices=MOTIONS, default="cartesian", help="as of lerobot-wmrl-record")
     parser.add_argument("--episodes", type=int, default=200, help="of each task and kind")
-    parser.add_argument("--docs", type=Path, default=DOCS, help="folder of results and images")
-    given = parser.parse_args(arguments)
+    parser.add_argument("--output_dir", type=Path, required=True, help="where JSON and picture go")
+    return parser
+
+
+def main() -> None:
+    """Entry point."""
+    given = make_parser().parse_args()
     suffix = "" if given.planner == "cartesian" else f"_{given.planner}"
     measured = measure(given.planner, given.episodes)
     table = {task: {kind: here.as_json() for kind, here in row.items()} for task, row in measured.items()}
     content = {"first_seed": FIRST_SEED, "planner": given.planner, "success": table}
-    write_json(given.docs / "results" / f"planners{suffix}.json", content)
-    draw(measured, given.docs / "images" / f"workspace{suffix}.png")
+    write_json(given.output_dir / f"planners{suffix}.json", content)
+    draw(measured, given.output_dir / f"workspace{suffix}.png")
     for task, row in measured.items():
         print(task, *(f"{kind} {here.success.k}/{here.success.n}" for kind, here in row.items()))
 

@@ -1,11 +1,11 @@
 """Do the algorithms solve what is known to be solvable? Gymnasium's control tasks, no world model.
 
-    python benchmarks/control.py
-    python benchmarks/control.py --trainings cartpole-ppo --seeds 0 --iterations 10
+    python -m experiments.control --output=outputs/control.json
+    python -m experiments.control --output=outputs/short.json --trainings cartpole-ppo --seeds 0
 
 The trainer, rollouts and algorithms of lerobot-wmrl-train, with small networks on the tasks' observations.
 Every training is measured on 100 episodes with evaluation seeds, without exploration, against the score at
-which the task counts as solved, and timed in seconds of one thread. Writes docs/results/control.json.
+which the task counts as solved, and timed in seconds of one thread.
 """
 
 import argparse
@@ -34,7 +34,6 @@ from lerobot_wmrl.rl.protocol import Observation, Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer
 from lerobot_wmrl.rl.trainer import Schedule, train
 
-RESULTS: Final = Path(__file__).parents[1] / "docs" / "results" / "control.json"
 EPISODES: Final = 100
 STATE: Final = "observation.state"
 FREE: Final[dict[str, Any]] = {"reference_coefficient": 0.0, "max_reference_kl": 1e9}
@@ -217,16 +216,20 @@ def measure(training: Training, iterations: int, seed: int) -> dict[str, float]:
     }
 
 
-def main() -> None:
-    """Train everything, print it, write it."""
+def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--trainings", nargs="+", choices=TRAININGS, default=list(TRAININGS))
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--iterations", type=int, help="by default as many as each training needs")
-    parser.add_argument("--output", type=Path, default=RESULTS, help="JSON file")
-    given = parser.parse_args()
+    parser.add_argument("--output", type=Path, required=True, help="JSON file")
+    return parser
+
+
+def main() -> None:
+    """Train everything, print it, write it."""
+    given = make_parser().parse_args()
     torch.set_num_threads(1)
     results: dict[str, Any] = {}
     for name in given.trainings:

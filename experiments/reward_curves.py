@@ -1,24 +1,10 @@
 """Which reward knows success from failure? The curves of the paper's Fig. 3, for every kind of reward.
 
-    for scenes in "known --env.scenes=[0,1,2] --num_episodes=270 --seed=1400000" \\
-                  "unseen --env.split=ood --num_episodes=240 --seed=1500000"; do set -- $scenes
-        lerobot-wmrl-record --env.type=wmrl_maniskill --env.task=push --env.image_size=64 \\
-            --env.cameras=[third_view,side_view] --depth=false --exploration=0 $2 $3 $4 \\
-            --policy.path=outputs/gate/policy_few/checkpoints/last/pretrained_model \\
-            --output_dir=outputs/rewards/$1
-    done
-    lerobot-train --reward_model.type=proxy --reward_model.cameras=[third_view,side_view] --steps=500 \\
-        --dataset.repo_id=local/gate --dataset.root=outputs/gate/dataset --batch_size=32 --num_workers=0 \\
-        --output_dir=outputs/rewards/proxy
-    lerobot-train --reward_model.type=embedding \\
-        --reward_model.world_model_path=outputs/gate/action_world_model \\
-        --dataset.repo_id=local/gate --dataset.root=outputs/gate/dataset --steps=300 --batch_size=4 \\
-        --num_workers=0 --output_dir=outputs/rewards/embedding
-    python benchmarks/reward_curves.py known=outputs/rewards/known unseen=outputs/rewards/unseen \\
-        --model.path=outputs/gate/action_world_model --proxy=outputs/rewards/proxy \\
-        --embedding=outputs/rewards/embedding --text_model.path=outputs/rl_comparison/text_world_model
+    python -m experiments.reward_curves known=outputs/known unseen=outputs/unseen \\
+        --model.path=outputs/action_world_model --text_model.path=outputs/text_world_model \\
+        --proxy=outputs/proxy --embedding=outputs/embedding --output=outputs/reward_curves.json
 
-What is named here and not made here, gate.py and rl_comparison.py leave behind. Real episodes are imagined
+Real episodes are imagined
 from their first frame with their own actions, as a policy would meet them, and every reward says what each
 frame is worth: `rule_based` (recorded in the simulator, the yardstick), `general` (alpha on success, the rest
 on similarity to the goal, absolute), its two parts, `embedding` and `proxy`. Of each: the mean curve of
@@ -26,8 +12,8 @@ successes and of failures with its band, Spearman's correlation with the rule-ba
 and the AUC of its highest run of three frames, success against failure. The same starts are also given to
 hands that move at random, not at all, and to one corner: they should earn less than the planner's actions.
 Does uncertainty warn? Of the episodes that the world model calls successes, how often is the
-greatest uncertainty until then in a false one above that in a true one. Writes
-docs/results/reward_curves.json and a picture beside it.
+greatest uncertainty until then in a false one above that in a true one. Writes a
+JSON file and a picture beside it.
 """
 
 import argparse
@@ -43,11 +29,11 @@ from matplotlib.figure import Figure
 from scipy.stats import spearmanr
 from torch import Tensor
 
+from experiments.figures import COLOURS, tidy
 from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.statistics import Estimate
 from lerobot_wmrl.data.episode_table import EpisodeTable, open_dataset, read_episodes
-from lerobot_wmrl.demo.report.figures import COLOURS, tidy
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.start_frames import chosen_episodes
 from lerobot_wmrl.envs.uncertainty import SIGNALS
@@ -57,7 +43,6 @@ from lerobot_wmrl.evaluation.report import markdown_table
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.world_models.checkpoint import load_model
 
-RESULTS: Final = Path(__file__).parents[1] / "docs" / "results" / "reward_curves.json"
 FRAMES = 3
 """In a row that count together, as in the environment."""
 
@@ -239,8 +224,7 @@ def draw(found: Mapping[str, Mapping[str, Any]], path: Path) -> None:
     tidy(figure).savefig(path, dpi=130)
 
 
-def main() -> None:
-    """Entry point."""
+def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -250,8 +234,13 @@ def main() -> None:
     for kind in ("proxy", "embedding"):
         parser.add_argument(f"--{kind}", help=f"trained {kind} reward; left out by default")
     parser.add_argument("--max_episodes", type=int, default=300, help="of each dataset, evenly spread")
-    parser.add_argument("--output", type=Path, default=RESULTS, help="JSON file")
-    given = parser.parse_args()
+    parser.add_argument("--output", type=Path, required=True, help="JSON file")
+    return parser
+
+
+def main() -> None:
+    """Entry point."""
+    given = make_parser().parse_args()
     register_third_party_plugins()
     paths = {kind: getattr(given, kind) for kind in ("proxy", "embedding") if getattr(given, kind)}
     rewards = {kind: load_model(path, kind) for kind, path in paths.items()}

@@ -1,6 +1,6 @@
 """Pictures of every object, every task and every kind of trajectory, for docs/images.
 
-    python benchmarks/scene_pictures.py
+    python -m experiments.scene_pictures --output_dir=outputs/pictures
 
 Writes objects.png, tasks.png and trajectories.png.
 """
@@ -20,7 +20,6 @@ from lerobot_wmrl.maniskill.scenes import SCENES, Scene
 from lerobot_wmrl.maniskill.simulation import Simulation
 from lerobot_wmrl.maniskill.tasks import TASKS
 
-IMAGES = Path(__file__).parents[1] / "docs" / "images"
 IMAGE_SIZE = 160
 STRIP_FRAMES = 6
 SEED = 4_000_000
@@ -69,13 +68,17 @@ def strip(frames: np.ndarray) -> np.ndarray:
     return in_a_row(frames[evenly_spaced(len(frames), STRIP_FRAMES)])
 
 
-def main() -> None:
-    """Entry point."""
+def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--folder", type=Path, default=IMAGES, help="where the pictures go")
-    folder = parser.parse_args().folder
+    parser.add_argument("--output_dir", type=Path, required=True, help="where the pictures go")
+    return parser
+
+
+def main() -> None:
+    """Entry point."""
+    folder = make_parser().parse_args().output_dir
     scenes = scenes_with_each_object()
     simulation = Simulation(TASKS["push"], SCENES, Rendering(CAMERAS, IMAGE_SIZE))
     things = [(s.object, simulation.reset(s, SEED).images["third_view"]) for s in scenes]

@@ -1,12 +1,12 @@
 """How exactly must one know where the object is, to judge a rollout from its first frame and its actions?
 
-    python benchmarks/gate_sensitivity.py --dataset.root=outputs/gate/rollouts
+    python -m experiments.gate_sensitivity --dataset.root=outputs/rollouts --output=outputs/sensitivity.json
 
 The gate replays real actions open loop. Here the simulator itself is asked in the world model's place: each
 recorded episode is repeated with its own actions, but the object stands a little off, by a normal error
 along x and y. The share of failures that then succeed, and of successes that still do, is what a perfect
 model of physics would get at the gate, were its eyes so good. With an error of 0 it is how exactly the
-simulator repeats itself. Writes docs/results/gate_sensitivity.json.
+simulator repeats itself.
 """
 
 import argparse
@@ -30,7 +30,6 @@ from lerobot_wmrl.maniskill.scenes import SCENES
 from lerobot_wmrl.maniskill.simulation import Simulation
 from lerobot_wmrl.maniskill.tasks import task_of
 
-RESULTS: Final = Path(__file__).parents[1] / "docs" / "results" / "gate_sensitivity.json"
 ERRORS_MM: Final = (0.0, 0.5, 1.0, 2.0, 3.0, 5.0)
 
 
@@ -82,19 +81,23 @@ def results_table(rows: Sequence[dict[str, Any]]) -> str:
     for row in rows:
         rates = (row[name] for name in ("false_positive_rate", "recall"))
         lines.append([row["error_mm"], *(str(Proportion(rate["k"], rate["n"])) for rate in rates)])
-    return markdown_table(["error (mm)", "failures called successes", "successes recognised"], lines)
+    return markdown_table(["error (mm)", "false positives", "recall"], lines)
 
 
-def main() -> None:
-    """Entry point."""
-    register_third_party_plugins()
+def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--dataset.root", dest="root", required=True, help="recorded rollouts")
     parser.add_argument("--errors", type=float, nargs="+", default=list(ERRORS_MM), help="in millimetres")
-    parser.add_argument("--output", type=Path, default=RESULTS, help="JSON file")
-    given = parser.parse_args()
+    parser.add_argument("--output", type=Path, required=True, help="JSON file")
+    return parser
+
+
+def main() -> None:
+    """Entry point."""
+    register_third_party_plugins()
+    given = make_parser().parse_args()
     table, real = read_episodes(open_dataset(given.root)), recorded_episodes(Path(given.root))
     scenes = [SCENES[scene] for scene in np.unique(real["scene"])]
     simulation = Simulation(task_of(TASKS[int(real["task"][0])]), scenes, Rendering(cameras=()))

@@ -1,11 +1,11 @@
 """What can be read from a single frame of a camera: a small network is asked where things are.
 
-    python benchmarks/camera_probe.py --episodes=3200 --cameras front_steep+wrist side_mid+wrist
+    python -m experiments.camera_probe --cameras front_steep+wrist --output=outputs/cameras.json
 
 Frames of planned episodes of all tasks and kinds, in all training scenes, are recorded once and kept.
 A CNN with a spatial soft-argmax is trained on three quarters of the episodes and tested on the others:
 errors of places in mm, of the gripper's opening in %, and whether finger and object touch.
-Adds to docs/results/cameras.json.
+Adds to the JSON file that is given.
 """
 
 import argparse
@@ -20,11 +20,10 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from tqdm import tqdm, trange
 
-from camera_frames import CANDIDATES, Frames, frames_of
+from experiments.camera_frames import CANDIDATES, Frames, frames_of
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.maniskill.tasks import TASKS
 
-RESULTS = Path(__file__).parents[1] / "docs" / "results"
 NAMES = ("object_x", "object_y", "object_z", "tcp_x", "tcp_y", "tcp_z")
 TEST_SHARE = 0.25
 BATCH = 64
@@ -154,13 +153,12 @@ def summary(error: np.ndarray, right: np.ndarray, gaps: np.ndarray, task: np.nda
     }
 
 
-def main() -> None:
-    """Entry point."""
+def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--episodes", type=int, default=800, help="planned episodes to take frames from")
-    parser.add_argument("--steps", type=int, default=2500, help="optimiser steps of each probe")
+    parser.add_argument("--steps", type=int, default=2500, help="optimizer steps of each probe")
     parser.add_argument(
         "--sizes", type=int, nargs="+", default=[64, 128], choices=WIDTHS, help="pixels a side"
     )
@@ -168,11 +166,16 @@ def main() -> None:
         "--cameras", nargs="+", default=[*CANDIDATES, "wrist"],
         help="what is probed: cameras, or several together, as in front_steep+wrist",
     )  # fmt: skip
-    parser.add_argument("--output", type=Path, default=RESULTS / "cameras.json", help="JSON file to add to")
+    parser.add_argument("--output", type=Path, required=True, help="JSON file to add to")
     parser.add_argument(
         "--frames", type=Path, default=Path("outputs/camera_frames"), help="folder that keeps the frames"
     )
-    given = parser.parse_args()
+    return parser
+
+
+def main() -> None:
+    """Entry point."""
+    given = make_parser().parse_args()
     views = sorted({view for cameras in given.cameras for view in cameras.split("+")})
     result = json.loads(given.output.read_text()) if given.output.exists() else {"probes": {}}
     for size in given.sizes:

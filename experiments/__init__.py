@@ -1,0 +1,1 @@
+"""Studies: one YAML file a question; together they make every JSON in docs/results."""

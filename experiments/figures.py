@@ -1,0 +1,118 @@
+"""Draw the pictures of results in docs/."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+COLOURS: Final = ("#2b6cb0", "#dd6b20", "#2f855a", "#805ad5")
+PLACES: Final = {"imagined": "PPO in imagination", "simulated": "PPO in ManiSkill"}
+DOMAINS: Final = {"ind": "known scenes", "ood": "unseen scenes", "drawn": "known scenes, tokens drawn"}
+CURVES: Final = (("data", "episodes"), ("time", "minutes"), ("size", "parameters"))
+"""How the names of a learning curve's trainings begin, and what they are drawn over."""
+
+
+def tidy(figure: Figure) -> Figure:
+    """Take away frames, put legends in."""
+    for axes in figure.axes:
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(axis="y", alpha=0.25)
+        if axes.get_legend_handles_labels()[0]:
+            axes.legend(frameon=False, fontsize=9)
+    return figure
+
+
+def spread(rate: Mapping[str, Any]) -> list[list[float]]:
+    """Return the distances of a share to both ends of its interval, as errorbar wants them."""
+    low, high = rate["wilson_95"]
+    return [[rate["share"] - low], [high - rate["share"]]]
+
+
+def draw_comparison(results: Mapping[str, Any], path: Path) -> None:
+    """Success in known scenes against steps and against time; a thin line a seed, a thick one their mean."""
+    figure = Figure(figsize=(9, 3.2), layout="constrained")
+    panels = figure.subplots(1, 2, sharey=True)
+    units = (
+        ("env_steps", 1e-3, "thousand steps of the environment"),
+        ("seconds", 1 / 60, "minutes on one core"),
+    )
+    for axes, (abscissa, unit, label) in zip(panels, units, strict=True):
+        _draw_curves(axes, results, abscissa, unit)
+        axes.set_xlabel(label)
+    panels[0].set_ylabel("success in ManiSkill")
+    tidy(figure).savefig(path, dpi=130)
+
+
+def _draw_curves(axes: Axes, results: Mapping[str, Any], abscissa: str, unit: float) -> None:
+    cloned = results["cloned"]["ind"]
+    axes.axhspan(*cloned["wilson_95"], color="#999", alpha=0.2)
+    axes.axhline(cloned["share"], color="#666", linestyle="--", label="SFT")
+    for colour, (place, title) in zip(COLOURS, PLACES.items(), strict=False):
+        curves = np.array([
+            [(0.0, cloned["share"]), *((point[abscissa] * unit, point["share"]) for point in run["ind"])]
+            for run in results["runs"][place]
+        ])  # fmt: skip
+        for curve in curves:
+            axes.plot(*curve.T, color=colour, alpha=0.35, linewidth=1)
+        axes.plot(*curves.mean(0).T, color=colour, marker="o", label=title)
+
+
+def draw_improvement(found: Mapping[str, Any], path: Path) -> None:
+    """A panel a domain: every policy's success before and after PPO in imagination."""
+    figure = Figure(figsize=(4 * len(found), 3.2), layout="constrained")
+    panels = figure.subplots(1, len(found), sharey=True, squeeze=False)[0]
+    for axes, (domain, numbers) in zip(panels, found.items(), strict=True):
+        policies = numbers["policies"]
+        for offset, (kind, title) in enumerate({"cloned": "SFT", "trained": "PPO in imagination"}.items()):
+            for place, row in enumerate(policies.values()):
+                axes.bar(
+                    place + 0.25 * offset, row[kind]["share"], 0.22, yerr=spread(row[kind]), capsize=3,
+                    color=COLOURS[offset], label=title if place == 0 and domain == list(found)[-1] else None,
+                )  # fmt: skip
+        axes.set_xticks([place + 0.125 for place in range(len(policies))], list(policies))
+        axes.set_title(DOMAINS[domain])
+        axes.set_ylim(0, 1.2)
+    panels[0].set_ylabel("success in ManiSkill")
+    tidy(figure).savefig(path, dpi=130)
+
+
+def draw_demo(results: Mapping[str, Any], path: Path) -> None:
+    """A panel a place: a line from the SFT to the PPO policy for each run of the demo."""
+    figure = Figure(figsize=(8, 3.4))
+    panels = figure.subplots(1, 2, sharey=True)
+    places = (("known", "in ManiSkill"), ("imagined", "in the world model"))
+    for axes, (place, title), colour in zip(panels, places, COLOURS, strict=False):
+        for offset, run in enumerate(results["runs"]):
+            rates = [run[place][kind] for kind in ("sft", "rl")]
+            errors = np.hstack([spread(rate) for rate in rates])
+            axes.errorbar(
+                [0.04 * offset, 1 + 0.04 * offset], [rate["share"] for rate in rates], errors, marker="o",
+                color=colour, alpha=1 - 0.2 * offset, capsize=3, label=f"seed {run['seed']}",
+            )  # fmt: skip
+        axes.set_title(title)
+        axes.set_xticks((0, 1), ("SFT", "PPO in imagination"))
+        axes.set_ylim(0, 1.05)
+    panels[0].set_ylabel("success rate")
+    tidy(figure).savefig(path, dpi=130, bbox_inches="tight")
+
+
+def draw_learning_curve(variants: Mapping[str, Mapping[str, Any]], path: Path) -> None:
+    """A column each for data, time and size: delta-PSNR above, the AUC of the gate below."""
+    figure = Figure(figsize=(9, 5), layout="constrained")
+    grid = figure.subplots(2, len(CURVES), sharex="col", sharey="row")
+    for (above, below), (prefix, amount) in zip(grid.T, CURVES, strict=True):
+        rows = [row for name, row in variants.items() if name.startswith(("full", prefix))]
+        rows.sort(key=lambda row: row[amount])
+        amounts, estimates = [row[amount] for row in rows], [row["delta_psnr_15"] for row in rows]
+        values = [each["value"] for each in estimates]
+        errors = [[abs(each["value"] - each["bootstrap_95"][side]) for each in estimates] for side in (0, 1)]
+        above.errorbar(amounts, values, errors, color=COLOURS[0], marker="o", capsize=3)
+        below.plot(amounts, [row["gate"]["auc"] for row in rows], color=COLOURS[1], marker="o")
+        below.set_xscale("log")
+        below.set_xlabel(amount)
+    grid[0, 0].set_ylabel("delta-PSNR at step 15 (dB)")
+    grid[1, 0].set_ylabel("AUC of the gate")
+    tidy(figure).savefig(path, dpi=130)

@@ -1,0 +1,189 @@
+"""Run a study: every command once, in order, then its results into docs/.
+
+    python -m experiments.run experiments/gate.yaml
+    python -m experiments.run experiments/gate.yaml steps=200 output_dir=outputs/short --docs=outputs/docs
+    python -m experiments.run experiments/rl_comparison.yaml --dry_run
+
+Commands are printed before they run. The same call again continues: a finished step is not repeated. A step
+whose command has changed since it was finished is refused, unless `--repeat` says that it and the steps after
+it are to run again. `name=value` sets one of the study's variables.
+"""
+
+import argparse
+import importlib
+import json
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any, Final
+
+from experiments.study import ROOT, Step, Study, read_study
+from lerobot_wmrl.common.files import write_json
+
+RECORDS: Final = "steps"
+PROVENANCE: Final = "provenance"
+
+
+class StudyError(RuntimeError):
+    """A study cannot go on; the message says why and what to do."""
+
+
+def run_study(study: Study, repeat: bool = False) -> None:
+    """Run every step that is not finished.
+
+    Raises:
+        StudyError: a needed study is not finished, a command has changed, or a command fails.
+    """
+    for name in study.needs:
+        if not (study.folder_of(name) / RECORDS).is_dir():
+            raise StudyError(f"needs {name}: run experiments/{name}.yaml first, or give {name}=FOLDER")
+    for number, step in enumerate(study.steps, start=1):
+        heading = f"[{number}/{len(study.steps)}] {step.name}"
+        record = read_record(study, step)
+        if record is None:
+            run_step(study, step, heading)
+        elif record["command"] == step.command:
+            print(f"{heading}: done in {record['seconds']:.0f} s", flush=True)
+        elif repeat:
+            print(f"{heading}: its command has changed, so it and what follows is repeated", flush=True)
+            for later in study.steps[number - 1 :]:
+                record_path(study, later).unlink(missing_ok=True)
+                delete_output(study, later)
+            run_step(study, step, heading)
+        else:
+            raise StudyError(
+                f"{step.name} was finished with another command.\n  then: {record['command']}\n"
+                f"  now:  {step.command}\nGive --repeat to run it and all steps after it again, or another "
+                "output_dir=FOLDER."
+            )
+
+
+def run_step(study: Study, step: Step, heading: str) -> None:
+    """Print one command, run it, and record that it is finished."""
+    if step.fresh:
+        delete_output(study, step)
+    print(f"\n{heading}\n$ {step.command}", flush=True)
+    commands = Path(sys.executable).parent
+    environment = {**os.environ, "PATH": f"{commands}{os.pathsep}{os.environ['PATH']}"}
+    began = time.monotonic()
+    status = subprocess.run(["bash", "-euo", "pipefail", "-c", step.command], env=environment).returncode
+    if status != 0:
+        raise StudyError(f"{step.name}: exit status {status}. Run the study again to continue here.")
+    seconds = round(time.monotonic() - began, 1)
+    finished = {"command": step.command, "seconds": seconds, "commit": commit(), "machine": machine()}
+    write_json(record_path(study, step), finished)
+
+
+def record_path(study: Study, step: Step) -> Path:
+    return study.folder / RECORDS / f"{step.name}.json"
+
+
+def read_record(study: Study, step: Step) -> dict[str, Any] | None:
+    """Return what was recorded of a finished step, None if it is not finished."""
+    path = record_path(study, step)
+    return json.loads(path.read_text()) if path.exists() else None
+
+
+def delete_output(study: Study, step: Step) -> None:
+    """Delete the folder that a step writes. StudyError if it is not in the study's own folder."""
+    if step.output is None or not step.output.exists():
+        return
+    if study.folder.resolve() not in step.output.resolve().parents:
+        raise StudyError(f"{step.name}: {step.output} is outside {study.folder}; nothing was deleted")
+    shutil.rmtree(step.output)
+
+
+def publish(study: Study, docs: Path) -> list[Path]:
+    """Collect the results of a finished study into docs/, each JSON with its provenance.
+
+    Returns:
+        The written files.
+    """
+    if study.collect:
+        module, _, function = study.collect.partition(".")
+        collected = getattr(importlib.import_module(f"experiments.{module}"), function)(study)
+        for stem, content in collected.items():
+            write_json(study.folder / f"{stem}.json", content)
+    written = []
+    for result in study.results:
+        source, target = study.folder / Path(result).name, docs / result
+        if not source.exists():
+            raise StudyError(f"{source} is missing, though all steps are finished: does a step write it?")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if source.suffix == ".json":
+            write_json(target, {PROVENANCE: provenance(study), **json.loads(source.read_text())})
+        else:
+            shutil.copyfile(source, target)
+        written.append(target)
+    return written
+
+
+def provenance(study: Study) -> dict[str, Any]:
+    """Return what the results of a finished study come from: commits, machines, commands."""
+    records = [record for step in study.steps if (record := read_record(study, step))]
+    return {
+        "study": study.name,
+        "commit": ", ".join(dict.fromkeys(record["commit"] for record in records)),
+        "machine": "; ".join(dict.fromkeys(record["machine"] for record in records)),
+        "commands": {step.name: step.command for step in study.steps},
+    }
+
+
+def commit() -> str:
+    """Return the commit of the code that runs, `+` behind it where files were changed."""
+    describe = ["git", "-C", str(ROOT), "describe", "--always", "--abbrev=7", "--exclude=*", "--dirty=+"]
+    found = subprocess.run(describe, capture_output=True, text=True)
+    return found.stdout.strip() or "unknown"
+
+
+def machine() -> str:
+    """Return the processor, the number of cores that may be used, and the GPU if there is one."""
+    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    processor = names[0] if names else platform.processor() or platform.machine()
+    gpu = shutil.which("nvidia-smi") and subprocess.run(
+        ["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"], capture_output=True, text=True
+    ).stdout.strip().replace("\n", ", ")
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return f"{processor}, {cores} cores" + (f", {gpu}" if gpu else "")
+
+
+def show(study: Study) -> None:
+    """Print what a study asks, its commands, and what it writes."""
+    print(f"{study.name}: {study.question}\n")
+    for step in study.steps:
+        print(f"# {step.name}\n{step.command}\n")
+    for result in study.results:
+        print(f"writes docs/{result}")
+
+
+def main() -> None:
+    """Entry point."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("study", type=Path, help="YAML file")
+    parser.add_argument("variables", nargs="*", help="name=value")
+    parser.add_argument("--dry_run", action="store_true", help="print the commands and stop")
+    parser.add_argument("--repeat", action="store_true", help="run steps again whose commands have changed")
+    parser.add_argument("--docs", type=Path, default=ROOT / "docs", help="where results/ and images/ are")
+    given = parser.parse_args()
+    try:
+        study = read_study(given.study, given.variables)
+        if given.dry_run:
+            show(study)
+            return
+        run_study(study, given.repeat)
+        for path in publish(study, given.docs):
+            print(f"wrote {path}")
+    except (ValueError, StudyError) as error:
+        sys.exit(f"error: {error}")
+    print("Next: python -m experiments.tables, which writes docs/results.md")
+
+
+if __name__ == "__main__":
+    main()

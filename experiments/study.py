@@ -1,0 +1,160 @@
+"""Read a study: a YAML file with a question, the commands that answer it, and what they write into docs/.
+
+A file has these keys:
+
+    question   what the study answers
+    needs      studies whose folders its commands read; `$gate` is the folder of gate.yaml
+    extends    another study, whose keys hold where this one has none of its own
+    variables  names for commands; a later one may use an earlier one
+    steps      name, command; `for`: repeat the step for every combination; `fresh: true`: delete first what
+               an interrupted run of it has left, since the command refuses that
+    collect    a function of this package, `module.function(study)`, that returns results by their stem
+    results    what appears in docs/, made by a step or by `collect` in the study's folder
+
+`$name` in a command is a variable, `$$` a dollar sign, and bash runs the command.
+"""
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from string import Template
+from typing import Any, Final
+
+import yaml
+
+ROOT: Final = Path(__file__).parents[1]
+OUTPUTS: Final = Path("outputs/experiments")
+KEYS: Final = {"question", "needs", "extends", "variables", "steps", "collect", "results"}
+
+
+@dataclass(frozen=True)
+class Step:
+    """One command of a study, ready to be typed."""
+
+    name: str
+    command: str
+    fresh: bool = False
+    """Whether the folder that it writes is deleted before it runs."""
+
+    @property
+    def output(self) -> Path | None:
+        """The folder that the command writes, by its flags."""
+        found = re.search(r"--(?:output_dir|new_root|target)=(\S+)", self.command)
+        return Path(found[1]) if found else None
+
+
+@dataclass(frozen=True)
+class Study:
+    """A study with all variables filled in."""
+
+    name: str
+    question: str
+    needs: tuple[str, ...]
+    variables: Mapping[str, Any]
+    steps: tuple[Step, ...]
+    collect: str | None
+    results: tuple[str, ...]
+    """Paths below docs/, such as `results/rl_comparison.json`."""
+
+    @property
+    def folder(self) -> Path:
+        """Where everything that the study makes lies."""
+        return Path(self.variables["output_dir"])
+
+    def folder_of(self, study: str) -> Path:
+        """The folder of a study that this one needs."""
+        return Path(self.variables[study])
+
+
+def read_study(path: Path, given: Sequence[str] = ()) -> Study:
+    """Read a study.
+
+    Args:
+        path: the YAML file.
+        given: `name=value` for variables, `output_dir` and needed studies included.
+
+    Raises:
+        ValueError: a key, variable or value is not known.
+    """
+    content = read_keys(path)
+    needs = tuple(content.get("needs", ()))
+    folders = {"output_dir": str(OUTPUTS / path.stem), **{name: str(OUTPUTS / name) for name in needs}}
+    variables = resolve({**folders, **content.get("variables", {})}, given)
+    steps = tuple(step for entry in content["steps"] for step in repeated(entry, variables))
+    names = [step.name for step in steps]
+    if twice := {name for name in names if names.count(name) > 1}:
+        raise ValueError(
+            f"{path}: steps with the same name: {', '.join(sorted(twice))}; add a variable to it"
+        )
+    return Study(
+        path.stem,
+        " ".join(content["question"].split()),
+        needs,
+        variables,
+        steps,
+        content.get("collect"),
+        tuple(content.get("results", ())),
+    )
+
+
+def read_keys(path: Path) -> dict[str, Any]:
+    """Return the keys of a study file, those of the file that it extends below its own."""
+    content: dict[str, Any] = yaml.safe_load(path.read_text())
+    if unknown := content.keys() - KEYS:
+        raise ValueError(
+            f"{path}: unknown key {', '.join(sorted(unknown))}; there are {', '.join(sorted(KEYS))}"
+        )
+    if "extends" not in content:
+        return content
+    base = read_keys(path.parent / content["extends"])
+    variables = {**base.get("variables", {}), **content.get("variables", {})}
+    return {**base, "results": (), "collect": None, **content, "variables": variables}
+
+
+def resolve(variables: Mapping[str, Any], given: Sequence[str]) -> dict[str, Any]:
+    """Return the variables, with those `given` as `name=value` in their place and all `$name` filled in."""
+    chosen = dict(variables)
+    for assignment in given:
+        name, equals, value = assignment.partition("=")
+        if not equals or name not in chosen:
+            raise ValueError(f"{assignment}: give name=value, with one of {', '.join(chosen)}")
+        chosen[name] = yaml.safe_load(value)
+    filled: dict[str, Any] = {}
+    for name, value in chosen.items():
+        filled[name] = fill(value, filled) if isinstance(value, str) else value
+    return filled
+
+
+def repeated(entry: Mapping[str, Any], variables: Mapping[str, Any]) -> list[Step]:
+    """Return the steps of one entry.
+
+    `for` is a list of rows, or a mapping from names to lists (or to the name of a variable that is one), of
+    which every combination is taken.
+    """
+    rows = entry.get("for", [{}])
+    if isinstance(rows, Mapping):
+        lists = [variables[values] if isinstance(values, str) else values for values in rows.values()]
+        rows = [dict(zip(rows, values, strict=True)) for values in product(*lists)]
+    steps = []
+    for row in rows:
+        known = {**variables, **row}
+        known.update({name: fill(value, known) for name, value in row.items() if isinstance(value, str)})
+        command = " ".join(fill(entry["command"], known).split())
+        steps.append(Step(fill(entry["name"], known), command, entry.get("fresh", False)))
+    return steps
+
+
+def fill(text: str, variables: Mapping[str, Any]) -> str:
+    """Replace every `$name`. ValueError names one that is not known."""
+    try:
+        return Template(text).substitute({name: as_text(value) for name, value in variables.items()})
+    except KeyError as error:
+        raise ValueError(f"${error.args[0]} in {text!r}: there is no such variable") from None
+
+
+def as_text(value: Any) -> str:
+    """Return a value as a flag has it: `[0,1]`, `true`, `0.5`."""
+    return value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))

@@ -1,0 +1,118 @@
+"""Write docs/results.md from the JSON in docs/results. Nothing on that page is typed by hand.
+
+python -m experiments.tables
+python -m experiments.tables --check
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from experiments import policy_sections as policies
+from experiments import world_model_sections as world_models
+from experiments.cells import Load
+from experiments.study import ROOT, Study, read_study
+from lerobot_wmrl.common.files import write_text
+
+DOCS: Final = ROOT / "docs"
+STUDIES: Final = ROOT / "experiments"
+
+SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
+    "demo": ("Policies", policies.demo),
+    "cloning_control": ("Policies", policies.cloning_control),
+    "rl_comparison": ("Policies", policies.rl_comparison),
+    "planning": ("Policies", policies.planning),
+    "synthetic_data": ("Policies", policies.synthetic_data),
+    "imagined_ppo": ("Policies", policies.imagined_ppo),
+    "openvla_small": ("Policies", policies.openvla_small),
+    "gate": ("Trust", world_models.gate),
+    "gate_one_scene": ("Trust", world_models.gate_one_scene),
+    "gate_autoregressive": ("Trust", world_models.gate_autoregressive),
+    "gate_sensitivity": ("Trust", world_models.gate_sensitivity),
+    "policies": ("Trust", world_models.policies),
+    "reward_curves": ("Trust", world_models.reward_curves),
+    "four_tasks": ("World models", world_models.four_tasks),
+    "learning_curve": ("World models", world_models.learning_curve),
+    "ablation": ("World models", world_models.ablation),
+    "ablation_network": ("World models", world_models.ablation_network),
+    "planners": ("Recording, algorithms, speed", world_models.planners),
+    "cameras": ("Recording, algorithms, speed", world_models.cameras),
+    "control": ("Recording, algorithms, speed", world_models.control),
+    "speed": ("Recording, algorithms, speed", world_models.speed),
+}
+"""Study → chapter and section, in the order of the page."""
+
+INTRODUCTION: Final = """# Results
+
+Every question that was measured, its answer, one table, and what limits it. The page is generated from
+[`docs/results/`](results) by `python -m experiments.tables`; each JSON there is made by one file of
+[`experiments/`](../experiments).
+
+- Success is success in ManiSkill unless a column says otherwise. *Known* scenes are those that policies and
+  world model were trained in; *unseen* ones are held out from all training. Starts are held out in both.
+- Behind a share stands Wilson's 95 % interval, behind a mean over episodes a bootstrap 95 % interval over
+  episodes, behind a change one that draws starts anew. None of them covers other seeds of training.
+- All numbers come from CPUs and from earlier commits than the present one. The commit stands under each
+  table, *before* it where only the commit that added the numbers is known. Today's files repeat the set-up;
+  they have not all been run again.
+- Numbers that did not come out as hoped stay here.
+"""
+
+
+def results_page(docs: Path = DOCS) -> str:
+    """Return docs/results.md."""
+
+    def load(stem: str) -> dict[str, Any]:
+        content: dict[str, Any] = json.loads((docs / "results" / f"{stem}.json").read_text())
+        return content
+
+    parts, chapter = [INTRODUCTION], ""
+    for name, (title, section) in SECTIONS.items():
+        if title != chapter:
+            chapter = title
+            parts.append(f"## {chapter}\n")
+        study = read_study(STUDIES / f"{name}.yaml")
+        parts.append(
+            f'### {study.question}<a id="{name}"></a>\n\n{joined(section(load))}\n\n{origin(study, load)}\n'
+        )
+    return "\n".join(parts)
+
+
+def joined(text: str) -> str:
+    """Return Markdown with each paragraph on one line, whatever the length of its numbers."""
+    blocks = text.split("\n\n")
+    return "\n\n".join(block if block.startswith("|") else " ".join(block.split()) for block in blocks)
+
+
+def origin(study: Study, load: Load) -> str:
+    """Return the line that says where numbers come from and how to repeat them."""
+    sources = [load(Path(result).stem)["provenance"] for result in study.results if result.endswith(".json")]
+    commits = ", ".join(dict.fromkeys(source["commit"] for source in sources))
+    machines = "; ".join(dict.fromkeys(source["machine"] for source in sources if "machine" in source))
+    files = ", ".join(
+        f"[{Path(result).name}]({result})" for result in study.results if result.endswith(".json")
+    )
+    where = f", {machines}" if machines else ""
+    return f"*Commit {commits}{where}; {files}; `python -m experiments.run experiments/{study.name}.yaml`*"
+
+
+def main() -> None:
+    """Entry point."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--check", action="store_true", help="only say whether the page is current")
+    target, page = DOCS / "results.md", results_page()
+    if parser.parse_args().check:
+        if not target.exists() or target.read_text() != page:
+            sys.exit("docs/results.md is not what the JSON says: run python -m experiments.tables")
+        return
+    write_text(target, page)
+    print(f"wrote {target.relative_to(ROOT)}")
+
+
+if __name__ == "__main__":
+    main()

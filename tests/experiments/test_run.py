@@ -1,0 +1,143 @@
+"""The runner of studies: it resumes, refuses what has changed, and publishes with provenance."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from experiments.run import StudyError, publish, run_study
+from experiments.study import Study, read_study
+
+COUNT = """
+question: How often
+  does it run?
+variables: {seeds: [0, 1], word: one, greeting: hello $word}
+steps:
+  - name: say_$seed
+    for: {seed: seeds}
+    command: >
+      mkdir -p $output_dir && echo '{greeting: $greeting}' $$((1 + 1))
+      >> $output_dir/said_$seed
+  - name: result
+    command: echo '{"n":' $$(cat $output_dir/said_* | wc -l)'}' > $output_dir/count.json
+results: [results/count.json]
+"""
+
+
+@pytest.fixture
+def study_file(tmp_path: Path) -> Path:
+    path = tmp_path / "count.yaml"
+    path.write_text(COUNT)
+    return path
+
+
+def read(path: Path, *given: str) -> Study:
+    return read_study(path, [f"output_dir={path.parent / 'out'}", *given])
+
+
+def lines(study: Study) -> list[str]:
+    return [line for path in sorted(study.folder.glob("said_*")) for line in path.read_text().splitlines()]
+
+
+def test_commands_are_as_a_user_types_them(study_file: Path) -> None:
+    study = read(study_file)
+    assert study.question == "How often does it run?"
+    assert [step.name for step in study.steps] == ["say_0", "say_1", "result"]
+    out = study_file.parent / "out"
+    assert study.steps[0].command == (
+        f"mkdir -p {out} && echo '{{greeting: hello one}}' $((1 + 1)) >> {out}/said_0"
+    )
+
+
+def test_a_finished_step_is_not_repeated(study_file: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    run_study(read(study_file))
+    assert f"$ {read(study_file).steps[0].command}" in capfd.readouterr().out
+    run_study(read(study_file))
+    assert lines(read(study_file)) == ["{greeting: hello one} 2"] * 2
+    assert "[1/3] say_0: done in" in capfd.readouterr().out
+
+
+def test_a_failed_step_is_run_again_and_those_before_it_are_not(study_file: Path) -> None:
+    broken = study_file.with_name("broken.yaml")
+    broken.write_text(COUNT.replace('echo \'{"n"', 'false && echo \'{"n"'))
+    with pytest.raises(StudyError, match=r"result: exit status 1\. Run the study again"):
+        run_study(read(broken))
+    run_study(read(study_file))
+    assert len(lines(read(study_file))) == 2
+
+
+def test_a_changed_command_is_refused_or_repeated(study_file: Path) -> None:
+    run_study(read(study_file))
+    with pytest.raises(StudyError, match="say_0 was finished with another command") as refused:
+        run_study(read(study_file, "word=two"))
+    assert "hello one" in str(refused.value)
+    assert "hello two" in str(refused.value)
+    assert len(lines(read(study_file))) == 2
+    run_study(read(study_file, "word=two"), repeat=True)
+    assert sum("hello two" in line for line in lines(read(study_file))) == 2
+
+
+def test_results_are_published_with_commit_machine_and_commands(study_file: Path) -> None:
+    study = read(study_file)
+    run_study(study)
+    assert publish(study, study_file.parent / "docs") == [study_file.parent / "docs/results/count.json"]
+    content = json.loads((study_file.parent / "docs/results/count.json").read_text())
+    assert content["n"] == 2
+    source = content["provenance"]
+    assert (source["study"], list(source["commands"])) == ("count", ["say_0", "say_1", "result"])
+    assert source["commit"]
+    assert "cores" in source["machine"]
+
+
+def test_a_result_that_no_step_wrote_is_named(study_file: Path) -> None:
+    study = read(study_file)
+    run_study(study)
+    (study.folder / "count.json").unlink()
+    with pytest.raises(StudyError, match=r"count\.json is missing"):
+        publish(study, study_file.parent / "docs")
+
+
+def test_what_is_needed_must_be_finished(study_file: Path) -> None:
+    study_file.write_text("needs: [gate]\n" + COUNT)
+    with pytest.raises(StudyError, match=r"needs gate: run experiments/gate\.yaml first"):
+        run_study(read(study_file, f"gate={study_file.parent / 'nothing'}"))
+
+
+def test_only_what_the_step_itself_writes_is_deleted(tmp_path: Path) -> None:
+    precious = tmp_path / "precious"
+    precious.mkdir()
+    text = "question: x\nsteps:\n  - {name: a, fresh: true, command: 'true --output_dir=FOLDER'}\n"
+    path = tmp_path / "fresh.yaml"
+    path.write_text(text.replace("FOLDER", str(precious)))
+    with pytest.raises(StudyError, match="nothing was deleted"):
+        run_study(read(path))
+    assert precious.exists()
+    path.write_text(text.replace("FOLDER", "$output_dir/left"))
+    left = tmp_path / "out" / "left"
+    left.mkdir(parents=True)
+    run_study(read(path))
+    assert not left.exists()
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    (COUNT + "colour: red\n", "unknown key colour"),
+    (COUNT.replace("$word", "$wrd"), r"\$wrd in .* there is no such variable"),
+    (COUNT.replace("say_$seed", "say"), "steps with the same name: say"),
+])  # fmt: skip
+def test_mistakes_are_named(study_file: Path, text: str, message: str) -> None:
+    study_file.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        read(study_file)
+
+
+def test_a_variable_that_is_not_there_cannot_be_set(study_file: Path) -> None:
+    with pytest.raises(ValueError, match="sed=3: give name=value, with one of output_dir, seeds"):
+        read(study_file, "sed=3")
+
+
+def test_a_study_may_extend_another(study_file: Path) -> None:
+    other = study_file.with_name("other.yaml")
+    other.write_text("question: Again?\nextends: count.yaml\nvariables: {word: three}\n")
+    study = read(other)
+    assert "hello three" in study.steps[0].command
+    assert (study.name, study.results) == ("other", ())

@@ -1,0 +1,49 @@
+"""The studies as committed: every file parses, today's commands take its flags, every result has one."""
+
+from pathlib import Path
+
+import pytest
+
+from experiments.run import provenance
+from experiments.study import ROOT, read_study
+from experiments.tables import SECTIONS, results_page
+
+STUDIES = {path.stem: read_study(path) for path in sorted((ROOT / "experiments").glob("*.yaml"))}
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_a_study_writes_into_its_own_folder(name: str) -> None:
+    study = STUDIES[name]
+    for step in study.steps:
+        assert step.output is None or study.folder in [step.output, *step.output.parents], step.name
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_what_a_study_needs_is_there(name: str) -> None:
+    """Its commands read no folder of a study that it does not name."""
+    study = STUDIES[name]
+    assert set(study.needs) <= STUDIES.keys()
+    read = {word for step in study.steps for word in STUDIES if f"experiments/{word}/" in step.command}
+    assert read <= {study.name, *study.needs}
+
+
+def test_every_result_is_made_by_exactly_one_study() -> None:
+    made = [result for study in STUDIES.values() for result in study.results]
+    assert len(made) == len(set(made))
+    docs = ROOT / "docs"
+    committed = {str(path.relative_to(docs)) for path in (docs / "results").iterdir()}
+    assert committed == {result for result in made if result.startswith("results/")}
+
+
+def test_every_study_with_results_has_a_section() -> None:
+    told = {name for name, study in STUDIES.items() if any(r.endswith(".json") for r in study.results)}
+    assert told == SECTIONS.keys()
+
+
+def test_the_committed_page_is_what_the_json_says() -> None:
+    assert (ROOT / "docs" / "results.md").read_text() == results_page(), "run python -m experiments.tables"
+
+
+def test_results_say_where_they_come_from(tmp_path: Path) -> None:
+    study = read_study(ROOT / "experiments" / "planning.yaml", [f"output_dir={tmp_path}"])
+    assert provenance(study)["commands"]["eval_ood"].startswith("lerobot-eval --policy.type=wm_mpc")
