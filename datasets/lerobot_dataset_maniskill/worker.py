@@ -13,7 +13,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.drivers import Driver, PlannerDriver, PolicyDriver
 from lerobot_dataset_maniskill.manifest import EpisodePlan, Part
-from lerobot_dataset_maniskill.planners.play import PLAY_STEPS
+from lerobot_dataset_maniskill.planners.kinds import PLAY_STEPS
 from lerobot_dataset_maniskill.quiet import silence_libraries
 from lerobot_dataset_maniskill.writer import HOLD_FRAMES, Outcome, StartColumns, add_step, create_dataset
 from lerobot_wmrl.common.constants import PLAY

@@ -1,4 +1,4 @@
-"""What MPLib adds to a plan: ways that can be repeated, around what stands in the way, and nothing else."""
+"""What MPLib adds to a plan: paths that can be repeated, around obstacles, and nothing else."""
 
 import logging
 import subprocess
@@ -35,7 +35,9 @@ table = ctypes.cast(address_of(_ARRAY_API, None), ctypes.POINTER(ctypes.c_void_p
 before = table[:300]
 import lerobot_dataset_maniskill.planners
 assert "mplib" not in sys.modules and table[:300] == before
-from lerobot_dataset_maniskill.planners.joint_space.numpy_slot import restore_copy_into
+from lerobot_dataset_maniskill.planners.planning_arm import restore_copy_into
+assert "mplib" not in sys.modules and table[:300] == before
+restore_copy_into()
 after = table[:300]
 assert [slot for slot in range(300) if before[slot] != after[slot]] == [82]
 assert after[82] == after[50]

@@ -7,8 +7,7 @@ import pytest
 
 from lerobot_dataset_maniskill.planners import MOTIONS, PLANNERS, TASK_KINDS, Follower, Planner, follow_plan
 from lerobot_dataset_maniskill.planners.follower import CLOSED, OPEN, OPTIMAL_SPEED, Noise, Plan, Waypoint
-from lerobot_dataset_maniskill.planners.kinds import FINGER_HALF_THICKNESS
-from lerobot_dataset_maniskill.planners.play import PLAY_STEPS
+from lerobot_dataset_maniskill.planners.kinds import FINGER_HALF_THICKNESS, PLAY_STEPS
 from lerobot_dataset_maniskill.planners.slide import (
     NEAR_MISSES,
     PullPlanner,

@@ -1,14 +1,12 @@
-"""Scripted planners, one a task, and the motions that lead from one of their waypoints to the next."""
+"""Scripted planners, one per task, and the motions between their waypoints."""
 
 from typing import Final
 
 import numpy as np
 
-from lerobot_dataset_maniskill.planners.follower import Follower, Plan
+from lerobot_dataset_maniskill.planners.follower import MOTIONS, Follower, Motion, Plan, straight_lines
+from lerobot_dataset_maniskill.planners.grasp import MoveToAimPlanner, PickPlacePlanner
 from lerobot_dataset_maniskill.planners.kinds import TASK_KINDS, Planner
-from lerobot_dataset_maniskill.planners.motion import MOTIONS, Motion, straight_lines
-from lerobot_dataset_maniskill.planners.move_to_aim import MoveToAimPlanner
-from lerobot_dataset_maniskill.planners.pick_place import PickPlacePlanner
 from lerobot_dataset_maniskill.planners.slide import PullPlanner, PushPlanner
 from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS
 from lerobot_wmrl.maniskill.scenes import Scene
@@ -30,7 +28,16 @@ def follow_plan(
     rng: np.random.Generator,
     motion: Motion = straight_lines,
 ) -> Follower:
-    """What steers an episode of the given kind (`constants.KINDS` without "policy") from its start."""
-    things = OBJECTS[scene.object], CONTAINERS[scene.container], start
-    plan = PLANNERS[task](*things).plan(kind, rng)
-    return Follower(motion(plan, *things), rng)
+    """Return the follower of a new plan for an episode.
+
+    Args:
+        task: name of the task.
+        scene: what is on the table.
+        start: how the episode starts.
+        kind: of the plan, `constants.KINDS` without "policy".
+        rng: source of the plan's and the actions' randomness.
+        motion: how the gripper gets from one waypoint to the next.
+    """
+    setting = OBJECTS[scene.object], CONTAINERS[scene.container], start
+    plan = PLANNERS[task](*setting).plan(kind, rng)
+    return Follower(motion(plan, *setting), rng)

@@ -1,4 +1,4 @@
-"""Plans, and the proportional delta actions that follow them. Pure numpy."""
+"""Plans, the proportional actions that follow them, and the motions between their waypoints. Pure numpy."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -8,9 +8,11 @@ import numpy as np
 
 from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW
 from lerobot_wmrl.maniskill.episode import WORKSPACE_FLOOR
+from lerobot_wmrl.maniskill.objects import ContainerSpec, ObjectSpec
+from lerobot_wmrl.maniskill.tasks import Start
 
 GAIN: Final = 2.0
-"""Commanded delta over remaining distance; the arm achieves about a third of a command in one step."""
+"""Commanded delta over remaining distance. The arm achieves about a third of a command in one step."""
 
 TOP_SPEED: Final = ACTION_HIGH[0]
 OPTIMAL_SPEED: Final = 0.8 * TOP_SPEED
@@ -18,19 +20,22 @@ CLOSED: Final = -1.0
 OPEN: Final = 1.0
 
 Aim = Callable[[np.ndarray], np.ndarray]
-"""Where to go, given where the object is: (3,) → (3,)"""
+"""Maps the object's present position (3,) to the TCP position (3,) to go to."""
 
 
 @dataclass(frozen=True)
 class Waypoint:
-    """A TCP position (3,) (m) that counts as reached within `tolerance` (m).
+    """A position that the gripper goes to.
 
     Args:
-        gripper: commanded all the way there.
+        position: of the TCP (3,), metres.
+        tolerance: distance (m) within which the waypoint counts as reached.
+        gripper: gripper command on the way there.
         dwell: steps to stay once there, for the fingers to close or open.
-        aim: replaces `position` by one that depends on the object's present place; never reached.
-        patience: steps after which it is given up.
-        clear: whether the way there is to keep clear of the object.
+        aim: replaces `position` by one that depends on where the object is now. Such a waypoint never counts
+            as reached, so it needs `patience`.
+        patience: steps after which the follower goes on to the next waypoint.
+        clear: whether a motion planner must keep the way there clear of the object.
     """
 
     position: np.ndarray
@@ -42,9 +47,12 @@ class Waypoint:
     clear: bool = False
 
 
+Waypoints = tuple[Waypoint, ...]
+
+
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations of what is added to every action: metres, radians, gripper units."""
+    """Standard deviations of the noise on every action: metres, radians, gripper units."""
 
     position: float = 0.0
     rotation: float = 0.0
@@ -55,22 +63,26 @@ class Noise:
 class Plan:
     """Waypoints in order, the largest command along an axis (m), and the noise on actions."""
 
-    waypoints: tuple[Waypoint, ...]
+    waypoints: Waypoints
     speed: float = TOP_SPEED
     noise: Noise = field(default_factory=Noise)
 
 
 class Follower:
-    """Turns a plan into actions, one a control step."""
+    """Turns a plan into actions, one per control step."""
 
     def __init__(self, plan: Plan, rng: np.random.Generator) -> None:
         self.plan, self.rng = plan, rng
         self.current, self.stayed, self.tried = 0, 0, 0
 
-    def act(self, tcp: np.ndarray, thing: np.ndarray) -> np.ndarray:
-        """The action (7,) float32 for the TCP at `tcp` and the object at `thing`, (3,) each, in the box."""
+    def act(self, tcp: np.ndarray, object_now: np.ndarray) -> np.ndarray:
+        """Return the action for the TCP at `tcp` (3,) and the object at `object_now` (3,).
+
+        Returns:
+            (7,) float32, inside the action box.
+        """
         waypoint = self._advance(tcp)
-        target = waypoint.position if waypoint.aim is None else waypoint.aim(thing)
+        target = waypoint.position if waypoint.aim is None else waypoint.aim(object_now)
         delta = GAIN * (target - tcp)
         delta *= min(1.0, self.plan.speed / max(np.abs(delta).max(), 1e-9))
         action = np.array([*delta, 0.0, 0.0, 0.0, waypoint.gripper])
@@ -81,15 +93,15 @@ class Follower:
         return np.clip(action, ACTION_LOW, ACTION_HIGH).astype(np.float32)
 
     def _advance(self, tcp: np.ndarray) -> Waypoint:
-        """The waypoint to go to now: the next one once this was reached and stayed at, or given up."""
+        """Return the waypoint to go to now: the next one once this one is done or given up."""
         waypoints = self.plan.waypoints
-        while self.current < len(waypoints) - 1 and not self._stays(waypoints[self.current], tcp):
+        while self.current < len(waypoints) - 1 and not self._is_pending(waypoints[self.current], tcp):
             self.current, self.stayed, self.tried = self.current + 1, 0, 0
         self.tried += 1
         return waypoints[self.current]
 
-    def _stays(self, waypoint: Waypoint, tcp: np.ndarray) -> bool:
-        """Whether there is still something to do there."""
+    def _is_pending(self, waypoint: Waypoint, tcp: np.ndarray) -> bool:
+        """Whether the waypoint is not reached yet, or its dwell is not over."""
         if waypoint.patience is not None and self.tried >= waypoint.patience:
             return False
         if not _reached(waypoint, tcp):
@@ -103,5 +115,36 @@ def _reached(waypoint: Waypoint, tcp: np.ndarray) -> bool:
 
 
 def above_table(position: np.ndarray) -> np.ndarray:
-    """The same position, not lower than the simulator lets the TCP go. (3,) → (3,)"""
+    """Return the position (3,), raised to the lowest height that the simulator lets the TCP go to."""
     return np.array([position[0], position[1], max(position[2], WORKSPACE_FLOOR)])
+
+
+Motion = Callable[[Plan, ObjectSpec, ContainerSpec, Start], Plan]
+"""Inserts points between a plan's waypoints, which stay as they are."""
+
+
+def straight_lines(plan: Plan, spec: ObjectSpec, container: ContainerSpec, start: Start) -> Plan:
+    """Return the plan as it is: the follower goes straight by itself."""
+    return plan
+
+
+def joint_space_motion() -> Motion:
+    """Return the motion that MPLib plans in joint space, around what stands on the table."""
+    from lerobot_dataset_maniskill.planners.joint_space import JointSpaceMotion  # needs MPLib
+
+    return JointSpaceMotion()
+
+
+MOTIONS: Final[dict[str, Callable[[], Motion]]] = {
+    "cartesian": lambda: straight_lines,
+    "mplib": joint_space_motion,
+}
+"""Value of the recorder's setting `planner` → what makes its motion."""
+
+
+def resample(path: np.ndarray, spacing: float) -> np.ndarray:
+    """Return a polyline's evenly spread points, at most `spacing` apart, with both ends. (N, D) → (M, D)"""
+    lengths = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    along = np.concatenate([[0.0], np.cumsum(lengths)])
+    even = np.linspace(0.0, along[-1], max(int(np.ceil(along[-1] / spacing)), 1) + 1)
+    return np.stack([np.interp(even, along, coordinate) for coordinate in path.T], axis=1)

@@ -1,31 +1,31 @@
-"""Plans for push and pull: behind the object, then along x, further than need be."""
+"""Plans for push and pull: go behind the object, then along x, further than success requires."""
 
 from collections.abc import Callable
 from typing import Final
 
 import numpy as np
 
-from lerobot_dataset_maniskill.planners.follower import Waypoint, above_table
-from lerobot_dataset_maniskill.planners.kinds import FINGER_HALF_THICKNESS, Planner, Waypoints
+from lerobot_dataset_maniskill.planners.follower import Waypoint, Waypoints, above_table
+from lerobot_dataset_maniskill.planners.kinds import FINGER_HALF_THICKNESS, Planner
 from lerobot_wmrl.maniskill.objects import ContainerSpec, ObjectSpec
 from lerobot_wmrl.maniskill.tasks import Pull, Push, Slide, Start
 
 MARGIN: Final = 0.04
-"""How much further than success demands a good slide aims (m), so that a clone stops no hair early."""
+"""How much further than success requires a good slide goes (m), so that an SFT policy does not stop just
+short."""
 
 BEHIND: Final = 0.025
-"""Between the gripper and the object before they touch (m)."""
+"""Gap between the gripper and the object before they touch (m)."""
 
 CLEARANCE: Final = 0.035
-"""Between the fingertips and the object's top when the gripper passes over it (m)."""
+"""Height of the fingertips above the object's top when the gripper passes over it (m)."""
 
-
-FARTHEST: Final = 0.16
-"""The largest x of a detour (m): beyond it the arm is stretched out and gets no further."""
+MAX_DETOUR_X: Final = 0.16
+"""Largest x of a detour (m): beyond it the arm is stretched out and gets no further."""
 
 
 class SlidePlanner(Planner):
-    """Push (`over_it` False) or pull (`over_it` True: the gripper has to get to the far side first)."""
+    """Plans a push, or a pull (`over_it`: the gripper passes over the object to its far side first)."""
 
     task: type[Slide]
     over_it: bool
@@ -37,13 +37,13 @@ class SlidePlanner(Planner):
         self.edge = spec.half_size[1] + FINGER_HALF_THICKNESS
 
     def at(self, forward: float, sideways: float = 0.0, height: float | None = None) -> np.ndarray:
-        """TCP position (3,) such that, touching, the object has slid by `forward` from its start."""
+        """Return the TCP position (3,) at which the touching gripper has slid the object by `forward` (m)."""
         x, y = self.start.object_xy
         z = self.height if height is None else height
         return above_table(np.array([x + self.task.direction * (forward - self.reach), y + sideways, z]))
 
     def approach(self, sideways: float = 0.0, height: float | None = None) -> Waypoints:
-        """To the place behind the object."""
+        """Return waypoints to the place behind the object."""
         behind = Waypoint(self.at(-BEHIND, sideways, height), 0.016, clear=True)
         if not self.over_it:
             return (behind,)
@@ -55,15 +55,15 @@ class SlidePlanner(Planner):
         return (*self.approach(), Waypoint(self.at(self.task.distance + MARGIN), 0.006))
 
     def detour(self, rng: np.random.Generator) -> np.ndarray:
-        """Behind the object or beside that place; for a pull above it."""
+        """Draw a position (3,) behind the object or beside that place; for a pull, above it."""
         lowest = 2.0 * self.spec.half_size[2] + CLEARANCE if self.over_it else 0.02
         place = self.at(
             rng.uniform(-0.14, -0.03), rng.uniform(-0.10, 0.10), rng.uniform(lowest, max(0.17, lowest))
         )
-        return np.minimum(place, (FARTHEST, np.inf, np.inf))
+        return np.minimum(place, (MAX_DETOUR_X, np.inf, np.inf))
 
     def near_miss(self, rng: np.random.Generator) -> Waypoints:
-        """Over, beside, short of, not far enough, or too much to one side; then rest or leave."""
+        """Draw one of `NEAR_MISSES`, then rest or leave."""
         miss = NEAR_MISSES[int(rng.integers(len(NEAR_MISSES)))](self, rng)
         if rng.random() < 0.5:
             return miss
@@ -80,7 +80,7 @@ class PullPlanner(SlidePlanner):
 
 
 def pass_over(slide: SlidePlanner, rng: np.random.Generator) -> Waypoints:
-    """Over the object: from scraping its top to well above it, with a slide's path in x and y."""
+    """Pass over the object, from scraping its top to well above it, with a slide's path in x and y."""
     height = 2.0 * slide.spec.half_size[2] + rng.choice([rng.uniform(-0.008, 0.012), rng.uniform(0.01, 0.05)])
     sideways = rng.normal(0.0, 0.012)
     far = slide.task.distance + rng.uniform(-0.02, 0.03)
@@ -88,7 +88,7 @@ def pass_over(slide: SlidePlanner, rng: np.random.Generator) -> Waypoints:
 
 
 def pass_beside(slide: SlidePlanner, rng: np.random.Generator) -> Waypoints:
-    """Past the object's side: from a grazing contact that turns it to a clear miss, at any height."""
+    """Pass beside the object, from a grazing contact that turns it to a clear miss, at any height."""
     sideways = rng.choice((-1.0, 1.0)) * (slide.edge + rng.uniform(-0.015, 0.045))
     height = slide.height + rng.choice([rng.uniform(-0.01, 0.015), rng.uniform(0.0, 0.08)])
     far = slide.task.distance + rng.uniform(-0.02, MARGIN)
@@ -96,9 +96,10 @@ def pass_beside(slide: SlidePlanner, rng: np.random.Generator) -> Waypoints:
 
 
 def slide_off_centre(slide: SlidePlanner, rng: np.random.Generator) -> Waypoints:
-    """Straight, anywhere along the object's back, then a rest: near the edge it turns and slips off.
+    """Push straight, anywhere along the object's back, then rest: near the edge the object turns and slips
+    off.
 
-    This is how a policy fails that has nearly learnt the task, and the world model must not believe it.
+    A policy that has nearly learnt the task fails like this, so the world model must know such failures.
     """
     sideways = rng.uniform(-1.0, 1.0) * slide.edge
     end = slide.at(slide.task.distance + rng.uniform(-0.03, MARGIN), sideways)
@@ -106,20 +107,20 @@ def slide_off_centre(slide: SlidePlanner, rng: np.random.Generator) -> Waypoints
 
 
 def stop_short(slide: SlidePlanner, rng: np.random.Generator) -> Waypoints:
-    """Stops just before contact and stays a while (a tolerance that is never met)."""
+    """Stop just before contact; half of the time wait there, as the tolerance is too small to be met."""
     stop = slide.at(-rng.uniform(0.002, 0.04), rng.normal(0.0, 0.01))
     last = Waypoint(stop, 0.001 if rng.random() < 0.5 else 0.012)
     return (*slide.approach()[:-1], last)
 
 
 def slide_partly(slide: SlidePlanner, rng: np.random.Generator) -> Waypoints:
-    """A good slide that ends 1 to 5 cm before success, then rests or leaves."""
+    """Slide well, but end 1 to 5 cm before success."""
     end = slide.at(rng.uniform(0.05, 0.09))
     return (*slide.approach(), Waypoint(end, 0.001 if rng.random() < 0.5 else 0.008))
 
 
 def slide_diagonally(slide: SlidePlanner, rng: np.random.Generator) -> Waypoints:
-    """Far enough, but at least 5 cm to one side."""
+    """Slide far enough, but at least 5 cm to one side."""
     side = rng.choice((-1.0, 1.0))
     end = slide.at(slide.task.distance + 0.01, side * rng.uniform(0.05, 0.10))
     return (*slide.approach(-side * rng.uniform(0.0, 0.015)), Waypoint(end))
