@@ -245,7 +245,7 @@ class RecordConfig(RunConfig):
             "image_size": env.image_size,
             "light_jitter": env.light_jitter,
             "camera_jitter": env.camera_jitter,
-            "assets": env.described_assets(),
+            "assets": env.describe_assets(),
             "robot_mesh_detail": env.robot_mesh_detail,
         }
 

@@ -53,7 +53,7 @@ def check_simulation(config: RecordConfig) -> None:
     """ValueError unless there is a renderer, and it shows what the policy looks at."""
     render_backend()
     if config.policy is not None:
-        check_fit(config.policy, config.maniskill.shown(), len(ACTION_NAMES))
+        check_fit(config.policy, config.maniskill.observation_shapes(), len(ACTION_NAMES))
 
 
 def already_recorded(output_dir: Path, content: Mapping[str, Any], episodes: int) -> bool:

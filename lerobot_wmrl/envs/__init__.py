@@ -1,1 +1,1 @@
-"""The world-model environment and the ManiSkill environment, as LeRobot environments."""
+"""The world model and ManiSkill as LeRobot environments."""

@@ -1,4 +1,4 @@
-"""The simulator as one batch on CUDA, behind the tensor interface that the world model has too."""
+"""ManiSkill as one batch on CUDA, behind the tensor interface that the world model has too."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -12,19 +12,19 @@ from torch import Tensor
 
 from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW, EVALUATION_SEED, FPS
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
-from lerobot_wmrl.envs.maniskill_tensor_env import image_observations, observation_space
+from lerobot_wmrl.envs.maniskill_env import image_observations, observation_space
 from lerobot_wmrl.envs.scene_results import SceneResults
 from lerobot_wmrl.maniskill.batched import BatchedFrame
 from lerobot_wmrl.maniskill.scenes import scene_for_seed
 
 
 class BatchedManiSkillEnv(gym.vector.VectorEnv):
-    """B episodes in one simulation; observations and results as `maniskill_tensor_env.ManiSkillTensorEnv`.
+    """B episodes in one simulation, with the observations and results of `ManiSkillTensorEnv`.
 
     Args:
-        restart: whether an episode that ended is followed by the next at once (SAME_STEP autoreset, with
-            `final_obs` and `final_info`). Without it, its table is left alone until all are reset, and
-            closing logs the success by scene: what lerobot-eval needs.
+        restart: whether an ended episode is followed by the next at once (SAME_STEP autoreset, with
+            `final_obs` and `final_info`). Otherwise its table is left alone until all are reset, and closing
+            logs the success by scene, as lerobot-eval needs it.
     """
 
     metadata = {"render_fps": FPS, "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012 (gymnasium's own)
@@ -47,16 +47,16 @@ class BatchedManiSkillEnv(gym.vector.VectorEnv):
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begin B episodes: a seed each, the seeds from an int on, or drawn training seeds."""
+        """Begin B episodes: with B seeds, with consecutive ones from an int on, or with training seeds."""
         if isinstance(seed, int):
             seed = range(seed, seed + self.num_envs)
         if seed is not None:
             self._rng = np.random.default_rng(seed[0])
-        frame = self._begin(self._draw(self.num_envs) if seed is None else seed, range(self.num_envs))
+        frame = self._begin(self._draw_seeds(self.num_envs) if seed is None else seed, range(self.num_envs))
         return self._observation(frame), {}
 
     def step(self, action: Tensor) -> tuple[dict[str, Any], Tensor, Tensor, Tensor, dict[str, Any]]:
-        """One control step of every episode."""
+        """Simulate one control step of every episode. action (B, 7)"""
         frame = self.simulation.step(action)
         self._elapsed += 1
         terminated = frame.success
@@ -72,7 +72,7 @@ class BatchedManiSkillEnv(gym.vector.VectorEnv):
             }
             if self.restart:
                 rows = ended.nonzero()[:, 0].tolist()
-                observation = self._observation(self._begin(self._draw(len(rows)), rows))
+                observation = self._observation(self._begin(self._draw_seeds(len(rows)), rows))
             else:
                 self._count(ended, terminated)
         return observation, reward, terminated, truncated, info
@@ -81,12 +81,12 @@ class BatchedManiSkillEnv(gym.vector.VectorEnv):
         self.simulation.close()
         self.results.log()
 
-    def _draw(self, count: int) -> list[int]:
-        """Training seeds."""
+    def _draw_seeds(self, count: int) -> list[int]:
+        """Draw training seeds."""
         return [int(seed) for seed in self._rng.integers(EVALUATION_SEED, size=count)]
 
     def _begin(self, seeds: Sequence[int], rows: Sequence[int]) -> BatchedFrame:
-        """New episodes in these rows."""
+        """Begin new episodes in these rows."""
         self._elapsed[list(rows)] = 0
         scenes = [scene_for_seed(self.scenes, seed) for seed in seeds]
         frame = self.simulation.reset(scenes, seeds, rows)

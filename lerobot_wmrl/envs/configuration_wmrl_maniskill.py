@@ -1,6 +1,6 @@
-"""`--env.type=wmrl_maniskill`: the real simulator, for lerobot-eval, recording and reinforcement learning.
+"""Configuration of ManiSkill as an environment, `--env.type=wmrl_maniskill`.
 
-Imports neither the simulator nor torch networks: those come when an environment is built.
+Importing it imports no simulator: that happens when an environment is built.
 """
 
 from dataclasses import dataclass, field
@@ -12,9 +12,12 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
 from lerobot_wmrl.common.constants import ACTION_NAMES, FPS, STATE_NAMES
-from lerobot_wmrl.maniskill.backend import require_simulator
+from lerobot_wmrl.common.errors import FieldError, require_at_least
+from lerobot_wmrl.maniskill.backend import render_backend, require_simulator
 from lerobot_wmrl.maniskill.cameras import CAMERAS, IMAGE_SIZE, ROBOT_MESH_DETAIL, Rendering
+from lerobot_wmrl.maniskill.objects import describe_assets, read_assets, use_assets
 from lerobot_wmrl.maniskill.scenes import Scene, scenes_of
+from lerobot_wmrl.maniskill.tasks import Task, task_of
 from lerobot_wmrl.rewards.general import RuleBasedReward
 
 if TYPE_CHECKING:
@@ -30,18 +33,18 @@ class WmrlManiSkillEnv(EnvConfig):
     """ManiSkill with this project's tasks and scenes.
 
     Args:
-        task: what to do; `lerobot_wmrl.maniskill.tasks.TASKS`.
-        split: "ind" (scenes that training may see) or "ood" (held out).
+        task: push, pull, pick_place or move_to_aim.
+        split: `ind` (scenes that training may see) or `ood` (scenes held out).
         scenes: indices of some scenes of the split; all of them by default.
-        cameras: which cameras the policy sees.
-        image_size: pixels of each side of a picture.
+        cameras: cameras that the policy sees.
+        image_size: side of the square images in pixels.
         episode_length: steps after which an episode is truncated; the task's own horizon by default.
         reward: what a step pays for success and for progress.
         assets: YAML file with meshes to use in place of objects (`lemon: {mesh: lemon.obj, scale: 0.001}`).
         robot_mesh_detail: share of the robot's triangles that are drawn; 1 draws all, three times slower.
-        batched: whether episodes share one simulation on CUDA, instead of having a process each.
-        light_jitter: how much the light varies from episode to episode, as a share (0.2 is plenty).
-        camera_jitter: how much the fixed camera is displaced from episode to episode (m; 0.01 is plenty).
+        batched: whether episodes share one simulation on CUDA instead of having a process each.
+        light_jitter: how much the light varies between episodes, as a share (0.2 is plenty).
+        camera_jitter: how far the fixed camera is displaced between episodes (m; 0.01 is plenty).
     """
 
     task: str | None = "push"
@@ -75,33 +78,25 @@ class WmrlManiSkillEnv(EnvConfig):
         }
 
     def _validate(self) -> None:
-        unknown = [camera for camera in self.cameras if camera not in CAMERAS]
-        if unknown or not self.cameras:
-            raise ValueError(f"--env.cameras={self.cameras}: choose from {', '.join(CAMERAS)}")
-        if self.image_size < 16:
-            raise ValueError(f"--env.image_size={self.image_size}: must be at least 16")
-        if self.episode_length is not None and self.episode_length < 1:
-            raise ValueError(f"--env.episode_length={self.episode_length}: must be at least 1")
+        if not self.cameras or not {*self.cameras} <= {*CAMERAS}:
+            raise FieldError("cameras", self.cameras, f"choose from {', '.join(CAMERAS)}")
+        require_at_least(self, 16, "image_size")
+        if self.episode_length is not None:
+            require_at_least(self, 1, "episode_length")
         if not 0.0 < self.robot_mesh_detail <= 1.0:
-            raise ValueError(
-                f"--env.robot_mesh_detail={self.robot_mesh_detail}: must be above 0 and at most 1"
-            )
-        if self.assets is not None:
-            from lerobot_wmrl.maniskill.objects import read_assets
-
-            read_assets(self.assets)
+            raise FieldError("robot_mesh_detail", self.robot_mesh_detail, "must be above 0 and at most 1")
         for name, most in (("light_jitter", 1.0), ("camera_jitter", 0.1)):
             if not 0.0 <= getattr(self, name) <= most:
-                raise ValueError(f"--env.{name}={getattr(self, name)}: must be from 0 (off) to {most}")
+                raise FieldError(name, getattr(self, name), f"must be from 0 (off) to {most}")
+        if self.assets is not None:
+            read_assets(self.assets)
 
     def selected_scenes(self) -> tuple[Scene, ...]:
-        """The scenes episodes take place in. ValueError if task, split or scenes are unknown."""
+        """Return the scenes of the episodes. FieldError if task, split or scenes are unknown."""
         self._task()
         return scenes_of(self.split, self.scenes)
 
-    def _task(self) -> Any:
-        from lerobot_wmrl.maniskill.tasks import task_of
-
+    def _task(self) -> Task:
         return task_of(self.task)
 
     @property
@@ -113,14 +108,14 @@ class WmrlManiSkillEnv(EnvConfig):
     def gym_kwargs(self) -> dict[str, Any]:
         return {"config": self}
 
-    def shown(self) -> dict[str, tuple[int, ...]]:
-        """The observations a policy gets, by LeRobot's names, with their shapes (images channels first)."""
-        picture = (3, self.image_size, self.image_size)
-        images = {f"{OBS_IMAGES}.{camera}": picture for camera in self.cameras}
+    def observation_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Return the shapes of a policy's observations by LeRobot's names, images channels first."""
+        image = (3, self.image_size, self.image_size)
+        images = {f"{OBS_IMAGES}.{camera}": image for camera in self.cameras}
         return {**images, OBS_STATE: (len(STATE_NAMES),)}
 
     def create_simulation(self, depth: bool = False) -> "Simulation":
-        """A simulator for these scenes and cameras, in this process."""
+        """Return a simulator of these scenes and cameras, in this process."""
         require_simulator()
         from lerobot_wmrl.maniskill.simulation import Simulation
 
@@ -128,30 +123,25 @@ class WmrlManiSkillEnv(EnvConfig):
         return Simulation(self._task(), self.selected_scenes(), self._rendering(depth))
 
     def create_batched_simulation(self, n_envs: int, device: str) -> "BatchedSimulation":
-        """The same for `n_envs` episodes at once. ValueError if light or cameras are to vary."""
+        """Return a simulator of `n_envs` episodes at once. FieldError if light or cameras are to vary."""
         require_simulator()
         from lerobot_wmrl.maniskill.batched import BatchedSimulation
 
-        if self.light_jitter or self.camera_jitter:
-            raise ValueError(
-                "--env.light_jitter and --env.camera_jitter vary nothing in a batched simulation: leave them "
-                "at 0, or leave out --env.batched=true"
-            )
+        for name in ("light_jitter", "camera_jitter"):
+            if getattr(self, name):
+                raise FieldError(
+                    name, getattr(self, name), "a batched simulation varies neither light nor camera",
+                    "set it to 0, or `batched` to false",
+                )  # fmt: skip
         self._use_assets()
         scenes = self.selected_scenes()
         return BatchedSimulation(self._task(), scenes, self._rendering(depth=False), n_envs, device)
 
-    def described_assets(self) -> dict[str, Any] | None:
-        """What the user's own meshes are, without where they lie; None if there are none."""
-        if self.assets is None:
-            return None
-        from lerobot_wmrl.maniskill.objects import describe_assets
-
-        return describe_assets(self.assets)
+    def describe_assets(self) -> dict[str, Any] | None:
+        """Describe the user's own meshes by their content; None if there are none."""
+        return None if self.assets is None else describe_assets(self.assets)
 
     def _use_assets(self) -> None:
-        from lerobot_wmrl.maniskill.objects import use_assets
-
         if self.assets is not None:
             use_assets(self.assets)
 
@@ -164,7 +154,8 @@ class WmrlManiSkillEnv(EnvConfig):
     def create_envs(
         self, n_envs: int, use_async_envs: bool = False
     ) -> dict[str, dict[int, "gym.vector.VectorEnv"]]:
-        """What lerobot-eval asks for: {suite: {task id: environment}}."""
+        """Return {suite: {task id: environment}}, as lerobot-eval wants it."""
+        require_simulator()
         if self.runs_batched("cuda"):
             from lerobot_wmrl.envs.batched_maniskill_env import BatchedManiSkillEnv
             from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
@@ -175,25 +166,24 @@ class WmrlManiSkillEnv(EnvConfig):
         return {self.type: {0: make_vector_env(self, n_envs, use_async_envs, freeze=True)}}
 
     def create_tensor_env(self, n_envs: int, device: str) -> "gym.vector.VectorEnv":
-        """The same world with tensors on `device` inside, for reinforcement learning."""
+        """Return `n_envs` simulators with tensors on `device`, for reinforcement learning."""
+        require_simulator()
         if self.runs_batched(device):
             from lerobot_wmrl.envs.batched_maniskill_env import BatchedManiSkillEnv
 
             return BatchedManiSkillEnv(self, n_envs, device, restart=True)
-        from lerobot_wmrl.envs.maniskill_tensor_env import ManiSkillTensorEnv
+        from lerobot_wmrl.envs.maniskill_env import ManiSkillTensorEnv
 
         return ManiSkillTensorEnv(self, n_envs, device)
 
     def runs_batched(self, device: str) -> bool:
-        """Whether episodes share one simulation on `device`. ValueError if they are to and cannot."""
+        """Return whether episodes share one simulation on `device`. FieldError if it cannot."""
         if not self.batched:
             return False
         import torch
 
-        from lerobot_wmrl.maniskill.backend import render_backend
-
         if not (device.startswith("cuda") and torch.cuda.is_available() and render_backend() == "gpu"):
-            raise ValueError(
-                f"--env.batched=true: SAPIEN cannot simulate and render on {device} here; leave the flag out"
+            raise FieldError(
+                "batched", self.batched, f"SAPIEN cannot simulate and render on {device} here", "leave it out"
             )
         return True

@@ -1,12 +1,16 @@
-"""ManiSkill as a gymnasium environment (one robot, numpy), and as the one lerobot-eval drives."""
+"""ManiSkill as an environment: one episode in numpy, several for lerobot-eval, and as tensors for PPO."""
 
+from collections.abc import Mapping
 from functools import partial
 from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
+import torch
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from lerobot.envs.utils import FreezeAfterEpisodeEnd
+from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
+from torch import Tensor
 
 from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW, EVALUATION_SEED, FPS, STATE_NAMES
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
@@ -17,11 +21,11 @@ from lerobot_wmrl.maniskill.scenes import scene_for_seed
 
 
 class ManiSkillEnv(gym.Env):
-    """One episode at a time. A seed decides scene and start; the simulator is built at the first reset.
+    """One episode at a time, in numpy. The simulator is built at the first reset.
 
     Observation: `pixels` {camera: (H, W, 3) uint8}, `agent_pos` (8,) float32. Action (7,): metres, radians,
-    gripper. Terminated as soon as success holds, truncated at the horizon. A reset without a seed draws a
-    training seed.
+    gripper. An episode is terminated as soon as success holds, and truncated at the horizon. The seed of a
+    reset decides scene and start; a reset without one draws a training seed.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": FPS}
@@ -33,10 +37,10 @@ class ManiSkillEnv(gym.Env):
         self._max_episode_steps = config.horizon
         self.task = str(config.task)
         self.task_description = ""
-        picture = gym.spaces.Box(0, 255, (config.image_size, config.image_size, 3), np.uint8)
+        image = gym.spaces.Box(0, 255, (config.image_size, config.image_size, 3), np.uint8)
         self.observation_space = gym.spaces.Dict(
             {
-                "pixels": gym.spaces.Dict(dict.fromkeys(config.cameras, picture)),
+                "pixels": gym.spaces.Dict(dict.fromkeys(config.cameras, image)),
                 "agent_pos": gym.spaces.Box(-np.inf, np.inf, (len(STATE_NAMES),), np.float32),
             }
         )
@@ -73,7 +77,7 @@ class ManiSkillEnv(gym.Env):
         )
 
     def render(self) -> np.ndarray:
-        """(H, W, 3) uint8, the first camera's picture."""
+        """Return the first camera's image, (H, W, 3) uint8."""
         return self._frame.images[self.config.cameras[0]]
 
     def close(self) -> None:
@@ -95,7 +99,7 @@ class ManiSkillEnv(gym.Env):
 
 
 def make_env(config: WmrlManiSkillEnv, freeze: bool) -> gym.Env:
-    """One environment; `freeze` stops it after an episode until lerobot-eval starts the next rollout."""
+    """Return one environment; `freeze` stops it after an episode until lerobot-eval begins a rollout."""
     env = ManiSkillEnv(config)
     return FreezeAfterEpisodeEnd(env) if freeze else env
 
@@ -103,9 +107,11 @@ def make_env(config: WmrlManiSkillEnv, freeze: bool) -> gym.Env:
 def make_vector_env(
     config: WmrlManiSkillEnv, n_envs: int, use_async_envs: bool, freeze: bool
 ) -> gym.vector.VectorEnv:
-    """`n_envs` environments with SAME_STEP autoreset, in processes of their own if `use_async_envs`.
+    """Return `n_envs` environments with SAME_STEP autoreset.
 
-    With `freeze`, as lerobot-eval wants it, they log the success by scene when they are closed.
+    Args:
+        use_async_envs: whether each has a process of its own.
+        freeze: whether episodes stop as lerobot-eval wants it. Success by scene is then logged on closing.
     """
     factories = [partial(make_env, config, freeze)] * n_envs
     if use_async_envs and n_envs > 1:
@@ -115,3 +121,95 @@ def make_vector_env(
     return (CountingSyncVectorEnv if freeze else SyncVectorEnv)(
         factories, autoreset_mode=AutoresetMode.SAME_STEP
     )
+
+
+class ManiSkillTensorEnv(gym.vector.VectorEnv):
+    """B simulators, each in a process of its own, with tensors on `device` and SAME_STEP autoreset.
+
+    The world model has the same interface. Observation: `observation.images.<camera>` (B, 3, H, W) float32 in
+    [0, 1], `observation.state` (B, 8), `task` (B instructions). When an episode ends in a step,
+    `info["final_obs"]` holds the observations before the reset (rows of the others equal the observation),
+    and `info["final_info"]` holds `is_success` and `episode_length`, (B,) each.
+    """
+
+    metadata = {"render_fps": FPS, "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012 (gymnasium's own)
+
+    def __init__(self, config: WmrlManiSkillEnv, n_envs: int, device: str) -> None:
+        self.envs = make_vector_env(config, n_envs, use_async_envs=n_envs > 1, freeze=False)
+        self.config, self.num_envs, self.device = config, n_envs, torch.device(device)
+        self.single_action_space, self.action_space = self.envs.single_action_space, self.envs.action_space
+        self.single_observation_space = observation_space(config)
+        self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, n_envs)
+        self.max_episode_steps = config.horizon
+        self._low, self._high = np.array(ACTION_LOW, np.float32), np.array(ACTION_HIGH, np.float32)
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        observation, info = self.envs.reset(seed=seed, options=options)
+        self._instructions = [str(text) for text in info["instruction"]]
+        return self._tensors(observation, self._instructions), {}
+
+    def step(self, action: Tensor) -> tuple[dict[str, Any], Tensor, Tensor, Tensor, dict[str, Any]]:
+        clipped = np.clip(action.detach().cpu().numpy(), self._low, self._high)
+        before = self._instructions
+        observation, reward, terminated, truncated, info = self.envs.step(clipped)
+        ended = terminated | truncated
+        if ended.any():
+            self._instructions = [
+                str(new) if over else old
+                for old, new, over in zip(before, info["instruction"], ended, strict=True)
+            ]
+        result = self._tensors(observation, self._instructions)
+        extra: dict[str, Any] = {}
+        if ended.any():
+            extra["final_obs"] = self._tensors(_final_observation(observation, info, ended), before)
+            extra["final_info"] = {
+                "is_success": torch.from_numpy(terminated.copy()).to(self.device),
+                "episode_length": self._vector(info["final_info"]["episode_length"]),
+            }
+        return result, self._vector(reward).float(), self._vector(terminated), self._vector(truncated), extra
+
+    def close_extras(self, **kwargs: Any) -> None:
+        self.envs.close()
+
+    def _vector(self, values: Any) -> Tensor:
+        return torch.from_numpy(np.asarray(values)).to(self.device)
+
+    def _tensors(self, observation: dict[str, Any], instructions: list[str]) -> dict[str, Any]:
+        images = {camera: self._vector(image) for camera, image in observation["pixels"].items()}
+        return {
+            **image_observations(images),
+            OBS_STATE: self._vector(observation["agent_pos"]),
+            "task": list(instructions),
+        }
+
+
+def observation_space(config: WmrlManiSkillEnv) -> gym.spaces.Dict:
+    """Return the space of one simulator's tensors: images (3, H, W) in [0, 1] and the state."""
+    image = gym.spaces.Box(0.0, 1.0, (3, config.image_size, config.image_size), np.float32)
+    images = {f"{OBS_IMAGES}.{camera}": image for camera in config.cameras}
+    state = gym.spaces.Box(-np.inf, np.inf, (len(STATE_NAMES),), np.float32)
+    return gym.spaces.Dict({**images, OBS_STATE: state})
+
+
+def image_observations(images: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Turn camera → (B, H, W, 3) uint8 into `observation.images.<camera>` → (B, 3, H, W) in [0, 1]."""
+    return {
+        f"{OBS_IMAGES}.{camera}": image.permute(0, 3, 1, 2).float() / 255.0
+        for camera, image in images.items()
+    }
+
+
+def _final_observation(
+    observation: dict[str, Any], info: dict[str, Any], ended: np.ndarray
+) -> dict[str, Any]:
+    """Return the last observations of the ended episodes and the current ones of the others."""
+    pixels = {camera: image.copy() for camera, image in observation["pixels"].items()}
+    state = observation["agent_pos"].copy()
+    for row in np.flatnonzero(ended):
+        last = info["final_obs"][row]
+        state[row] = last["agent_pos"]
+        for camera, image in pixels.items():
+            image[row] = last["pixels"][camera]
+    return {"pixels": pixels, "agent_pos": state}

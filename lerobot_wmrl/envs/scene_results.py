@@ -1,6 +1,6 @@
-"""Success by scene, which lerobot-eval does not report: the environments count, and say it at the end.
+"""Success by scene, which lerobot-eval does not report: the environments log it when they are closed.
 
-They count whole batches, of which lerobot-eval leaves out what is beyond its number of episodes.
+They count whole batches, lerobot-eval only its number of episodes.
 """
 
 import logging
@@ -15,24 +15,29 @@ from lerobot_wmrl.maniskill.scenes import SCENES, UNSEEN_OBJECTS, Scene
 
 
 class SceneResults:
-    """Which episodes succeeded. An episode is known by its seed, and counts when it first ends."""
+    """Outcomes of episodes by scene. An episode is identified by its seed and counts when it first ends."""
 
     def __init__(self) -> None:
         self.episodes: dict[int, tuple[Scene, bool]] = {}
 
     def add(self, info: Mapping[str, np.ndarray], ended: np.ndarray) -> None:
-        """`info`: `seed`, `scene`, `is_success` of all rows; `ended` (B,) bool marks those that count."""
+        """Add the episodes that ended.
+
+        Args:
+            info: `seed`, `scene` and `is_success` of all rows, (B,) each.
+            ended: which rows count, (B,) bool.
+        """
         for row in np.flatnonzero(ended):
             scene = SCENES[int(info["scene"][row])]
             self.episodes.setdefault(int(info["seed"][row]), (scene, bool(info["is_success"][row])))
 
     def log(self) -> None:
-        """Say it, if there was an episode."""
+        """Log the table, if there was an episode."""
         if self.episodes:
             logging.info("Success by scene, of all %d episodes:\n%s", len(self.episodes), self.table())
 
     def table(self) -> str:
-        """One line a scene, then the groups of held-out scenes and all together, with 95 % intervals."""
+        """Return the rates of scenes, of the groups of held-out scenes and of all, with 95 % intervals."""
         lines = [_line(_name(scene), self._rate({scene.index})) for scene in self._scenes()]
         for name, scenes in self._groups().items():
             lines.append(_line(name, self._rate({scene.index for scene in scenes})))
@@ -62,7 +67,7 @@ def _line(name: str, rate: Proportion) -> str:
 
 
 class _Counting:
-    """Mixed into a vector environment: counts what ends, and logs the table when it is closed."""
+    """Mixin of a vector environment that counts the episodes that end, and logs the table on closing."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -81,8 +86,8 @@ class _Counting:
 
 
 class CountingSyncVectorEnv(_Counting, SyncVectorEnv):
-    """Environments in this process."""
+    """Environments in this process, which log success by scene."""
 
 
 class CountingAsyncVectorEnv(_Counting, AsyncVectorEnv):
-    """Environments in processes of their own."""
+    """Environments in processes of their own, which log success by scene."""

@@ -212,7 +212,7 @@ def train_in(
     adopt_features(config, shown)
     check_fit(config, shown, env.single_action_space.shape[-1])
     if cfg.simulator is not None:
-        check_fit(config, cfg.simulator.shown(), len(ACTION_NAMES))
+        check_fit(config, cfg.simulator.observation_shapes(), len(ACTION_NAMES))
     if cfg.peft is not None:
         policy = with_new_adapters(policy, cfg.peft)
     algorithm = make_algorithm(policy, algorithm_config, cfg.iterations)

@@ -11,8 +11,8 @@ from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.envs.batched_maniskill_env import BatchedManiSkillEnv
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
-from lerobot_wmrl.envs.maniskill_tensor_env import ManiSkillTensorEnv
-from lerobot_wmrl.maniskill.batched import BatchedFrame
+from lerobot_wmrl.envs.maniskill_env import ManiSkillTensorEnv
+from lerobot_wmrl.maniskill.batched import BatchedFrame, BatchedSimulation
 from lerobot_wmrl.maniskill.episode import Episode
 from lerobot_wmrl.maniskill.scenes import Scene
 from lerobot_wmrl.maniskill.tasks import TASKS
@@ -22,11 +22,22 @@ CONFIG = WmrlManiSkillEnv(episode_length=HORIZON, image_size=32, split="ood")
 STAY = torch.tensor([[0.0, 0, 0, 0, 0, 0, -1]])
 
 
+@pytest.fixture(scope="module")
+def simulation() -> Iterator[BatchedSimulation]:
+    """One simulation for all tests: to build it takes ten seconds."""
+    simulation = CONFIG.create_batched_simulation(1, "cpu")
+    yield simulation
+    simulation.close()
+
+
 @pytest.fixture
-def env(request: pytest.FixtureRequest) -> Iterator[BatchedManiSkillEnv]:
-    env = BatchedManiSkillEnv(CONFIG, 1, "cpu", restart=request.param)
-    yield env
-    env.close()
+def env(
+    request: pytest.FixtureRequest, simulation: BatchedSimulation, monkeypatch: pytest.MonkeyPatch
+) -> BatchedManiSkillEnv:
+    """An environment, with `restart` as the test asks, that leaves the simulation open."""
+    monkeypatch.setattr(WmrlManiSkillEnv, "create_batched_simulation", lambda *_: simulation)
+    monkeypatch.setattr(simulation, "close", lambda: None)
+    return BatchedManiSkillEnv(CONFIG, 1, "cpu", restart=request.param)
 
 
 @pytest.mark.parametrize("env", [True], indirect=True)
@@ -68,7 +79,7 @@ def test_lerobot_eval_gets_arrays_and_the_success_by_scene(
 
 
 def test_jitter_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"--env.light_jitter.*--env.batched=true"):
+    with pytest.raises(ValueError, match=r"^light_jitter=0\.1: .*`batched` to false"):
         WmrlManiSkillEnv(light_jitter=0.1).create_batched_simulation(1, "cpu")
 
 
@@ -126,7 +137,7 @@ def test_one_row_ends_and_the_others_go_on(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_batched_without_cuda_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"--env.batched=true: .* leave the flag out"):
+    with pytest.raises(ValueError, match=r"^batched=True: .* leave it out"):
         WmrlManiSkillEnv(batched=True).create_tensor_env(1, "cpu")
 
 

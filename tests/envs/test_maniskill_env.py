@@ -10,8 +10,7 @@ from lerobot.envs.utils import NEW_ROLLOUT_OPTION, preprocess_observation
 
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
-from lerobot_wmrl.envs.maniskill_env import ManiSkillEnv
-from lerobot_wmrl.envs.maniskill_tensor_env import ManiSkillTensorEnv
+from lerobot_wmrl.envs.maniskill_env import ManiSkillEnv, ManiSkillTensorEnv
 from lerobot_wmrl.rewards.general import RuleBasedReward
 
 HORIZON = 3
@@ -49,14 +48,15 @@ def test_an_episode_is_truncated_at_the_horizon_not_terminated(env: ManiSkillEnv
     assert ends == [(False, False)] * (HORIZON - 1) + [(False, True)]
 
 
-def test_a_step_pays_for_the_progress_that_it_made() -> None:
+def test_a_step_pays_for_the_progress_that_it_made(
+    env: ManiSkillEnv, monkeypatch: pytest.MonkeyPatch
+) -> None:
     down = np.array([0.0, 0, -1, 0, 0, 0, -1], np.float32)
     earned = []
     for reward in (RuleBasedReward(alpha=0.0, form="absolute"), RuleBasedReward()):
-        env = ManiSkillEnv(WmrlManiSkillEnv(image_size=32, reward=reward))
+        monkeypatch.setattr(env.config, "reward", reward)
         env.reset(seed=0)
         earned.append([env.step(down)[1] for _ in range(3)])
-        env.close()
     progress, paid = earned
     expected = [0.1 * (0.97 * now - before) for before, now in pairwise(progress)]
     assert progress[0] != progress[-1]
@@ -87,50 +87,52 @@ def test_lerobot_gets_what_a_policy_is_trained_on() -> None:
         envs.close()
 
 
-def test_a_sub_environment_begins_where_its_seed_in_the_list_says() -> None:
+@pytest.fixture(scope="module")
+def tensor_env() -> Iterator[ManiSkillTensorEnv]:
+    env = ManiSkillTensorEnv(WmrlManiSkillEnv(episode_length=HORIZON, image_size=64), 1, "cpu")
+    yield env
+    env.close()
+
+
+def test_a_sub_environment_begins_where_its_seed_in_the_list_says(tensor_env: ManiSkillTensorEnv) -> None:
     """So several that have one seed begin alike; one of them is enough to see it."""
-    env = ManiSkillTensorEnv(WmrlManiSkillEnv(image_size=32), 1, "cpu")
-    try:
-        first, again, other = (env.reset(seed=[seed])[0] for seed in (5, 5, 6))
-    finally:
-        env.close()
+    first, again, other = (tensor_env.reset(seed=[seed])[0] for seed in (5, 5, 6))
     for name in ("observation.images.third_view", "observation.state"):
         assert torch.equal(first[name], again[name])
         assert not torch.equal(first[name], other[name])
 
 
-def test_the_tensor_environment_keeps_the_last_observation_of_an_episode() -> None:
-    env = ManiSkillTensorEnv(WmrlManiSkillEnv(episode_length=HORIZON, image_size=64), 1, "cpu")
-    try:
-        observation, _ = env.reset(seed=[0])
-        arrays = {name: value.numpy() for name, value in observation.items() if name != "task"}
-        assert env.observation_space.contains(arrays)
-        assert observation["observation.images.third_view"].shape == (1, 3, 64, 64)
-        assert observation["observation.images.third_view"].min() >= 0.0
-        assert observation["observation.images.third_view"].max() <= 1.0
-        raise_gripper = torch.tensor([[0.0, 0.0, 0.05, 0.0, 0.0, 0.0, -1.0]])
-        for step in range(HORIZON):
-            observation, reward, terminated, truncated, info = env.step(raise_gripper)
-            assert ("final_obs" in info) == (step == HORIZON - 1)
-        assert reward.dtype == torch.float32
-        assert truncated.all()
-        assert not terminated.any()
-        assert info["final_info"]["episode_length"].tolist() == [HORIZON]
-        assert not info["final_info"]["is_success"].any()
-        final = info["final_obs"]["observation.state"]
-        assert not torch.allclose(final, observation["observation.state"], atol=1e-3)
-        assert len(info["final_obs"]["task"]) == 1
-    finally:
-        env.close()
+def test_the_tensor_environment_keeps_the_last_observation_of_an_episode(
+    tensor_env: ManiSkillTensorEnv,
+) -> None:
+    env = tensor_env
+    observation, _ = env.reset(seed=[0])
+    arrays = {name: value.numpy() for name, value in observation.items() if name != "task"}
+    assert env.observation_space.contains(arrays)
+    assert observation["observation.images.third_view"].shape == (1, 3, 64, 64)
+    assert observation["observation.images.third_view"].min() >= 0.0
+    assert observation["observation.images.third_view"].max() <= 1.0
+    raise_gripper = torch.tensor([[0.0, 0.0, 0.05, 0.0, 0.0, 0.0, -1.0]])
+    for step in range(HORIZON):
+        observation, reward, terminated, truncated, info = env.step(raise_gripper)
+        assert ("final_obs" in info) == (step == HORIZON - 1)
+    assert reward.dtype == torch.float32
+    assert truncated.all()
+    assert not terminated.any()
+    assert info["final_info"]["episode_length"].tolist() == [HORIZON]
+    assert not info["final_info"]["is_success"].any()
+    final = info["final_obs"]["observation.state"]
+    assert not torch.allclose(final, observation["observation.state"], atol=1e-3)
+    assert len(info["final_obs"]["task"]) == 1
 
 
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"cameras": ["ceiling"]}, "env.cameras"),
-        ({"image_size": 4}, "env.image_size=4"),
-        ({"episode_length": 0}, "env.episode_length=0"),
-        ({"robot_mesh_detail": 0.0}, "env.robot_mesh_detail"),
+        ({"cameras": ["ceiling"]}, "^cameras="),
+        ({"image_size": 4}, "^image_size=4: must be at least 16"),
+        ({"episode_length": 0}, "^episode_length=0: must be at least 1"),
+        ({"robot_mesh_detail": 0.0}, "^robot_mesh_detail=0.0"),
     ],
 )
 def test_bad_settings_are_named(fields: dict, message: str) -> None:

@@ -31,5 +31,5 @@ def test_they_are_what_the_simulator_shows(recwarn):
     assert found.instructions[3] == simulation.instruction
     simulation.close()
     config.depth = True
-    with pytest.raises(ValueError, match=r"looks at depth.*--env\.dataset\.root"):
+    with pytest.raises(ValueError, match=r"^dataset\.root=None: .*looks at depth.*give a dataset"):
         found.depth(type("Model", (), {"config": config}))
