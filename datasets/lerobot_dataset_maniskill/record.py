@@ -1,4 +1,16 @@
-"""`lerobot-wmrl-record`: trajectories in ManiSkill → a LeRobotDataset."""
+"""lerobot-wmrl-record: record trajectories in ManiSkill, or rollouts of a policy, as a LeRobotDataset.
+
+    lerobot-wmrl-record --preset=demo --output_dir=outputs/planned
+    lerobot-wmrl-record --policy.path=outputs/sft --env.type=wmrl_maniskill --num_episodes=60 \\
+        --output_dir=outputs/rollouts
+    lerobot-wmrl-record --policy.path=outputs/sft --env.type=world_model --env.world_model_path=W \\
+        --env.dataset.root=D --output_dir=outputs/imagined
+
+Planners act by default; with `--policy.path` that policy does, in ManiSkill or in a world model.
+`--recipe=FILE` stands for the settings in a YAML file, `--preset=tiny|demo|cpu|gpu|paper` for one of those in
+the package; flags further right override them.
+Running the same command again continues an interrupted recording, or reports that it is complete.
+"""
 
 from huggingface_hub import HfApi
 

@@ -1,27 +1,34 @@
-"""What every console command shares: presets, parsing, claimed output folders, errors without tracebacks."""
+"""What every console command shares: parsing, help, claimed output folders, errors without tracebacks."""
 
+import inspect
 import json
 import logging
 import re
 import sys
-from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import redirect_stderr
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stderr
 from dataclasses import dataclass
+from difflib import get_close_matches
 from io import StringIO
 from pathlib import Path
-from types import NoneType
-from typing import Any, ClassVar, get_args, get_type_hints
+from typing import Any, ClassVar
 
 import draccus
 from draccus.utils import ParsingError
+from draccus.wrappers import docstring
 from lerobot.configs import parser
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import flatten_dict, init_logging
 
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.files import foreign_files, write_json
-from lerobot_wmrl.common.suggestion import nearest
+from lerobot_wmrl.common.presets import TYPE, format_value, read_settings
+from lerobot_wmrl.common.settings import Setting, help_page, settings_of, type_hints, without_none
 
 CONFIG_FILE = "train_config.json"
+
+FIELD = re.compile(r"`([\w.]+)((?:=[^`]*)?)`")
+"""A field in a message, alone or with a value: `dynamics.type=anchored`."""
 
 
 @dataclass
@@ -30,9 +37,12 @@ class RunConfig:
 
     path_fields: ClassVar[list[str]] = []
 
+    other_names: ClassVar[dict[str, str]] = {}
+    """Names that LeRobot's own commands have for some of the flags (`{"steps": "iterations"}`)."""
+
     @classmethod
     def __get_path_fields__(cls) -> list[str]:
-        """Fields that are loaded from a checkpoint given as `--<field>.path`."""
+        """Return the fields that are loaded from a checkpoint given as `--<field>.path`."""
         return cls.path_fields
 
     def save_pretrained(self, folder: Path) -> None:
@@ -40,18 +50,203 @@ class RunConfig:
         write_json(folder / CONFIG_FILE, draccus.encode(self))
 
 
+def run_command[Config: RunConfig](
+    function: Callable[[Config], None],
+    config_class: type[Config],
+    expand: Callable[[Sequence[str]], list[str]],
+) -> None:
+    """Parse the command line for `function` and run it. Bad input ends in one clear line and exit code 1.
+
+    Args:
+        function: what the command does; the docstring of its module introduces `--help`.
+        config_class: of its settings.
+        expand: replaces the flags that stand for others (`--preset`).
+    """
+    register_third_party_plugins()
+    init_logging()
+    logging.getLogger("lerobot.configs").setLevel(logging.ERROR)
+    try:
+        sys.argv[1:] = expand(sys.argv[1:])
+        if {"--help", "-h"} & set(sys.argv[1:]):
+            print(help_of(function, config_class))
+            return
+        function(parse_flags(config_class))
+    except (ValueError, OSError, ParsingError) as error:
+        print(f"error: {said_in_flags(cause(error), config_class, sys.argv[1:])}", file=sys.stderr)
+        sys.exit(1)
+
+
+def help_of(function: Callable[..., None], config_class: type) -> str:
+    """Return the page that `--help` prints, with the flags of the types that are given beside it."""
+    introduction = inspect.getdoc(inspect.getmodule(function)) or ""
+    command = introduction.partition(":")[0].strip("`").removeprefix("lerobot-wmrl-")
+    return help_page(config_class, introduction, command, chosen_types(sys.argv[1:]))
+
+
+def parse_flags[Config: RunConfig](config_class: type[Config]) -> Config:
+    """Parse the command line as LeRobot does.
+
+    Raises:
+        ValueError: it cannot be parsed; in one line, without argparse's page of usage, and with the reason
+            that draccus keeps to itself.
+    """
+
+    @parser.wrap()
+    def parsed(cfg: config_class) -> Config:  # type: ignore[valid-type]
+        return cfg
+
+    said = StringIO()
+    try:
+        with redirect_stderr(said), without_help_texts():
+            return parsed()
+    except SystemExit as stopped:
+        reason = stopped.__context__ and cause(stopped.__context__)
+        if isinstance(reason, FieldError):
+            raise reason from None
+        raise ValueError(parsing_error(said.getvalue().strip(), config_class)) from None
+
+
+@contextmanager
+def without_help_texts() -> Iterator[None]:
+    """Keep draccus from looking for every flag's help text in source files, which takes seconds."""
+    look_up = docstring.get_attribute_docstring
+    docstring.get_attribute_docstring = lambda *_: docstring.AttributeDocString()
+    try:
+        yield
+    finally:
+        docstring.get_attribute_docstring = look_up
+
+
+def parsing_error(said: str, config_class: type[RunConfig]) -> str:
+    """Return why the command line was refused. `said` is what argparse or draccus printed of it."""
+    if undecoded := re.match(r"error: `(\w+)`: Could not decode the value into any", said):
+        return refusal(undecoded[1], config_class) or said
+    reason = said.rpartition("error: ")[2]
+    unknown = re.findall(r"--[\w.-]+", reason) if reason.startswith("unrecognized arguments") else []
+    settings = list(settings_of(config_class, chosen_types(sys.argv[1:])))
+    found = [
+        f"there is no flag {flag}: "
+        + (
+            f"did you mean --{near}?"
+            if (near := near_flag(flag[2:], settings, config_class))
+            else "see --help"
+        )
+        for flag in unknown
+    ]
+    return "; ".join(found) or reason
+
+
+def refusal(name: str, config_class: type[RunConfig]) -> str | None:
+    """Return why the configuration of an optional field refuses its settings: draccus only says that it does.
+
+    Raises:
+        FieldError: it says which setting cannot be.
+    """
+    kind = without_none(type_hints(config_class)[name])
+    chosen = kind.get_choice_class(parser.get_type_arg(name))
+    try:
+        with without_help_texts():
+            draccus.parse(chosen, args=parser.get_cli_overrides(name))
+    except ParsingError as error:
+        if isinstance(cause(error), FieldError):
+            raise cause(error) from None
+        return str(cause(error))
+    return None
+
+
+def near_flag(name: str, settings: Sequence[Setting], config_class: type[RunConfig]) -> str | None:
+    """Return the flag that somebody may have meant who typed `name`, None if no flag is near.
+
+    LeRobot's name for it counts first, then a flag that ends so, then one of the same group that is spelt
+    nearly so, then the same last word in another group.
+    """
+    group, _, last = name.rpartition(".")
+    others = [config_class.other_names[name]] if name in config_class.other_names else []
+    known = sorted((each.name for each in settings), key=lambda each: each.count("."))
+    longer = [each for each in known if group and each.endswith(f".{name}")]
+    beside = {each.rpartition(".")[2]: each for each in known if each.rpartition(".")[0] == group}
+    spelt = [beside[each] for each in get_close_matches(last, beside, 1)]
+    elsewhere = [each for each in known if group and each.rpartition(".")[2] == last]
+    return next(iter([*others, *longer, *spelt, *elsewhere]), None)
+
+
+def cause(error: BaseException) -> BaseException:
+    """Return the reason behind what draccus raises: the FieldError among its causes, else the next cause."""
+    each: BaseException | None = error
+    while each is not None and not isinstance(each, FieldError):
+        each = each.__cause__ or each.__context__
+    return each or (error.__cause__ if isinstance(error, ParsingError) and error.__cause__ else error)
+
+
+def chosen_types(argv: Sequence[str]) -> dict[str, str]:
+    """Return the types that a command line chooses, also by its `--config_path`: field → type."""
+    flags = typed_flags(argv)
+    path = Path(str(flags.get("config_path", "")))
+    stored = read_settings(path) if path.suffix in (".yaml", ".yml", ".json") and path.is_file() else {}
+    return {
+        name.removesuffix(TYPE): str(value)
+        for name, value in {**stored, **flags}.items()
+        if name.endswith(TYPE)
+    }
+
+
+def typed_flags(argv: Sequence[str]) -> dict[str, str]:
+    """Return the flags of a command line: name → value, of what is typed twice the last."""
+    split = [argument[2:].partition("=") for argument in argv if argument.startswith("--")]
+    return {name: value for name, _, value in split}
+
+
+def said_in_flags(error: BaseException, config_class: type, argv: Sequence[str]) -> str:
+    """Return an error's message, with fields as the flags that set them: `reward.form` → `--env.reward.form`.
+
+    Args:
+        error: a FieldError knows its field, relative to the configuration that raised it, and names others in
+            backquotes. Any other error keeps its message.
+        config_class: of the command.
+        argv: what was typed.
+    """
+    if not isinstance(error, FieldError):
+        return str(error)
+    typed = typed_flags(argv)
+    known = {each.name: each.default for each in settings_of(config_class, chosen_types(argv))}
+    known |= {name.rpartition(".")[0]: None for name in known if "." in name}
+    flag = flag_of(error.field, error.value, typed) or flag_of(error.field, error.value, known)
+    groups = (flag or "").removesuffix(error.field).split(".")[:-1]
+
+    def as_flag(match: re.Match[str]) -> str:
+        nearest = (".".join([*groups[:count], match[1]]) for count in range(len(groups), -1, -1))
+        found = next((name for name in nearest if name in known or name in typed), None)
+        found = found or flag_of(match[1], None, known)
+        return f"--{found}{match[2]}" if found else match[0]
+
+    problem, remedy = (re.sub(FIELD, as_flag, text) for text in (error.problem, error.remedy))
+    value = "" if error.value in (None, "") else f"={format_value(error.value)}"
+    said = f"{f'--{flag}' if flag else error.field}{value}: {problem}"
+    return f"{said}; {remedy}" if remedy else said
+
+
+def flag_of(field: str, value: object, flags: Mapping[str, Any]) -> str | None:
+    """Return the flag that ends with a field's name, one with that value first, then the shortest."""
+    found = [name for name in flags if name == field or name.endswith(f".{field}")]
+    return min(
+        found,
+        key=lambda name: (format_value(flags[name]) != format_value(value), name.count(".")),
+        default=None,
+    )
+
+
 def claim_output_dir(output_dir: Path, config: dict[str, Any], free: Collection[str] = ()) -> None:
-    """Mark a new folder as this run's, or recognise it. ValueError if it holds something else."""
+    """Mark a new folder as this run's, or recognise it. Raises ValueError if it holds something else."""
     require_free(output_dir, config, free)
     if not (output_dir / CONFIG_FILE).is_file():
         write_json(output_dir / CONFIG_FILE, config)
 
 
 def require_free(output_dir: Path, config: dict[str, Any], free: Collection[str] = ()) -> None:
-    """ValueError unless the folder is new, empty or this run's; it is left as it is.
+    """Raise ValueError unless the folder is new, empty or this run's; leave it as it is.
 
-    Only `output_dir`, for a run may be moved, and the settings called `free` may differ between the first
-    call and its continuation.
+    `output_dir` (a run may be moved) and the settings called `free` may differ between the first call and its
+    continuation.
     """
     marker = output_dir / CONFIG_FILE
     if output_dir.exists() and not output_dir.is_dir():
@@ -70,7 +265,7 @@ def require_free(output_dir: Path, config: dict[str, Any], free: Collection[str]
 def different_settings(
     stored: Mapping[str, Any], given: Mapping[str, Any], free: Collection[str]
 ) -> list[str]:
-    """`name 'stored' → 'given'` of every setting that differs and is not `free`, alone or with its group."""
+    """Return `name 'stored' → 'given'` of every setting that differs, unless it or its group is `free`."""
     before, now = (flatten_dict(dict(settings), sep=".") for settings in (stored, given))
     return [
         f"{name} {before.get(name)!r} → {now.get(name)!r}"
@@ -78,66 +273,3 @@ def different_settings(
         if before.get(name) != now.get(name)
         and not any(name == each or name.startswith(f"{each}.") for each in free)
     ]
-
-
-def run_command[Config: RunConfig](
-    function: Callable[[Config], None],
-    config_class: type[Config],
-    expand: Callable[[Sequence[str]], list[str]],
-) -> None:
-    """Parse the command line for `function`, run it, and turn bad input into one clear line, exit code 1.
-
-    `expand` replaces the flags that stand for others.
-    """
-    register_third_party_plugins()
-    init_logging()
-    logging.getLogger("lerobot.configs").setLevel(logging.ERROR)
-    try:
-        sys.argv[1:] = expand(sys.argv[1:])
-        function(parse_flags(config_class))
-    except (ValueError, OSError, ParsingError) as error:
-        reason = error.__cause__ if isinstance(error, ParsingError) and error.__cause__ else error
-        print(f"error: {reason}", file=sys.stderr)
-        sys.exit(1)
-
-
-def parse_flags[Config: RunConfig](config_class: type[Config]) -> Config:
-    """The command line as LeRobot parses it. ValueError if it cannot, in one line: without the page of usage
-    that argparse prints, and with the reason that draccus keeps to itself."""
-
-    @parser.wrap()
-    def parsed(cfg: config_class) -> Config:  # type: ignore[valid-type]
-        return cfg
-
-    said = StringIO()
-    try:
-        with redirect_stderr(said):
-            return parsed()
-    except SystemExit as stopped:
-        if stopped.code in (None, 0):  # --help
-            raise
-        raise ValueError(parsing_error(said.getvalue().strip(), config_class)) from None
-
-
-def parsing_error(said: str, config_class: type[RunConfig]) -> str:
-    """What argparse or draccus has against the command line, who `said` so at length."""
-    if undecoded := re.match(r"error: `(\w+)`: Could not decode the value into any", said):
-        return refusal(undecoded[1], config_class) or said
-    usage, _, reason = said.rpartition("error: ")
-    known = sorted({*re.findall(r"--[\w.]+", usage)})
-    unknown = re.findall(r"--[\w.-]+", reason) if reason.startswith("unrecognized arguments") else []
-    hints = [f"did you mean {near}?" if (near := nearest(name, known)) else "see --help" for name in unknown]
-    found = [f"there is no flag {name}: {hint}" for name, hint in zip(unknown, hints, strict=True)]
-    return "; ".join(found) or reason
-
-
-def refusal(name: str, config_class: type[RunConfig]) -> str | None:
-    """Why the configuration of an optional field refuses its settings: of a type that may also be None,
-    draccus only says that it does."""
-    kind = next(each for each in get_args(get_type_hints(config_class)[name]) if each is not NoneType)
-    chosen = kind.get_choice_class(parser.get_type_arg(name))
-    try:
-        draccus.parse(chosen, args=parser.get_cli_overrides(name))
-    except ParsingError as error:
-        return str(error.__cause__ or error).replace("--env.", f"--{name}.")
-    return None

@@ -9,6 +9,7 @@ from pathlib import Path
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 
 from lerobot_wmrl.common.checkpoints import LAST_CHECKPOINT, latest_checkpoint
+from lerobot_wmrl.common.command_line import RunConfig
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.presets import Flags, format_flags, preset_flags
 from lerobot_wmrl.demo.episodes import optimal_episodes
@@ -27,7 +28,7 @@ EXPLORATION = 0.4
 
 
 @dataclass
-class DemoConfig:
+class DemoConfig(RunConfig):
     """The whole loop on one task: record, train, clone, improve, measure, report.
 
     Running the same command again continues after the last finished piece of work. `--preset=demo` (the
@@ -40,6 +41,7 @@ class DemoConfig:
         sft_episodes: optimal episodes the first policy is cloned from.
         explore_episodes: episodes of that policy, noisy, that the world models learn from as well.
         eval_episodes: held-out episodes of each success rate.
+        rollout_episodes: recorded episodes of each policy that are replayed in the world model.
     """
 
     output_dir: Path = Path("outputs/demo")
@@ -48,7 +50,7 @@ class DemoConfig:
     sft_episodes: int = 8
     explore_episodes: int = 300
     eval_episodes: int = 100
-    rollout_episodes: int = 60  # real episodes of each policy that are replayed in the world model
+    rollout_episodes: int = 60
 
     def check(self) -> None:
         """ValueError names a setting that cannot be."""

@@ -7,12 +7,11 @@ Running the same command again continues after the last finished piece of work.
 
 import signal
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import NoReturn
 
-import draccus
-from draccus.utils import DraccusException
-
+from lerobot_wmrl.common.command_line import run_command
 from lerobot_wmrl.common.presets import expand_preset
 from lerobot_wmrl.demo.pipeline import StageError, claimed, run_stages
 from lerobot_wmrl.demo.stages import DemoConfig, demo_stages
@@ -35,15 +34,18 @@ def interrupt(signal_number: int, frame: object) -> NoReturn:
     raise KeyboardInterrupt
 
 
+def with_preset(argv: Sequence[str]) -> list[str]:
+    """Replace the preset by its flags; without one it is the demo's."""
+    given = any(argument.startswith("--preset") for argument in argv)
+    return expand_preset(argv if given else ["--preset=demo", *argv], "demo")
+
+
 def main() -> None:
-    """Entry point of the console command; without a preset it is the demo's."""
+    """Run the console command."""
     signal.signal(signal.SIGTERM, interrupt)
-    arguments = sys.argv[1:]
-    if not any(argument.startswith("--preset") for argument in arguments):
-        arguments = ["--preset=demo", *arguments]
     try:
-        run_demo(draccus.parse(config_class=DemoConfig, args=expand_preset(arguments, "demo")))
-    except (ValueError, StageError, DraccusException) as error:
+        run_command(run_demo, DemoConfig, with_preset)
+    except StageError as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
         sys.exit("\nstopped: run the same command again to continue where it stopped")

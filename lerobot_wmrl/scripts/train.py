@@ -68,6 +68,7 @@ class TrainConfig(CallbackSettings, RunConfig):
     """
 
     path_fields: ClassVar[list[str]] = ["policy"]
+    other_names: ClassVar[dict[str, str]] = {"steps": "iterations", "batch_size": "num_envs"}
     dataset: ClassVar[None] = None
     is_reward_model_training: ClassVar[bool] = False
 
