@@ -64,8 +64,8 @@ def settings_of(
         name, hint = f"{prefix}{field.name}", without_none(hints.get(field.name, field.type))
         value = default_of(field) if isinstance(config, type) else getattr(config, field.name)
         said = explanations.get(field.name, "")
-        if isinstance(hint, type) and issubclass(hint, ChoiceType):
-            known = hint.get_known_choices()
+        known = known_types(hint)
+        if known is not None:
             chosen = types.get(name) or registered_name(known, type(value))
             yield Setting(f"{name}.type", "|".join(known), chosen, said, depth)
             if chosen in known:
@@ -76,6 +76,12 @@ def settings_of(
             yield from settings_of(inner, types, f"{name}.", depth + 1)
         else:
             yield Setting(name, kind_of(hint), value, said, depth)
+
+
+def known_types(hint: Any) -> dict[str, type] | None:
+    """Return the types registered under a choice, None if the annotation is not a choice."""
+    is_choice = isinstance(hint, type) and issubclass(hint, ChoiceType)
+    return hint.get_known_choices() if is_choice else None  # type: ignore[attr-defined]
 
 
 def type_hints(cls: type) -> dict[str, Any]:
