@@ -22,5 +22,5 @@ lint: setup
 UV ?= $(or $(wildcard .uv/bin/uv),uv)
 
 lock:  ## requirements.lock: every package pinned and hashed, no address, so any mirror serves it
-	$(UV) pip compile pyproject.toml --extra dev --universal --python-version 3.12 \
+	$(UV) pip compile pyproject.toml --extra dev --extra maniskill --universal --python-version 3.12 \
 		--no-header --no-annotate --generate-hashes -o requirements.lock

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -15,7 +16,8 @@ ROOT = Path(__file__).parents[1]
 TRAIN_WITHOUT_SIMULATOR = """
 import sys
 
-sys.modules |= dict.fromkeys(("mani_skill", "sapien", "mplib"))  # to import one raises ModuleNotFoundError
+blocked = ("mani_skill", "sapien", "mplib", "trimesh", "fast_simplification", "transforms3d")
+sys.modules |= dict.fromkeys(blocked)  # to import one of them raises ModuleNotFoundError
 
 import lerobot_env_wmrl
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
@@ -52,3 +54,12 @@ def test_ppo_in_a_world_model_runs_without_a_simulator(
     )  # fmt: skip
     assert result.returncode == 0, result.stderr[-3000:]
     assert [line["step"] for line in read_metrics(tmp_path / "rl")] == [1, 2]
+
+
+def test_the_simulator_is_an_extra_of_the_installation() -> None:
+    """And so is `opencv-python`, which SAPIEN asks for beside LeRobot's `opencv-python-headless`."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    needed = " ".join(project["dependencies"])
+    for package in ("mani-skill", "sapien", "mplib"):
+        assert package not in needed
+        assert any(each.startswith(package) for each in project["optional-dependencies"]["maniskill"])
