@@ -31,7 +31,7 @@ from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_policy_cnn.processor_cnn import make_cnn_pre_post_processors
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
-from lerobot_wmrl.rl.configuration_ppo import PPOConfig
+from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.ppo import PPO
 from lerobot_wmrl.rl.protocol import make_pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
@@ -107,12 +107,13 @@ def measure(env: Any, steps: int, iterations: int, device: str) -> dict[str, Any
     else:
         watch.watch(env, "simulator", "step", "reset")
     watch.watch(policy, "policy", "sample", "value")
-    watch.watch(algorithm, "update", "improve")
+    watch.watch(algorithm, "update", "prepare", "update")
     found: list[dict[str, float]] = []
     for iteration in range(1 + iterations):
         watch.seconds, began = {}, watch.now()
         collect(env, policy, pipeline, buffer, iteration * env.num_envs)
-        algorithm.improve(buffer, pipeline)
+        minibatches, _ = algorithm.prepare(buffer, pipeline)
+        algorithm.update(iter(minibatches))
         whole = watch.now() - began
         found.append({**watch.seconds, "rest": whole - sum(watch.seconds.values()), "iteration": whole})
     seconds = {name: float(np.median([each[name] for each in found[1:]])) for name in found[-1]}

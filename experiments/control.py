@@ -26,13 +26,10 @@ from torch.distributions import Categorical, Distribution, Normal
 
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.files import write_json
-from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
-from lerobot_wmrl.rl.configuration_policy_gradient import PolicyGradientConfig
-from lerobot_wmrl.rl.configuration_ppo import PPOConfig
-from lerobot_wmrl.rl.factory import make_algorithm
+from lerobot_wmrl.rl.configuration_algorithms import GRPOConfig, PolicyGradientConfig, PPOConfig
 from lerobot_wmrl.rl.protocol import Observation, Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer
-from lerobot_wmrl.rl.trainer import Schedule, train
+from lerobot_wmrl.rl.trainer import Schedule, make_algorithm, train
 
 EPISODES: Final = 100
 STATE: Final = "observation.state"
@@ -57,7 +54,6 @@ CARTPOLE: Final[dict[str, Any]] = {
 }  # fmt: skip
 PENDULUM: Final[dict[str, Any]] = {
     **FREE, "policy_lr": 1e-3, "minibatch_size": 400, "epochs": 8, "gamma": 0.95, "target_kl": 0.05,
-    "lr_schedule": "linear",
 }  # fmt: skip
 
 TRAININGS: Final = {
@@ -200,7 +196,7 @@ def measure(training: Training, iterations: int, seed: int) -> dict[str, float]:
     policy = ControlPolicy(env)
     pipeline = Pipeline(lambda observation: observation, policy.to_action)
     buffer = RolloutBuffer(env.max_episode_steps, training.num_envs, "cpu")
-    algorithm = make_algorithm(policy, training.config, iterations)
+    algorithm = make_algorithm(policy, training.config)
     began = time.process_time()
     with tempfile.TemporaryDirectory() as folder:
         train(

@@ -68,27 +68,18 @@ def sum_over_processes(values: Tensor) -> Tensor:
 
 
 def largest_over_processes(values: Tensor) -> Tensor:
-    """The largest of every process's `values`, in place."""
+    """Return the largest of every process's `values`, in place. All processes must call it."""
     if rank_and_size()[1] > 1:
         dist.all_reduce(values, dist.ReduceOp.MAX)
     return values
 
 
-def joined_columns(values: Tensor) -> Tensor:
-    """Every process's columns side by side, in the order of their ranks. (T, B) → (T, processes · B)"""
-    _, size = rank_and_size()
-    if size == 1:
-        return values
-    parts = [torch.empty_like(values) for _ in range(size)]
-    dist.all_gather(parts, values.contiguous())
-    return torch.cat(parts, dim=1)
-
-
-def of_first_process(values: Tensor) -> Tensor:
-    """What the first process has, for all, in place."""
-    if rank_and_size()[1] > 1:
-        dist.broadcast(values, src=0)
-    return values
+def gather_counts(count: int, device: torch.device | str) -> list[int]:
+    """Return every process's count, in the order of their ranks. All processes must call it."""
+    rank, size = rank_and_size()
+    counts = torch.zeros(size, dtype=torch.long, device=device)
+    counts[rank] = count
+    return sum_over_processes(counts).tolist()
 
 
 def wait_for_all() -> None:
@@ -104,12 +95,14 @@ def mean_and_variance(values: Tensor) -> tuple[Tensor, Tensor]:
     return mean, sum_over_processes((values - mean).square().sum()) / (count - 1).clamp_min(1)
 
 
-def sum_gradients(parameters: Iterable[nn.Parameter]) -> None:
-    """Add up every process's gradients, in one message. The same parameters must have one in all."""
+def average_gradients(parameters: Iterable[nn.Parameter]) -> None:
+    """Replace gradients by their means over all processes, in one message. The same parameters must have a
+    gradient in all of them."""
     gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
-    if rank_and_size()[1] == 1 or not gradients:
+    _, size = rank_and_size()
+    if size == 1 or not gradients:
         return
-    summed = sum_over_processes(torch.cat([gradient.flatten() for gradient in gradients]))
-    parts = summed.split([gradient.numel() for gradient in gradients])
+    mean = sum_over_processes(torch.cat([gradient.flatten() for gradient in gradients])) / size
+    parts = mean.split([gradient.numel() for gradient in gradients])
     for gradient, part in zip(gradients, parts, strict=True):
         gradient.copy_(part.view_as(gradient))

@@ -1,6 +1,7 @@
 """Errors that know the field they are about; the command that was called knows its flag."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 
 class FieldError(ValueError):
@@ -45,3 +46,12 @@ def require_choice(settings: object, field: str, choices: Iterable[object]) -> N
     value, known = getattr(settings, field), list(choices)
     if value not in known:
         raise FieldError(field, value, f"choose one of {', '.join(map(str, known))}")
+
+
+@contextmanager
+def within(group: str) -> Iterator[None]:
+    """Put `group.` before the field of a FieldError that leaves the block."""
+    try:
+        yield
+    except FieldError as error:
+        raise FieldError(f"{group}.{error.field}", error.value, error.problem, error.remedy) from None

@@ -1,70 +1,87 @@
-"""What is done between iterations: looked at, judged, recorded anew. None of it touches a training's dice.
+"""Callbacks between iterations, such as measuring success. They leave the training's random numbers alone.
 
-A training knows callbacks by `due`, `run` and `apply` only. What one finds is kept beside the checkpoints, in
-`<output_dir>/<name>/<iteration>/record.json`: it is found once, also if the training is killed in between.
+A callback returns a record, which is kept in `<output_dir>/<name>/<iteration>/record.json`. A training that
+was killed and resumed reads the record instead of running the callback again.
 """
 
 import json
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+import draccus
 from lerobot.common.train_utils import get_step_identifier
+from lerobot.envs.configs import EnvConfig
+from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from lerobot.utils.random_utils import get_rng_state, set_rng_state
 from lerobot.utils.utils import flatten_dict
 
 from lerobot_wmrl.common.distributed import rank_and_size, wait_for_all
 from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.common.presets import Flags, format_flags
+from lerobot_wmrl.common.subcommand import run_subcommand
 from lerobot_wmrl.common.tracking import Tracker
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 
 RECORD_FILE = "record.json"
 REAL_STEPS = "real_steps"
-"""In a record: control steps of the real robot or simulator that finding it has taken."""
+"""Key of a record: control steps that the callback has taken outside the world model."""
 
 Record = dict[str, Any]
-"""JSON: what was found at an iteration. Its numbers are logged as `<name>/<key>`."""
+"""JSON. Its numbers are logged as `<name>/<key>`."""
+
+DERIVED = ("features", "features_map", "cameras")
+"""Settings of an environment that follow from others, or are given apart."""
 
 
 class Callback(Protocol):
-    """Something to be done between two iterations."""
+    """Something that runs between two iterations."""
 
     name: str
 
     def due(self, iteration: int) -> bool:
-        """Whether after so many iterations."""
+        """Return whether to run after so many iterations."""
 
     def run(self, iteration: int, checkpoint: Path, folder: Path) -> Record:
-        """Do it, with the policy's checkpoint at hand. What `folder` holds, the same call left, killed."""
+        """Run, and return the record.
+
+        Args:
+            iteration: finished iterations.
+            checkpoint: the policy's, of this iteration.
+            folder: where to leave files. It may hold those of the same call, which was killed.
+        """
 
     def apply(self, records: Mapping[int, Record]) -> None:
-        """Draw the conclusion from all records so far, by iteration: after a run, and on resuming.
+        """Act on all records so far, by iteration. Called after `run` and when a training is resumed.
 
-        TrainingStopped if the training must not go on.
+        Raises:
+            TrainingStopped: the training must not go on.
         """
 
 
 class Callbacks:
-    """Runs callbacks, in order, and keeps what they find. Of several processes the first runs them, and all
-    read what it found."""
+    """Runs callbacks in order and keeps their records. Of several processes the first one runs them, and all
+    read the records."""
 
     def __init__(self, callbacks: Sequence[Callback], output_dir: Path, total: int, tracker: Tracker) -> None:
         self.callbacks, self.output_dir, self.total, self.tracker = callbacks, output_dir, total, tracker
         self.records: dict[str, dict[int, Record]] = {callback.name: {} for callback in callbacks}
 
     def resume(self, iteration: int) -> None:
-        """Take up what was found up to here; what was found later belongs to iterations that are repeated."""
+        """Read the records up to `iteration`, and remove later ones, whose iterations are repeated."""
         for callback in self.callbacks:
-            self._take_up(callback.name, iteration)
+            self._read_records(callback.name, iteration)
         for callback in self.callbacks:
-            found = self.records[callback.name]
-            if iteration in found:
+            records = self.records[callback.name]
+            if iteration in records:
                 self._log(callback.name, iteration)
-            if found:
+            if records:
                 self._apply(callback)
 
-    def _take_up(self, name: str, iteration: int) -> None:
+    def _read_records(self, name: str, iteration: int) -> None:
         for folder in sorted((self.output_dir / name).glob("[0-9]*")):
             if int(folder.name) > iteration:
                 shutil.rmtree(folder, ignore_errors=True)
@@ -72,16 +89,16 @@ class Callbacks:
                 self.records[name][int(folder.name)] = json.loads((folder / RECORD_FILE).read_text())
 
     def _apply(self, callback: Callback) -> None:
-        """Also when resumed, which has the training's dice at the checkpoint: to make a model rolls some."""
+        """Apply without drawing from the training's generators: loading a model draws random weights."""
         with preserved_randomness():
             callback.apply(self.records[callback.name])
 
     def due(self, iteration: int) -> bool:
-        """Whether any of them has something to do that is not done yet."""
+        """Return whether any callback has to run here and has not."""
         return any(self._pending(callback, iteration) for callback in self.callbacks)
 
     def run(self, iteration: int, checkpoint: Path) -> None:
-        """Those that are due. The random numbers of the training go on as if nothing had happened."""
+        """Run the callbacks that are due, and put the training's generators back afterwards."""
         for callback in self.callbacks:
             if self._pending(callback, iteration):
                 folder = record_folder(self.output_dir, callback.name, iteration, self.total)
@@ -95,7 +112,7 @@ class Callbacks:
                 self._apply(callback)
 
     def real_steps(self) -> dict[str, float]:
-        """Steps in reality so far, by what they were spent on: `real_steps/<name>`."""
+        """Return the steps outside the world model so far, `real_steps/<name>` for each callback."""
         return {
             f"{REAL_STEPS}/{name}": sum(record.get(REAL_STEPS, 0) for record in records.values())
             for name, records in self.records.items()
@@ -110,17 +127,17 @@ class Callbacks:
 
 
 def record_folder(output_dir: Path, name: str, iteration: int, total: int) -> Path:
-    """Where a callback of this name leaves what it makes, called as the checkpoint of the iteration."""
+    """Return the folder of a callback's record, which is called like the iteration's checkpoint."""
     return output_dir / name / get_step_identifier(iteration, total)
 
 
 def has_record(output_dir: Path, name: str, iteration: int, total: int) -> bool:
-    """Whether the callback of this name was done with."""
+    """Return whether the callback of this name has a record of the iteration."""
     return (record_folder(output_dir, name, iteration, total) / RECORD_FILE).is_file()
 
 
 def numbers(name: str, record: Record) -> dict[str, float]:
-    """What can be plotted, `<name>/<key>` with slashes for nesting; steps are logged as totals."""
+    """Return what can be plotted, `<name>/<key>` with slashes for nesting; steps are logged as totals."""
     return {
         f"{name}/{key}": value
         for key, value in flatten_dict(record).items()
@@ -130,9 +147,50 @@ def numbers(name: str, record: Record) -> dict[str, float]:
 
 @contextmanager
 def preserved_randomness() -> Iterator[None]:
-    """Put Python's, numpy's and torch's generators back to where they were."""
+    """Put Python's, numpy's and torch's generators back to their states before the block."""
     state = get_rng_state()
     try:
         yield
     finally:
         set_rng_state(state)
+
+
+@dataclass(frozen=True)
+class RolloutRecorder:
+    """Records a policy in ManiSkill with lerobot-wmrl-record, in a process of its own.
+
+    Args:
+        env: the environment.
+        num_workers: simulators at once.
+        cameras: what is recorded.
+        depth: whether depth is recorded too.
+    """
+
+    env: WmrlManiSkillEnv
+    num_workers: int
+    cameras: Sequence[str]
+    depth: bool
+
+    def record(
+        self, checkpoint: Path, episodes: int, seed: int, folder: Path, exploration: float = 0.0
+    ) -> None:
+        """Record a dataset in `folder`, or complete it after a kill. Episode i starts from `seed` + i."""
+        flags: Flags = {
+            "policy.path": str(checkpoint / PRETRAINED_MODEL_DIR), **env_flags(self.env),
+            "env.cameras": str(list(self.cameras)), "depth": self.depth, "num_workers": self.num_workers,
+            "num_episodes": episodes, "seed": seed, "exploration": exploration, "output_dir": str(folder),
+        }  # fmt: skip
+        run_subcommand(["lerobot-wmrl-record", *format_flags(flags)])
+
+
+def env_flags(env: EnvConfig) -> Flags:
+    """Return `env.type` and the settings that differ from their defaults, as a command takes them."""
+    given, default = (flatten_dict(draccus.encode(each, EnvConfig), sep=".") for each in (env, type(env)()))
+    return {
+        "env.type": env.type,
+        **{
+            f"env.{name}": value
+            for name, value in given.items()
+            if name.split(".")[0] not in DERIVED and value != default.get(name)
+        },
+    }

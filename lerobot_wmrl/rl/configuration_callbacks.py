@@ -1,10 +1,11 @@
-"""Configuration of what is done between iterations: `--selection.*`, `--gate.*`, `--dyna.*`."""
+"""Configuration of what runs between iterations: `--selection.*`, `--gate.*`, `--dyna.*`, `--real_env.*`."""
 
 from dataclasses import dataclass, field
 from typing import Final
 
 from lerobot.envs.configs import EnvConfig
 
+from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice, require_share, within
 from lerobot_wmrl.data.dataset_source import DatasetSource
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
@@ -12,44 +13,37 @@ from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 GATE_ACTIONS: Final = ("stop", "warn", "off")
 
 DYNA_SEEDS: Final = 100_000
-"""The last so many below EVALUATION_SEED: what a world model learns from is not evaluated on."""
+"""Number of seeds just below EVALUATION_SEED that Dyna records on: a world model is not evaluated on them."""
 
 
 @dataclass
 class SelectionConfig:
-    """Which checkpoint is the best, `checkpoints/best`.
+    """Choice of the best checkpoint, `checkpoints/best`.
 
     Args:
-        freq: iterations between two measurements of success, which also save a checkpoint; 0 is off.
-        n_episodes: of each, always the same ones, neither trained on nor evaluated on; in `real_env` if
-            there is one, else imagined ones alone decide.
-        dataset: whose first frames the imagined episodes begin with; by default those that the training
-            begins with.
+        freq: iterations between two measurements of success, each of which also saves a checkpoint; 0 is off.
+        n_episodes: episodes of a measurement, always the same and kept apart from training and evaluation.
+            They are played in `real_env` if there is one; otherwise imagined ones alone decide.
+        dataset: dataset whose first frames imagined episodes start from; by default the training's.
     """
 
     freq: int = 0
     n_episodes: int = 50
     dataset: DatasetSource = field(default_factory=DatasetSource)
 
-    def check(self) -> None:
-        """ValueError names the setting that cannot be."""
-        _at_least(0, "selection.freq", self.freq)
-        _at_least(1, "selection.n_episodes", self.n_episodes)
-
 
 @dataclass
 class GateConfig:
-    """May a policy be trained in this world model? Not if it calls real failures successes.
+    """Check that the world model does not call too many failures successes.
 
     Args:
-        action: `stop` when more failures than `limit` are believed, `warn` of it, or `off`.
-        limit: largest share of real failures that the world model may call successes.
-        dataset: real rollouts with success labels, that the world model was not trained on; it is asked about
-            them before the first update and after each Dyna round.
-        freq: iterations from one batch of fresh rollouts in `real_env` to the next; there are some before the
-            first update too. 0: only then.
-        n_episodes: of each batch of fresh
-            rollouts.
+        action: `stop` the training, `warn`, or `off`.
+        limit: largest share of false positives: failed episodes that the world model calls successes.
+        dataset: labelled rollouts that the world model was not trained on. It is checked on them before the
+            first update and after each Dyna round.
+        freq: iterations between two checks on new rollouts in `real_env`. Before the first update there is
+            one in any case; 0: only then.
+        n_episodes: rollouts of a check in `real_env`.
     """
 
     action: str = "stop"
@@ -62,23 +56,14 @@ class GateConfig:
         if self.action == str(False):  # what YAML, which reads the flags, makes of `off`
             self.action = "off"
 
-    def check(self) -> None:
-        """ValueError names the setting that cannot be."""
-        if self.action not in GATE_ACTIONS:
-            raise ValueError(f"--gate.action={self.action}: choose one of {', '.join(GATE_ACTIONS)}")
-        if not 0 <= self.limit <= 1:
-            raise ValueError(f"--gate.limit={self.limit}: must be a share, from 0 to 1")
-        _at_least(0, "gate.freq", self.freq)
-        _at_least(1, "gate.n_episodes", self.n_episodes)
-
 
 @dataclass
 class NewRollouts:
-    """What was recorded elsewhere.
+    """Datasets of the policy that were recorded elsewhere.
 
     Args:
-        roots: LeRobotDatasets, one for each round. The training stops where one is missing and says which
-            policy to record; the same command with one more goes on. Begin with [].
+        roots: a LeRobotDataset for each round. The training stops where one is missing and says which policy
+            to record; the same command with one more root continues. Begin with [].
     """
 
     roots: list[str] | None = None
@@ -86,16 +71,15 @@ class NewRollouts:
 
 @dataclass
 class DynaConfig:
-    """Rounds in which the world model learns what the policy does by now (Sutton 1991).
+    """Rounds that train the world model further on what the policy does by then (Sutton 1991).
 
     Args:
         rounds: how many, evenly spread over the iterations; 0 is off.
-        n_episodes: of the policy recorded in `real_env` each round, half of them noisy by noise.
-        dataset: recorded elsewhere instead (on a real robot, say).
-        learnt: what the world model has been trained on so far and is not to forget; by default the
-            dataset of `env`.
-        steps, batch_size, learning_rate: of each round's training on old and new episodes, half and half, by
-            lerobot-wmrl-train-world-model.
+        n_episodes: episodes of the policy recorded in `real_env` in each round, half of them with noise.
+        dataset: datasets recorded elsewhere instead, on a real robot for example.
+        learnt: dataset that the world model was trained on and must not forget; by default `env.dataset`.
+        steps: training steps of each round, half on old and half on new episodes.
+        batch_size: clips of a training step.
     """
 
     rounds: int = 0
@@ -104,27 +88,11 @@ class DynaConfig:
     learnt: DatasetSource = field(default_factory=DatasetSource)
     steps: int = 1000
     batch_size: int = 16
-    learning_rate: float = 3e-4
-
-    def check(self, iterations: int) -> None:
-        """ValueError names the setting that cannot be."""
-        for least, name in ((0, "rounds"), (2, "n_episodes"), (1, "steps"), (1, "batch_size")):
-            _at_least(least, f"dyna.{name}", getattr(self, name))
-        if self.rounds >= iterations:
-            raise ValueError(
-                f"--dyna.rounds={self.rounds}: there is room for {iterations - 1}, one between two iterations"
-            )
-        if self.rounds * self.n_episodes > DYNA_SEEDS:
-            raise ValueError(
-                f"--dyna.n_episodes={self.n_episodes}: at most {DYNA_SEEDS} episodes in all rounds together"
-            )
-        if self.learning_rate <= 0:
-            raise ValueError(f"--dyna.learning_rate={self.learning_rate}: must be above 0")
 
 
 @dataclass
 class CallbackSettings:
-    """What is done between iterations; and `real_env`, the reality it is done in."""
+    """What runs between iterations, and `real_env`, the environment outside the world model."""
 
     real_env: EnvConfig | None = None
     real_num_envs: int = 2
@@ -133,53 +101,78 @@ class CallbackSettings:
     dyna: DynaConfig = field(default_factory=DynaConfig)
 
     def check_callbacks(self, env: EnvConfig, iterations: int) -> None:
-        """ValueError names the setting that cannot be, of a training in `env`."""
-        _at_least(1, "real_num_envs", self.real_num_envs)
-        self.selection.check()
-        self.gate.check()
-        self.dyna.check(iterations)
+        """Raise FieldError for a setting that cannot be in a training in `env`."""
+        require_at_least(self, 1, "real_num_envs")
+        self._check_selection_and_gate()
+        if isinstance(env, WorldModelEnv) and self.gate.action == "stop":
+            self._check_gate_has_labels()
+        self._check_dyna_sizes(iterations)
         if self.dyna.rounds:
             self._check_dyna(env)
-        asked = self.gate.dataset.root or self.simulator
-        if isinstance(env, WorldModelEnv) and self.gate.action == "stop" and not asked:
-            raise ValueError(
-                "--gate.action=stop: nothing says what is real, so whether this world model calls failures "
-                "successes cannot be known; give labelled rollouts (--gate.dataset.root) or a simulator "
-                "(--real_env.type=wmrl_maniskill), or train unchecked with --gate.action=warn"
-            )
 
     @property
     def simulator(self) -> WmrlManiSkillEnv | None:
-        """Where lerobot-wmrl-record can record."""
+        """The environment in which lerobot-wmrl-record can record, if `real_env` is one."""
         return self.real_env if isinstance(self.real_env, WmrlManiSkillEnv) else None
 
     def learnt(self, env: EnvConfig) -> DatasetSource:
-        """The dataset that the world model has learnt from."""
+        """Return the dataset that the world model was trained on."""
         own = self.dyna.learnt
         return own if own.root or not isinstance(env, WorldModelEnv) else env.dataset
 
+    def _check_selection_and_gate(self) -> None:
+        with within("selection"):
+            require_at_least(self.selection, 0, "freq")
+            require_at_least(self.selection, 1, "n_episodes")
+        with within("gate"):
+            require_choice(self.gate, "action", GATE_ACTIONS)
+            require_share(self.gate, "limit")
+            require_at_least(self.gate, 0, "freq")
+            require_at_least(self.gate, 1, "n_episodes")
+
+    def _check_gate_has_labels(self) -> None:
+        if not self.gate.dataset.root and self.simulator is None:
+            raise FieldError(
+                "gate.action", self.gate.action,
+                "no episode says what success is outside the world model, so its false positives cannot be "
+                "counted",
+                "give labelled rollouts (`gate.dataset.root`) or a simulator (`real_env.type`, "
+                "wmrl_maniskill), or train unchecked with `gate.action` warn",
+            )  # fmt: skip
+
+    def _check_dyna_sizes(self, iterations: int) -> None:
+        dyna = self.dyna
+        with within("dyna"):
+            require_at_least(dyna, 0, "rounds")
+            require_at_least(dyna, 2, "n_episodes")
+            require_at_least(dyna, 1, "steps", "batch_size")
+            if dyna.rounds >= iterations:
+                raise FieldError(
+                    "rounds", dyna.rounds, f"there is room for {iterations - 1}, one between two iterations"
+                )
+            if dyna.rounds * dyna.n_episodes > DYNA_SEEDS:
+                raise FieldError(
+                    "n_episodes", dyna.n_episodes, f"at most {DYNA_SEEDS} episodes in all rounds together"
+                )
+
     def _check_dyna(self, env: EnvConfig) -> None:
-        where = f"--dyna.rounds={self.dyna.rounds}"
+        problem = remedy = None
         if not isinstance(env, WorldModelEnv):
-            raise ValueError(f"{where}: there is no world model to refresh in --env.type={env.type}")
-        if env.reward.type == "embedding":
-            raise ValueError(
-                f"{where}: an embedding reward reads the hidden state of one world model and means nothing "
-                "to a refreshed one; choose --env.reward.type=general or proxy"
+            problem, remedy = "there is no world model to refresh", "choose `env.type` world_model"
+        elif env.reward.type == "embedding":
+            problem = (
+                "an embedding reward reads the hidden state of one world model and means nothing to a "
+                "refreshed one"
             )
-        if self.simulator is None and self.dyna.dataset.roots is None:
-            raise ValueError(
-                f"{where}: give a simulator to record in (--real_env.type=wmrl_maniskill), or datasets "
-                "recorded elsewhere (--dyna.dataset.roots)"
+            remedy = "choose `env.reward.type` general or proxy"
+        elif self.simulator is None and self.dyna.dataset.roots is None:
+            problem = "there are no new episodes to learn from"
+            remedy = (
+                "give a simulator to record in (`real_env.type`, wmrl_maniskill), or datasets recorded "
+                "elsewhere (`dyna.dataset.roots`)"
             )
-        if not self.learnt(env).root:
-            raise ValueError(
-                f"{where}: give the dataset that the world model has learnt from, --dyna.learnt.root, for it "
-                "is not to forget it"
-            )
-
-
-def _at_least(least: int, name: str, value: int) -> None:
-    """ValueError below."""
-    if value < least:
-        raise ValueError(f"--{name}={value}: must be at least {least}")
+        elif not self.learnt(env).root:
+            problem = "the world model would forget what it was trained on"
+            remedy = "give that dataset, `dyna.learnt.root`"
+        if problem and remedy:
+            raise FieldError("dyna.rounds", self.dyna.rounds, problem, remedy)

@@ -1,8 +1,8 @@
-"""Dyna rounds (Sutton 1991): the world model learns what the policy does by now, and training goes on in it.
+"""Dyna rounds (Sutton 1991): train the world model further on what the policy does by then.
 
-A round records the policy in ManiSkill, as it is and noisy, or takes what was recorded elsewhere, and
-trains the world model further on that and on what it has learnt from. Both are commands of the package, so a
-round that was killed goes on where it was.
+A round records the policy in ManiSkill, with and without noise, or takes a dataset recorded elsewhere, and
+trains the world model on that and on its first dataset. Both are commands of the package, so that a round
+that was killed continues where it was.
 """
 
 from collections.abc import Mapping
@@ -18,34 +18,37 @@ from lerobot_wmrl.common.subcommand import run_subcommand
 from lerobot_wmrl.data.dataset_source import DatasetSource
 from lerobot_wmrl.data.episode_table import open_dataset
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
-from lerobot_wmrl.rl.callbacks import REAL_STEPS, Record, record_folder
+from lerobot_wmrl.rl.callbacks import REAL_STEPS, Record, RolloutRecorder, record_folder
 from lerobot_wmrl.rl.configuration_callbacks import DYNA_SEEDS, DynaConfig
 from lerobot_wmrl.rl.policy_gradient import TrainingStopped
-from lerobot_wmrl.rl.recording import RolloutRecorder
 from lerobot_wmrl.world_models.checkpoint import load_model
 
-MANNERS: Final = {"calm": 0.0, "noisy": 0.4}
-"""How the policy acts while it is recorded: exploration. A policy that is only ever seen noisy is
-believed when it fails calmly."""
+NOISE_LEVELS: Final = {"calm": 0.0, "noisy": 0.4}
+"""Exploration of the recorded policy, by the name of the recording. A world model that has only seen a policy
+with noise calls its failures without noise successes."""
+
+LEARNING_RATE: Final = 3e-4
+"""Peak learning rate of a round, below that of a training from nothing."""
 
 WORLD_MODEL = "action_world_model"
 
 
 def round_iterations(rounds: int, iterations: int) -> list[int]:
-    """After which iterations there is a round: evenly spread, none at either end."""
+    """Return the iterations after which there is a round: evenly spread, none at either end."""
     return [round(iterations * number / (rounds + 1)) for number in range(1, rounds + 1)]
 
 
 @dataclass
 class DynaRounds:
-    """Refreshes the world model of `env` after some of the iterations.
+    """Trains the world model of `env` further after some of the iterations.
 
     Args:
         config: how much to record and to train.
-        env: the imagination that the policy is trained in.
-        recorder: of the policy; None where `config.dataset.roots` are taken.
-        learnt: the dataset that the world model has learnt from.
-        output_dir: of the training; total: its iterations.
+        env: the world model as the environment of the training.
+        recorder: records the policy; None where `config.dataset.roots` are taken.
+        learnt: the dataset that the world model was trained on.
+        output_dir: of the training.
+        total: iterations of the training.
     """
 
     config: DynaConfig
@@ -60,10 +63,11 @@ class DynaRounds:
         self.iterations = round_iterations(self.config.rounds, self.total)
 
     def due(self, iteration: int) -> bool:
+        """Return whether there is a round after so many iterations."""
         return iteration in self.iterations
 
     def run(self, iteration: int, checkpoint: Path, folder: Path) -> Record:
-        """A new world model in `folder`, and the steps in reality that it took."""
+        """Train a new world model in `folder`; return the recorded episodes and their steps."""
         new = self._new_datasets(iteration, checkpoint, folder)
         self._train(iteration, [*self._earlier(iteration), *map(str, new)], folder / WORLD_MODEL)
         metas = [open_dataset(root).meta for root in new]
@@ -78,41 +82,42 @@ class DynaRounds:
         self.env.adopt(model)
 
     def _new_datasets(self, iteration: int, checkpoint: Path, folder: Path) -> list[Path]:
-        """What this round adds. TrainingStopped if it has to be recorded elsewhere first."""
+        """Return the datasets of this round. TrainingStopped if one has to be recorded elsewhere first."""
         number, given = self.iterations.index(iteration), self.config.dataset.roots or []
         if self.recorder is not None:
-            return [self._record(manner, number, checkpoint, folder) for manner in MANNERS]
+            return [self._record(self.recorder, name, number, checkpoint, folder) for name in NOISE_LEVELS]
         if number < len(given):
             return [Path(given[number])]
         raise TrainingStopped(
             f"Dyna round {number + 1} of {len(self.iterations)}, after iteration {iteration}: record what "
             f"the policy in {checkpoint / PRETRAINED_MODEL_DIR} does, add the dataset to "
-            f"--dyna.dataset.roots ({len(given)} there now), and repeat the command: it goes on from here"
+            f"`dyna.dataset.roots` ({len(given)} there now), and repeat the command: it continues from here"
         )
 
-    def _record(self, manner: str, number: int, checkpoint: Path, folder: Path) -> Path:
-        assert self.recorder is not None
-        place, every = list(MANNERS).index(manner), self.config.n_episodes
+    def _record(
+        self, recorder: RolloutRecorder, noise: str, number: int, checkpoint: Path, folder: Path
+    ) -> Path:
+        place, every = list(NOISE_LEVELS).index(noise), self.config.n_episodes
         first = EVALUATION_SEED - DYNA_SEEDS + number * every + place * (every // 2)
-        self.recorder.record(checkpoint, (every + place) // 2, first, folder / manner, MANNERS[manner])
-        return folder / manner
+        recorder.record(checkpoint, (every + place) // 2, first, folder / noise, NOISE_LEVELS[noise])
+        return folder / noise
 
     def _earlier(self, iteration: int) -> list[str]:
-        """What earlier rounds have added."""
+        """Return the datasets of earlier rounds."""
         rounds = [number for number, at in enumerate(self.iterations) if at < iteration]
         if self.recorder is None:
             return [(self.config.dataset.roots or [])[number] for number in rounds]
         folders = [self._folder(self.iterations[number]) for number in rounds]
-        return [str(folder / manner) for folder in folders for manner in MANNERS]
+        return [str(folder / noise) for folder in folders for noise in NOISE_LEVELS]
 
     def _train(self, iteration: int, more: list[str], output_dir: Path) -> None:
-        """Of the datasets in `more` every second step's batch, of the old one the others."""
+        """Train on the datasets in `more` in every second step, and on the first dataset in the others."""
         number, before = self.iterations.index(iteration), self.env.config.world_model_path
         if number:
             before = str(self._world_model(self.iterations[number - 1]))
         flags: Flags = {
             "model.path": before, "model.device": self.env.device.type, "dataset.root": self.learnt.root,
-            "dataset.more": str(more), "model.learning_rate": self.config.learning_rate,
+            "dataset.more": str(more), "model.learning_rate": LEARNING_RATE,
             "steps": self.config.steps, "batch_size": self.config.batch_size,
             "save_freq": max(1, self.config.steps // 4), "seed": number, "output_dir": str(output_dir),
             **({"dataset.repo_id": self.learnt.repo_id} if self.learnt.repo_id else {}),
@@ -123,5 +128,5 @@ class DynaRounds:
         return record_folder(self.output_dir, self.name, iteration, self.total)
 
     def _world_model(self, iteration: int) -> Path:
-        """Of the round after this iteration."""
+        """Return the folder of the world model of the round after this iteration."""
         return self._folder(iteration) / WORLD_MODEL

@@ -1,7 +1,7 @@
-"""May a policy be trained in this world model? Of real failures, how many does it call successes?
+"""The gate: whether the world model calls too many failures successes for a policy to be trained in it.
 
-The gate of `world_models.evaluation.gate`, at the done threshold and the number of frames of the environment
-itself, asked before the first update and again while the policy changes.
+It replays recorded episodes open loop (`evaluation.gate`) and judges them at the environment's own done
+threshold and number of frames, before the first update and again while the policy changes.
 """
 
 import logging
@@ -19,34 +19,33 @@ from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.evaluation.gate import Gate, Outcomes, gate_at, labelled_recording, predict_outcomes
 from lerobot_wmrl.evaluation.pictures import save_strip, side_by_side
 from lerobot_wmrl.evaluation.replay import Recording, replay_episodes
-from lerobot_wmrl.rl.callbacks import REAL_STEPS, Record
+from lerobot_wmrl.rl.callbacks import REAL_STEPS, Record, RolloutRecorder
 from lerobot_wmrl.rl.configuration_callbacks import GateConfig
 from lerobot_wmrl.rl.policy_gradient import TrainingStopped
-from lerobot_wmrl.rl.recording import RolloutRecorder
 
 SEEDS = 1_000_000
-"""From GATE_SEED on."""
+"""Number of seeds from GATE_SEED on."""
 
 LABELLED, FRESH = "labelled", "fresh"
-"""Where the rollouts come from: a dataset that was there before, or this policy just now."""
+"""Sources of rollouts: a dataset that was there before, or this policy just now."""
 
 REMEDIES = (
     "A policy trained here learns what only looks like success. Record more near misses and train the world "
-    "model again, let Dyna rounds do so (--dyna.rounds), take another checkpoint of it, or judge success "
-    "more strictly (--env.done_threshold, --env.done_frames)"
+    "model again, let Dyna rounds do so (`dyna.rounds`), take another checkpoint of it, or judge success "
+    "more strictly (`env.done_threshold`, `env.done_frames`)"
 )
 
 
 @dataclass
 class SuccessGate:
-    """Asks at intervals.
+    """Counts the world model's false positives at intervals.
 
     Args:
-        config: what to ask, when, and what follows.
-        env: the imagination in question.
-        recorder: of fresh rollouts; None without a simulator.
+        config: when to check, and what follows.
+        env: the world model as the environment of the training.
+        recorder: records fresh rollouts; None without a simulator.
         refreshed: iterations after which the world model is another one.
-        total: of the training.
+        total: iterations of the training.
     """
 
     config: GateConfig
@@ -57,26 +56,26 @@ class SuccessGate:
     name: str = "gate"
 
     def due(self, iteration: int) -> bool:
-        """Before an update in a new world model, and every `freq` iterations if there are fresh rollouts."""
+        """Return whether to check: in a new world model, and every `freq` iterations with fresh rollouts."""
         if iteration >= self.total:
             return False
         again = self.recorder is not None and self.config.freq and iteration % self.config.freq == 0
         return self._new_model(iteration) or bool(again)
 
     def run(self, iteration: int, checkpoint: Path, folder: Path) -> Record:
-        """Each verdict as of lerobot-wmrl-eval-world-model, and a warning if one is not as it should be."""
-        asked: dict[str, Recording] = {}
+        """Return a verdict for each source of rollouts, and a warning if one is bad or there is none."""
+        sources: dict[str, Recording] = {}
         if self.config.dataset.root and self._new_model(iteration):
-            asked[LABELLED] = labelled_recording(self.env.model, self.config.dataset.root)
+            sources[LABELLED] = labelled_recording(self.env.model, self.config.dataset.root)
         if self.recorder is not None:
-            asked[FRESH] = self._fresh(self.recorder, iteration, checkpoint, folder / "rollouts")
+            sources[FRESH] = self._fresh(self.recorder, iteration, checkpoint, folder / "rollouts")
         verdicts = {}
-        for place, source in asked.items():
+        for place, source in sources.items():
             outcomes = predict_outcomes(self.env.model, source)
             verdicts[place] = gate_at(outcomes, self.env.config.done_threshold, self.env.config.done_frames)
             save_strips(self.env, source, outcomes, folder, place)
         shutil.rmtree(folder / "rollouts.cache", ignore_errors=True)
-        steps = int(asked[FRESH].table.length.sum()) if FRESH in asked else 0
+        steps = int(sources[FRESH].table.length.sum()) if FRESH in sources else 0
         return {
             **{place: verdict.as_json() for place, verdict in verdicts.items()},
             "failed": any(self._above(verdict) for verdict in verdicts.values()),
@@ -85,10 +84,10 @@ class SuccessGate:
         }
 
     def apply(self, records: Mapping[int, Record]) -> None:
-        """TrainingStopped, or a warning in red, if the last answer was a bad one."""
+        """Warn in red, or raise TrainingStopped, if the latest verdict is bad."""
         latest = records[max(records)]
         if latest["failed"] and self.config.action == "stop":
-            raise TrainingStopped(f"{latest['warning']}; or train nonetheless with --gate.action=warn")
+            raise TrainingStopped(f"{latest['warning']}; or train nonetheless with `gate.action` warn")
         if latest["warning"]:
             logging.warning(colored(latest["warning"], "red", attrs=["bold"]))
 
@@ -96,7 +95,7 @@ class SuccessGate:
         return iteration == 0 or iteration in self.refreshed
 
     def _fresh(self, recorder: RolloutRecorder, iteration: int, checkpoint: Path, folder: Path) -> Recording:
-        """Rollouts of the policy as it is, from seeds that no earlier ones had."""
+        """Record the current policy, from seeds that no earlier rollouts had."""
         episodes = self.config.n_episodes
         first = GATE_SEED + iteration * episodes % (SEEDS - episodes)
         recorder.record(checkpoint, episodes, first, folder)
@@ -106,19 +105,19 @@ class SuccessGate:
         return verdict.false_positives.share > self.config.limit
 
     def _warning(self, iteration: int, verdicts: Mapping[str, Gate]) -> str | None:
-        """What is wrong, in plain words, if anything is."""
+        """Return what is wrong with the verdicts, if anything is."""
         failed = {place: verdict for place, verdict in verdicts.items() if self._above(verdict)}
         if failed:
             told = " and ".join(f"{v.false_positives} of {place} rollouts" for place, v in failed.items())
             return (
-                f"Gate, iteration {iteration}: the world model calls real failures successes, {told}, above "
-                f"--gate.limit={self.config.limit}. {REMEDIES}"
+                f"Gate, iteration {iteration}: the world model calls failures successes, {told}, above "
+                f"`gate.limit` ({self.config.limit}). {REMEDIES}"
             )
         if not verdicts:
             return (
-                "Gate: nobody has asked how many real failures this world model calls successes. What it "
-                "imagines may be wrong; give labelled rollouts (--gate.dataset.root) or a simulator "
-                "(--real_env.type=wmrl_maniskill)"
+                "Gate: nothing says how many failures this world model calls successes, so what it imagines "
+                "may be wrong; give labelled rollouts (`gate.dataset.root`) or a simulator "
+                "(`real_env.type`, wmrl_maniskill)"
             )
         if not any(verdict.false_positives.n for verdict in verdicts.values()):
             return f"Gate, iteration {iteration}: no rollout failed, so they say nothing of the world model"
@@ -128,12 +127,12 @@ class SuccessGate:
 def save_strips(
     env: WorldModelVectorEnv, source: Recording, outcomes: Outcomes, folder: Path, place: str
 ) -> None:
-    """Two short episodes as they happened, above, and as they are imagined, below: a success and a failure,
-    one that the model believes in if there is one."""
+    """Draw two short episodes as recorded, above, and as imagined, below: a success and a failure, which is a
+    false positive if there is one."""
     folder.mkdir(parents=True, exist_ok=True)
-    called = outcomes.first_predicted_success(env.config.done_threshold, env.config.done_frames) >= 0
-    believed = called & ~outcomes.success
-    failures = believed if believed.any() else ~outcomes.success
+    predicted = outcomes.first_predicted_success(env.config.done_threshold, env.config.done_frames) >= 0
+    false_positives = predicted & ~outcomes.success
+    failures = false_positives if false_positives.any() else ~outcomes.success
     for name, rows in {"success": outcomes.success, "failure": failures}.items():
         if rows.any():
             episodes = outcomes.episodes[rows]

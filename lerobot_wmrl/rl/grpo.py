@@ -4,18 +4,30 @@ import torch
 from torch import Tensor, nn
 
 from lerobot_wmrl.common.distributed import mean_over_processes
-from lerobot_wmrl.rl.advantages import group_advantages
-from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
-from lerobot_wmrl.rl.minibatches import Steps
-from lerobot_wmrl.rl.policy_gradient import PolicyGradient
+from lerobot_wmrl.rl.configuration_algorithms import GRPOConfig
+from lerobot_wmrl.rl.policy_gradient import Batch, PolicyGradient
 from lerobot_wmrl.rl.rollout import RolloutBuffer
 
 
-class GRPO(PolicyGradient):
-    """A decision's advantage is its whole episode's, among the group's episodes from the same start.
+def group_advantages(returns: Tensor, least_std: float) -> tuple[Tensor, Tensor]:
+    """Return (R − mean) / std within each group (Shao et al. 2024, section 4.1.2), and which have a signal.
 
-    Each environment's first episode counts: later ones of a rollout begin elsewhere.
+    Args:
+        returns: of each episode, (B / G, G).
+        least_std: groups whose returns have a smaller standard deviation have no signal.
+
+    Returns:
+        Advantages (B / G, G), 0 in groups without a signal, and the signal (B / G,) bool.
     """
+    deviation = returns - returns.mean(dim=1, keepdim=True)
+    std = deviation.square().mean(dim=1, keepdim=True).sqrt()  # (B / G, 1)
+    signal = std >= least_std
+    return torch.where(signal, deviation / std.clamp_min(1e-8), 0), signal[:, 0]
+
+
+class GRPO(PolicyGradient):
+    """Every decision has its episode's advantage: the return compared with the group's episodes, which start
+    from the same state. Only the first episode of each environment counts; later ones start elsewhere."""
 
     config_class = GRPOConfig
     name = "grpo"
@@ -23,28 +35,31 @@ class GRPO(PolicyGradient):
 
     @property
     def group_size(self) -> int:
+        """Neighbouring environments that start from the same state."""
         return self.config.group_size
 
     def parameter_groups(self) -> dict[str, tuple[list[nn.Parameter], float]]:
+        """Return the policy alone."""
         return {"policy": (self.policy_parameters, self.config.policy_lr)}
 
     @torch.no_grad()
-    def add_targets(self, buffer: RolloutBuffer) -> tuple[Tensor, dict[str, float]]:
-        """Advantages within groups; only those with a signal are trained on."""
-        returns = (buffer.reward * buffer.first_episode).sum(dim=0)
+    def add_targets(self, rollout: RolloutBuffer) -> tuple[Tensor, dict[str, float]]:
+        """Add advantages within groups. Decisions of groups with a signal are trained on."""
+        returns = (rollout.reward * rollout.first_episode).sum(dim=0)  # (B,)
         advantages, signal = group_advantages(
             returns.view(-1, self.config.group_size), self.config.least_group_std
         )
-        buffer.columns = {"advantage": advantages.flatten().expand(buffer.steps, -1)}
-        learnt_from = signal.repeat_interleave(self.config.group_size)
-        chosen = buffer.decided & buffer.first_episode & learnt_from
-        numbers = {
+        rollout.columns = {"advantage": advantages.flatten().expand(rollout.steps, -1)}  # (T, B)
+        with_signal = signal.repeat_interleave(self.config.group_size)  # (B,)
+        chosen = rollout.decided & rollout.first_episode & with_signal
+        metrics = {
             "return": returns.mean().item(),
             "groups_with_signal": signal.float().mean().item(),
             "decisions": chosen.float().mean().item(),
         }
-        return chosen, mean_over_processes(numbers, buffer.device)
+        return chosen, mean_over_processes(metrics, rollout.device)
 
-    def losses(self, batch: Steps) -> tuple[Tensor, dict[str, Tensor]]:
-        found = self.evaluate(batch)
-        return self.policy_losses(found, batch, self.config.clip_low, self.config.clip_high)
+    def losses(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the clipped objective with its penalty."""
+        loss, record, _ = self.policy_losses(batch, self.config.clip_low, self.config.clip_high)
+        return loss, record

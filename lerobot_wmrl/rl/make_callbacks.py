@@ -1,4 +1,4 @@
-"""The callbacks that a training's settings ask for."""
+"""Callbacks made from a training's configuration."""
 
 import logging
 from functools import partial
@@ -11,16 +11,15 @@ from lerobot_wmrl.common.constants import SELECTION_SEED
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv, make_success_env
 from lerobot_wmrl.evaluation.agreement import evaluate_policy, evaluate_within
-from lerobot_wmrl.rl.callbacks import Callback
+from lerobot_wmrl.rl.callbacks import Callback, RolloutRecorder
 from lerobot_wmrl.rl.configuration_callbacks import CallbackSettings
 from lerobot_wmrl.rl.dyna import DynaRounds, round_iterations
 from lerobot_wmrl.rl.gate import SuccessGate
-from lerobot_wmrl.rl.recording import RolloutRecorder
 from lerobot_wmrl.rl.selection import IMAGINED, REAL, Measure, Selection
 
 
 class Trained(NamedTuple):
-    """What is trained, and where: a policy with its processors, in `env`, made from `config`."""
+    """A policy with its processors, and the environment that it is trained in, made from `config`."""
 
     policy: Any
     processors: tuple[Any, Any]
@@ -31,7 +30,7 @@ class Trained(NamedTuple):
 def make_callbacks(
     settings: CallbackSettings, trained: Trained, output_dir: Path, iterations: int
 ) -> list[Callback]:
-    """In the order in which they run: what renews the world model, what judges it, what judges policies."""
+    """Return the callbacks in the order in which they run: Dyna rounds, gate, selection."""
     callbacks: list[Callback] = []
     if isinstance(trained.env, WorldModelVectorEnv):
         recorder = make_recorder(settings, trained.env)
@@ -50,7 +49,7 @@ def make_callbacks(
 
 
 def make_recorder(settings: CallbackSettings, env: WorldModelVectorEnv) -> RolloutRecorder | None:
-    """Records what the policy sees and what the world model looks at; None without a simulator."""
+    """Return a recorder of the cameras that policy and world model need; None without a simulator."""
     simulator, model = settings.simulator, env.model.config
     if simulator is None:
         return None
@@ -59,8 +58,8 @@ def make_recorder(settings: CallbackSettings, env: WorldModelVectorEnv) -> Rollo
 
 
 def make_measures(settings: CallbackSettings, trained: Trained) -> dict[str, Measure]:
-    """Success where it can be measured: in `real_env`, and in the training's environment, which is imagined
-    or, being a simulator, as real as it gets."""
+    """Return how success is measured: in `real_env` and in imagination, or, for a training that is not in a
+    world model, in its own environment."""
     policy, processors, env, config = trained
     episodes, dataset = settings.selection.n_episodes, settings.selection.dataset
     measures: dict[str, Measure] = {}
@@ -82,7 +81,7 @@ def make_measures(settings: CallbackSettings, trained: Trained) -> dict[str, Mea
         measures[REAL] = within
     if REAL not in measures:
         logging.warning(
-            "selection: without --real_env.type the best checkpoint is the one that succeeds most often in "
-            "imagination; nothing real is measured"
+            "selection: without `real_env` the best checkpoint is the one that succeeds most often in "
+            "imagination, which is not checked outside the world model"
         )
     return measures

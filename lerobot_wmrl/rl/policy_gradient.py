@@ -1,7 +1,7 @@
-"""What PPO and GRPO share: descent on a clipped objective, near the policy as it was given.
+"""What PPO and GRPO share: minibatches, the clipped objective, the KL penalty and the update.
 
-B decisions, K action components. Under `torchrun` every process has its own environments, and all take the
-steps that one process with all of them would take.
+T time, B environments or decisions, K action components, J ratios of a decision. In several processes each
+one cuts minibatches from its own rollout, and gradients and metrics are averaged over all of them.
 """
 
 import copy
@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from lerobot.rl.algorithms.base import RLAlgorithm
 from lerobot.rl.algorithms.configs import TrainingStats
 from torch import Tensor, nn
@@ -18,63 +19,133 @@ from torch.optim import AdamW, Optimizer
 
 from lerobot_wmrl.common.adapters import load_trained_weights
 from lerobot_wmrl.common.distributed import (
+    average_gradients,
+    gather_counts,
     largest_over_processes,
     mean_and_variance,
-    sum_gradients,
-    sum_over_processes,
+    mean_over_processes,
 )
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.precision import require_exact_updates
-from lerobot_wmrl.rl.configuration_policy_gradient import PolicyGradientConfig
-from lerobot_wmrl.rl.minibatches import Minibatch, Steps, make_minibatches, read_steps
-from lerobot_wmrl.rl.objectives import (
-    clipped_objective,
-    kl_estimate,
-    log_ratios,
-    outside_clip,
-    reference_penalty,
-)
+from lerobot_wmrl.rl.configuration_algorithms import PolicyGradientConfig
+from lerobot_wmrl.rl.policy_adapters import as_stochastic
 from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer
-from lerobot_wmrl.rl.stochastic_policies import stochastic
 
-REFERENCE, EXECUTED = "reference_log_prob", "executed"
+GRAD_CLIP_NORM = 1.0
+"""Largest gradient norm, of the policy's parameters and of the value's separately."""
+
+REFERENCE, EXECUTED, RATIO_ERROR = "reference_log_prob", "executed", "ratio_error"
 LOSS, NORM = "_loss", "_grad_norm"
+
+Batch = dict[str, Any]
+"""B decisions: `observation`, `raw_action`, `log_prob` and the buffer's columns."""
 
 
 class TrainingStopped(ValueError):
     """Training cannot go on; the last checkpoint is good."""
 
 
-class Evaluated(NamedTuple):
-    """What a policy says of decisions: log-probs (B, K) now, when sampled and of the reference, 0 where a
-    component was not acted; entropies (B,) and values (B,)."""
+def log_ratios(log_prob_change: Tensor, kind: str) -> Tensor:
+    """Return log-ratios of whole actions (B, 1) or of each token (B, K) from the components' (B, K)."""
+    return log_prob_change if kind == "token" else log_prob_change.sum(dim=1, keepdim=True)
 
-    log_prob: Tensor
-    old: Tensor
-    reference: Tensor
-    entropy: Tensor
-    value: Tensor
+
+def clipped_objective(log_ratio: Tensor, advantage: Tensor, low: float, high: float) -> Tensor:
+    """Return −min(r A, clip(r, 1 − low, 1 + high) A), r = exp(log_ratio) (Schulman et al. 2017, eq. 7).
+
+    (B, J), (B,) → (B, J)
+    """
+    ratio, advantage = log_ratio.exp(), advantage[:, None]
+    return -torch.minimum(ratio * advantage, ratio.clamp(1 - low, 1 + high) * advantage)
+
+
+def outside_clip(log_ratio: Tensor, low: float, high: float) -> Tensor:
+    """Return 1 where a ratio has left the interval in which it may move. (B, J) → (B, J)"""
+    ratio = log_ratio.exp()
+    return ((ratio < 1 - low) | (ratio > 1 + high)).to(ratio.dtype)
+
+
+def kl_estimate(log_prob: Tensor, other: Tensor) -> Tensor:
+    """Estimate KL(sampling ‖ other) by r − 1 − log r, r = other / sampling (Schulman 2020). (B, K) → (B,)"""
+    log_ratio = (other - log_prob).sum(dim=1)
+    return log_ratio.exp() - 1 - log_ratio
+
+
+def reference_penalty(log_prob: Tensor, reference: Tensor) -> Tensor:
+    """Return ½ (log π − log π_ref)², whose gradient on π's samples is that of KL(π ‖ π_ref). (B, K) → (B,)"""
+    return 0.5 * (log_prob - reference).square().sum(dim=1)
+
+
+def read_batch(rollout: RolloutBuffer, rows: Tensor, pipeline: Pipeline) -> Batch:
+    """Return the steps of flat rows t · B + b (N,), which are on the CPU."""
+    moved = rows.to(rollout.device)
+    stored = {"raw_action": rollout.raw_action, "log_prob": rollout.log_prob, **rollout.columns}
+    taken = {name: values.flatten(0, 1)[moved] for name, values in stored.items()}
+    return {"observation": pipeline.prepare(rollout.observations.read(rows)), **taken}
+
+
+class Minibatch(NamedTuple):
+    """One optimiser step's decisions: their mean number over the processes, and the passes through the policy
+    that they are cut into, each with the number of decisions that count."""
+
+    size: float
+    passes: Iterator[tuple[int, Batch]]
+
+
+class Minibatches:
+    """Every chosen step of a rollout once an epoch, in random order.
+
+    All processes get equally many minibatches and passes, also where they have chosen different numbers of
+    steps, so that gradients can be averaged and large models be sharded.
+    """
+
+    def __init__(
+        self, rollout: RolloutBuffer, chosen: Tensor, pipeline: Pipeline, config: PolicyGradientConfig
+    ) -> None:
+        self.rollout, self.pipeline, self.config = rollout, pipeline, config
+        self.rows = chosen.flatten().nonzero()[:, 0].cpu()  # (T, B) bool → (N,)
+        self.counts = gather_counts(len(self.rows), rollout.device)
+
+    def __len__(self) -> int:
+        return self.config.epochs * math.ceil(max(self.counts) / self.config.minibatch_size)
+
+    def __iter__(self) -> Iterator[Minibatch]:
+        size = self.config.minibatch_size
+        for _ in range(self.config.epochs if max(self.counts) else 0):
+            order = self.rows[torch.randperm(len(self.rows))]
+            for first in range(0, max(self.counts), size):
+                shares = [min(max(count - first, 0), size) for count in self.counts]
+                passes = math.ceil(max(shares) / (self.config.micro_batch_size or size))
+                cut = order[first : first + size].tensor_split(passes)
+                yield Minibatch(sum(shares) / len(shares), (self._read(rows) for rows in cut))
+
+    def _read(self, rows: Tensor) -> tuple[int, Batch]:
+        """Return the rows' number and batch; for none a row that does not count, to pass the policy too."""
+        return len(rows), read_batch(self.rollout, rows if len(rows) else rows.new_zeros(1), self.pipeline)
 
 
 class PolicyGradient(RLAlgorithm):
-    """Improves a policy from rollouts. `iteration` counts the finished ones of `iterations`.
+    """Ascent on a clipped objective, with a KL penalty towards the SFT policy (the reference).
 
-    `policy` samples; it is the policy that was `given`, or that in its adapter.
+    `policy` samples: the policy that was given, or that policy in its adapter. `iteration` counts the
+    rollouts that were trained on. A training iteration is `prepare`, then `update`.
     """
 
     config: PolicyGradientConfig
 
-    def __init__(self, policy: Any, config: PolicyGradientConfig, iterations: int | None = None) -> None:
-        if config.lr_schedule != "constant" and iterations is None:
-            raise ValueError(f"algorithm.lr_schedule={config.lr_schedule}: needs the number of iterations")
-        self.given, self.policy = policy, stochastic(policy)
-        self.config, self.iterations, self.iteration = config, iterations, 0
+    def __init__(self, policy: Any, config: PolicyGradientConfig) -> None:
+        self.given, self.policy = policy, as_stochastic(policy)
+        self.config, self.iteration = config, 0
         if config.initial_std is not None:
             if not hasattr(self.policy, "set_std"):
-                raise ValueError("algorithm.initial_std: this policy has no standard deviation, leave it out")
+                raise FieldError(
+                    "algorithm.initial_std", config.initial_std,
+                    "this policy has no standard deviation", "leave it out",
+                )  # fmt: skip
             self.policy.set_std(config.initial_std)
         self.policy.eval()
-        self.reference = reference_of(self.policy)
+        self.reference = frozen_copy(self.policy)
         self.value_parameters = list(self.policy.value_parameters())
         owned = {id(parameter) for parameter in self.value_parameters}
         self.policy_parameters = [
@@ -85,132 +156,114 @@ class PolicyGradient(RLAlgorithm):
 
     @property
     def group_size(self) -> int:
-        """Neighbouring environments that begin alike."""
+        """Neighbouring environments that start from the same state."""
         return 1
 
     @abstractmethod
     def parameter_groups(self) -> dict[str, tuple[list[nn.Parameter], float]]:
-        """What is trained, by name, and its learning rate."""
+        """Return parameters and learning rates by name."""
+
+    def trained_groups(self) -> list[str]:
+        """Return the names of the parameter groups that this iteration trains."""
+        return list(self.parameter_groups())
 
     @abstractmethod
-    def add_targets(self, buffer: RolloutBuffer) -> tuple[Tensor, dict[str, float]]:
-        """Fill the columns that `losses` needs. → decisions to train on (T, B) bool, numbers to log"""
+    def add_targets(self, rollout: RolloutBuffer) -> tuple[Tensor, dict[str, float]]:
+        """Fill the columns that `losses` needs; return the decisions to train on (T, B) bool, and metrics."""
 
     @abstractmethod
-    def losses(self, batch: Steps) -> tuple[Tensor, dict[str, Tensor]]:
-        """Each decision's loss and its parts. → (B,), (B,) by name"""
+    def losses(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return each decision's loss (B,), and what is logged of it, (B,) by name."""
 
-    def make_optimizers_and_scheduler(self) -> dict[str, Optimizer]:
-        groups = [{"params": params, "lr": rate} for params, rate in self.parameter_groups().values()]
-        return {self.name: AdamW(groups, weight_decay=0.0)}
-
-    def get_optimizers(self) -> dict[str, Optimizer]:
-        return {self.name: self.optimizer}
-
-    def improve(self, buffer: RolloutBuffer, pipeline: Pipeline) -> TrainingStats:
-        """One iteration's updates from a filled buffer."""
-        config = self.config
-        chosen, numbers = self.add_targets(buffer)
-        numbers["reference_kl"] = self._add_reference(buffer, pipeline)
-        factor = schedule_factor(config.lr_schedule, self.iteration, self.iterations)
-        rates = [rate for _, rate in self.parameter_groups().values()]
-        for group, rate in zip(self.optimizer.param_groups, rates, strict=True):
-            group["lr"] = rate * factor
-        stats = self.update(
-            make_minibatches(
-                buffer, chosen, pipeline, config.minibatch_size, config.micro_batch_size, config.epochs
-            )
-        )
-        stats.extra = {**numbers, "policy_lr": config.policy_lr * factor, **stats.extra}
-        self.iteration += 1
-        return stats
-
-    @torch.no_grad()
-    def _add_reference(self, buffer: RolloutBuffer, pipeline: Pipeline) -> float:
-        """The reference's log-probs of what was done, and which steps of decisions were. → KL from it"""
-        reference = torch.zeros_like(buffer.log_prob)
-        executed = buffer.executed()
-        if executed is not None:
-            buffer.columns[EXECUTED] = executed
-        size = self.config.micro_batch_size or self.config.minibatch_size
-        for rows in buffer.decided.flatten().nonzero()[:, 0].cpu().split(size):
-            batch = read_steps(buffer, rows, pipeline)
-            log_prob = self.reference.evaluate(batch["observation"], batch["raw_action"])[0]
-            reference.flatten(0, 1)[rows.to(reference.device)] = log_prob
-        buffer.columns[REFERENCE] = reference
-        acted = 1.0 if executed is None else executed
-        flat = [(each * acted).flatten(0, 1).flatten(1) for each in (buffer.log_prob, reference)]
-        return mean_and_variance(kl_estimate(*flat)[buffer.decided.flatten()])[0].item()
+    def prepare(self, rollout: RolloutBuffer, pipeline: Pipeline) -> tuple[Minibatches, dict[str, float]]:
+        """Compute advantages and the reference's log-probabilities; return minibatches for `update`, and
+        metrics."""
+        chosen, metrics = self.add_targets(rollout)
+        metrics["reference_kl"] = self.add_reference(rollout, pipeline)
+        return Minibatches(rollout, chosen, pipeline, self.config), metrics
 
     def update(self, batch_iterator: Iterator[Minibatch]) -> TrainingStats:
-        """Descend on each minibatch until they end or the policy has moved by `target_kl`."""
+        """Take one optimiser step on each minibatch, until the policy has moved by `target_kl`."""
         records: list[dict[str, float]] = []
         first = self.optimization_step
-        for batch in batch_iterator:
-            record = self._accumulate(batch)
+        for minibatch in batch_iterator:
+            record = self.accumulate_gradient(minibatch)
             self._check(record)
             records.append(record)
             if record["kl"] > self.config.target_kl:
                 break
-            record |= self._descend()
-        return summary(records, self.optimization_step - first)
+            record |= self.optimizer_step()
+        self.iteration += 1
+        return training_stats(records, self.optimization_step - first)
 
-    def _accumulate(self, batch: Minibatch) -> dict[str, float]:
-        """The gradient of a minibatch's mean loss, pass by pass. → the means of its parts"""
+    def accumulate_gradient(self, minibatch: Minibatch) -> dict[str, float]:
+        """Add up the gradient of a minibatch's mean loss, pass by pass, and return its metrics."""
         self.optimizer.zero_grad()
         parts: list[dict[str, Tensor]] = []
-        for steps in batch.passes:
-            loss, record = self.losses(steps)
-            (loss * steps["weight"]).sum().div(batch.size).backward()
-            parts.append({name: (value.detach() * steps["weight"]) for name, value in record.items()})
-        names = [name for name in parts[0] if name != "ratio_error"]
-        sums = torch.stack([torch.cat([part[name] for part in parts]).sum() for name in names])
-        means = sum_over_processes(sums).div(batch.size)
-        furthest = largest_over_processes(torch.stack([part["ratio_error"].max() for part in parts]).max())
-        return dict(zip([*names, "ratio_error"], [*means.tolist(), furthest.item()], strict=True))
-
-    def evaluate(self, batch: Steps) -> Evaluated:
-        """The policy on what was done."""
-        log_prob, entropy, value = self.policy.evaluate(batch["observation"], batch["raw_action"])
-        acted = batch.get(EXECUTED, 1.0)
-        now, old, reference = (
-            (each * acted).flatten(1) for each in (log_prob, batch["log_prob"], batch[REFERENCE])
-        )
-        return Evaluated(now, old, reference, entropy, value)
+        for count, batch in minibatch.passes:
+            loss, record = self.losses(batch)  # (B,), (B,) by name
+            loss[:count].sum().div(minibatch.size).backward()
+            parts.append({name: value.detach()[:count] for name, value in record.items()})
+        joined = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+        furthest = F.pad(joined.pop(RATIO_ERROR), (0, 1)).max()  # 0 where no decision counts
+        means = torch.stack([value.sum() for value in joined.values()]).div(minibatch.size)
+        metrics = mean_over_processes(dict(zip(joined, means.tolist(), strict=True)), means.device)
+        return {**metrics, RATIO_ERROR: largest_over_processes(furthest).item()}
 
     def policy_losses(
-        self, found: Evaluated, batch: Steps, low: float, high: float
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """The policy's loss of each decision, clipped at 1 − low and 1 + high, and its parts."""
-        config = self.config
-        log_ratio = log_ratios(found.log_prob - found.old, config.ratio)
+        self, batch: Batch, low: float, high: float
+    ) -> tuple[Tensor, dict[str, Tensor], Tensor]:
+        """Return the loss of each decision, clipped at 1 − low and 1 + high, what is logged of it, and the
+        value. All (B,)"""
+        log_prob, entropy, value = self.policy.evaluate(batch["observation"], batch["raw_action"])
+        executed = batch.get(EXECUTED, 1.0)  # (B, n, 1): the other steps of a chunk count nothing
+        now, old, reference = (
+            (each * executed).flatten(1) for each in (log_prob, batch["log_prob"], batch[REFERENCE])
+        )  # (B, K), or (B, n · K)
+        log_ratio = log_ratios(now - old, self.config.ratio)  # (B, J)
         record = {
             "policy_loss": clipped_objective(log_ratio, batch["advantage"], low, high).mean(dim=1),
-            "kl": kl_estimate(found.old, found.log_prob),
-            "reference_kl": kl_estimate(found.log_prob, found.reference),
-            "entropy": found.entropy,
+            "kl": kl_estimate(old, now),
+            "reference_kl": kl_estimate(now, reference),
+            "entropy": entropy,
             "clip_fraction": outside_clip(log_ratio, low, high).mean(dim=1),
-            "ratio_error": (log_ratio.exp() - 1).abs().amax(dim=1),
+            RATIO_ERROR: (log_ratio.exp() - 1).abs().amax(dim=1),
         }
-        penalty = config.reference_coefficient * reference_penalty(found.log_prob, found.reference)
-        loss = record["policy_loss"] + penalty - config.entropy_coefficient * found.entropy
-        return loss, record
+        penalty = self.config.reference_coefficient * reference_penalty(now, reference)
+        return record["policy_loss"] + penalty, record, value
 
-    def trained(self) -> list[str]:
-        """Names of the parameter groups that this iteration trains."""
-        return list(self.parameter_groups())
+    @torch.no_grad()
+    def add_reference(self, rollout: RolloutBuffer, pipeline: Pipeline) -> float:
+        """Add the reference's log-probabilities of what was done, and which steps of chunks were executed.
+        Return the mean KL of the policy to the reference."""
+        reference = torch.zeros_like(rollout.log_prob)
+        executed = rollout.executed()
+        if executed is not None:
+            rollout.columns[EXECUTED] = executed
+        size = self.config.micro_batch_size or self.config.minibatch_size
+        for rows in rollout.decided.flatten().nonzero()[:, 0].cpu().split(size):
+            batch = read_batch(rollout, rows, pipeline)
+            log_prob = self.reference.evaluate(batch["observation"], batch["raw_action"])[0]
+            reference.flatten(0, 1)[rows.to(reference.device)] = log_prob
+        rollout.columns[REFERENCE] = reference
+        counted = 1.0 if executed is None else executed
+        flat = [(each * counted).flatten(0, 1).flatten(1) for each in (rollout.log_prob, reference)]
+        return mean_and_variance(kl_estimate(*flat)[rollout.decided.flatten()])[0].item()
 
-    def _descend(self) -> dict[str, float]:
-        """One step along the gradients, those of each group clipped. → their norms. TrainingStopped before it
-        if they are not finite."""
-        trained, clipped = self.trained(), {}
+    def optimizer_step(self) -> dict[str, float]:
+        """Clip the gradients of each group, step, and return their norms.
+
+        Raises:
+            TrainingStopped: a gradient is not finite; no weights have changed.
+        """
+        trained, clipped = self.trained_groups(), {}
         for name, (parameters, _) in self.parameter_groups().items():
             if name not in trained:
                 for parameter in parameters:
                     parameter.grad = None
                 continue
-            sum_gradients(parameters)
-            clipped[name + NORM] = nn.utils.clip_grad_norm_(parameters, self.config.grad_clip_norm)
+            average_gradients(parameters)
+            clipped[name + NORM] = nn.utils.clip_grad_norm_(parameters, GRAD_CLIP_NORM)
         norms = {name: norm.item() for name, norm in clipped.items()}
         self._check_finite(norms)
         self.optimizer.step()
@@ -222,29 +275,40 @@ class PolicyGradient(RLAlgorithm):
         if broken:
             raise TrainingStopped(
                 f"iteration {self.iteration + 1}: {', '.join(broken)} is not finite; the last checkpoint is "
-                "kept: lower algorithm.policy_lr or algorithm.value_lr"
+                "kept: lower `algorithm.policy_lr` or `algorithm.value_lr`"
             )
 
     def _check(self, record: dict[str, float]) -> None:
-        """TrainingStopped before a step that would spoil the policy."""
+        """Raise TrainingStopped before a step that would spoil the policy."""
         self._check_finite(record)
         if record["reference_kl"] > self.config.max_reference_kl:
             raise TrainingStopped(
-                f"iteration {self.iteration + 1}: the policy is {record['reference_kl']:.1f} nats "
-                f"from the cloned one, above algorithm.max_reference_kl={self.config.max_reference_kl}; "
-                "raise algorithm.reference_coefficient or lower algorithm.policy_lr"
+                f"iteration {self.iteration + 1}: the policy is {record['reference_kl']:.1f} nats from the "
+                f"SFT policy, above `algorithm.max_reference_kl` ({self.config.max_reference_kl}); raise "
+                "`algorithm.reference_coefficient` or lower `algorithm.policy_lr`"
             )
 
+    def make_optimizers_and_scheduler(self) -> dict[str, Optimizer]:
+        """Return AdamW with a constant rate for each parameter group."""
+        groups = [{"params": params, "lr": rate} for params, rate in self.parameter_groups().values()]
+        return {self.name: AdamW(groups, weight_decay=0.0)}
+
+    def get_optimizers(self) -> dict[str, Optimizer]:
+        """Return the optimiser by the algorithm's name."""
+        return {self.name: self.optimizer}
+
     def load_weights(self, weights: dict[str, Any], device: str | torch.device = "cpu") -> None:
+        """Load the policy's weights from a checkpoint's."""
         load_trained_weights(self.given, weights)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """What is not in the policy's checkpoint: an adapter's tensors, and what an algorithm adds."""
+        """Return what the policy's checkpoint lacks: the adapter's tensors, and what an algorithm adds."""
         added = {} if self.policy is self.given else self.policy.own_tensors()
         return {f"adapter.{name}": value for name, value in added.items()}
 
     @torch.no_grad()
     def load_state_dict(self, state_dict: dict[str, Tensor], device: str | torch.device = "cpu") -> None:
+        """Copy the tensors of `state_dict` into this algorithm's own."""
         own = self.state_dict()
         if state_dict.keys() != own.keys():
             raise ValueError(
@@ -254,27 +318,19 @@ class PolicyGradient(RLAlgorithm):
             value.copy_(state_dict[name])
 
 
-def reference_of(policy: Any) -> Any:
-    """A copy that is not trained. It shares the parameters that the policy does not train either, as those
-    under LoRA's."""
+def frozen_copy(policy: Any) -> Any:
+    """Return a copy that is not trained. It shares the parameters that the policy does not train either, such
+    as a large network under LoRA's adapters."""
     frozen = {id(each): each for each in policy.parameters() if not each.requires_grad}
     return copy.deepcopy(policy, frozen).requires_grad_(False)
 
 
-def schedule_factor(schedule: str, iteration: int, iterations: int | None) -> float:
-    """Share of the learning rate in an iteration, counted from 0: 1 in the first, above 0 in the last."""
-    if schedule == "constant" or iterations is None:
-        return 1.0
-    left = 1 - iteration / iterations
-    return left if schedule == "linear" else 0.5 * (1 - math.cos(math.pi * left))
-
-
-def summary(records: list[dict[str, float]], updates: int) -> TrainingStats:
-    """Means over minibatches, the first one's ratio error apart."""
+def training_stats(records: list[dict[str, float]], updates: int) -> TrainingStats:
+    """Return means over minibatches, and the first one's ratio error, which must be 0 up to rounding."""
     names = dict.fromkeys(name for record in records for name in record)
     seen = {name: [record[name] for record in records if name in record] for name in names}
     mean = {name: sum(values) / len(values) for name, values in seen.items()}
     losses = {name: mean.pop(name) for name in names if name.endswith(LOSS)}
     norms = {name.removesuffix(NORM): mean.pop(name) for name in names if name.endswith(NORM)}
-    first = {"first_ratio_error": records[0]["ratio_error"]} if records else {}
+    first = {"first_ratio_error": records[0][RATIO_ERROR]} if records else {}
     return TrainingStats(losses, norms, extra={**mean, **first, "updates": float(updates)})

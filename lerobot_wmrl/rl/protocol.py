@@ -1,7 +1,8 @@
-"""What reinforcement learning needs of a policy. B environments, K action components.
+"""Interfaces between a policy and reinforcement learning. B environments, K action components.
 
-A policy may decide on n steps at once, which are then acted one after the other: all (B, K) of a decision
-are (B, n, K) for it, and it is asked again after n steps, or when an episode has begun.
+A policy may decide on n steps at once (an action chunk). Its raw actions and log-probabilities are then
+(B, n, K) instead of (B, K). The n actions are executed one after the other, and the policy is asked again
+after n steps or when a new episode begins.
 """
 
 from collections.abc import Callable, Iterable
@@ -16,61 +17,66 @@ Observation = dict[str, Any]
 """Tensors by LeRobot's names, batch first, and `task`: a list of instructions."""
 
 
-class Sample(Protocol):
-    """Actions as they were sampled, before any clipping or unnormalisation."""
+class ActionSample(Protocol):
+    """Actions as the policy draws them, before any clipping or unnormalisation."""
 
     @property
     def raw_action(self) -> Tensor:
-        """(B, K)"""
+        """Actions, of any dtype. (B, K)"""
 
     @property
     def log_prob(self) -> Tensor:
-        """One a component, float32. (B, K)"""
+        """Log-probability of each component, float32. (B, K)"""
 
     @property
     def value(self) -> Tensor:
-        """(B,)"""
+        """Value V(o). (B,)"""
 
 
 @runtime_checkable
 class StochasticPolicy(Protocol):
-    """A policy that can sample, and say how likely a sample is. Observations come from its preprocessor."""
+    """A policy that draws actions and knows their probability. Observations come from its preprocessor."""
 
-    def sample(self, observation: Observation) -> Sample:
-        """Draw actions from the very distribution that `evaluate` measures."""
+    def sample(self, observation: Observation) -> ActionSample:
+        """Draw actions from the distribution that `evaluate` measures."""
 
     def evaluate(self, observation: Observation, raw_action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """→ log-probs (B, K), entropies (B,) of all that was decided, values (B,)"""
+        """Return log-probabilities (B, K), entropies (B,) of the whole decision and values (B,)."""
 
     def value(self, observation: Observation) -> Tensor:
-        """→ (B,)"""
+        """Return the values V(o). (B,)"""
 
     def value_parameters(self) -> Iterable[nn.Parameter]:
-        """Parameters that only the value depends on."""
+        """Return the parameters that only the value depends on."""
 
 
 @dataclass(frozen=True)
 class Pipeline:
-    """A policy's processors: `prepare` an environment's observation, turn raw actions into metres."""
+    """A policy's processors as functions.
+
+    Args:
+        prepare: from the environment's observation to the policy's.
+        to_action: from raw actions to the environment's actions.
+    """
 
     prepare: Callable[[Observation], Observation]
     to_action: Callable[[Tensor], Tensor]
 
 
 def make_pipeline(config: PreTrainedConfig, preprocessor: Any, postprocessor: Any) -> Pipeline:
-    """The processors as functions; observations the policy does not know are left out, and actions stay on
-    the policy's device, where LeRobot's postprocessors would fetch them."""
+    """Wrap a policy's processors. Observations that the policy does not know are left out, and actions stay
+    on the policy's device, although LeRobot's postprocessors fetch them to the CPU."""
     known = {*(config.input_features or {}), "task"}
     steps = [
         replace(step, device=config.device) if isinstance(step, DeviceProcessorStep) else step
         for step in postprocessor.steps
     ]
-    staying = replace(postprocessor, steps=steps)
+    on_device = replace(postprocessor, steps=steps)
 
     def prepare(observation: Observation) -> Observation:
         return preprocessor({name: value for name, value in observation.items() if name in known})
 
     def to_action(raw_action: Tensor) -> Tensor:
-        return staying(raw_action)
+        return on_device(raw_action)
 
     return Pipeline(prepare, to_action)

@@ -1,6 +1,6 @@
-"""Rollouts in preallocated tensors on the device.
+"""Rollouts: collected from an environment into preallocated tensors on the device.
 
-T time, B environments, K action components, n steps that are acted by one decision.
+T time, B environments, K action components, n steps of one decision (an action chunk).
 """
 
 from collections.abc import Iterator
@@ -8,20 +8,87 @@ from contextlib import contextmanager
 
 import gymnasium as gym
 import torch
+from lerobot.utils.constants import OBS_IMAGES
 from torch import Tensor
+from tqdm import tqdm
 
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.distributed import mean_over_processes, rank_and_size
-from lerobot_wmrl.rl.observations import ObservationBuffer, as_bytes_see_it
-from lerobot_wmrl.rl.protocol import Observation, Pipeline, Sample, StochasticPolicy
+from lerobot_wmrl.rl.protocol import ActionSample, Observation, Pipeline, StochasticPolicy
 
 NOISE_SEED = 2**31
-"""Added to a rollout's seed: the policy's noise must not be that with which the environment draws."""
+"""Added to a rollout's seed, so that the policy's noise differs from the numbers the environment draws."""
+
+TASK = "task"
+
+
+class ObservationBuffer:
+    """Observations of T × B steps. Images are kept as bytes and instructions as indices.
+
+    The policy acts on what is read back, so it is trained on exactly what it has seen.
+    """
+
+    def __init__(self, steps: int, num_envs: int) -> None:
+        self.steps, self.num_envs = steps, num_envs
+        self.tensors: dict[str, Tensor] = {}  # (T, B, …) by name
+        self.instructions: dict[str, int] = {}
+
+    def write(self, step: int, observation: Observation) -> None:
+        """Keep the observations (B, …) of `step`."""
+        encoded = {
+            name: to_bytes(value) if name.startswith(OBS_IMAGES) else value
+            for name, value in observation.items()
+            if isinstance(value, Tensor)
+        }
+        if texts := observation.get(TASK):
+            indices = [self.instructions.setdefault(text, len(self.instructions)) for text in texts]
+            encoded[TASK] = torch.tensor(indices)  # on the CPU, where the texts are
+        for name, value in encoded.items():
+            if name not in self.tensors:
+                self.tensors[name] = value.new_empty((self.steps, self.num_envs, *value.shape[1:]))
+            self.tensors[name][step] = value
+
+    def read_step(self, step: int) -> Observation:
+        """Return the observations (B, …) of `step`."""
+        return self._decoded({name: value[step] for name, value in self.tensors.items()})
+
+    def read(self, rows: Tensor) -> Observation:
+        """Return the observations of flat rows t · B + b. `rows` (N,) is on the CPU, so that reading the
+        instructions waits for no other device."""
+        moved = {device: rows.to(device) for device in {value.device for value in self.tensors.values()}}
+        return self._decoded(
+            {name: value.flatten(0, 1)[moved[value.device]] for name, value in self.tensors.items()}
+        )
+
+    def _decoded(self, encoded: dict[str, Tensor]) -> Observation:
+        texts = list(self.instructions)
+        return {
+            name: value.float() / 255 if name.startswith(OBS_IMAGES)
+            else [texts[index] for index in value.tolist()] if name == TASK
+            else value
+            for name, value in encoded.items()
+        }  # fmt: skip
+
+
+def to_bytes(image: Tensor) -> Tensor:
+    """Convert an image from [0, 1] to uint8."""
+    return (image * 255).round().byte()
+
+
+def as_read_back(observation: Observation) -> Observation:
+    """Return the observation as an ObservationBuffer would give it back."""
+    return {
+        name: to_bytes(value).float() / 255 if name.startswith(OBS_IMAGES) else value
+        for name, value in observation.items()
+    }
 
 
 class RolloutBuffer:
-    """One iteration's steps, all (T, B); raw actions and log-probs (T, B, K), or (T, B, n, K) if the policy
-    decides on n steps at once: then at the step of the decision, the only one of the n that is trained on.
+    """The steps of one rollout, preallocated.
+
+    All fields are (T, B); `raw_action` and `log_prob` are (T, B, K), or (T, B, n, K) for a policy that
+    decides on n steps at once. Then they are written at the step of the decision, the only one of the n
+    steps that is trained on.
     """
 
     def __init__(self, steps: int, num_envs: int, device: torch.device | str) -> None:
@@ -32,19 +99,15 @@ class RolloutBuffer:
         self.observations = ObservationBuffer(steps, num_envs)
         self.reward, self.value, self.next_value = empty(), empty(), empty()
         self.final_value = torch.full((steps, num_envs), torch.nan, device=device)
-        self.terminated, self.truncated, self.success = (
-            empty(torch.bool),
-            empty(torch.bool),
-            empty(torch.bool),
-        )
-        self.age = empty(torch.long)
-        """Steps since the decision that is acted on; 0 where one was made."""
+        self.terminated, self.truncated = empty(torch.bool), empty(torch.bool)
+        self.success, self.age = empty(torch.bool), empty(torch.long)
+        """`age`: steps since the decision that is executed; 0 where a decision was made."""
         self.raw_action = self.log_prob = torch.empty(0)
         self.columns: dict[str, Tensor] = {}
-        """What the updates need beside observation, raw_action and log_prob: (T, B, …) by name."""
+        """What an algorithm adds for its loss, such as advantages: (T, B, …) by name."""
 
-    def write_decision(self, step: int, rows: Tensor, sample: Sample) -> None:
-        """Keep what was sampled at `step` in the environments `rows`."""
+    def write_decision(self, step: int, rows: Tensor, sample: ActionSample) -> None:
+        """Keep what was drawn at `step` in the environments `rows`."""
         if not self.raw_action.numel():
             if sample.log_prob.dtype != torch.float32:
                 raise ValueError(
@@ -59,25 +122,25 @@ class RolloutBuffer:
         self.value[step, rows] = sample.value
 
     def write(self, step: int, age: Tensor, reward: Tensor, terminated: Tensor, truncated: Tensor) -> None:
-        """Keep the outcome of `step`, of decisions made `age` steps before. All (B,)"""
+        """Keep the outcome of `step`, which executed decisions of `age` steps before. All (B,)"""
         self.value[step].masked_fill_(age > 0, 0.0)
         self.age[step], self.reward[step] = age, reward
         self.success[step], self.final_value[step] = False, torch.nan
         self.terminated[step], self.truncated[step] = terminated, truncated
 
     def write_end(self, step: int, success: Tensor, final_value: Tensor) -> None:
-        """Keep an ended episode's outcome and the value of its final observation. (B,), (B,)"""
+        """Keep whether ended episodes succeeded, and the values of their final observations. (B,), (B,)"""
         self.success[step] = success & self.finished[step]
         self.final_value[step] = final_value
 
     def fill_next_value(self, last_value: Tensor) -> None:
-        """V(o_{t+1}): the next row's, or the final observation's where the next row is another episode."""
-        following = torch.cat([self.value[1:], last_value[None]])
+        """Set V(o_{t+1}): the next row's value, or the final observation's where an episode has ended."""
+        following = torch.cat([self.value[1:], last_value[None]])  # (T, B)
         self.next_value = torch.where(self.finished, self.final_value, following)
         if not bool(self.value.isfinite().all()):
             raise ValueError(
-                "rollout: the policy's value is not finite, so neither is what it saw or became; the last "
-                "checkpoint is kept: lower --algorithm.value_lr or --algorithm.policy_lr"
+                "rollout: the policy's value is not finite, because its observation or its weights are not; "
+                "the last checkpoint is kept: lower `algorithm.value_lr` or `algorithm.policy_lr`"
             )
         if not bool(self.next_value.isfinite().all()):
             raise ValueError(
@@ -85,36 +148,33 @@ class RolloutBuffer:
             )
 
     @property
-    def total_envs(self) -> int:
-        """Environments of all processes."""
-        return self.num_envs * rank_and_size()[1]
-
-    @property
     def finished(self) -> Tensor:
+        """Steps at which an episode ended. (T, B) bool"""
         return self.terminated | self.truncated
 
     @property
     def decided(self) -> Tensor:
-        """Where the policy made a decision. (T, B) bool"""
+        """Steps at which the policy made a decision. (T, B) bool"""
         return self.age == 0
 
     @property
     def first_episode(self) -> Tensor:
-        """The steps of each environment's first episode, which began where its seed says. (T, B) bool"""
+        """Steps of each environment's first episode, which started from its seed. (T, B) bool"""
         ended = self.finished.long()
         return ended.cumsum(0) == ended
 
     def executed(self) -> Tensor | None:
-        """Which of a decision's n steps were acted. → (T, B, n, 1) bool, None for n = 1"""
+        """Return which of a decision's n steps were executed. (T, B, n, 1) bool; None for n = 1"""
         if self.raw_action.ndim < 4:
             return None
-        length = torch.ones_like(self.age)
+        length = torch.ones_like(self.age)  # (T, B)
         for step in reversed(range(self.steps - 1)):
             length[step] += torch.where(self.decided[step + 1], 0, length[step + 1])
         return torch.arange(self.raw_action.shape[2], device=self.device)[:, None] < length[..., None, None]
 
     def statistics(self) -> dict[str, float]:
-        """Success and length of each environment's first episode; of later ones only short ones would end."""
+        """Return success and length of first episodes, and the mean reward. Later episodes would bias them:
+        only the short ones of them end within the rollout."""
         first = self.finished & self.first_episode
         steps = torch.arange(1, self.steps + 1, device=self.device)[:, None]
         episodes = first.sum().clamp_min(1)
@@ -126,32 +186,32 @@ class RolloutBuffer:
 
 
 class Actor:
-    """Asks the policy where a decision is due, and otherwise goes on with the last one.
+    """Asks the policy for a decision where one is due, and otherwise executes the last one.
 
-    Ages of decisions are counted on the host too, and fetched only when an episode has ended.
+    The ages of decisions are counted on the host too, so that the device is read only when an episode ends.
     """
 
     def __init__(self, policy: StochasticPolicy, pipeline: Pipeline, buffer: RolloutBuffer) -> None:
         self.policy, self.pipeline, self.buffer = policy, pipeline, buffer
-        self.here = torch.arange(buffer.num_envs, device=buffer.device)
-        self.age = torch.zeros_like(self.here)
+        self.all_rows = torch.arange(buffer.num_envs, device=buffer.device)
+        self.age = torch.zeros_like(self.all_rows)
         self.known_age = [0] * buffer.num_envs
         self.plan = torch.empty(0, 1, 0)
-        """The decisions that are acted on, (B, n, K)."""
+        """The decisions that are executed, (B, n, K)."""
 
     def act(self, step: int) -> Tensor:
-        """The raw action of every environment at `step`. → (B, K)"""
+        """Return the raw action of every environment at `step`. (B, K)"""
         due, count = [row for row, age in enumerate(self.known_age) if not age], self.buffer.num_envs
         if len(due) == count:
-            self._decide(step, self.here, self.buffer.observations.read_step(step))
+            self._decide(step, self.all_rows, self.buffer.observations.read_step(step))
         elif due:
             rows = torch.tensor(due)
             observed = self.buffer.observations.read(step * count + rows)
-            self._decide(step, rows.to(self.here.device), observed)
-        return self.plan[self.here, self.age]
+            self._decide(step, rows.to(self.all_rows.device), observed)
+        return self.plan[self.all_rows, self.age]
 
     def advance(self, finished: Tensor, any_finished: bool) -> None:
-        """A new decision is due after n steps, and where an episode has ended. (B,)"""
+        """Count one step. A decision is due after n steps and where an episode has ended. (B,)"""
         length = self.plan.shape[1]
         self.age = torch.where(finished, 0, (self.age + 1) % length)
         if length > 1:
@@ -161,15 +221,15 @@ class Actor:
     def _decide(self, step: int, rows: Tensor, observed: Observation) -> None:
         sample = self.policy.sample(self.pipeline.prepare(observed))
         self.buffer.write_decision(step, rows, sample)
-        raw = sample.raw_action if sample.raw_action.ndim == 3 else sample.raw_action[:, None]
+        raw = sample.raw_action if sample.raw_action.ndim == 3 else sample.raw_action[:, None]  # (B, n, K)
         if not self.plan.numel():
             self.plan = raw.new_zeros((self.buffer.num_envs, *raw.shape[1:]))
         self.plan[rows] = raw
 
 
 @contextmanager
-def noise_of(seed: int, device: torch.device | str) -> Iterator[None]:
-    """Random numbers as `seed` has them, the generators as they were afterwards."""
+def seeded_noise(seed: int, device: torch.device | str) -> Iterator[None]:
+    """Seed the generators for the policy's noise, and put them back afterwards."""
     on_cuda = torch.device(device).type == "cuda"
     with torch.random.fork_rng([torch.cuda.current_device()] if on_cuda else []):
         torch.manual_seed(seed + NOISE_SEED)
@@ -177,7 +237,7 @@ def noise_of(seed: int, device: torch.device | str) -> Iterator[None]:
 
 
 def start_seeds(first: int, num_envs: int, group_size: int) -> int | list[int]:
-    """What to reset with: the first seed of `num_envs`, or a drawn one for each `group_size` of them."""
+    """Return the seeds to reset with: `first` for consecutive ones, or a drawn one for each group."""
     if group_size == 1:
         return first
     generator = torch.Generator().manual_seed(first)
@@ -190,20 +250,23 @@ def collect(
     env: gym.vector.VectorEnv, policy: StochasticPolicy, pipeline: Pipeline, buffer: RolloutBuffer, seed: int,
     group_size: int = 1,
 ) -> dict[str, float]:  # fmt: skip
-    """Fill `buffer` from fresh episodes; every decision's `next_value` too. → numbers to log
+    """Fill `buffer` with T steps of fresh episodes, and return metrics, means over all processes.
 
-    Every `group_size` neighbouring environments begin alike. `seed` is the first of all processes'
-    environments; starts and noise of this one's are drawn from its share.
+    Args:
+        env: B environments with `final_obs` in `info` (autoreset in the same step).
+        policy: draws the actions.
+        pipeline: the policy's processors.
+        buffer: is overwritten.
+        seed: first of this process's B seeds, of episodes and of noise.
+        group_size: neighbouring environments that start from the same state.
     """
-    own = rank_and_size()[0] * buffer.num_envs
-    starts = start_seeds(seed, buffer.total_envs, group_size)
-    reset = seed + own if isinstance(starts, int) else starts[own : own + buffer.num_envs]
-    observation, _ = env.reset(seed=reset)
+    observation, _ = env.reset(seed=start_seeds(seed, buffer.num_envs, group_size))
     actor, logged = Actor(policy, pipeline, buffer), dict[str, list[Tensor]]()
-    with noise_of(seed + own, buffer.device):
-        for step in range(buffer.steps):
+    quiet = True if rank_and_size()[0] else None  # None: shown only in a terminal
+    with seeded_noise(seed, buffer.device):
+        for step in tqdm(range(buffer.steps), "rollout", leave=False, unit="step", disable=quiet):
             buffer.observations.write(step, observation)
-            raw_action, age = actor.act(step), actor.age
+            raw_action, age = actor.act(step), actor.age  # (B, K), (B,)
             action = pipeline.to_action(raw_action).to(buffer.device)
             observation, reward, terminated, truncated, info = env.step(action)
             buffer.write(step, age, reward, terminated, truncated)
@@ -211,9 +274,9 @@ def collect(
             for name, part in info.get("reward_parts", {}).items():
                 logged.setdefault(name, []).append(part.float().mean())
             if "final_obs" in info:
-                final = pipeline.prepare(as_bytes_see_it(info["final_obs"]))
+                final = pipeline.prepare(as_read_back(info["final_obs"]))
                 buffer.write_end(step, info["final_info"]["is_success"], policy.value(final))
-        last = policy.value(pipeline.prepare(as_bytes_see_it(observation)))
+        last = policy.value(pipeline.prepare(as_read_back(observation)))
     buffer.fill_next_value(last)
     parts = {name: torch.stack(values).mean().item() for name, values in logged.items()}
     return mean_over_processes({**buffer.statistics(), **parts}, buffer.device)

@@ -1,4 +1,4 @@
-"""Which checkpoint is the best: success on seeds that neither training nor evaluation uses."""
+"""Selection of the best checkpoint by its success on seeds that neither training nor evaluation uses."""
 
 import logging
 from collections.abc import Callable, Mapping
@@ -16,16 +16,17 @@ from lerobot_wmrl.rl.policy_gradient import TrainingStopped
 REAL, IMAGINED = "real", "imagined"
 
 Measure = Callable[[], Evaluated]
-"""Success of the policy as it is, with the actions it would take in earnest."""
+"""Plays episodes with the current policy, without exploration."""
 
 
 class Selection:
-    """Measures the policy at intervals and points `checkpoints/best` at the best checkpoint so far.
+    """Measures success at intervals and points `checkpoints/best` at the best checkpoint so far.
 
     Args:
-        freq: iterations between two measurements; the first is before any update, the last after all.
+        freq: iterations between two measurements. The first is before any update, the last after all.
         total: iterations of the training.
-        measures: of success, `real` and `imagined`; real success decides where it is measured.
+        measures: how success is measured, `real` (outside the world model) and `imagined`. The real one
+            decides where there is one.
         output_dir: of the training.
     """
 
@@ -36,10 +37,11 @@ class Selection:
         self.judge = REAL if REAL in measures else IMAGINED
 
     def due(self, iteration: int) -> bool:
+        """Return whether to measure after so many iterations."""
         return iteration % self.freq == 0 or iteration == self.total
 
     def run(self, iteration: int, checkpoint: Path, folder: Path) -> Record:
-        """`real` and `imagined`: how many episodes of how many succeeded."""
+        """Return the proportion of successes by `real` and `imagined`."""
         found = {place: measure() for place, measure in self.measures.items()}
         shares = {
             place: Proportion(sum(each.successes), len(each.successes)) for place, each in found.items()
@@ -50,38 +52,43 @@ class Selection:
         return {**{place: share.as_json() for place, share in shares.items()}, REAL_STEPS: steps}
 
     def apply(self, records: Mapping[int, Record]) -> None:
-        """Point at the best, the earlier of equals. TrainingStopped where imagined and real success part."""
+        """Link the best checkpoint, the earlier of equals.
+
+        Raises:
+            TrainingStopped: real success has fallen while imagined success has not.
+        """
         best = best_iteration(records, self.judge)
         checkpoint = get_step_checkpoint_dir(self.output_dir, self.total, best)
         if rank_and_size()[0] == 0:
             link_checkpoint(checkpoint, BEST_CHECKPOINT_LINK)
         latest = max(records)
-        if parted(records[best], records[latest]):
+        if diverged(records[best], records[latest]):
             before, now = (
-                " and ".join(f"{place} {measured(records[at], place)}" for place in (IMAGINED, REAL))
+                " and ".join(f"{place} {success(records[at], place)}" for place in (IMAGINED, REAL))
                 for at in (best, latest)
             )
             raise TrainingStopped(
                 f"iteration {latest}: real success has fallen while imagined success has not: {now}, after "
-                f"{before} at iteration {best}. The policy has learnt what only the world model believes. "
-                f"{checkpoint} is the best one; teach the world model what this policy does (--dyna.rounds), "
-                "hold the policy nearer (--algorithm.reference_coefficient), or stop earlier (--iterations)"
+                f"{before} at iteration {best}. The policy exploits errors of the world model. {checkpoint} "
+                "is the best one; train the world model on what this policy does (`dyna.rounds`), keep the "
+                "policy nearer to the SFT policy (`algorithm.reference_coefficient`), or stop earlier "
+                "(`iterations`)"
             )
 
 
-def measured(record: Record, place: str) -> Proportion:
-    """Episodes that succeeded there."""
+def success(record: Record, place: str) -> Proportion:
+    """Return the proportion of successes in a record."""
     return Proportion(record[place]["k"], record[place]["n"])
 
 
 def best_iteration(records: Mapping[int, Record], place: str) -> int:
-    """Where most succeeded; the earlier of equals, which is nearer to the cloned policy."""
-    return max(sorted(records), key=lambda iteration: measured(records[iteration], place).share)
+    """Return the iteration with most successes, of equals the earlier, which is nearer to the SFT policy."""
+    return max(sorted(records), key=lambda iteration: success(records[iteration], place).share)
 
 
-def parted(best: Record, latest: Record) -> bool:
-    """Whether real success has fallen since, the intervals being apart, and imagined success has not."""
+def diverged(best: Record, latest: Record) -> bool:
+    """Return whether real success has fallen, with separate intervals, while imagined success has not."""
     if any(place not in record for place in (REAL, IMAGINED) for record in (best, latest)):
         return False
-    fallen = measured(latest, REAL).interval[1] < measured(best, REAL).interval[0]
-    return fallen and measured(latest, IMAGINED).share >= measured(best, IMAGINED).share
+    fallen = success(latest, REAL).interval[1] < success(best, REAL).interval[0]
+    return fallen and success(latest, IMAGINED).share >= success(best, IMAGINED).share

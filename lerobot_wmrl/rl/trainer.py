@@ -1,4 +1,4 @@
-"""The loop around an algorithm: collect, improve, log, keep, pause. Resumes bit by bit on a CPU."""
+"""The training loop: collect, update, log, save, and run callbacks. It resumes bit for bit on a CPU."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -21,9 +21,13 @@ from tqdm import tqdm
 from lerobot_wmrl.common.checkpoints import latest_checkpoint, read_weights, write_checkpoint
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.distributed import rank_and_size, wait_for_all
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.tracking import Tracker
 from lerobot_wmrl.rl.callbacks import Callback, Callbacks
+from lerobot_wmrl.rl.configuration_algorithms import GRPOConfig, PolicyGradientConfig
+from lerobot_wmrl.rl.grpo import GRPO
 from lerobot_wmrl.rl.policy_gradient import PolicyGradient
+from lerobot_wmrl.rl.ppo import PPO
 from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
 
@@ -31,13 +35,19 @@ SHOWN = (
     "success_rate", "reward", "policy_loss", "value_loss", "explained_variance", "kl", "reference_kl",
     "clip_fraction", "entropy", "rollout_s", "update_s",
 )  # fmt: skip
-"""What a line in the terminal has of an iteration's metrics; metrics.jsonl has all."""
+"""Metrics of a line in the terminal; metrics.jsonl has all."""
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """How long to train: `iterations` rollouts from `seed` on, a checkpoint every `save_freq` of them, a line
-    in the terminal every `log_freq`."""
+    """How long to train.
+
+    Args:
+        iterations: rollouts, each followed by an update.
+        save_freq: iterations between checkpoints.
+        seed: of the first episodes.
+        log_freq: iterations between lines in the terminal.
+    """
 
     iterations: int
     save_freq: int
@@ -45,31 +55,46 @@ class Schedule:
     log_freq: int = 1
 
 
-def rollout_seed(seed: int, iteration: int, num_envs: int) -> int:
-    """First of the `num_envs` environment seeds of an iteration, all of them below EVALUATION_SEED."""
-    return (seed + iteration * num_envs) % (EVALUATION_SEED - num_envs)
+def make_algorithm(policy: Any, config: PolicyGradientConfig) -> PolicyGradient:
+    """Return the algorithm that `config` describes, to train `policy`."""
+    algorithm: type[PolicyGradient] = GRPO if isinstance(config, GRPOConfig) else PPO
+    return algorithm(policy, config)
 
 
 def train(
-    env: gym.vector.VectorEnv, algorithm: PolicyGradient, pipeline: Pipeline, buffer: RolloutBuffer,
+    env: gym.vector.VectorEnv, algorithm: PolicyGradient, pipeline: Pipeline, rollout: RolloutBuffer,
     schedule: Schedule, output_dir: Path, save_pretrained: Callable[[Path], None],
     callbacks: Sequence[Callback] = (), wandb: Any = None,
 ) -> None:  # fmt: skip
-    """Run what is left of the schedule. An iteration begins with fresh episodes, so that it can be repeated.
+    """Train until the end of the schedule, from the latest checkpoint in `output_dir` if there is one.
 
-    `save_pretrained` writes a checkpoint's `pretrained_model`. Callbacks run where they are due, before the
-    first iteration or after one, and find a checkpoint there. `wandb`: LeRobot's WandBLogger.
+    Every iteration starts fresh episodes, so it can be repeated after a kill. Callbacks run where they are
+    due, before the first iteration or after one, and find a checkpoint there.
+
+    Args:
+        env: vectorised environment on the device.
+        algorithm: trains its `policy`.
+        pipeline: the policy's processors.
+        rollout: buffer that each iteration fills.
+        schedule: how long to train.
+        output_dir: where checkpoints, metrics and records go.
+        save_pretrained: writes a checkpoint's `pretrained_model`.
+        callbacks: what runs between iterations.
+        wandb: LeRobot's WandBLogger.
     """
     checkpoint, total = resume(algorithm, output_dir), schedule.iterations
-    tracker = make_tracker(output_dir, buffer, schedule, algorithm.iteration, wandb)
+    tracker = make_tracker(output_dir, rollout, schedule, algorithm.iteration, wandb)
     pauses = Callbacks(callbacks, output_dir, total, tracker)
-    with progress_bar(algorithm, total) as progress:
+    with tqdm(
+        total=total, initial=algorithm.iteration, desc=algorithm.name.upper(), unit="iteration",
+        disable=rank_and_size()[0] > 0,
+    ) as progress:  # fmt: skip
         pauses.resume(algorithm.iteration)
         wait_for_all()  # else a slow process would find what the first one has written since
         if pauses.due(algorithm.iteration):
             pauses.run(algorithm.iteration, checkpoint or save(algorithm, output_dir, total, save_pretrained))
         while algorithm.iteration < total:
-            metrics = iterate(env, algorithm, pipeline, buffer, schedule.seed)
+            metrics = iterate(env, algorithm, pipeline, rollout, schedule.seed)
             step = algorithm.iteration
             tracker.log_step(step, {**metrics, **pauses.real_steps()})
             progress.set_postfix(
@@ -83,44 +108,50 @@ def train(
 
 
 def iterate(
-    env: gym.vector.VectorEnv, algorithm: PolicyGradient, pipeline: Pipeline, buffer: RolloutBuffer, seed: int
-) -> dict[str, float]:
-    """A rollout and what is learnt from it. → numbers to log"""
+    env: gym.vector.VectorEnv, algorithm: PolicyGradient, pipeline: Pipeline, rollout: RolloutBuffer,
+    seed: int,
+) -> dict[str, float]:  # fmt: skip
+    """Collect one rollout, update the policy on it, and return metrics."""
+    rank, processes = rank_and_size()
+    num_envs = rollout.num_envs * processes
+    own_seed = first_seed(seed, algorithm.iteration, num_envs) + rank * rollout.num_envs
     started = time.perf_counter()
-    first = rollout_seed(seed, algorithm.iteration, buffer.total_envs)
-    rollout = collect(env, algorithm.policy, pipeline, buffer, first, algorithm.group_size)
-    collected = time.perf_counter()
-    stats = algorithm.improve(buffer, pipeline).to_log_dict()
-    seconds = {"rollout_s": collected - started, "update_s": time.perf_counter() - collected}
+    collected = collect(env, algorithm.policy, pipeline, rollout, own_seed, algorithm.group_size)
+    rollout_end = time.perf_counter()
+    minibatches, targets = algorithm.prepare(rollout, pipeline)
+    quiet = True if rank else None  # None: shown only in a terminal
+    progress = tqdm(minibatches, "update", leave=False, unit="minibatch", disable=quiet)
+    stats = algorithm.update(iter(progress))
+    progress.close()
     return {
-        **rollout,
-        **stats,
-        **seconds,
-        "env_steps": algorithm.iteration * buffer.steps * buffer.total_envs,
+        **collected,
+        **targets,
+        **stats.to_log_dict(),
+        "rollout_s": rollout_end - started,
+        "update_s": time.perf_counter() - rollout_end,
+        "env_steps": algorithm.iteration * rollout.steps * num_envs,
     }
 
 
+def first_seed(seed: int, iteration: int, num_envs: int) -> int:
+    """Return the first of an iteration's `num_envs` environment seeds, all of them below EVALUATION_SEED."""
+    return (seed + iteration * num_envs) % (EVALUATION_SEED - num_envs)
+
+
 def make_tracker(
-    output_dir: Path, buffer: RolloutBuffer, schedule: Schedule, iteration: int, wandb: Any
+    output_dir: Path, rollout: RolloutBuffer, schedule: Schedule, iteration: int, wandb: Any
 ) -> Tracker:
-    """LeRobot's lines with steps as samples, rollouts as episodes, and the whole schedule as one epoch."""
-    samples, total = buffer.steps * buffer.total_envs, schedule.iterations
-    meters = MetricsTracker(samples, samples * total, buffer.total_envs * total, {}, initial_step=iteration)
+    """Return a tracker that counts steps as samples, rollouts as episodes, and the schedule as an epoch."""
+    num_envs, total = rollout.num_envs * rank_and_size()[1], schedule.iterations
+    samples = rollout.steps * num_envs
+    meters = MetricsTracker(samples, samples * total, num_envs * total, {}, initial_step=iteration)
     return Tracker(output_dir, meters, SHOWN, schedule.log_freq, wandb)
-
-
-def progress_bar(algorithm: PolicyGradient, total: int) -> tqdm:
-    """Iterations, and the time left."""
-    return tqdm(
-        total=total, initial=algorithm.iteration, desc=algorithm.name.upper(), unit="iteration",
-        disable=rank_and_size()[0] > 0,
-    )  # fmt: skip
 
 
 def save(
     algorithm: PolicyGradient, output_dir: Path, total: int, save_pretrained: Callable[[Path], None]
 ) -> Path:
-    """A whole checkpoint or none: policy, algorithm, optimiser, random states, iteration."""
+    """Write a whole checkpoint or none: policy, algorithm, optimiser, random states, iteration."""
 
     def write(folder: Path) -> None:
         save_pretrained(folder / PRETRAINED_MODEL_DIR)
@@ -136,16 +167,16 @@ def save(
 
 
 def resume(algorithm: PolicyGradient, output_dir: Path) -> Path | None:
-    """Continue from the latest checkpoint in `output_dir`, if there is one."""
+    """Load the latest checkpoint in `output_dir`, if there is one, and return it."""
     checkpoint = latest_checkpoint(output_dir)
     if checkpoint is None:
         return None
     began_with, size = load_training_num_processes(checkpoint) or 1, rank_and_size()[1]
     if began_with != size:
-        raise ValueError(
-            f"--output_dir={output_dir}: this run began with {began_with} processes, here are {size}; "
-            f"continue it with torchrun --nproc_per_node={began_with}"
-        )
+        raise FieldError(
+            "output_dir", output_dir, f"this run began with {began_with} processes, here are {size}",
+            f"continue it with torchrun --nproc_per_node={began_with}",
+        )  # fmt: skip
     algorithm.load_weights(read_weights(checkpoint))
     algorithm.load_state_dict(read_weights(checkpoint, ALGORITHM_DIR))
     algorithm.iteration, _, _ = load_training_state(checkpoint, algorithm.optimizer, None)

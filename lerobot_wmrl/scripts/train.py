@@ -29,10 +29,8 @@ from lerobot_wmrl.common.constants import ACTION_NAMES, EVALUATION_SEED
 from lerobot_wmrl.common.distributed import LONGEST_WAIT, rank_and_size, wait_for_all
 from lerobot_wmrl.common.malloc import keep_freed_memory
 from lerobot_wmrl.common.presets import expand_preset
+from lerobot_wmrl.rl.configuration_algorithms import GRPOConfig, PolicyGradientConfig, PPOConfig
 from lerobot_wmrl.rl.configuration_callbacks import CallbackSettings
-from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
-from lerobot_wmrl.rl.configuration_policy_gradient import PolicyGradientConfig
-from lerobot_wmrl.rl.configuration_ppo import PPOConfig
 
 MAY_DIFFER = ("resume", "job_name", "log_freq", "wandb", "gate.action", "dyna.dataset")
 """Settings that a continued run may have otherwise than when it began."""
@@ -201,11 +199,10 @@ def train_in(
     """See that policy and environment fit, then train."""
     from lerobot_wmrl.common.adapters import with_new_adapters
     from lerobot_wmrl.common.policy_checkpoints import adopt_features, check_fit
-    from lerobot_wmrl.rl.factory import make_algorithm
     from lerobot_wmrl.rl.make_callbacks import Trained, make_callbacks
     from lerobot_wmrl.rl.protocol import make_pipeline
     from lerobot_wmrl.rl.rollout import RolloutBuffer
-    from lerobot_wmrl.rl.trainer import Schedule, train
+    from lerobot_wmrl.rl.trainer import Schedule, make_algorithm, train
 
     config, settings = policy.config, draccus.encode(cfg)
     observation = env.reset(seed=cfg.seed)[0]
@@ -216,7 +213,7 @@ def train_in(
         check_fit(config, cfg.simulator.observation_shapes(), len(ACTION_NAMES))
     if cfg.peft is not None:
         policy = with_new_adapters(policy, cfg.peft)
-    algorithm = make_algorithm(policy, algorithm_config, cfg.iterations)
+    algorithm = make_algorithm(policy, algorithm_config)
     buffer = RolloutBuffer(rollout_length(cfg, env.max_episode_steps), cfg.num_envs, config.device)
     trained = Trained(policy, processors, env, cfg.env)
     callbacks = make_callbacks(cfg, trained, cfg.output_dir, cfg.iterations)

@@ -13,7 +13,7 @@ from lerobot.policies.factory import make_policy, make_pre_post_processors
 
 from lerobot_policy_openvla.loading import compute_dtype
 from lerobot_policy_openvla.modeling_openvla import OpenVLAPolicy
-from lerobot_wmrl.rl.configuration_ppo import PPOConfig
+from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.ppo import PPO
 from tests.lerobot_policy_openvla.small import (
     ACTIONS,

@@ -30,7 +30,7 @@ from lerobot_wmrl.common.policy_checkpoints import (
     read_policy_config,
 )
 from lerobot_wmrl.common.tracking import read_metrics
-from lerobot_wmrl.rl.policy_gradient import reference_of
+from lerobot_wmrl.rl.policy_gradient import frozen_copy
 from lerobot_wmrl.scripts.convert_openvla import ConvertOpenVLAConfig, convert
 from lerobot_wmrl.scripts.train import main
 from tests.lerobot_policy_openvla.small import observe, small_policy
@@ -189,7 +189,7 @@ def test_adapters_are_improved_in_the_world_model(
 def test_the_reference_shares_what_is_frozen(tuned: Path) -> None:
     """So PPO's reference costs adapters, not a second network."""
     policy = load(tuned)
-    copies = zip(policy.named_parameters(), reference_of(policy).parameters(), strict=True)
+    copies = zip(policy.named_parameters(), frozen_copy(policy).parameters(), strict=True)
     for (name, parameter), copied in copies:
         assert (copied is parameter) == (not parameter.requires_grad), name
         assert torch.equal(copied, parameter)

@@ -21,23 +21,23 @@ from point_env import PointEnv
 
 from lerobot_wmrl.common.distributed import rank_and_size
 from lerobot_wmrl.rl.callbacks import Record
-from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
-from lerobot_wmrl.rl.configuration_policy_gradient import PolicyGradientConfig
-from lerobot_wmrl.rl.configuration_ppo import PPOConfig
-from lerobot_wmrl.rl.factory import make_algorithm
+from lerobot_wmrl.rl.configuration_algorithms import GRPOConfig, PolicyGradientConfig, PPOConfig
 from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer
-from lerobot_wmrl.rl.trainer import Schedule, train
+from lerobot_wmrl.rl.trainer import Schedule, make_algorithm, train
 
 ENVS, STEPS, ITERATIONS = 24, 12, 3
-COMMON: dict[str, Any] = {"policy_lr": 1e-3, "minibatch_size": 50, "target_kl": 0.05}
+GROUP = 4
+WHOLE: dict[str, Any] = {"policy_lr": 1e-3, "minibatch_size": 10_000, "target_kl": 0.05}
+"""A minibatch holds the whole rollout, so that a step is the same whichever process has which decisions."""
+
 RUNS: dict[str, tuple[PolicyGradientConfig, int]] = {
-    "ppo": (PPOConfig(value_iterations=1, value_normalisation=True, **COMMON), 1),
-    "ppo_in_passes": (PPOConfig(value_iterations=0, micro_batch_size=7, ratio="token", **COMMON), 1),
-    "ppo_in_chunks": (PPOConfig(value_iterations=0, value_loss="clipped", lr_schedule="linear", **COMMON), 3),
-    "grpo": (GRPOConfig(group_size=4, least_group_std=0.1, **COMMON), 1),
+    "ppo": (PPOConfig(value_iterations=1, value_normalisation=True, epochs=6, **WHOLE), 1),
+    "ppo_in_passes": (PPOConfig(value_iterations=0, micro_batch_size=7, ratio="token", **WHOLE), 1),
+    "ppo_in_chunks": (PPOConfig(value_iterations=0, **WHOLE), 3),
+    "grpo": (GRPOConfig(group_size=GROUP, least_group_std=0.3, **WHOLE), 1),
 }
-"""Configurations, and steps a decision."""
+"""Configurations, and steps of a decision."""
 
 
 class SeeingIsDeciding(ChunkPolicy):
@@ -50,6 +50,18 @@ class SeeingIsDeciding(ChunkPolicy):
         noise = 1.4 * turned.view(-1, self.chunk, ACTIONS)
         raw_action = distribution.mean + distribution.stddev * noise
         return Sample(raw_action, distribution.log_prob(raw_action), self.value(observation))
+
+
+class GroupedPointEnv(PointEnv):
+    """Its groups start from seeds that do not depend on which process they are in."""
+
+    resets = 0
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
+        first = rank_and_size()[0] * self.num_envs
+        self.resets += 1
+        groups = [(first + row) // GROUP for row in range(self.num_envs)]
+        return super().reset(seed=[100 * self.resets + group for group in groups])
 
 
 class Pause:
@@ -72,7 +84,7 @@ def run(name: str, output_dir: Path) -> None:
     config, chunk = RUNS[name]
     torch.manual_seed(0)
     policy = SeeingIsDeciding(chunk)
-    algorithm = make_algorithm(policy, config, ITERATIONS)
+    algorithm = make_algorithm(policy, config)
     num_envs = ENVS // rank_and_size()[1]
     buffer = RolloutBuffer(STEPS, num_envs, "cpu")
     pipeline = Pipeline(prepare=lambda observation: observation, to_action=lambda raw: raw * 0.1)
@@ -82,7 +94,8 @@ def run(name: str, output_dir: Path) -> None:
         torch.save(policy.state_dict(), folder / "policy.pt")
 
     output_dir.mkdir(parents=True, exist_ok=True)
-    env, schedule = PointEnv(num_envs, horizon=6), Schedule(ITERATIONS, 1, seed=5)
+    world = GroupedPointEnv if isinstance(config, GRPOConfig) else PointEnv
+    env, schedule = world(num_envs, horizon=6), Schedule(ITERATIONS, 1, seed=5)
     time.sleep(0.5 * rank_and_size()[0])
     train(env, algorithm, pipeline, buffer, schedule, output_dir, save_pretrained, [Pause()])
 

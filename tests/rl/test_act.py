@@ -10,12 +10,13 @@ from lerobot.policies.act.modeling_act import ACTPolicy
 from safetensors.torch import load_file
 from torch.distributions import Normal
 
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.evaluation.agreement import policy_outcomes
-from lerobot_wmrl.rl.act_adapter import INITIAL_STD, ActAdapter
-from lerobot_wmrl.rl.configuration_ppo import PPOConfig
-from lerobot_wmrl.rl.minibatches import read_steps
+from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
+from lerobot_wmrl.rl.policy_adapters import INITIAL_STD, ActAdapter
+from lerobot_wmrl.rl.policy_gradient import read_batch
 from lerobot_wmrl.rl.ppo import PPO
 from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
@@ -79,8 +80,8 @@ def test_the_first_ratio_is_one_and_the_value_leaves_act_alone(pipeline: Pipelin
     assert buffer.raw_action.shape == (STEPS, ENVS, ACTED, 3)
     assert set(buffer.age.unique().tolist()) == {0, 1, 2}
     chosen, _ = algorithm.add_targets(buffer)
-    algorithm._add_reference(buffer, pipeline)
-    batch = read_steps(buffer, chosen.flatten().nonzero()[:, 0], pipeline)
+    algorithm.add_reference(buffer, pipeline)
+    batch = read_batch(buffer, chosen.flatten().nonzero()[:, 0], pipeline)
     loss, record = algorithm.losses(batch)
     assert record["ratio_error"].max() < 1e-3
     loss.sum().backward()
@@ -115,7 +116,7 @@ def test_resumed_it_ends_where_the_other_does(pipeline: Pipeline, tmp_path: Path
 def test_averaged_chunks_are_refused() -> None:
     policy = small_act()
     policy.config.temporal_ensemble_coeff = 0.01
-    with pytest.raises(ValueError, match=r"--policy\.temporal_ensemble_coeff=null"):
+    with pytest.raises(FieldError, match=r"temporal_ensemble_coeff=0.01: .*set `policy\..*` to null"):
         PPO(policy, PPOConfig())
 
 

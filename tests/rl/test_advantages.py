@@ -4,7 +4,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_wmrl.rl.advantages import generalised_advantages, group_advantages, normalised
+from lerobot_wmrl.rl.grpo import group_advantages
+from lerobot_wmrl.rl.ppo import generalised_advantages, normalised
 
 GAMMA, LAMBDA = 0.97, 0.95
 STEPS, ENVS = 17, 5

@@ -20,14 +20,14 @@ from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.evaluation.agreement import evaluate_within
 from lerobot_wmrl.rl import gate
 from lerobot_wmrl.rl.callbacks import Callback, Record
+from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.configuration_callbacks import DYNA_SEEDS
-from lerobot_wmrl.rl.configuration_ppo import PPOConfig
 from lerobot_wmrl.rl.policy_gradient import TrainingStopped
 from lerobot_wmrl.rl.ppo import PPO
 from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer
 from lerobot_wmrl.rl.selection import Selection
-from lerobot_wmrl.rl.trainer import Schedule, rollout_seed, train
+from lerobot_wmrl.rl.trainer import Schedule, first_seed, train
 from tests.rl.conftest import ACTION_SCALE
 from tests.rl.point_env import PointEnv
 
@@ -243,7 +243,7 @@ def test_a_callback_stops_the_training_again_when_it_is_resumed(
 
 def test_selection_gate_and_dyna_have_seeds_of_their_own() -> None:
     """Each from its first number to the next: training < Dyna's last < evaluation < selection < gate."""
-    training = {rollout_seed(seed, i, 64) + 63 for seed in (0, 999_999) for i in (0, 9, 15_000, 15_624)}
+    training = {first_seed(seed, i, 64) + 63 for seed in (0, 999_999) for i in (0, 9, 15_000, 15_624)}
     assert max(training) < EVALUATION_SEED
     assert EVALUATION_SEED > DYNA_SEEDS
     assert EVALUATION_SEED < SELECTION_SEED < GATE_SEED

@@ -3,10 +3,9 @@
 import pytest
 import torch
 
-from lerobot_wmrl.rl.advantages import generalised_advantages
-from lerobot_wmrl.rl.configuration_ppo import PPOConfig
-from lerobot_wmrl.rl.minibatches import read_steps
-from lerobot_wmrl.rl.ppo import PPO
+from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
+from lerobot_wmrl.rl.policy_gradient import read_batch
+from lerobot_wmrl.rl.ppo import PPO, generalised_advantages
 from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
 from tests.rl.chunk_policy import ChunkPolicy
@@ -79,9 +78,9 @@ def test_what_was_not_acted_counts_for_nothing(
     assert set(lengths[buffer.decided].tolist()) > {2, CHUNK}
     algorithm = PPO(policy, PPOConfig(value_iterations=0))
     chosen, _ = algorithm.add_targets(buffer)
-    algorithm._add_reference(buffer, pipeline)
+    algorithm.add_reference(buffer, pipeline)
     rows = chosen.flatten().nonzero()[:, 0]
-    batch = read_steps(buffer, rows, pipeline)
+    batch = read_batch(buffer, rows, pipeline)
     loss, record = algorithm.losses(batch)
     assert record["ratio_error"].max() < 1e-3
     batch["raw_action"] = torch.where(batch["executed"], batch["raw_action"], 100.0)

@@ -108,7 +108,7 @@ def test_rounds_build_on_one_another(
     settings = json.loads((last / "train_config.json").read_text())
     assert settings["model"]["pretrained_path"].startswith(str(tmp_path / "dyna" / "000003"))
     assert settings["dataset"]["more"] == [
-        str(tmp_path / "dyna" / at / manner) for at in ("000003", "000006") for manner in ("calm", "noisy")
+        str(tmp_path / "dyna" / at / noise) for at in ("000003", "000006") for noise in ("calm", "noisy")
     ]
 
 

@@ -9,14 +9,20 @@ import pytest
 import torch
 
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
-from lerobot_wmrl.rl.configuration_ppo import PPOConfig
-from lerobot_wmrl.rl.minibatches import Minibatch, make_minibatches, read_steps
-from lerobot_wmrl.rl.objectives import clipped_objective, kl_estimate, reference_penalty
-from lerobot_wmrl.rl.policy_gradient import TrainingStopped
+from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
+from lerobot_wmrl.rl.policy_gradient import (
+    Minibatch,
+    Minibatches,
+    TrainingStopped,
+    clipped_objective,
+    kl_estimate,
+    read_batch,
+    reference_penalty,
+)
 from lerobot_wmrl.rl.ppo import PPO
 from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
-from tests.rl.learning import assert_it_learns
+from tests.rl.learning import assert_it_learns, update
 from tests.rl.point_env import PointEnv
 
 FAST = {"policy_lr": 3e-3, "value_lr": 3e-3, "target_kl": 0.05, "minibatch_size": 240, "value_iterations": 1}
@@ -32,7 +38,7 @@ def one_rollout(
     buffer = RolloutBuffer(12, 16, "cpu")
     collect(env, policy, pipeline, buffer, seed=0)
     algorithm.add_targets(buffer)
-    algorithm._add_reference(buffer, pipeline)
+    algorithm.add_reference(buffer, pipeline)
     return algorithm, buffer
 
 
@@ -41,7 +47,7 @@ def test_before_the_first_update_the_ratio_is_one_and_kl_is_zero(
     make_policy: MakePolicy, pipeline: Pipeline, image_size: int
 ) -> None:
     algorithm, buffer = one_rollout(make_policy(image_size), pipeline, image_size, initial_std=0.3)
-    _, record = algorithm.losses(read_steps(buffer, torch.randperm(192)[:100], pipeline))
+    _, record = algorithm.losses(read_batch(buffer, torch.randperm(192)[:100], pipeline))
     assert record["ratio_error"].max() < 1e-3
     assert record["kl"].abs().max() < 1e-5
     assert record["reference_kl"].abs().max() < 1e-5
@@ -54,8 +60,8 @@ def test_positive_advantage_raises_the_log_prob_of_what_was_done(
         policy = make_policy()
         algorithm, buffer = one_rollout(policy, pipeline, policy_lr=1e-3)
         buffer.columns["advantage"] = torch.full((12, 16), sign)
-        batch = read_steps(buffer, torch.arange(192), pipeline)
-        algorithm.update(iter([Minibatch(192, iter([batch]))]))
+        batch = read_batch(buffer, torch.arange(192), pipeline)
+        algorithm.update(iter([Minibatch(192, iter([(192, batch)]))]))
         moved = policy.evaluate(batch["observation"], batch["raw_action"])[0] - batch["log_prob"]
         assert sign * moved.sum(dim=1).mean() > 1e-3
 
@@ -87,14 +93,14 @@ def test_value_iterations_leave_the_policy_alone(make_policy: MakePolicy, pipeli
     policy = make_policy()
     algorithm, buffer = one_rollout(policy, pipeline, value_iterations=1)
     before = copy.deepcopy(policy.state_dict())
-    algorithm.improve(buffer, pipeline)
+    update(algorithm, buffer, pipeline)
     changed = {
         name.split(".")[0]
         for name, value in policy.state_dict().items()
         if not torch.equal(value, before[name])
     }
     assert changed == {"critic"}
-    algorithm.improve(buffer, pipeline)
+    update(algorithm, buffer, pipeline)
     assert not torch.equal(policy.actor.head.weight, before["actor.head.weight"])
     reference = algorithm.reference.state_dict()
     assert all(torch.equal(reference[name], value) for name, value in before.items())
@@ -102,7 +108,7 @@ def test_value_iterations_leave_the_policy_alone(make_policy: MakePolicy, pipeli
 
 def test_updates_stop_at_the_target_kl(make_policy: MakePolicy, pipeline: Pipeline) -> None:
     algorithm, buffer = one_rollout(make_policy(), pipeline, policy_lr=5e-3, minibatch_size=32, epochs=9)
-    stats = algorithm.improve(buffer, pipeline)
+    stats = update(algorithm, buffer, pipeline)
     assert 1 < stats.extra["updates"] < 9 * 6
 
 
@@ -117,8 +123,9 @@ def test_training_stops_before_a_bad_step(
     before = copy.deepcopy(policy.state_dict())
     shift = torch.full_like(buffer.columns[column], value)
     buffer.columns[column] = buffer.columns[column] - shift
+    minibatches = Minibatches(buffer, buffer.decided, pipeline, PPOConfig(epochs=1, minibatch_size=64))
     with pytest.raises(TrainingStopped, match=reason):
-        algorithm.update(make_minibatches(buffer, buffer.decided, pipeline, 64, None, 1))
+        algorithm.update(iter(minibatches))
     assert all(torch.equal(value, before[name]) for name, value in policy.state_dict().items())
 
 
@@ -145,6 +152,6 @@ def test_the_reference_holds_the_policy(make_policy: MakePolicy, pipeline: Pipel
         algorithm = PPO(policy, PPOConfig(**FAST, reference_coefficient=coefficient))
         for iteration in range(6):
             collect(env, policy, pipeline, buffer, 64 * iteration)
-            stats = algorithm.improve(buffer, pipeline)
+            stats = update(algorithm, buffer, pipeline)
         distance[coefficient] = stats.extra["reference_kl"]
     assert distance[3.0] < 0.5 * distance[0.0]

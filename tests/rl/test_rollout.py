@@ -9,10 +9,10 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
-from lerobot_wmrl.rl.minibatches import make_minibatches, read_steps
-from lerobot_wmrl.rl.observations import ObservationBuffer
+from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
+from lerobot_wmrl.rl.policy_gradient import Minibatches, read_batch
 from lerobot_wmrl.rl.protocol import Pipeline
-from lerobot_wmrl.rl.rollout import Actor, RolloutBuffer, collect
+from lerobot_wmrl.rl.rollout import Actor, ObservationBuffer, RolloutBuffer, collect
 from tests.read_backs import ReadBacks
 from tests.rl.chunk_policy import ChunkPolicy
 from tests.rl.point_env import PointEnv
@@ -97,8 +97,9 @@ def test_minibatches_visit_every_step_once_an_epoch(
 ) -> None:
     _, buffer, _ = filled(make_policy(), pipeline)
     buffer.columns = {"row": torch.arange(20 * 16).view(20, 16)}
-    batches = make_minibatches(buffer, buffer.decided, pipeline, 50, None, 2)
-    rows = torch.cat([steps["row"] for batch in batches for steps in batch.passes])
+    batches = Minibatches(buffer, buffer.decided, pipeline, PPOConfig(epochs=2, minibatch_size=50))
+    rows = torch.cat([steps["row"] for batch in batches for _, steps in batch.passes])
+    assert len(batches) == 2 * 7
     assert torch.equal(rows.sort().values, torch.arange(320).repeat_interleave(2))
 
 
@@ -108,7 +109,7 @@ def test_actions_keep_their_values(make_policy: Callable[..., CnnPolicy], pipeli
     _, buffer, _ = filled(policy, pipeline, image_size=0)
     assert buffer.raw_action.dtype == buffer.log_prob.dtype == torch.float32
     assert (buffer.raw_action.abs() > 1).any()
-    batch = read_steps(buffer, torch.arange(320), pipeline)
+    batch = read_batch(buffer, torch.arange(320), pipeline)
     log_prob = policy.evaluate(batch["observation"], batch["raw_action"])[0]
     assert torch.allclose(log_prob, batch["log_prob"], atol=1e-5)
 

@@ -9,7 +9,7 @@ from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.evaluation.agreement import Evaluated
 from lerobot_wmrl.rl.callbacks import Record
 from lerobot_wmrl.rl.policy_gradient import TrainingStopped
-from lerobot_wmrl.rl.selection import Measure, Selection, best_iteration, parted
+from lerobot_wmrl.rl.selection import Measure, Selection, best_iteration, diverged
 
 N = 64
 
@@ -75,7 +75,7 @@ def test_real_success_decides_and_of_equals_the_earlier(tmp_path: Path) -> None:
     (record(0.20, None), False),
 ])  # fmt: skip
 def test_imagined_and_real_success_part(latest: Record, expected: bool) -> None:
-    assert parted(record(0.53, 0.55), latest) is expected
+    assert diverged(record(0.53, 0.55), latest) is expected
 
 
 def test_a_training_whose_imagination_parts_from_reality_is_stopped(tmp_path: Path) -> None:

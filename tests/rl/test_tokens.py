@@ -5,8 +5,8 @@ from typing import Any
 import pytest
 import torch
 
-from lerobot_wmrl.rl.configuration_ppo import PPOConfig
-from lerobot_wmrl.rl.minibatches import read_steps
+from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
+from lerobot_wmrl.rl.policy_gradient import read_batch
 from lerobot_wmrl.rl.ppo import PPO
 from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
@@ -32,7 +32,7 @@ def test_integer_actions_survive_the_buffer() -> None:
     assert buffer.raw_action.shape == (12, 16, TOKENS)
     bins = buffer.raw_action - FIRST_ID
     assert set(bins.unique().tolist()) == set(range(BINS))
-    batch = read_steps(buffer, torch.arange(192), PIPELINE)
+    batch = read_batch(buffer, torch.arange(192), PIPELINE)
     assert torch.equal(batch["raw_action"], buffer.raw_action.flatten(0, 1))
 
 
@@ -42,8 +42,8 @@ def test_before_the_first_update_every_ratio_is_one(ratio: str) -> None:
     policy = TokenPolicy()
     buffer, algorithm = rollout(policy), PPO(policy, PPOConfig(value_iterations=0, ratio=ratio))
     algorithm.add_targets(buffer)
-    algorithm._add_reference(buffer, PIPELINE)
-    _, record = algorithm.losses(read_steps(buffer, torch.arange(192), PIPELINE))
+    algorithm.add_reference(buffer, PIPELINE)
+    _, record = algorithm.losses(read_batch(buffer, torch.arange(192), PIPELINE))
     assert record["ratio_error"].max() < 1e-3
 
 

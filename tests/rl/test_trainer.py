@@ -9,12 +9,12 @@ import torch
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.tracking import read_metrics
-from lerobot_wmrl.rl.configuration_ppo import PPOConfig
+from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.policy_gradient import TrainingStopped
 from lerobot_wmrl.rl.ppo import PPO
 from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer
-from lerobot_wmrl.rl.trainer import Schedule, rollout_seed, train
+from lerobot_wmrl.rl.trainer import Schedule, first_seed, train
 from tests.rl.point_env import PointEnv
 
 MakePolicy = Callable[..., CnnPolicy]
@@ -95,7 +95,7 @@ def test_not_a_number_stops_training_and_the_last_checkpoint_stays(
 def test_training_seeds_are_apart_from_evaluation_seeds() -> None:
     for seed, num_envs in ((0, 64), (900_000, 64), (EVALUATION_SEED - 3, 128)):
         for iteration in (0, 1, 77, 10_000):
-            first = rollout_seed(seed, iteration, num_envs)
+            first = first_seed(seed, iteration, num_envs)
             assert first >= 0
             assert first + num_envs <= EVALUATION_SEED
-    assert rollout_seed(5, 2, 64) != rollout_seed(5, 3, 64)
+    assert first_seed(5, 2, 64) != first_seed(5, 3, 64)

@@ -1,0 +1,109 @@
+"""Configurations of the algorithms, `--algorithm.type=ppo|grpo`."""
+
+from dataclasses import dataclass
+from typing import Any, Final, Self
+
+from lerobot.rl.algorithms.configs import RLAlgorithmConfig
+
+from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice, require_share
+
+RATIOS: Final = ("action", "token")
+
+
+@dataclass
+class PolicyGradientConfig(RLAlgorithmConfig):
+    """Options that PPO and GRPO share: ascent on a clipped objective, several epochs a rollout."""
+
+    # `--help` finds the description of an inherited field only below the field itself, not in Args.
+    epochs: int = 3
+    """Passes over the decisions of each rollout."""
+    minibatch_size: int = 384
+    """Decisions of one optimiser step, in each process of `torchrun`."""
+    micro_batch_size: int | None = None
+    """Decisions in memory at once, if a whole minibatch does not fit; the gradient stays the same."""
+    policy_lr: float = 1e-4
+    """Learning rate of the policy (AdamW)."""
+    ratio: str = "action"
+    """Probability ratio that is clipped: of the whole `action`, or of each `token` (component) of it."""
+    reference_coefficient: float = 0.02
+    """Weight of the KL penalty towards the SFT policy that training starts from."""
+    target_kl: float = 0.015
+    """KL to the policy that collected the rollout beyond which its updates end early."""
+    max_reference_kl: float = 20.0
+    """KL to the SFT policy, in nats a decision, beyond which training stops."""
+    initial_std: float | None = None
+    """Standard deviation of exploration in normalised actions; by default the policy's own."""
+
+    def __post_init__(self) -> None:
+        require_positive(self, "epochs", "minibatch_size", "policy_lr", "target_kl")
+        require_choice(self, "ratio", RATIOS)
+        if self.micro_batch_size is not None:
+            require_at_least(self, 1, "micro_batch_size")
+
+    @classmethod
+    def from_policy_config(cls, policy_cfg: Any) -> Self:
+        """Return the defaults, which depend on no policy."""
+        return cls()
+
+
+@RLAlgorithmConfig.register_subclass("ppo")
+@dataclass
+class PPOConfig(PolicyGradientConfig):
+    """Proximal policy optimisation (Schulman et al. 2017) with a KL penalty towards the SFT policy.
+
+    Args:
+        gamma: discount factor.
+        gae_lambda: λ of generalised advantage estimation.
+        clip: half-width of the interval around 1 in which the ratio may move.
+        value_lr: learning rate of the value function (AdamW).
+        value_iterations: first iterations, in which only the value function learns.
+        value_normalisation: learn returns in units of their running standard deviation; for returns that are
+            far from 1 in size.
+    """
+
+    gamma: float = 0.97
+    gae_lambda: float = 0.95
+    clip: float = 0.2
+    value_lr: float = 5e-4
+    value_iterations: int = 3
+    value_normalisation: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_positive(self, "gamma", "gae_lambda", "clip", "value_lr")
+        require_share(self, "gamma", "gae_lambda", "clip")
+
+
+@RLAlgorithmConfig.register_subclass("grpo")
+@dataclass
+class GRPOConfig(PolicyGradientConfig):
+    """Group relative policy optimisation (Shao et al. 2024): episodes that start alike are compared with each
+    other, so no value function is needed. Asymmetric clip and group filter as in DAPO (Yu et al. 2025).
+
+    Args:
+        group_size: environments that start from the same state; divides --num_envs.
+        clip_low: how far the ratio may move below 1.
+        clip_high: how far the ratio may move above 1.
+        least_group_std: smallest standard deviation of a group's returns at which the group is trained on.
+            With a reward of about 1 for success, groups below it have all succeeded or all failed.
+        reference_coefficient: weight of the KL penalty towards the SFT policy; GRPO needs none.
+    """
+
+    group_size: int = 8
+    clip_low: float = 0.2
+    clip_high: float = 0.28
+    least_group_std: float = 0.05
+    reference_coefficient: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_positive(self, "clip_low", "clip_high", "least_group_std")
+        require_share(self, "clip_low", "clip_high")
+        require_at_least(self, 2, "group_size")
+
+
+def require_positive(settings: object, *fields: str) -> None:
+    """Raise FieldError for the first of the `fields` that is not above 0."""
+    for field in fields:
+        if getattr(settings, field) <= 0:
+            raise FieldError(field, getattr(settings, field), "must be above 0")

@@ -1,0 +1,120 @@
+"""Adapters that make policies of LeRobot stochastic, without a change to their code.
+
+B environments, n steps of a decision, K action components, D width of ACT's decoder.
+"""
+
+import math
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import torch
+from lerobot.utils.constants import OBS_IMAGES
+from torch import Tensor, nn
+from torch.distributions import Normal
+
+from lerobot_wmrl.common.adapters import unwrapped
+from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.rl.protocol import Observation, StochasticPolicy
+
+INITIAL_STD = 0.1
+"""In normalised actions. ACT's L1 loss learns no spread, so exploration needs a value to start from."""
+
+VALUE_WIDTH = 256
+
+
+class ChunkSample(NamedTuple):
+    """Actions of n steps, their log-probabilities and the value."""
+
+    raw_action: Tensor  # (B, n, K)
+    log_prob: Tensor  # (B, n, K)
+    value: Tensor  # (B,)
+
+
+class ActAdapter(nn.Module):
+    """ACT as a StochasticPolicy: π(a|o) = N(chunk(o), std), with a learnable std for each action component.
+
+    A decision is the first `n_action_steps` actions of ACT's chunk, executed without a new observation, as
+    ACT does. The value is an MLP on the decoder's feature of the first action; its gradient stops there.
+    """
+
+    def __init__(self, policy: Any) -> None:
+        super().__init__()
+        config = policy.config
+        if config.temporal_ensemble_coeff is not None:
+            raise FieldError(
+                "policy.temporal_ensemble_coeff", config.temporal_ensemble_coeff,
+                "averaged chunks have no log-probability", "set `policy.temporal_ensemble_coeff` to null",
+            )  # fmt: skip
+        self.policy, self.config = policy, config
+        width, actions = config.dim_model, config.action_feature.shape[0]
+        device = next(policy.parameters()).device
+        self.log_std = nn.Parameter(torch.full((actions,), math.log(INITIAL_STD), device=device))  # (K,)
+        self.critic = nn.Sequential(
+            nn.Linear(width, VALUE_WIDTH), nn.SiLU(), nn.Linear(VALUE_WIDTH, 1), nn.Flatten(0)
+        ).to(device)  # (B, D) → (B,)
+
+    def sample(self, observation: Observation) -> ChunkSample:
+        """Draw the next n actions. (B, n, K)"""
+        distribution, value = self._decide(observation)
+        raw_action = distribution.sample()
+        return ChunkSample(raw_action, distribution.log_prob(raw_action), value)
+
+    def evaluate(self, observation: Observation, raw_action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return log-probabilities (B, n, K), entropies (B,) and values (B,)."""
+        distribution, value = self._decide(observation)
+        return distribution.log_prob(raw_action), distribution.entropy().sum(dim=(1, 2)), value
+
+    def value(self, observation: Observation) -> Tensor:
+        """Return the values V(o). (B,)"""
+        return self._decide(observation)[1]
+
+    def value_parameters(self) -> Iterator[nn.Parameter]:
+        """Return the parameters of the MLP."""
+        return self.critic.parameters()
+
+    @torch.no_grad()
+    def set_std(self, std: float) -> None:
+        """Start exploration from `std` in every component."""
+        if std <= 0:
+            raise FieldError("initial_std", std, "must be above 0")
+        self.log_std.fill_(math.log(std))
+
+    def own_tensors(self) -> dict[str, Tensor]:
+        """Return the tensors that are not in ACT's own checkpoint, by name."""
+        return {name: value for name, value in self.state_dict().items() if not name.startswith("policy.")}
+
+    def _decide(self, observation: Observation) -> tuple[Normal, Tensor]:
+        """Return the distribution of the next n actions (B, n, K) and the values (B,)."""
+        images = {OBS_IMAGES: [observation[camera] for camera in self.config.image_features]}
+        decoded: list[Tensor] = []  # (B, chunk, D)
+        hook = self.policy.model.action_head.register_forward_pre_hook(
+            lambda _, inputs: decoded.append(inputs[0])
+        )
+        try:
+            chunk = self.policy.model({**observation, **(images if images[OBS_IMAGES] else {})})[0]
+        finally:
+            hook.remove()
+        mean = chunk[:, : self.config.n_action_steps]  # (B, n, K)
+        return Normal(mean, self.log_std.exp(), validate_args=False), self.critic(decoded[0][:, 0].detach())
+
+
+ADAPTERS = {"act": ActAdapter}
+"""Adapters by the type of the policy. The `own_tensors` of one are saved with the algorithm."""
+
+
+def as_stochastic(policy: Any) -> Any:
+    """Return the policy itself if it is stochastic, else the policy in its adapter.
+
+    Raises:
+        FieldError: there is no adapter for this type of policy.
+    """
+    suitable: bool = isinstance(unwrapped(policy), StochasticPolicy)
+    if suitable:
+        return policy
+    if policy.config.type not in ADAPTERS:
+        raise FieldError(
+            "policy.type", policy.config.type,
+            "reinforcement learning needs a policy with `sample`, `evaluate`, `value` and `value_parameters`",
+            f"take one that has them, for example cnn, or one of {', '.join(ADAPTERS)}",
+        )  # fmt: skip
+    return ADAPTERS[policy.config.type](policy)
