@@ -1,6 +1,26 @@
 """World models for LeRobot: imagine a robot's next observation, reward and done, and train policies inside.
 
+Importing any part of this package registers its policies, reward models, environments and algorithms with
+LeRobot. Only their configurations are imported for that: models and the simulator load when one is built.
+
 Notation used as tensor suffixes across the package:
 B batch (environments), T time (frames), S tokens a frame, C channels or code factors, D model width,
 H image height, W image width, A action size, P proprioceptive state size, V code levels of one factor.
 """
+
+from importlib import import_module
+
+CONFIGURATIONS = (
+    "lerobot_wmrl.world_models.configuration_frame_tokenizer",
+    "lerobot_wmrl.world_models.configuration_world_model",
+    "lerobot_wmrl.rewards.configuration_rewards",
+    "lerobot_wmrl.envs.configuration_world_model",
+    "lerobot_wmrl.envs.configuration_wmrl_maniskill",
+    "lerobot_wmrl.rl.configuration_algorithms",
+    "lerobot_policy_cnn.configuration_cnn",
+    "lerobot_policy_openvla.configuration_openvla",
+    "lerobot_policy_wm_mpc.configuration_wm_mpc",
+)
+
+for _module in CONFIGURATIONS:
+    import_module(_module)

@@ -1,4 +1,4 @@
-"""LeRobot's own commands find every policy, reward model and environment with no extra flag."""
+"""LeRobot's own commands find every type with no extra flag, and importing any part of the package does too."""
 
 import subprocess
 import sys
@@ -7,6 +7,18 @@ from pathlib import Path
 import pytest
 
 BIN = Path(sys.executable).parent
+
+REGISTERED = """
+from lerobot.configs import PreTrainedConfig
+from lerobot.configs.rewards import RewardModelConfig
+from lerobot.envs.configs import EnvConfig
+from lerobot.rl.algorithms.configs import RLAlgorithmConfig
+for base in (PreTrainedConfig, RewardModelConfig, EnvConfig, RLAlgorithmConfig):
+    print(*base.get_known_choices())
+import sys
+print("built", *({"mani_skill", "sapien", "transformers"} & set(sys.modules)))
+"""
+REWARD_MODELS = ("frame_tokenizer", "action_world_model", "text_world_model", "general", "embedding", "proxy")
 
 
 @pytest.mark.parametrize(
@@ -25,6 +37,30 @@ def test_lerobot_accepts_our_types(command: str, types: tuple[str, ...], tmp_pat
     assert result.returncode == 0, result.stderr[-2000:]
     choices = {choice for line in result.stdout.splitlines() if ".type" in line for choice in words(line)}
     assert set(types) <= choices
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "import lerobot_wmrl",
+        "from lerobot_wmrl.world_models.checkpoint import load_model",
+        "import lerobot_policy_cnn.configuration_cnn",
+        "import lerobot_policy_wm_mpc.configuration_wm_mpc",
+    ],
+)
+def test_any_import_registers_every_type(statement: str) -> None:
+    """And imports no simulator and no language model for it, when it is the package alone."""
+    result = subprocess.run(
+        [sys.executable, "-c", f"{statement}\n{REGISTERED}"], capture_output=True, text=True
+    )
+    assert result.returncode == 0, result.stderr[-2000:]
+    *registered, built = result.stdout.splitlines()[-5:]
+    expected = (
+        {"cnn", "openvla", "wm_mpc"}, set(REWARD_MODELS), {"world_model", "wmrl_maniskill"}, {"ppo", "grpo"},
+    )  # fmt: skip
+    for names, wanted in zip(registered, expected, strict=True):
+        assert wanted <= set(names.split())
+    assert statement != "import lerobot_wmrl" or built == "built"
 
 
 def words(line: str) -> set[str]:

@@ -81,7 +81,7 @@ def settings_of(
 def known_types(hint: Any) -> dict[str, type] | None:
     """Return the types registered under a choice, None if the annotation is not a choice."""
     is_choice = isinstance(hint, type) and issubclass(hint, ChoiceType)
-    return hint.get_known_choices() if is_choice else None  # type: ignore[attr-defined]
+    return hint.get_known_choices() if is_choice else None
 
 
 def type_hints(cls: type) -> dict[str, Any]:

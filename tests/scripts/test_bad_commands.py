@@ -36,7 +36,7 @@ ROLL_OUT = ["--policy.path={policy}", *SIMULATOR, "--num_episodes=1"]
     (train, ["--policy.path={foreign}", *SIMULATOR], "config.json is missing"),
     (train, [*SIMULATOR, "--preset=huge"], "--preset=huge: unknown preset"),
     (train_world_model, ["--dataset.root={foreign}"], "no LeRobotDataset there"),
-    (train_world_model, ["--dataset.root={data}", "--preset=demo"], "give a type: action_world_model, frame_tokenizer"),
+    (train_world_model, ["--dataset.root={data}", "--preset=demo"], "give a type: action_world_model, frame"),
     (train_world_model, [*TRAIN, "--output_dir={foreign}"], "foreign holds something else"),
     (train_world_model, [*TRAIN, "--output_dir={foreign}/thesis.txt"], "txt is a file"),
     (eval_world_model, [*REPLAY, "--output_dir={foreign}"], "foreign holds something else"),
