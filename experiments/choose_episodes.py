@@ -8,7 +8,7 @@ import argparse
 from pathlib import Path
 
 from lerobot_wmrl.data.recorded_episodes import recorded_episodes
-from lerobot_wmrl.demo.episodes import optimal_episodes
+from lerobot_wmrl.demo.stages import optimal_episodes
 
 
 def make_parser() -> argparse.ArgumentParser:

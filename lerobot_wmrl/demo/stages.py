@@ -1,47 +1,51 @@
 """The stages of the demo: which command each one runs, as a user would type it."""
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 
 from lerobot_wmrl.common.checkpoints import LAST_CHECKPOINT, latest_checkpoint
 from lerobot_wmrl.common.command_line import RunConfig
-from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.constants import EVALUATION_SEED, KINDS
+from lerobot_wmrl.common.errors import FieldError, require_at_least
 from lerobot_wmrl.common.presets import Flags, format_flags, preset_flags
-from lerobot_wmrl.demo.episodes import optimal_episodes
+from lerobot_wmrl.data.recorded_episodes import recorded_episodes
+from lerobot_wmrl.demo.runner import Stage
 
 SEED_STRIDE = 100_000
 """Demo seed s records and trains with seeds from s·SEED_STRIDE on, below EVALUATION_SEED."""
 
 EXPLORATION_SEED = SEED_STRIDE // 2
-"""Offset of the seeds with which the cloned policy gathers experience for the world models."""
+"""Offset of the seeds with which the SFT policy gathers experience for the world models."""
 
 ROLLOUT_SEED = EVALUATION_SEED + SEED_STRIDE
 """First seed of the rollouts replayed in the world model: neither trained on nor used for a success rate."""
 
 EXPLORATION = 0.4
-"""Largest noise on the cloned policy's actions while it gathers experience, as a share of the action box."""
+"""Largest noise on the SFT policy's actions while it gathers experience, as a share of the action box."""
 
 
 @dataclass
 class DemoConfig(RunConfig):
-    """The whole loop on one task: record, train, clone, improve, measure, report.
+    """Run the whole loop on one task: record, train, SFT, reinforce in imagination, measure, report.
 
     Running the same command again continues after the last finished piece of work. `--preset=demo` (the
-    default) or `--preset=tiny` sets the sizes; flags further right override it.
+    default) takes 40 minutes on one core, `--preset=tiny` a few and shows only that everything runs; flags
+    further right override the preset.
 
     Args:
-        output_dir: folder of everything the demo makes.
+        output_dir: folder of everything the demo makes; `report.html` is the page to read.
         seed: of recording, training and PPO; the evaluation seeds stay the same.
-        stage_preset: the --preset that each stage's command gets.
-        sft_episodes: optimal episodes the first policy is cloned from.
-        explore_episodes: episodes of that policy, noisy, that the world models learn from as well.
+        stage_preset: the `--preset` that each stage's command gets.
+        sft_episodes: optimal episodes that the SFT policy is cloned from.
+        explore_episodes: noisy episodes of that policy that the world models learn from as well.
         eval_episodes: held-out episodes of each success rate.
-        rollout_episodes: recorded episodes of each policy that are replayed in the world model.
+        rollout_episodes: episodes of each policy in ManiSkill that are replayed in the world model.
     """
 
     output_dir: Path = Path("outputs/demo")
@@ -53,33 +57,21 @@ class DemoConfig(RunConfig):
     rollout_episodes: int = 60
 
     def check(self) -> None:
-        """ValueError names a setting that cannot be."""
+        """Raise FieldError for a setting that cannot be."""
         preset_flags(self.stage_preset, "demo")
         last = EVALUATION_SEED // SEED_STRIDE - 1
         if not 0 <= self.seed <= last:
-            raise ValueError(
-                f"--seed={self.seed}: must be from 0 to {last}, so that no evaluation seed is trained on"
+            raise FieldError(
+                "seed", self.seed, f"must be from 0 to {last}, so that no evaluation seed is trained on"
             )
-        for name in ("sft_episodes", "explore_episodes", "eval_episodes", "rollout_episodes"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"--{name}={getattr(self, name)}: must be at least 1")
-
-
-@dataclass(frozen=True)
-class Stage:
-    """One command, made when the stage starts: some flags depend on what earlier stages left, and what an
-    interrupted call left may have to be cleared away first."""
-
-    name: str
-    title: str
-    command: Callable[[], list[str]]
+        require_at_least(self, 1, "sft_episodes", "explore_episodes", "eval_episodes", "rollout_episodes")
 
 
 def demo_stages(config: DemoConfig) -> list[Stage]:
-    """Every stage in order. Paths are relative to where the demo runs, so that each line can be copied."""
+    """List every stage in order. Paths are relative to where the demo runs, so each line can be copied."""
     return [
         Stage("record", "Record planned trajectories in ManiSkill", partial(record, config)),
-        Stage("sft", "Clone a policy from a few optimal episodes", partial(clone, config)),
+        Stage("sft", "Clone an SFT policy from a few optimal episodes", partial(train_sft, config)),
         Stage("explore", "Record noisy attempts of that policy", partial(explore, config)),
         Stage("merge", "Merge both recordings", partial(merge, config)),
         *(
@@ -91,21 +83,21 @@ def demo_stages(config: DemoConfig) -> list[Stage]:
             "Replay held-out recordings in it",
             partial(replay, config, "dataset", "held_out"),
         ),
-        *measurements(config, "sft", "cloned policy"),
-        Stage("rl", "Improve it by PPO inside the world model", partial(reinforce, config)),
+        *measurements(config, "sft", "SFT policy"),
+        Stage("rl", "Train it by PPO inside the world model", partial(reinforce, config)),
         *measurements(config, "rl", "PPO policy"),
     ]
 
 
 def measurements(config: DemoConfig, policy: str, title: str) -> list[Stage]:
-    """For a policy: its real and its imagined success, and its real episodes replayed in the world model."""
+    """Measure a policy's success in ManiSkill and in imagination, and replay its ManiSkill episodes."""
     rollouts = f"rollouts_{policy}"
     return [
         Stage(f"eval_{policy}", f"Success of the {title} in ManiSkill", partial(evaluate, config, policy)),
         Stage(
             f"imagine_{policy}", f"Success of the {title} in imagination", partial(imagine, config, policy)
         ),
-        Stage(rollouts, f"Record real episodes of the {title}", partial(record_policy, config, policy)),
+        Stage(rollouts, f"Record ManiSkill episodes of the {title}", partial(record_policy, config, policy)),
         Stage(
             f"replay_{policy}", "Replay those in the world model", partial(replay, config, rollouts, policy)
         ),
@@ -113,7 +105,7 @@ def measurements(config: DemoConfig, policy: str, title: str) -> list[Stage]:
 
 
 def checkpoint(folder: Path) -> Path:
-    """The latest checkpoint of a training command that wrote to `folder`."""
+    """Return the latest checkpoint of a training command that wrote to `folder`."""
     return folder / LAST_CHECKPOINT / PRETRAINED_MODEL_DIR
 
 
@@ -121,29 +113,17 @@ def first_seed(config: DemoConfig) -> int:
     return config.seed * SEED_STRIDE
 
 
-def ours(config: DemoConfig, program: str, flags: Flags) -> list[str]:
-    """A command of this package, at the demo's size."""
+def preset_command(config: DemoConfig, program: str, flags: Flags) -> list[str]:
+    """Return a command of this package, at the demo's size."""
     return [program, f"--preset={config.stage_preset}", *format_flags(flags)]
 
 
 def record(config: DemoConfig) -> list[str]:
     flags: Flags = {"output_dir": str(config.output_dir / "planned"), "seed": first_seed(config)}
-    return ours(config, "lerobot-wmrl-record", flags)
+    return preset_command(config, "lerobot-wmrl-record", flags)
 
 
-def train_model(config: DemoConfig, model: str) -> list[str]:
-    out = config.output_dir
-    flags: dict[str, str | int] = {"model.type": model, "dataset.root": str(out / "dataset")}
-    if model != "frame_tokenizer":
-        flags["model.tokenizer_path"] = str(checkpoint(out / "frame_tokenizer"))
-    return ours(
-        config,
-        "lerobot-wmrl-train-world-model",
-        {**flags, "output_dir": str(out / model), "seed": first_seed(config)},
-    )
-
-
-def clone(config: DemoConfig) -> list[str]:
+def train_sft(config: DemoConfig) -> list[str]:
     dataset = config.output_dir / "planned"
     flags: Flags = {"policy.type": "cnn", "dataset.repo_id": "local/demo", "seed": first_seed(config)}
     return lerobot_train(
@@ -154,9 +134,28 @@ def clone(config: DemoConfig) -> list[str]:
     )
 
 
+def optimal_episodes(root: Path, count: int) -> list[int]:
+    """Return the first `count` successful episodes of the kind `optimal`, taken from the scenes in turn."""
+    table = recorded_episodes(root)
+    chosen = (table["kind"] == KINDS.index("optimal")) & table["success"]
+    rank = np.zeros(len(chosen), dtype=np.int64)
+    for scene in np.unique(table["scene"]):
+        members = chosen & (table["scene"] == scene)
+        rank[members] = np.arange(members.sum())
+    order = sorted(np.flatnonzero(chosen), key=lambda row: (rank[row], table["scene"][row]))
+    if len(order) < count:
+        raise ValueError(
+            f"{root} holds {len(order)} successful optimal episodes, {count} are needed: record more"
+        )
+    return sorted(int(table["episode"][row]) for row in order[:count])
+
+
 def lerobot_train(folder: Path, dataset: Path, episodes: Sequence[int], flags: Sequence[str]) -> list[str]:
-    """LeRobot's own training. It continues by other flags, and refuses a folder without checkpoints, which
-    is therefore removed. It points `last` at a checkpoint that is whole, but a kill can come in between."""
+    """Return LeRobot's own training command, begun or continued.
+
+    It continues by other flags, and refuses a folder without checkpoints, which is therefore removed. It
+    points `last` at a checkpoint that is whole, but a kill can come between the two.
+    """
     last = folder / LAST_CHECKPOINT
     newest = last if last.exists() else latest_checkpoint(folder)
     if newest is not None:
@@ -172,62 +171,8 @@ def lerobot_train(folder: Path, dataset: Path, episodes: Sequence[int], flags: S
     return ["lerobot-train", *flags, *format_flags(files)]
 
 
-def imagination(config: DemoConfig) -> Flags:
-    """The environment that the two world models make."""
-    out = config.output_dir
-    return {
-        "env.type": "world_model",
-        "env.world_model_path": str(checkpoint(out / "action_world_model")),
-        "env.text_world_model_path": str(checkpoint(out / "text_world_model")),
-        "env.dataset.root": str(out / "dataset"),
-    }
-
-
-def reinforce(config: DemoConfig) -> list[str]:
-    """Whatever the gate says of the cloned policy's rollouts: the report shows its warning."""
-    out = config.output_dir
-    flags: Flags = {
-        "policy.path": str(checkpoint(out / "sft")),
-        **imagination(config),
-        "gate.dataset.root": str(out / "rollouts_sft"),
-        "algorithm.type": "ppo",
-        "output_dir": str(out / "rl"),
-        "seed": first_seed(config),
-    }
-    return ours(config, "lerobot-wmrl-train", flags)
-
-
-def evaluate(config: DemoConfig, policy: str) -> list[str]:
-    """LeRobot's own evaluation, on the same held-out starts for every policy and every demo seed."""
-    return success_rate(config, policy, {}, preset="eval", folder=f"eval_{policy}")
-
-
-def imagine(config: DemoConfig, policy: str) -> list[str]:
-    """The same command inside the world model."""
-    return success_rate(
-        config, policy, imagination(config), preset="eval-imagined", folder=f"imagine_{policy}"
-    )
-
-
-def success_rate(config: DemoConfig, policy: str, env: Flags, preset: str, folder: str) -> list[str]:
-    flags: Flags = {
-        "policy.path": str(checkpoint(config.output_dir / policy)),
-        **env,
-        "eval.n_episodes": config.eval_episodes,
-        "seed": EVALUATION_SEED,
-        "output_dir": str(config.output_dir / folder),
-    }
-    return ["lerobot-eval", *preset_flags(config.stage_preset, preset), *format_flags(flags)]
-
-
-def record_policy(config: DemoConfig, policy: str) -> list[str]:
-    """Held-out episodes of a policy, as it acts."""
-    folder = config.output_dir / f"rollouts_{policy}"
-    return roll_out(config, policy, folder, config.rollout_episodes, ROLLOUT_SEED)
-
-
 def explore(config: DemoConfig) -> list[str]:
-    """The world models must know how a cloned policy fails, not only how planners do."""
+    """Record noisy episodes of the SFT policy: the world models must see how it fails, not planners only."""
     seed = first_seed(config) + EXPLORATION_SEED
     command = roll_out(config, "sft", config.output_dir / "explored", config.explore_episodes, seed)
     return [*command, f"--exploration={EXPLORATION}"]
@@ -241,11 +186,11 @@ def roll_out(config: DemoConfig, policy: str, folder: Path, episodes: int, seed:
         "output_dir": str(folder),
         "seed": seed,
     }
-    return ours(config, "lerobot-wmrl-record", flags)
+    return preset_command(config, "lerobot-wmrl-record", flags)
 
 
 def merge(config: DemoConfig) -> list[str]:
-    """LeRobot's own tool. It refuses a folder that an interrupted call left, which is therefore removed."""
+    """Merge with LeRobot's own tool, which refuses what an interrupted call left; that is removed first."""
     target, names = config.output_dir / "dataset", ("planned", "explored")
     shutil.rmtree(target, ignore_errors=True)
     flags: Flags = {
@@ -260,8 +205,72 @@ def merge(config: DemoConfig) -> list[str]:
     return ["lerobot-edit-dataset", *format_flags(flags)]
 
 
+def train_model(config: DemoConfig, model: str) -> list[str]:
+    out = config.output_dir
+    flags: dict[str, str | int] = {"model.type": model, "dataset.root": str(out / "dataset")}
+    if model != "frame_tokenizer":
+        flags["model.tokenizer_path"] = str(checkpoint(out / "frame_tokenizer"))
+    flags |= {"output_dir": str(out / model), "seed": first_seed(config)}
+    return preset_command(config, "lerobot-wmrl-train-world-model", flags)
+
+
+def imagination(config: DemoConfig) -> Flags:
+    """Return the environment that the two world models make."""
+    out = config.output_dir
+    return {
+        "env.type": "world_model",
+        "env.world_model_path": str(checkpoint(out / "action_world_model")),
+        "env.text_world_model_path": str(checkpoint(out / "text_world_model")),
+        "env.dataset.root": str(out / "dataset"),
+    }
+
+
+def reinforce(config: DemoConfig) -> list[str]:
+    """Train whatever the gate says of the SFT policy's rollouts; the report shows its warning."""
+    out = config.output_dir
+    flags: Flags = {
+        "policy.path": str(checkpoint(out / "sft")),
+        **imagination(config),
+        "gate.dataset.root": str(out / "rollouts_sft"),
+        "algorithm.type": "ppo",
+        "output_dir": str(out / "rl"),
+        "seed": first_seed(config),
+    }
+    return preset_command(config, "lerobot-wmrl-train", flags)
+
+
+def evaluate(config: DemoConfig, policy: str) -> list[str]:
+    """Evaluate in ManiSkill, on the same held-out starts for every policy and every demo seed."""
+    return success_rate(config, policy, {}, preset="eval", folder=f"eval_{policy}")
+
+
+def imagine(config: DemoConfig, policy: str) -> list[str]:
+    """Evaluate with the same command inside the world model."""
+    return success_rate(
+        config, policy, imagination(config), preset="eval-imagined", folder=f"imagine_{policy}"
+    )
+
+
+def success_rate(config: DemoConfig, policy: str, env: Flags, preset: str, folder: str) -> list[str]:
+    """Return LeRobot's own evaluation command."""
+    flags: Flags = {
+        "policy.path": str(checkpoint(config.output_dir / policy)),
+        **env,
+        "eval.n_episodes": config.eval_episodes,
+        "seed": EVALUATION_SEED,
+        "output_dir": str(config.output_dir / folder),
+    }
+    return ["lerobot-eval", *preset_flags(config.stage_preset, preset), *format_flags(flags)]
+
+
+def record_policy(config: DemoConfig, policy: str) -> list[str]:
+    """Record held-out episodes of a policy without exploration."""
+    folder = config.output_dir / f"rollouts_{policy}"
+    return roll_out(config, policy, folder, config.rollout_episodes, ROLLOUT_SEED)
+
+
 def replay(config: DemoConfig, dataset: str, name: str) -> list[str]:
-    """Imagine real episodes from their first frame and actions; of the training data, those held out."""
+    """Replay recorded episodes in the world model; of the training data, those held out."""
     out = config.output_dir
     flags: Flags = {
         "model.path": str(checkpoint(out / "action_world_model")),
@@ -270,4 +279,4 @@ def replay(config: DemoConfig, dataset: str, name: str) -> list[str]:
         "split": "validation" if dataset == "dataset" else "all",
         "output_dir": str(out / f"replay_{name}"),
     }
-    return ours(config, "lerobot-wmrl-eval-world-model", flags)
+    return preset_command(config, "lerobot-wmrl-eval-world-model", flags)

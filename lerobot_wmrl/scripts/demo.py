@@ -2,7 +2,10 @@
 
     lerobot-wmrl-demo --preset=demo --output_dir=outputs/demo
 
-Running the same command again continues after the last finished piece of work.
+It records a task in ManiSkill, clones an SFT policy from a few episodes, trains the world models, trains the
+policy by PPO inside them, and measures both policies on the same held-out starts in ManiSkill. Every stage is
+one console command, which it prints. Running the same command again continues after the last finished piece
+of work. It ends with the result in a few lines and `report.html`.
 """
 
 import signal
@@ -13,35 +16,38 @@ from typing import NoReturn
 
 from lerobot_wmrl.common.command_line import run_command
 from lerobot_wmrl.common.presets import expand_preset
-from lerobot_wmrl.demo.pipeline import StageError, claimed, run_stages
 from lerobot_wmrl.demo.stages import DemoConfig, demo_stages
 
 
 def run_demo(cfg: DemoConfig) -> None:
-    """Every stage, then the report."""
+    """Run every stage, write the report, and say what came of it."""
+    from lerobot_wmrl.demo.runner import claimed, run_stages
+
     cfg.check()
     stages = demo_stages(cfg)
     with claimed(cfg.output_dir, {**asdict(cfg), "output_dir": str(cfg.output_dir)}):
         run_stages(stages, cfg.output_dir)
-        from lerobot_wmrl.demo.report.build import write_report
+        from lerobot_wmrl.demo.report.page import conclusion, write_report
 
         page = write_report(cfg, [stage.name for stage in stages])
-    print(f"\nreport: {page}")
-
-
-def interrupt(signal_number: int, frame: object) -> NoReturn:
-    """`kill` ends the demo as Ctrl-C does: with its stage, and with a word on how to go on."""
-    raise KeyboardInterrupt
+    print(f"\n{conclusion(cfg, page)}")
 
 
 def with_preset(argv: Sequence[str]) -> list[str]:
-    """Replace the preset by its flags; without one it is the demo's."""
+    """Expand the preset, `demo` if none is given."""
     given = any(argument.startswith("--preset") for argument in argv)
     return expand_preset(argv if given else ["--preset=demo", *argv], "demo")
 
 
+def interrupt(signal_number: int, frame: object) -> NoReturn:
+    """Let `kill` end the demo as Ctrl-C does: with its stage, and with a word on how to go on."""
+    raise KeyboardInterrupt
+
+
 def main() -> None:
     """Run the console command."""
+    from lerobot_wmrl.demo.runner import StageError
+
     signal.signal(signal.SIGTERM, interrupt)
     try:
         run_command(run_demo, DemoConfig, with_preset)

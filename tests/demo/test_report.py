@@ -16,9 +16,10 @@ from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.statistics import PairedChange, Proportion
 from lerobot_wmrl.common.tracking import append_metrics
 from lerobot_wmrl.data.recorded_episodes import recorded_episodes
-from lerobot_wmrl.demo.episodes import optimal_episodes
-from lerobot_wmrl.demo.report.build import verdict, write_report
-from lerobot_wmrl.demo.stages import DemoConfig, demo_stages
+from lerobot_wmrl.demo.report import figures
+from lerobot_wmrl.demo.report.page import conclusion, verdict, write_report
+from lerobot_wmrl.demo.report.results import lerobot_train_curve, metric_curves, success_rate
+from lerobot_wmrl.demo.stages import DemoConfig, demo_stages, optimal_episodes
 
 SUCCESSES = {"eval_sft": 4, "imagine_sft": 5, "eval_rl": 6, "imagine_rl": 9}
 
@@ -50,6 +51,12 @@ def finished(tmp_path: Path) -> DemoConfig:
     return config
 
 
+@pytest.fixture
+def without_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out the curves, which take seconds, where a test is about words and numbers."""
+    monkeypatch.setattr(figures, "drawn", lambda figure: "data:image/png;base64,")
+
+
 def write_dataset(root: Path) -> None:
     """Four episodes of three rows; the first and the last succeed, at their last row."""
     kinds = [KINDS.index(kind) for kind in ("optimal", "optimal", "near_miss", "optimal")]
@@ -73,23 +80,35 @@ def test_page_is_self_contained_and_says_the_numbers(finished: DemoConfig) -> No
     page = write_report(finished, stages).read_text()
     assert not re.findall(r"""(?:src|href)=["'](?!data:)""", page), "the page needs other files"
     assert "4 of 10; 95 %: 17–69 %" in page
-    assert "Real success went from 40 % to 60 % (+20 points): of the same 10 starts, 2 were gained" in page
+    assert (
+        "Success in ManiSkill went from 40 % to 60 % (+20 points): of the same 10 starts, 2 were gained"
+        in page
+    )
     assert "40 % (2 of 5; 12–77 %)" in page
     for name in stages:
         assert f"<pre>run-{name}</pre>" in page
     assert page.count("data:image/png;base64,") >= 8
 
 
+def test_the_demo_ends_by_saying_what_came_of_it(finished: DemoConfig) -> None:
+    said = conclusion(finished, finished.output_dir / "report.html")
+    assert "Success in ManiSkill went from 40 % to 60 %" in said
+    assert "predicts 2 of 5 failures as successes (false positives) and 3 of 4 successes (recall)" in said
+    assert f"Report: {finished.output_dir}/report.html" in said
+
+
+@pytest.mark.usefixtures("without_drawing")
 def test_the_gates_last_warning_is_shown_in_red(finished: DemoConfig) -> None:
     stages, gate = [stage.name for stage in demo_stages(finished)], finished.output_dir / "rl" / "gate"
     shown = '<p class="warning">'
     assert shown not in write_report(finished, stages).read_text()
-    write_json(gate / "000000" / "record.json", {"warning": "most failures are believed"})
-    assert f"{shown}most failures are believed" in write_report(finished, stages).read_text()
+    write_json(gate / "000000" / "record.json", {"warning": "many false positives"})
+    assert f"{shown}many false positives" in write_report(finished, stages).read_text()
     write_json(gate / "000010" / "record.json", {"warning": None})
     assert shown not in write_report(finished, stages).read_text()
 
 
+@pytest.mark.usefixtures("without_drawing")
 def test_summary_holds_every_headline_number(finished: DemoConfig) -> None:
     write_report(finished, [stage.name for stage in demo_stages(finished)])
     summary = json.loads((finished.output_dir / "summary.json").read_text())
@@ -101,6 +120,7 @@ def test_summary_holds_every_headline_number(finished: DemoConfig) -> None:
     assert summary["seconds"] == 3.0 * len(demo_stages(finished))
 
 
+@pytest.mark.usefixtures("without_drawing")
 def test_runs_with_other_seeds_stand_side_by_side(finished: DemoConfig) -> None:
     """Those beside this one, of the same size and on as many starts; each seed once."""
     config = replace(finished, eval_episodes=10)
@@ -119,7 +139,7 @@ def test_runs_with_other_seeds_stand_side_by_side(finished: DemoConfig) -> None:
 
 @pytest.mark.parametrize(
     ("gained", "lost", "words"),
-    [(20, 5, "It helped in reality"), (5, 20, "made the policy worse"), (14, 9, "does not show")],
+    [(20, 5, "made the policy better"), (5, 20, "made the policy worse"), (14, 9, "does not show")],
 )
 def test_verdict_claims_no_more_than_the_same_starts_show(gained: int, lost: int, words: str) -> None:
     before, after = Proportion(50, 100), Proportion(50 + gained - lost, 100)
@@ -138,3 +158,24 @@ def test_cloning_takes_successful_optimal_episodes_only(tmp_path: Path) -> None:
     assert optimal_episodes(tmp_path, 2) == [0, 3]
     with pytest.raises(ValueError, match="holds 2 successful optimal episodes, 3 are needed"):
         optimal_episodes(tmp_path, 3)
+
+
+def test_success_rate_counts_every_episode_of_every_task(tmp_path: Path) -> None:
+    tasks = [{"metrics": {"successes": [True, False]}}, {"metrics": {"successes": [True]}}]
+    (tmp_path / "eval_info.json").write_text(json.dumps({"per_task": tasks}))
+    rate = success_rate(tmp_path)
+    assert (rate.k, rate.n) == (2, 3)
+
+
+def test_curve_from_lerobots_log_lines(tmp_path: Path) -> None:
+    log = tmp_path / "sft.log"
+    log.write_text(
+        "INFO ot_train.py:1 step:200 smpl:2K ep:3 epch:0.10 loss:0.250 grdn:1.2 lr:1.0e-04\n"
+        "Training:  10%|\rINFO step:1K smpl:9K ep:9 epch:0.20 loss:1.5e-02 grdn:1.1 lr:1.0e-04\n"
+    )
+    assert lerobot_train_curve(log) == ([200.0, 1000.0], [0.25, 0.015])
+
+
+def test_curves_skip_rows_and_columns_that_are_missing() -> None:
+    rows = [{"step": 1, "loss": 2.0}, {"step": 2, "speed": 9.0}, {"step": 3, "loss": 1.0}]
+    assert metric_curves(rows, ["loss", "accuracy"]) == {"loss": ([1.0, 3.0], [2.0, 1.0])}

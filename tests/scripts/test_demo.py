@@ -22,9 +22,9 @@ STAGES = [stage.name for stage in demo_stages(DemoConfig())]
 HEADINGS = (
     "Success, before and after",
     "Can the world model be trusted?",
-    "Real beside imagined",
+    "Recorded beside imagined",
     "Goal frames",
-    "The reward along real episodes",
+    "The reward along recorded episodes",
     "Training",
     "Time and memory",
     "The commands",

@@ -1,4 +1,4 @@
-"""Numbers → pictures as data URLs. Pure functions."""
+"""Figures of the report, as data URLs that a self-contained page can hold."""
 
 import base64
 import io
@@ -8,10 +8,10 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from lerobot_wmrl.common.statistics import Proportion
-from lerobot_wmrl.demo.report.sources import Curve
+from lerobot_wmrl.demo.report.results import Curve
 
 COLOURS = ("#2b6cb0", "#dd6b20", "#2f855a", "#805ad5")
-REAL, IMAGINED = COLOURS[:2]
+MANISKILL, IMAGINED = COLOURS[:2]
 
 
 def data_url(content: bytes, kind: str) -> str:
@@ -19,7 +19,7 @@ def data_url(content: bytes, kind: str) -> str:
 
 
 def picture(path: Path) -> str:
-    """A PNG or GIF file as it is."""
+    """Return a PNG or GIF file as it is."""
     return data_url(path.read_bytes(), path.suffix.lstrip("."))
 
 
@@ -30,10 +30,10 @@ def drawn(figure: Figure) -> str:
 
 
 def success_bars(rates: Mapping[str, tuple[Proportion, Proportion]]) -> str:
-    """Real and imagined success of each policy with Wilson intervals: `{policy: (real, imagined)}`."""
+    """Draw each policy's success in ManiSkill and in the world model, with 95 % intervals."""
     figure = Figure(figsize=(6.4, 3.4))
     axes = figure.subplots()
-    for side, (label, colour) in enumerate((("in ManiSkill", REAL), ("in the world model", IMAGINED))):
+    for side, (label, colour) in enumerate((("in ManiSkill", MANISKILL), ("in the world model", IMAGINED))):
         for place, pair in enumerate(rates.values()):
             rate, x = pair[side], place + (side - 0.5) * 0.36
             low, high = rate.interval
@@ -49,7 +49,7 @@ def success_bars(rates: Mapping[str, tuple[Proportion, Proportion]]) -> str:
 
 
 def curves(named: Mapping[str, Curve], title: str, xlabel: str = "step") -> str:
-    """One panel with a line a name."""
+    """Draw one panel with a line a name."""
     figure = Figure(figsize=(4.6, 2.9))
     axes = figure.subplots()
     for colour, (name, (steps, values)) in zip(COLOURS * 4, named.items(), strict=False):

@@ -11,10 +11,17 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_wmrl.demo import pipeline, process
-from lerobot_wmrl.demo.pipeline import StageError, claimed, run_stages
-from lerobot_wmrl.demo.process import entry_point, run_measured, tree_memory
-from lerobot_wmrl.demo.stages import DemoConfig, Stage, demo_stages
+from lerobot_wmrl.demo import runner
+from lerobot_wmrl.demo.runner import (
+    Stage,
+    StageError,
+    claimed,
+    entry_point,
+    run_measured,
+    run_stages,
+    tree_memory,
+)
+from lerobot_wmrl.demo.stages import DemoConfig, demo_stages
 
 
 def run_code() -> None:
@@ -25,8 +32,8 @@ def run_code() -> None:
 @pytest.fixture(autouse=True)
 def commands_of_the_tests(monkeypatch: pytest.MonkeyPatch) -> None:
     """The test stages run code that takes a moment, and need none of the libraries that are preloaded."""
-    monkeypatch.setattr(process, "entry_point", lambda program: run_code)
-    monkeypatch.setattr(pipeline, "preload", lambda: None)
+    monkeypatch.setattr(runner, "entry_point", lambda program: run_code)
+    monkeypatch.setattr(runner, "preload", lambda: None)
 
 
 def python(name: str, code: str) -> Stage:
@@ -79,10 +86,10 @@ def test_a_stage_ends_when_the_demo_is_stopped(sign: signal.Signals, tmp_path: P
         f"Path({str(pid_file)!r}).write_text(str(os.getpid())); time.sleep(60)"
     )
     runner = (
-        "import signal, sys; from pathlib import Path; from lerobot_wmrl.demo import process; "
+        "import signal, sys; from pathlib import Path; from lerobot_wmrl.demo import runner; "
         "signal.signal(signal.SIGINT, signal.default_int_handler); "  # background jobs ignore it
-        "process.entry_point = lambda program: lambda: exec(sys.argv[1], {}); "
-        f"process.run_measured(['python', {stage!r}], Path({str(log)!r}), print)"
+        "runner.entry_point = lambda program: lambda: exec(sys.argv[1], {}); "
+        f"runner.run_measured(['python', {stage!r}], Path({str(log)!r}), print)"
     )
     process = subprocess.Popen([sys.executable, "-c", runner], stdout=subprocess.DEVNULL)
     wait_until(lambda: pid_file.exists() and pid_file.read_text() != "")
@@ -109,7 +116,7 @@ def test_other_settings_are_refused_by_name(tmp_path: Path) -> None:
     with claimed(tmp_path, {"seed": 1}):
         pass
     with (
-        pytest.raises(ValueError, match=r"--seed=2: .* was started with 1"),
+        pytest.raises(ValueError, match=r"seed=2: .* was started with 1"),
         claimed(tmp_path, {"seed": 2}),
     ):
         pass
@@ -122,7 +129,7 @@ def test_two_runs_do_not_share_a_folder(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("flags", [{"seed": -1}, {"seed": 10}, {"eval_episodes": 0}, {"explore_episodes": 0}])
 def test_impossible_settings_are_named(flags: dict[str, int]) -> None:
-    with pytest.raises(ValueError, match=f"--{next(iter(flags))}="):
+    with pytest.raises(ValueError, match=f"{next(iter(flags))}="):
         DemoConfig(**flags).check()
 
 

@@ -1,0 +1,253 @@
+"""Run stages in order and remember, in the output folder, which are finished: a second call continues.
+
+Each stage is one console command. It runs in a forked process, which shows and logs its output and is
+measured. Forking from a process that has imported the libraries saves every stage the ten seconds of import.
+"""
+
+import fcntl
+import importlib
+import importlib.metadata
+import json
+import logging
+import multiprocessing
+import os
+import select
+import shlex
+import shutil
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import psutil
+
+from lerobot_wmrl.common.die_with_parent import die_with
+from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.files import foreign_files, write_json
+from lerobot_wmrl.common.malloc import keep_freed_memory
+from lerobot_wmrl.common.progress import own_progress_lock
+
+MARKER = "settings.json"
+
+SAMPLE_SECONDS = 1.0
+"""How often memory is sampled and progress is reported."""
+
+PRELOADED = (
+    "lerobot.scripts.lerobot_train",
+    "lerobot.scripts.lerobot_eval",
+    "lerobot_env_wmrl",
+    "lerobot_wmrl.maniskill.simulation",
+)
+
+Progress = Callable[[float, int], None]
+"""Called about once a second with the seconds since the start and the peak memory so far in bytes."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One console command.
+
+    The command is made when the stage starts: some of its flags depend on what earlier stages left, and what
+    an interrupted call left may have to be removed first.
+    """
+
+    name: str
+    title: str
+    command: Callable[[], list[str]]
+
+
+class StageError(RuntimeError):
+    """A stage's command failed; the message names the stage, its log, and how to go on."""
+
+
+@contextmanager
+def claimed(output_dir: Path, settings: Mapping[str, Any]) -> Iterator[None]:
+    """Hold a folder for stages that are made from `settings` (name → text or number).
+
+    Raises:
+        FieldError: the folder holds other things, was claimed with other settings, or is in use.
+    """
+    marker = output_dir / MARKER
+    if marker.exists():
+        check_settings(output_dir, json.loads(marker.read_text()), settings)
+    elif foreign_files(output_dir, MARKER):
+        raise FieldError(
+            "output_dir", output_dir, "holds what this command did not make", "choose another folder"
+        )
+    else:
+        write_json(marker, dict(settings))
+    with marker.open() as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise FieldError("output_dir", output_dir, "another run of this command is there") from None
+        yield
+
+
+def check_settings(output_dir: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+    """Raise FieldError for a setting that differs from the one the folder was begun with."""
+    for name, value in wanted.items():
+        if found.get(name) != value:
+            raise FieldError(
+                name, value, f"{output_dir} was started with {found.get(name)}",
+                "give that value to continue, or another `output_dir`",
+            )  # fmt: skip
+
+
+def run_stages(stages: Sequence[Stage], output_dir: Path) -> None:
+    """Run every stage that is not finished. Raises StageError when a command fails."""
+    for number, stage in enumerate(stages, start=1):
+        record = read_record(output_dir, stage)
+        heading = f"[{number}/{len(stages)}] {stage.title}"
+        if record.get("finished"):
+            print(f"{heading}: done in {record['seconds']:.0f} s", flush=True)
+        else:
+            run_stage(stage, heading, output_dir, record)
+
+
+def run_stage(stage: Stage, heading: str, output_dir: Path, record: dict[str, Any]) -> None:
+    """Run one stage. Its record is written about once a second, so an interruption loses no time measured."""
+    command = stage.command()
+    seconds, peak = record.get("seconds", 0.0), record.get("peak_memory_bytes", 0)
+    # The first command is the one to copy: a resumed stage may run another one.
+    record = {"name": stage.name, "title": stage.title, "command": record.get("command", shlex.join(command))}
+
+    def save(elapsed: float, memory: int, finished: bool = False) -> None:
+        measured = {
+            "seconds": seconds + elapsed,
+            "peak_memory_bytes": max(peak, memory),
+            "finished": finished,
+        }
+        record.update(measured)
+        write_json(record_path(output_dir, stage), record)
+
+    print(f"\n{heading}\n$ {shlex.join(command)}", flush=True)
+    log = output_dir / "logs" / f"{stage.name}.log"
+    log.parent.mkdir(parents=True, exist_ok=True)
+    preload()
+    status = run_measured(command, log, save)
+    if status != 0:
+        raise StageError(
+            f"{stage.title}: exit status {status}. Its output is in {log}; run the same command again to "
+            "continue."
+        )
+    save(record["seconds"] - seconds, record["peak_memory_bytes"], finished=True)
+
+
+def record_path(output_dir: Path, stage: Stage) -> Path:
+    return output_dir / "stages" / f"{stage.name}.json"
+
+
+def read_record(output_dir: Path, stage: Stage) -> dict[str, Any]:
+    """Return what is known of a stage, nothing before its first second."""
+    path = record_path(output_dir, stage)
+    return json.loads(path.read_text()) if path.exists() else {}
+
+
+def preload() -> None:
+    """Import once what every stage needs, without network and without LeRobot's page about FFmpeg.
+
+    The libraries ask whether they may use the network when they are imported, and no stage needs it.
+    """
+    os.environ.setdefault("HF_HUB_OFFLINE", "1")
+    logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
+    for module in PRELOADED:
+        importlib.import_module(module)
+
+
+def entry_point(program: str) -> Callable[[], int | None]:
+    """Return the function that the console command calls. Raises ValueError if no package installs it."""
+    found = importlib.metadata.entry_points(group="console_scripts", name=program)
+    if not found:
+        raise ValueError(f"the command {program} is not installed: run `make setup`")
+    return next(iter(found)).load()
+
+
+def run_measured(command: Sequence[str], log: Path, progress: Progress) -> int:
+    """Run `command` to its end and return its exit status; an exception ends its process group first."""
+    reader, writer = os.pipe()
+    process = multiprocessing.get_context("fork").Process(
+        target=_run_command, args=(list(command), writer, os.getpid())
+    )
+    sys.stdout.flush()
+    try:
+        process.start()
+        os.close(writer)
+        with log.open("ab") as file:
+            _follow(process, reader, file, progress)
+        process.join()
+        assert process.exitcode is not None
+        return process.exitcode
+    finally:
+        _end_group(process)
+        os.close(reader)
+
+
+def _run_command(command: list[str], output: int, parent: int) -> None:
+    """Become, in the forked process, what a shell would have started."""
+    os.setsid()
+    die_with(parent)
+    own_progress_lock()
+    for sign in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(sign, signal.SIG_DFL if sign == signal.SIGTERM else signal.default_int_handler)
+    for stream in (1, 2):
+        os.dup2(output, stream)
+    sys.stdout, sys.stderr = (os.fdopen(stream, "w", buffering=1, closefd=False) for stream in (1, 2))
+    os.environ.setdefault("COLUMNS", str(shutil.get_terminal_size().columns))
+    keep_freed_memory()
+    sys.argv = command
+    sys.exit(entry_point(command[0])())
+
+
+def _follow(process: BaseProcess, output: int, log: BinaryIO, progress: Progress) -> None:
+    """Copy the output to the log and the screen, and report time and memory, until the process ends."""
+    start, peak, sampled = time.monotonic(), 0, float("-inf")
+    while True:
+        finished = not process.is_alive()
+        readable, _, _ = select.select([output], [], [], 0.0 if finished else 0.2)
+        chunk = os.read(output, 1 << 16) if readable else b""
+        if chunk:
+            log.write(chunk)
+            log.flush()
+            sys.stdout.buffer.write(chunk)
+            sys.stdout.flush()
+        if finished and not chunk:
+            progress(time.monotonic() - start, peak)
+            return
+        if time.monotonic() - sampled >= SAMPLE_SECONDS:
+            sampled = time.monotonic()
+            peak = max(peak, tree_memory(process.pid or 0))
+            progress(sampled - start, peak)
+
+
+def tree_memory(pid: int) -> int:
+    """Sum the resident bytes of a process and its descendants; shared pages count once for each."""
+    total = 0
+    try:
+        root = psutil.Process(pid)
+        processes = [root, *root.children(recursive=True)]
+    except psutil.NoSuchProcess:
+        return 0
+    for process in processes:
+        try:
+            total += process.memory_info().rss
+        except psutil.NoSuchProcess:
+            continue
+    return total
+
+
+def _end_group(process: BaseProcess) -> None:
+    """Interrupt what is left of the process group, then kill it. Does nothing after a normal end."""
+    if process.pid is None:
+        return
+    for sign, seconds in ((signal.SIGINT, 10.0), (signal.SIGKILL, 5.0)):
+        try:
+            os.killpg(process.pid, sign)
+        except ProcessLookupError:
+            break
+        process.join(seconds)
