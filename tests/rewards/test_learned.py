@@ -14,7 +14,7 @@ from lerobot_wmrl.rewards.modeling_rewards import EmbeddingRewardModel, ProxyRew
 from lerobot_wmrl.world_models.checkpoint import load_model
 
 IMAGE = "observation.images.third_view"
-STEPS = 200
+STEPS = 100
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,7 @@ def trained(small_dataset, trained_models, tmp_path_factory) -> Callable[..., Pa
         given = [
             f"--reward_model.type={kind}", "--reward_model.device=cpu", "--reward_model.hidden=32",
             "--dataset.repo_id=local/synthetic", f"--dataset.root={root}", f"--output_dir={folder}",
-            "--batch_size=16", "--num_workers=0", f"--steps={steps}", f"--save_freq={steps}", *flags,
+            "--batch_size=8", "--num_workers=0", f"--steps={steps}", f"--save_freq={steps}", *flags,
         ]  # fmt: skip
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(sys, "argv", ["lerobot-train", *given])
