@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from lerobot_wmrl.common.precision import compute_in
-from lerobot_wmrl.data.clip import Clip
+from lerobot_wmrl.data.clips import Clip
 from lerobot_wmrl.data.frames import Context
 from lerobot_wmrl.world_models.imagination import ImaginationState
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel

@@ -7,8 +7,8 @@ python -m experiments.choose_episodes outputs/attempts --successes=160
 import argparse
 from pathlib import Path
 
-from lerobot_wmrl.data.recorded_episodes import recorded_episodes
 from lerobot_wmrl.demo.stages import optimal_episodes
+from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
 
 def make_parser() -> argparse.ArgumentParser:

@@ -22,10 +22,10 @@ from tqdm import tqdm
 from lerobot_wmrl.common.constants import TASKS
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.statistics import Proportion
-from lerobot_wmrl.data.episode_table import EpisodeTable, open_dataset, read_episodes
-from lerobot_wmrl.data.recorded_episodes import recorded_episodes
+from lerobot_wmrl.data.episodes import EpisodeTable, open_dataset, read_episodes
 from lerobot_wmrl.evaluation.report import markdown_table
 from lerobot_wmrl.maniskill.cameras import Rendering
+from lerobot_wmrl.maniskill.recordings import recorded_episodes
 from lerobot_wmrl.maniskill.scenes import SCENES
 from lerobot_wmrl.maniskill.simulation import Simulation
 from lerobot_wmrl.maniskill.tasks import task_of

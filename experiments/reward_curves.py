@@ -33,7 +33,7 @@ from experiments.figures import COLOURS, tidy
 from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.statistics import Estimate
-from lerobot_wmrl.data.episode_table import EpisodeTable, open_dataset, read_episodes
+from lerobot_wmrl.data.episodes import EpisodeTable, open_dataset, read_episodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.start_frames import chosen_episodes
 from lerobot_wmrl.envs.uncertainty import SIGNALS

@@ -15,7 +15,7 @@ from lerobot_dataset_maniskill.writer import VOCABULARY_FILE
 from lerobot_wmrl.common.constants import FPS, KINDS, TASKS
 from lerobot_wmrl.common.files import write_text
 from lerobot_wmrl.common.statistics import Proportion
-from lerobot_wmrl.data.recorded_episodes import recorded_episodes
+from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
 CARD_FILE = Path("README.md")
 
@@ -41,7 +41,7 @@ def name_card(root: Path, repo_id: str) -> None:
 def write_card(root: Path, repo_id: str, table: Mapping[str, np.ndarray]) -> None:
     """The pictures, then the card, of the dataset at `root`, called `repo_id`.
 
-    `table` is `lerobot_wmrl.data.recorded_episodes.recorded_episodes`.
+    `table` is `lerobot_wmrl.maniskill.recordings.recorded_episodes`.
     """
     write_pictures(root, repo_id, table)
     vocabulary = json.loads((root / VOCABULARY_FILE).read_text())

@@ -34,7 +34,7 @@ class Example:
 def chosen_examples(table: Mapping[str, np.ndarray]) -> list[Example]:
     """One episode of each recorded task: the first success, optimal if possible; else the first failure.
 
-    `table` is `lerobot_wmrl.data.recorded_episodes.recorded_episodes`.
+    `table` is `lerobot_wmrl.maniskill.recordings.recorded_episodes`.
     """
     best = np.lexsort((table["episode"], table["kind"], ~table["success"]))
     rows = [best[table["task"][best] == task][0] for task in np.unique(table["task"])]

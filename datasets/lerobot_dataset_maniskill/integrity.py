@@ -7,7 +7,7 @@ import av
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from lerobot_wmrl.data.recorded_episodes import parquet_files
+from lerobot_wmrl.data.episodes import parquet_files
 
 
 def whole_dataset(root: Path, episodes: int) -> str | None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from lerobot_dataset_maniskill.configuration import POLICY_KIND, RecordConfig
 from lerobot_wmrl.common.constants import KINDS, START_COLUMNS, TASKS
-from lerobot_wmrl.data.recorded_episodes import recorded_episodes
+from lerobot_wmrl.maniskill.recordings import recorded_episodes
 from lerobot_wmrl.maniskill.scenes import SCENES, Scene, scene_for_seed
 
 
@@ -65,7 +65,7 @@ def simulated_episodes(config: RecordConfig) -> list[EpisodePlan]:
 def imagined_episodes(config: RecordConfig) -> list[EpisodePlan]:
     """From the environment's start frames in turn. Task, scene and seed are those of the real episodes that
     began so: an imagined episode can be repeated for real."""
-    from lerobot_wmrl.data.episode_table import open_dataset, read_episodes
+    from lerobot_wmrl.data.episodes import open_dataset, read_episodes
     from lerobot_wmrl.envs.start_frames import chosen_episodes
 
     assert config.imagination is not None

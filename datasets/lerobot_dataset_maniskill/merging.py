@@ -10,7 +10,7 @@ from lerobot.datasets.aggregate import aggregate_datasets
 from lerobot_dataset_maniskill.card import write_card
 from lerobot_dataset_maniskill.writer import write_vocabulary
 from lerobot_wmrl.common.constants import KINDS
-from lerobot_wmrl.data.recorded_episodes import recorded_episodes
+from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
 
 def merge_folders(folders: Sequence[Path], target: Path, repo_id: str) -> None:
@@ -33,7 +33,7 @@ def finish(merged: Path, output_dir: Path, repo_id: str, content: Mapping[str, A
 
 
 def success_by_kind(table: Mapping[str, np.ndarray]) -> dict[str, tuple[int, int]]:
-    """Kind → (successful episodes, episodes), of `lerobot_wmrl.data.recorded_episodes.recorded_episodes`."""
+    """Kind → (successful episodes, episodes), of `lerobot_wmrl.maniskill.recordings.recorded_episodes`."""
     kinds, success = table["kind"], table["success"]
     return {
         name: (int(success[kinds == index].sum()), int(np.sum(kinds == index)))

@@ -26,6 +26,8 @@ KINDS: Final = ("optimal", "waypoint", "interpolated", "noisy", "near_miss", "po
 START_COLUMNS: Final = ("start.task", "start.scene", "start.seed", "start.kind")
 """int64 (1,) columns from which an episode's start can be rebuilt in the simulator."""
 
+START_TASK, START_SCENE, START_SEED, START_KIND = START_COLUMNS
+
 EVALUATION_SEED: Final = 1_000_000
 """Recording and training seeds are below this number, evaluation seeds from it to the next."""
 

@@ -1,25 +1,30 @@
-"""Frames decoded once, tokens encoded once, both in memory-mapped arrays.
+"""Frames and depth decoded once, tokens encoded once, all in memory-mapped arrays.
 
 Reading random windows from video costs milliseconds an item; from these arrays it is a memory copy.
-The caches stand beside the dataset (`<root>.cache/`), never in it, and are rebuilt when absent.
+The caches stand beside the dataset (`<root>.cache/`), never in it, and are rebuilt when absent. Depth is
+brought to the grid of the tokens: metres, 0 where nothing was measured, one camera's grid after the other.
 """
 
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import psutil
 import torch
+from lerobot.configs.video import DEPTH_METER_UNIT, DepthEncoderConfig, infer_depth_unit
+from lerobot.datasets.depth_utils import MM_PER_METRE, dequantize_depth
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.video_utils import decode_video_frames
+from torch import Tensor
+from torch.nn import functional as F
 from tqdm import tqdm
 
-from lerobot_wmrl.data.compatibility import frame_size
-from lerobot_wmrl.data.episode_table import VIDEO_BACKEND
+from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.data.episodes import VIDEO_BACKEND, depth_key, frame_size
 from lerobot_wmrl.data.frames import NO_CONTEXT, Context
 
 ENCODE_BATCH = 128
@@ -35,21 +40,21 @@ class FrameEncoder(Protocol):
     def parameters(self) -> Iterator[torch.nn.Parameter]:
         """Its weights, of which the caches are valid."""
 
-    def context(self, images: torch.Tensor) -> Context:
+    def context(self, images: Tensor) -> Context:
         """Return the context of first frames (B, N, 3, H, W) in [0, 1]."""
 
-    def encode(self, images: torch.Tensor, context: Context = NO_CONTEXT) -> torch.Tensor:
+    def encode(self, images: Tensor, context: Context = NO_CONTEXT) -> Tensor:
         """Return the tokens (B, S) of frames (B, N, 3, H, W) in [0, 1]."""
 
 
 def cache_dir(dataset: LeRobotDataset) -> Path:
-    """Where a dataset's caches stand."""
+    """Return the folder of a dataset's caches."""
     root = Path(dataset.root)
     return root.with_name(root.name + ".cache")
 
 
 def cached_frames(dataset: LeRobotDataset, camera_keys: Sequence[str]) -> np.ndarray:
-    """All frames as a read-only memory map, uint8 (rows, N, H, W, 3); decoded on the first call."""
+    """Return all frames as a read-only memory map, uint8 (rows, N, H, W, 3); decoded on the first call."""
     shape = (dataset.num_frames, len(camera_keys), *frame_size(dataset.features[camera_keys[0]]), 3)
     key = digest([dataset.num_episodes, dataset.num_frames, *camera_keys, *file_stamps(dataset)])
 
@@ -64,7 +69,7 @@ def cached_frames(dataset: LeRobotDataset, camera_keys: Sequence[str]) -> np.nda
 
 
 def cached_tokens(dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer: FrameEncoder) -> np.ndarray:
-    """All frames' tokens as a read-only memory map, int32 (rows, S); encoded on the first call.
+    """Return all frames' tokens as a read-only memory map, int32 (rows, S); encoded on the first call.
 
     A context-conditioned tokenizer is given the first frame of each row's episode.
     """
@@ -89,8 +94,10 @@ def cached_tokens(dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer
 def cached_context(
     dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer: FrameEncoder
 ) -> np.ndarray:
-    """The coarsest features of every episode's context as a read-only memory map, float32 (E, N, C, g, g);
-    encoded on the first call."""
+    """Return the coarsest features of every episode's context as a read-only memory map.
+
+    float32 (E, N, C, g, g), encoded on the first call.
+    """
     frames, device = cached_frames(dataset, camera_keys), next(tokenizer.parameters()).device
     starts = np.asarray(dataset.meta.episodes["dataset_from_index"])
 
@@ -110,19 +117,19 @@ def cached_context(
 def encoded_path(
     name: str, dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer: FrameEncoder
 ) -> Path:
-    """Where the cache `name` of what exactly this tokenizer makes of these cameras stands."""
+    """Return the path of the cache `name` of what exactly this tokenizer makes of these cameras."""
     weights = hashlib.sha256(b"".join(p.detach().cpu().numpy().tobytes() for p in tokenizer.parameters()))
     key = digest([weights.hexdigest(), *camera_keys, *file_stamps(dataset)])
     return cache_dir(dataset) / f"{name}-{key}.npy"
 
 
-def frames_to_tensor(frames: np.ndarray) -> torch.Tensor:
+def frames_to_tensor(frames: np.ndarray) -> Tensor:
     """uint8 (B, N, H, W, 3) → float32 (B, N, 3, H, W) in [0, 1]."""
     return torch.from_numpy(np.array(frames)).permute(0, 1, 4, 2, 3).float() / 255
 
 
 def _decode_episode(dataset: LeRobotDataset, episode: int, key: str) -> np.ndarray:
-    """Frames of one episode and camera, uint8 (T, H, W, 3), from video or from stored images."""
+    """Decode one episode and camera, uint8 (T, H, W, 3), from video or from stored images."""
     rows = dataset.meta.episodes[episode]
     indices = range(rows["dataset_from_index"], rows["dataset_to_index"])
     if key not in dataset.meta.video_keys:
@@ -132,10 +139,11 @@ def _decode_episode(dataset: LeRobotDataset, episode: int, key: str) -> np.ndarr
     return decode_video(dataset, episode, key).permute(0, 2, 3, 1).numpy()
 
 
-def decode_video(dataset: LeRobotDataset, episode: int, key: str) -> torch.Tensor:
-    """Frames of one episode and camera: uint8 (T, 3, H, W), or codes of depth (T, 1, H, W).
+def decode_video(dataset: LeRobotDataset, episode: int, key: str) -> Tensor:
+    """Decode the video of one episode and camera: uint8 (T, 3, H, W), or codes of depth (T, 1, H, W).
 
-    ValueError if the video is corrupted.
+    Raises:
+        ValueError: the video is corrupted.
     """
     rows = dataset.meta.episodes[episode]
     first, length = rows[f"videos/{key}/from_timestamp"], rows["length"]
@@ -156,7 +164,7 @@ def decode_video(dataset: LeRobotDataset, episode: int, key: str) -> torch.Tenso
 def memory_map(
     path: Path, shape: tuple[int, ...], dtype: type, fill: Callable[[np.ndarray], None]
 ) -> np.ndarray:
-    """The array at `path`, or a new one that `fill` writes; it appears only once it is whole."""
+    """Return the array at `path`, or a new one that `fill` writes; it appears only once it is whole."""
     if not path.is_file():
         path.parent.mkdir(parents=True, exist_ok=True)
         for torn in path.parent.glob("*.partial"):
@@ -174,10 +182,76 @@ def memory_map(
 
 
 def file_stamps(dataset: LeRobotDataset) -> list[object]:
-    """Size and time of the dataset's files: another recording in the same folder is another cache."""
+    """Return size and time of the dataset's files: another recording in the same folder is another cache."""
     files = sorted(path for pattern in ("*.mp4", "*.parquet") for path in Path(dataset.root).rglob(pattern))
     return [item for path in files for item in (path.name, path.stat().st_size, path.stat().st_mtime_ns)]
 
 
 def digest(parts: Sequence[object]) -> str:
+    """Return a short hash of what a cache depends on."""
     return hashlib.sha256(json.dumps([str(part) for part in parts]).encode()).hexdigest()[:12]
+
+
+def token_depth(metres: Tensor, grid: int) -> Tensor:
+    """Average what was measured (> 0, finite) in each token's square, 0 where nothing was.
+
+    metres (F, N, H, W) → (F, N·g²)
+    """
+    known = torch.isfinite(metres) & (metres > 0)
+    share = F.adaptive_avg_pool2d(known.float(), grid)
+    mean = F.adaptive_avg_pool2d(torch.where(known, metres, 0.0), grid)
+    return torch.where(share > 0, mean / share, 0.0).flatten(1)
+
+
+def cached_depth(dataset: LeRobotDataset, camera_keys: Sequence[str], grid: int) -> np.ndarray:
+    """Return all frames' depth as a read-only memory map, float32 (rows, S) metres; decoded once."""
+    keys = [depth_key(camera) for camera in camera_keys]
+    key = digest([dataset.num_episodes, dataset.num_frames, grid, *keys, *file_stamps(dataset)])
+
+    def fill(target: np.ndarray) -> None:
+        for episode in tqdm(range(dataset.num_episodes), desc="Decoding depth", unit="episode"):
+            rows = dataset.meta.episodes[episode]
+            maps = torch.cat([decode_depth(dataset, episode, name) for name in keys], 1)
+            target[rows["dataset_from_index"] : rows["dataset_to_index"]] = token_depth(maps, grid).numpy()
+
+    shape = (dataset.num_frames, len(keys) * grid**2)
+    return memory_map(cache_dir(dataset) / f"depth-{key}.npy", shape, np.float32, fill)
+
+
+def depth_at(model: Any, dataset: LeRobotDataset, rows: Any) -> Tensor | None:
+    """Return depth (…, S) of rows of the dataset on the model's device, None if it does not look at depth."""
+    if not model.config.depth:
+        return None
+    depth = cached_depth(dataset, model.config.tokenizer.camera_keys, model.tokenizer.grid)[rows]
+    return torch.from_numpy(np.array(depth)).to(model.state_mean.device)
+
+
+def decode_depth(dataset: LeRobotDataset, episode: int, key: str) -> Tensor:
+    """Decode the depth of one episode and camera, (T, 1, H, W) metres, from video or from stored images."""
+    info = dataset.features[key].get("info") or {}
+    if key in dataset.meta.video_keys:
+        codes, encoder = decode_video(dataset, episode, key), DepthEncoderConfig.from_video_info(info)
+        metres = dequantize_depth(
+            codes, encoder.depth_min, encoder.depth_max, encoder.shift, encoder.use_log,
+            output_unit=DEPTH_METER_UNIT,
+        )  # fmt: skip
+        return torch.where(codes.int() > 0, torch.as_tensor(metres), 0.0)
+    rows = dataset.meta.episodes[episode]
+    indices = range(rows["dataset_from_index"], rows["dataset_to_index"])
+    maps = np.stack([np.asarray(image) for image in dataset.hf_dataset.with_format(None)[indices][key]])
+    unit = info.get("depth_unit") or infer_depth_unit(maps.dtype)
+    scale = 1.0 if unit == DEPTH_METER_UNIT else 1 / MM_PER_METRE
+    return torch.from_numpy(maps.astype(np.float32) * np.float32(scale))[:, None]
+
+
+def depth_of_windows(batch: Mapping[str, Any], camera_keys: Sequence[str], grid: int) -> Tensor:
+    """Bring depth maps (B, T, 1, H, W) of lerobot-train's batch, in millimetres, to metres a token (B, T, S).
+
+    Raises:
+        FieldError: the depth of a camera is missing.
+    """
+    missing = [name for name in map(depth_key, camera_keys) if name not in batch]
+    if missing:
+        raise FieldError("depth", True, f"the batch lacks {missing}", "use a dataset recorded with depth")
+    maps = torch.cat([batch[depth_key(camera)] for camera in camera_keys], 2).float() / MM_PER_METRE
+    return token_depth(maps.flatten(0, 1), grid).unflatten(0, maps.shape[:2])

@@ -12,7 +12,7 @@ from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
 from lerobot_wmrl.common.constants import FPS, TASKS
 from lerobot_wmrl.common.errors import FieldError, require_at_least
-from lerobot_wmrl.data.dataset_source import DatasetSource
+from lerobot_wmrl.data.episodes import DatasetSource
 from lerobot_wmrl.envs.uncertainty import Uncertainty
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 

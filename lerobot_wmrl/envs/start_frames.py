@@ -15,22 +15,22 @@ import torch
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from lerobot_wmrl.common.constants import ACTION_LOW, TASKS
+from lerobot_wmrl.common.constants import ACTION_LOW, START_SCENE, START_TASK, TASKS
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.compatibility import check_dataset
-from lerobot_wmrl.data.depth_maps import depth_at
-from lerobot_wmrl.data.episode_table import (
+from lerobot_wmrl.data.episodes import (
     EpisodeTable,
+    check_dataset,
     choose_episodes,
     evenly_spread,
     open_dataset,
     read_episodes,
 )
-from lerobot_wmrl.data.frame_cache import cached_frames, frames_to_tensor
+from lerobot_wmrl.data.frame_cache import cached_frames, depth_at, frames_to_tensor
 from lerobot_wmrl.data.frames import Context
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
-from lerobot_wmrl.maniskill.scenes import scene_for_seed, scenes_of
+from lerobot_wmrl.maniskill.recordings import scene_splits
+from lerobot_wmrl.maniskill.scenes import scene_for_seed
 from lerobot_wmrl.maniskill.tasks import task_of
 from lerobot_wmrl.rewards.similarity import Features, Similarity
 from lerobot_wmrl.world_models.goal import imagine_goal
@@ -120,11 +120,10 @@ def chosen_episodes(table: EpisodeTable, source: StartFrames) -> np.ndarray:
     Raises:
         ValueError: there is no such episode.
     """
-    unseen = {scene.index for scene in scenes_of("ood")}
-    wanted = np.ones(len(table.start), bool)
+    wanted, scene = np.ones(len(table.start), bool), table.column(START_SCENE)
     for name, column, values in (
-        ("tasks", table.task, [TASKS.index(task) for task in source.tasks or ()]),
-        ("scenes", table.scene, source.scenes or ()),
+        ("tasks", table.column(START_TASK), [TASKS.index(task) for task in source.tasks or ()]),
+        ("scenes", scene, source.scenes or ()),
     ):
         if values and not np.isin(column, values).any():
             raise FieldError(
@@ -133,7 +132,7 @@ def chosen_episodes(table: EpisodeTable, source: StartFrames) -> np.ndarray:
         wanted &= np.isin(column, values) if values else True
     if source.past:
         wanted &= undecided_after(table, source.past)
-    return choose_episodes(table, source.split, source.max_starts, unseen, wanted)
+    return choose_episodes(table, source.split, source.max_starts, scene_splits(scene, source.split), wanted)
 
 
 def undecided_after(table: EpisodeTable, frames: int) -> np.ndarray:
@@ -164,7 +163,7 @@ def read_dataset_frames(source: StartFrames, config: Any) -> FirstFrames:
         table.state[rows],
         table.action[rows[:, :-1]],
         [table.instructions[episode] for episode in episodes],
-        table.task[episodes],
+        table.column(START_TASK)[episodes],
         depth,
     )
 

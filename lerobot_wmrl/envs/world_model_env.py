@@ -13,7 +13,6 @@ from torch import Tensor
 
 from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW, FPS
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.compatibility import check_same_tokenizer
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.start_frames import FirstFrames, Goals, Starts, load_starts, read_first_frames
 from lerobot_wmrl.envs.uncertainty import entropies
@@ -21,7 +20,7 @@ from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rewards.general import consecutive_count, sparse_reward
 from lerobot_wmrl.rewards.loading import Reward, load_reward
 from lerobot_wmrl.rewards.similarity import Similarity, make_similarity, select_features
-from lerobot_wmrl.world_models.checkpoint import load_model
+from lerobot_wmrl.world_models.checkpoint import check_same_tokenizer, load_model
 from lerobot_wmrl.world_models.frame_tokenizer import Decoded
 from lerobot_wmrl.world_models.imagination import Imagined
 from lerobot_wmrl.world_models.modeling_world_model import (

@@ -14,11 +14,10 @@ import numpy as np
 from scipy.stats import mannwhitneyu
 from torch import Tensor
 
-from lerobot_wmrl.common.constants import KINDS, PLAY, TASKS
+from lerobot_wmrl.common.constants import KINDS, PLAY, START_KIND, START_TASK, TASKS
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.statistics import Estimate, Proportion
-from lerobot_wmrl.data.compatibility import check_dataset
-from lerobot_wmrl.data.episode_table import EpisodeTable, open_dataset, read_episodes
+from lerobot_wmrl.data.episodes import EpisodeTable, check_dataset, open_dataset, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames
 from lerobot_wmrl.evaluation.replay import MAX_ACTIONS, EpisodeReplay, Recording, in_batches
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
@@ -70,7 +69,7 @@ class Outcomes:
 
     def attempts(self, table: EpisodeTable) -> "Outcomes":
         """Leave out play, which attempts no task, unless there is nothing else."""
-        kept = table.kind[self.episodes] != KINDS.index(PLAY)
+        kept = table.column(START_KIND)[self.episodes] != KINDS.index(PLAY)
         return self.where(kept) if kept.any() else self
 
     def where(self, kept: np.ndarray) -> "Outcomes":
@@ -206,7 +205,7 @@ def gate_at(outcomes: Outcomes, threshold: float, frames: int) -> Gate:
 
 def gates_by_task(outcomes: Outcomes, table: EpisodeTable, threshold: float, frames: int) -> dict[str, Gate]:
     """Return the gate of each task in the dataset; none if the dataset does not name tasks."""
-    tasks = table.task[outcomes.episodes]
+    tasks = table.column(START_TASK)[outcomes.episodes]
     return {
         TASKS[task]: gate_at(outcomes.where(tasks == task), threshold, frames)
         for task in np.unique(tasks[tasks >= 0])

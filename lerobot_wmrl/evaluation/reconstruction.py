@@ -10,7 +10,7 @@ from torch import Tensor
 from tqdm import trange
 
 from lerobot_wmrl.common.files import write_json
-from lerobot_wmrl.data.episode_table import EpisodeTable, choose_episodes
+from lerobot_wmrl.data.episodes import EpisodeTable, choose_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames, frames_to_tensor
 from lerobot_wmrl.evaluation.image_metrics import motion_mask, psnr_from_mse
 from lerobot_wmrl.world_models.codebook import CodeBook, make_codebook

@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from lerobot_wmrl.data.depth_maps import depth_at
-from lerobot_wmrl.data.episode_table import EpisodeTable
-from lerobot_wmrl.data.frame_cache import frames_to_tensor
+from lerobot_wmrl.data.episodes import EpisodeTable
+from lerobot_wmrl.data.frame_cache import depth_at, frames_to_tensor
 from lerobot_wmrl.data.frames import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel

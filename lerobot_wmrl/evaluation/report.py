@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lerobot_wmrl.common.constants import KINDS, PLAY
+from lerobot_wmrl.common.constants import KINDS, PLAY, START_KIND
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.statistics import Estimate
 from lerobot_wmrl.data.frames import NO_CONTEXT
@@ -120,7 +120,7 @@ def evaluate(model: ActionWorldModelRewardModel, recording: Recording, episodes:
     for run in replay_episodes(model, recording, episodes):
         accuracy.append(measure(model, recording, run, lpips))
         replays.append(replace(run, tokens=run.tokens.new_empty(0), context=NO_CONTEXT))
-        if recording.table.kind[run.episode] != KINDS.index(PLAY) and len(run.done) > 1:
+        if recording.table.column(START_KIND)[run.episode] != KINDS.index(PLAY) and len(run.done) > 1:
             shown.setdefault("success" if run.done.any() else "failure", run)
     accuracy.sort(key=lambda each: each.episode)
     outcomes = Outcomes.stack(replays).attempts(recording.table)
@@ -135,7 +135,9 @@ def report_action_model(
     """Report accuracy, done, gate and robustness, and save their pictures in `folder`."""
     outcomes = evaluation.outcomes
     estimates = headline(evaluation.accuracy) | done_accuracy(outcomes, threshold, frames)
-    play = [e for e in evaluation.accuracy if recording.table.kind[e.episode] == KINDS.index(PLAY)]
+    play = [
+        e for e in evaluation.accuracy if recording.table.column(START_KIND)[e.episode] == KINDS.index(PLAY)
+    ]
     steps, play_steps = by_step(evaluation.accuracy, HORIZON), by_step(play, MAX_ACTIONS)
     gates, by_task = sweep(outcomes), gates_by_task(outcomes, recording.table, threshold, frames)
     best = best_operating_point(gates)

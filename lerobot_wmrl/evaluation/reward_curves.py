@@ -6,9 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_wmrl.data.clip import Clip
-from lerobot_wmrl.data.depth_maps import depth_at
-from lerobot_wmrl.data.frame_cache import frames_to_tensor
+from lerobot_wmrl.data.clips import Clip
+from lerobot_wmrl.data.frame_cache import depth_at, frames_to_tensor
 from lerobot_wmrl.evaluation.replay import Recording
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rewards.general import consecutive_count, general_reward, sparse_reward

@@ -15,8 +15,7 @@ from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.presets import Flags, format_flags
 from lerobot_wmrl.common.subcommand import run_subcommand
-from lerobot_wmrl.data.dataset_source import DatasetSource
-from lerobot_wmrl.data.episode_table import open_dataset
+from lerobot_wmrl.data.episodes import DatasetSource, open_dataset
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.rl.callbacks import REAL_STEPS, Record, RolloutRecorder, record_folder
 from lerobot_wmrl.rl.configuration_callbacks import DYNA_SEEDS, DynaConfig

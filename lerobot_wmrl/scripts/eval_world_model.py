@@ -24,7 +24,7 @@ from lerobot_wmrl.common.command_line import RunConfig, claim_output_dir, run_co
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import FieldError, require_at_least
 from lerobot_wmrl.common.presets import expand_preset
-from lerobot_wmrl.data.dataset_source import DatasetSource
+from lerobot_wmrl.data.episodes import DatasetSource
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 
 if TYPE_CHECKING:
@@ -109,14 +109,14 @@ class EvalWorldModelConfig(RunConfig):
 
 def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     """Replay, measure, and write metrics.json, metrics.md and the pictures."""
+    from lerobot_wmrl.common.constants import START_SCENE
     from lerobot_wmrl.common.files import write_json, write_text
-    from lerobot_wmrl.data.compatibility import check_dataset
-    from lerobot_wmrl.data.episode_table import choose_episodes, open_dataset, read_episodes
+    from lerobot_wmrl.data.episodes import check_dataset, choose_episodes, open_dataset, read_episodes
     from lerobot_wmrl.data.frame_cache import cached_frames
     from lerobot_wmrl.evaluation.reconstruction import reconstruction_metrics
     from lerobot_wmrl.evaluation.replay import Recording
     from lerobot_wmrl.evaluation.report import evaluate, report_action_model, report_agreement
-    from lerobot_wmrl.maniskill.scenes import scenes_of
+    from lerobot_wmrl.maniskill.recordings import scene_splits
     from lerobot_wmrl.world_models.checkpoint import load_model
 
     cfg.check()
@@ -124,8 +124,8 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     table = read_episodes(open_dataset(cfg.dataset.root, cfg.dataset.repo_id))
     check_dataset(model.config, table.dataset.features)
     text_model = load_text_model(cfg, model)
-    unseen = {scene.index for scene in scenes_of("ood")}
-    episodes = choose_episodes(table, cfg.split, cfg.max_episodes, unseen)
+    scenes = scene_splits(table.column(START_SCENE), cfg.split)
+    episodes = choose_episodes(table, cfg.split, cfg.max_episodes, scenes)
     claim_output_dir(cfg.output_dir, draccus.encode(cfg))
     recording = Recording(table, cached_frames(table.dataset, model.config.tokenizer.camera_keys))
     evaluation = evaluate(model, recording, episodes)
@@ -175,8 +175,7 @@ def load_text_model(
     cfg: EvalWorldModelConfig, model: "ActionWorldModelRewardModel"
 ) -> "TextWorldModelRewardModel | None":
     """Load the text world model if one is named. ValueError if its tokens are another tokenizer's."""
-    from lerobot_wmrl.data.compatibility import check_same_tokenizer
-    from lerobot_wmrl.world_models.checkpoint import load_model
+    from lerobot_wmrl.world_models.checkpoint import check_same_tokenizer, load_model
 
     if not cfg.text_model.path:
         return None

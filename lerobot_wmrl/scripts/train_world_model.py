@@ -25,7 +25,7 @@ from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.malloc import keep_freed_memory
 from lerobot_wmrl.common.precision import PRECISIONS, training_dtype
 from lerobot_wmrl.common.presets import expand_preset
-from lerobot_wmrl.data.dataset_source import TrainingData
+from lerobot_wmrl.data.episodes import TrainingData
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
 
 TRAINED = ("frame_tokenizer", "action_world_model", "text_world_model")
@@ -100,7 +100,7 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
     from lerobot.utils.random_utils import set_seed
 
     from lerobot_wmrl.common.checkpoints import latest_checkpoint
-    from lerobot_wmrl.data.episode_table import open_dataset, read_episodes
+    from lerobot_wmrl.data.episodes import open_dataset, read_episodes
     from lerobot_wmrl.evaluation.reconstruction import write_reconstruction
     from lerobot_wmrl.world_models.checkpoint import config_to_continue
     from lerobot_wmrl.world_models.training import build_model, make_joint_sampler, train
@@ -121,7 +121,8 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
         print(f"{cfg.output_dir}: already trained for {cfg.steps} steps")
     else:
         with processes.main_process_first():
-            sampler = make_joint_sampler(model, table, cfg.dataset, cfg.batch_size, cfg.seed)
+            seed = cfg.seed + processes.process_index
+            sampler = make_joint_sampler(model, table, cfg.dataset, cfg.batch_size, seed)
             if processes.is_main_process:
                 claim_output_dir(cfg.output_dir, given)
         dtype = training_dtype(cfg.precision, cfg.model.device)

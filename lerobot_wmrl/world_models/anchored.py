@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from lerobot_wmrl.common.precision import compute_in
-from lerobot_wmrl.data.clip import take_rows
+from lerobot_wmrl.data.clips import take_rows
 from lerobot_wmrl.data.frames import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.conditioning import AddedCondition, Conditioning, ConditionTokens, pooled
 from lerobot_wmrl.world_models.depth_branch import NoDepth

@@ -84,3 +84,13 @@ def load_model(path: str | Path, expected_type: str, device: str | None = "cpu")
             f"{path}: model.safetensors cannot be read ({error}). It is truncated or of another version: "
             "use an earlier checkpoint or train again"
         ) from error
+
+
+def check_same_tokenizer(model: Any, text_model: Any, flag: str) -> None:
+    """ValueError unless both world models, the second given by `flag`, speak of frames in the same tokens."""
+    own, other = model.tokenizer.state_dict(), text_model.tokenizer.state_dict()
+    if own.keys() != other.keys() or not all(torch.equal(own[name], other[name]) for name in own):
+        raise ValueError(
+            f"{flag}: trained on another tokenizer than the action world model; train both with the same "
+            "--model.tokenizer_path"
+        )

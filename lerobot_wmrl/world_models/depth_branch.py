@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from lerobot_wmrl.common.distributed import masked_mean
-from lerobot_wmrl.data.clip import known_transitions
+from lerobot_wmrl.data.clips import known_transitions
 from lerobot_wmrl.world_models.frame_grids import FrameEmbedding, FrameHead
 from lerobot_wmrl.world_models.st_transformer import LayerHook, SpatialTemporalTransformer, unchanged
 from lerobot_wmrl.world_models.temporal_memory import TemporalMemory

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from lerobot_wmrl.common.distributed import masked_mean
 from lerobot_wmrl.common.precision import compute_in
-from lerobot_wmrl.data.clip import known_transitions
+from lerobot_wmrl.data.clips import known_transitions
 from lerobot_wmrl.world_models.codebook import CodeBook
 from lerobot_wmrl.world_models.losses import (
     MOTION_LEVELS,

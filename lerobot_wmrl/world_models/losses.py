@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from lerobot_wmrl.common.distributed import draw_own_rows, masked_mean
-from lerobot_wmrl.data.clip import Clip, known_transitions, take_rows
+from lerobot_wmrl.data.clips import Clip, known_transitions, take_rows
 from lerobot_wmrl.world_models.codebook import CodeBook
 from lerobot_wmrl.world_models.frame_network import STATE_STEP, Prediction
 

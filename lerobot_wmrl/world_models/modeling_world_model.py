@@ -9,7 +9,7 @@ from lerobot.configs.rewards import RewardModelConfig
 from lerobot.utils.constants import ACTION
 from torch import Tensor, nn
 
-from lerobot_wmrl.data.clip import Clip
+from lerobot_wmrl.data.clips import Clip
 from lerobot_wmrl.world_models.configuration_world_model import (
     ActionWorldModelConfig,
     TextWorldModelConfig,

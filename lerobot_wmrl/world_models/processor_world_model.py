@@ -21,7 +21,7 @@ from lerobot.utils.constants import (
     POLICY_PREPROCESSOR_DEFAULT_NAME,
 )
 
-from lerobot_wmrl.data.episode_table import success_column
+from lerobot_wmrl.data.episodes import success_column
 
 
 def labelled_transition(batch: dict[str, Any]) -> EnvTransition:

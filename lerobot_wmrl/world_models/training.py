@@ -1,7 +1,7 @@
 """The one training loop of tokenizer and world models: seeded, resumable, logged, on one or more devices.
 
-Under `torchrun` every process has `batch_size` rows of the batch, DistributedDataParallel averages their
-gradients, and the first process alone writes.
+Under `torchrun` every process draws batches of `batch_size` from a seed of its own, DistributedDataParallel
+averages the gradients, and the first process alone writes.
 """
 
 import logging
@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from accelerate import PartialState
 from lerobot.configs.rewards import RewardModelConfig
@@ -24,6 +25,7 @@ from torch.optim import Optimizer
 from tqdm import tqdm
 
 from lerobot_wmrl.common.checkpoints import latest_checkpoint, write_checkpoint
+from lerobot_wmrl.common.constants import KINDS, START_KIND
 from lerobot_wmrl.common.distributed import mean_over_processes
 from lerobot_wmrl.common.lerobot_compat import (
     gather_random_states,
@@ -33,17 +35,15 @@ from lerobot_wmrl.common.lerobot_compat import (
 )
 from lerobot_wmrl.common.precision import compute_in, training_dtype
 from lerobot_wmrl.common.tracking import append_metrics
-from lerobot_wmrl.data.compatibility import check_dataset
-from lerobot_wmrl.data.dataset_source import TrainingData
-from lerobot_wmrl.data.depth_maps import cached_depth
-from lerobot_wmrl.data.episode_table import (
+from lerobot_wmrl.data.clips import ClipSampler, FrameSampler, InTurn
+from lerobot_wmrl.data.episodes import (
     EpisodeTable,
-    golden_episodes,
+    TrainingData,
+    check_dataset,
     open_dataset,
     read_episodes,
 )
-from lerobot_wmrl.data.frame_cache import cached_context, cached_frames, cached_tokens
-from lerobot_wmrl.data.samplers import ClipSampler, FrameSampler, InTurn
+from lerobot_wmrl.data.frame_cache import cached_context, cached_depth, cached_frames, cached_tokens
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import cosine_schedule
 from lerobot_wmrl.world_models.configuration_world_model import TextWorldModelConfig
@@ -57,6 +57,15 @@ def build_model(config: RewardModelConfig, table: EpisodeTable, output_dir: Path
         check_dataset(model.config, meta.features)
         return model
     return make_reward_model(config, dataset_stats=meta.stats, dataset_meta=meta)
+
+
+def golden_episodes(table: EpisodeTable) -> np.ndarray:
+    """Mark the episodes that the text world model learns from. (E,)
+
+    They are successes of an optimal planner, or all successes of a dataset that does not say who acted.
+    """
+    kind = table.column(START_KIND)
+    return table.success & ((kind == KINDS.index("optimal")) | (kind == -1))
 
 
 def make_sampler(
@@ -133,8 +142,8 @@ def train(
     save_config: Callable[[Path], None],
 ) -> None:
     """Optimise from the last checkpoint to `cfg.steps`. ValueError (and no new checkpoint) on a NaN loss."""
-    set_seed(cfg.seed)
     processes = PartialState()
+    set_seed(cfg.seed + processes.process_index)
     preset: Any = model.config.get_optimizer_preset()
     optimizer = preset.build([p for p in model.parameters() if p.requires_grad])
     scheduler = cosine_schedule(preset.lr, cfg.steps).build(optimizer, cfg.steps)

@@ -12,16 +12,15 @@ from lerobot.utils.constants import OBS_STATE
 from torch import Tensor, nn
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.clip import Clip
-from lerobot_wmrl.data.compatibility import (
+from lerobot_wmrl.data.clips import Clip, clip_from_windows
+from lerobot_wmrl.data.episodes import (
     check_cameras,
     check_dataset,
     check_depth,
     check_episode_lengths,
+    success_column,
 )
-from lerobot_wmrl.data.depth_maps import depth_of_windows
-from lerobot_wmrl.data.episode_table import success_column
-from lerobot_wmrl.data.windows import clip_from_windows
+from lerobot_wmrl.data.frame_cache import depth_of_windows
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.configuration_world_model import WorldModelConfig
 from lerobot_wmrl.world_models.decoding import Condition, make_decoding

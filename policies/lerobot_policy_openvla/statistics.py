@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow.parquet as pq
 from lerobot.utils.constants import ACTION
 
-from lerobot_wmrl.data.recorded_episodes import parquet_files
+from lerobot_wmrl.data.episodes import parquet_files
 
 NormStats = dict[str, Any]
 """OpenVLA's: dataset → {"action": {"q01", "q99", "mask", …}, …}, lists of one number a component."""

@@ -15,11 +15,11 @@ from lerobot_wmrl.common.constants import KINDS
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.statistics import PairedChange, Proportion
 from lerobot_wmrl.common.tracking import append_metrics
-from lerobot_wmrl.data.recorded_episodes import recorded_episodes
 from lerobot_wmrl.demo.report import figures
 from lerobot_wmrl.demo.report.page import conclusion, verdict, write_report
 from lerobot_wmrl.demo.report.results import lerobot_train_curve, metric_curves, success_rate
 from lerobot_wmrl.demo.stages import DemoConfig, demo_stages, optimal_episodes
+from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
 SUCCESSES = {"eval_sft": 4, "imagine_sft": 5, "eval_rl": 6, "imagine_rl": 9}
 

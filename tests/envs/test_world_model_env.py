@@ -8,7 +8,7 @@ import torch
 from gymnasium.vector import AutoresetMode
 
 from lerobot_wmrl.common.constants import ACTION_HIGH, TASKS
-from lerobot_wmrl.data.dataset_source import DatasetSource
+from lerobot_wmrl.data.episodes import DatasetSource
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
 from lerobot_wmrl.envs.uncertainty import Uncertainty

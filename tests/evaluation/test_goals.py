@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_wmrl.data.episode_table import read_episodes
+from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames
 from lerobot_wmrl.data.frames import NO_CONTEXT, Context
 from lerobot_wmrl.evaluation.goals import (

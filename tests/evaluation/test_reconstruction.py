@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_wmrl.data.episode_table import read_episodes
+from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames, frames_to_tensor
 from lerobot_wmrl.evaluation.image_metrics import psnr_from_mse
 from lerobot_wmrl.evaluation.reconstruction import code_use, reconstruction_metrics

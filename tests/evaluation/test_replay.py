@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from lerobot_wmrl.common.constants import KINDS
-from lerobot_wmrl.data.dataset_source import DatasetSource
-from lerobot_wmrl.data.episode_table import choose_episodes, open_dataset, read_episodes
+from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.data.episodes import DatasetSource, choose_episodes, open_dataset, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames
 from lerobot_wmrl.data.frames import NO_CONTEXT
 from lerobot_wmrl.evaluation import replay as replay_module
@@ -26,6 +26,7 @@ from lerobot_wmrl.evaluation.accuracy import (
 from lerobot_wmrl.evaluation.gate import Outcomes, gate_at, success_gate
 from lerobot_wmrl.evaluation.replay import EpisodeReplay, Recording, replay_episodes
 from lerobot_wmrl.evaluation.report import evaluate
+from lerobot_wmrl.maniskill.recordings import scene_splits
 from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
 from lerobot_wmrl.world_models.checkpoint import load_model
 from tests.relabelled import UNLABELLED, relabelled
@@ -129,20 +130,25 @@ def test_extreme_actions_are_what_they_are_called(source, model):
 def test_splits_compose(small_dataset):
     table = read_episodes(small_dataset)
     assert choose_episodes(table, "all", 4).tolist() == [0, 1, 3, 5]
-    assert choose_episodes(table, "ind", 6, unseen={1}).tolist() == [0, 2, 4]
-    assert choose_episodes(table, "train,ood", 6, unseen={1}).tolist() == [1, 3, 5]
-    with pytest.raises(ValueError, match="no episode in its validation split"):
+    scenes = scene_splits(table.column("start.scene"), "ind", unseen={1})
+    assert choose_episodes(table, "ind", 6, scenes).tolist() == [0, 2, 4]
+    assert choose_episodes(table, "train,ood", 6, scenes).tolist() == [1, 3, 5]
+    with pytest.raises(FieldError, match=r"^split=validation: .* has no episode in it"):
         choose_episodes(table, "validation", 4)
-    with pytest.raises(ValueError, match="split='test': choose one of train, validation, all, ind, ood"):
-        choose_episodes(table, "test", 4, unseen={1})
-    with pytest.raises(ValueError, match="does not say which scenes"):
-        choose_episodes(replace(table, scene=np.full(6, -1)), "ood", 4, unseen={1})
+    with pytest.raises(FieldError, match=r"^split=test: choose one of train, validation, all, ind, ood"):
+        choose_episodes(table, "test", 4, scenes)
+    unknown = replace(table, columns={}).column("start.scene")
+    with pytest.raises(FieldError, match=r"^split=train,ood: .*does not say which scenes"):
+        scene_splits(unknown, "train,ood")
+    assert not np.any(scene_splits(unknown, "train")["ind"])
 
 
 def test_play_is_no_attempt(source, model):
     runs = [perfect(source, model, episode) for episode in range(6)]
     kind = np.array([KINDS.index("play")] * 2 + [KINDS.index("optimal")] * 4)
-    assert Outcomes.stack(runs).attempts(replace(source.table, kind=kind)).episodes.tolist() == [2, 3, 4, 5]
+    assert Outcomes.stack(runs).attempts(
+        replace(source.table, columns={"start.kind": kind})
+    ).episodes.tolist() == [2, 3, 4, 5]
 
 
 def test_episodes_of_one_frame_are_named(source, model):

@@ -11,8 +11,8 @@ from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.recorder import record
 from lerobot_wmrl.common.constants import KINDS
 from lerobot_wmrl.common.policy_checkpoints import read_policy_config
-from lerobot_wmrl.data.recorded_episodes import recorded_episodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
+from lerobot_wmrl.maniskill.recordings import recorded_episodes
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from tests.rl.checkpoints import save_untrained_policy
 

@@ -14,9 +14,9 @@ from lerobot_dataset_maniskill.planners import MOTIONS, PLANNERS, Follower, Moti
 from lerobot_dataset_maniskill.planners.follower import OPTIMAL_SPEED, Waypoint
 from lerobot_dataset_maniskill.recorder import record
 from lerobot_wmrl.common.constants import KINDS, PLAY
-from lerobot_wmrl.data.recorded_episodes import recorded_episodes
 from lerobot_wmrl.maniskill.cameras import Rendering
 from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS
+from lerobot_wmrl.maniskill.recordings import recorded_episodes
 from lerobot_wmrl.maniskill.scenes import SCENES
 from lerobot_wmrl.maniskill.simulation import Simulation
 from lerobot_wmrl.maniskill.tasks import TASKS

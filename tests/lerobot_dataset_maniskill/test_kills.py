@@ -14,7 +14,7 @@ import pytest
 from lerobot_dataset_maniskill.integrity import whole_dataset
 from lerobot_dataset_maniskill.manifest import planned_parts
 from lerobot_dataset_maniskill.recorder import count_episodes, merge
-from lerobot_wmrl.data.recorded_episodes import recorded_episodes
+from lerobot_wmrl.maniskill.recordings import recorded_episodes
 from tests.lerobot_dataset_maniskill.killed_writers import ADVISED, Order, Writers, running_writers
 from tests.lerobot_dataset_maniskill.made_up import ROWS, write_missing
 

@@ -21,8 +21,8 @@ from lerobot_dataset_maniskill.manifest import planned_parts
 from lerobot_dataset_maniskill.recorder import follow_workers, missing_parts, record
 from lerobot_dataset_maniskill.writer import HOLD_FRAMES
 from lerobot_wmrl.common.constants import KINDS, STATE_NAMES
-from lerobot_wmrl.data.recorded_episodes import recorded_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
 EPISODES, PART = 6, 2
 KIND_SHARES = {"optimal": 0.5, "near_miss": 0.5}

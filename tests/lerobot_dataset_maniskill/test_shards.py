@@ -7,7 +7,7 @@ import pytest
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.manifest import planned_parts
 from lerobot_dataset_maniskill.shards import check_set, merge_shards
-from lerobot_wmrl.data.recorded_episodes import recorded_episodes
+from lerobot_wmrl.maniskill.recordings import recorded_episodes
 from tests.lerobot_dataset_maniskill.made_up import record_made_up
 
 NAMES = [Path("a"), Path("b"), Path("c")]

@@ -14,8 +14,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.presets import preset_settings
 from lerobot_wmrl.common.tracking import read_metrics
-from lerobot_wmrl.data.recorded_episodes import recorded_episodes
 from lerobot_wmrl.demo.stages import DemoConfig, demo_stages
+from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
 KILLED_STAGE = "explore"
 STAGES = [stage.name for stage in demo_stages(DemoConfig())]

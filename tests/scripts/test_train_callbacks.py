@@ -16,7 +16,7 @@ from safetensors.torch import load_file
 
 from lerobot_wmrl.common.constants import GATE_SEED
 from lerobot_wmrl.common.tracking import read_metrics
-from lerobot_wmrl.data.recorded_episodes import recorded_episodes
+from lerobot_wmrl.maniskill.recordings import recorded_episodes
 from lerobot_wmrl.scripts.train import main
 from tests.rl.checkpoints import save_untrained_policy
 from tests.rl.point_env import PointEnv

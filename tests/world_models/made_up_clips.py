@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lerobot_wmrl.data.clip import Clip
+from lerobot_wmrl.data.clips import Clip
 from lerobot_wmrl.world_models.configuration_world_model import TextWorldModelConfig
 from lerobot_wmrl.world_models.modeling_world_model import TextWorldModelRewardModel
 from tests.trained import small_tokenizer

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from lerobot_wmrl.data.clip import Clip
+from lerobot_wmrl.data.clips import Clip
 from lerobot_wmrl.data.frames import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.codebook import CodeBook
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig, TextWorldModelConfig

@@ -11,8 +11,7 @@ import pytest
 import torch
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.dataset_source import DatasetSource
-from lerobot_wmrl.data.episode_table import choose_episodes, read_episodes
+from lerobot_wmrl.data.episodes import DatasetSource, choose_episodes, read_episodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
@@ -172,12 +171,14 @@ def test_episodes_of_one_frame_are_named(build, make_synthetic_dataset, trained_
 
 
 def test_a_split_without_episodes_is_named(small_dataset):
-    with pytest.raises(ValueError, match="no episode in its validation split"):
+    with pytest.raises(FieldError, match=r"^split=validation: .* has no episode in it"):
         choose_episodes(read_episodes(small_dataset), "validation", 5)
 
 
 def test_episodes_that_are_not_there_are_named(small_dataset):
-    with pytest.raises(ValueError, match=r"--dataset.episodes: there is no episode 6 in .*episodes 0 to 5"):
+    with pytest.raises(
+        FieldError, match=r"^dataset\.episodes=\[0, 6\]: there is no episode 6 in .*episodes 0 to 5"
+    ):
         read_episodes(small_dataset).among([0, 6])
 
 

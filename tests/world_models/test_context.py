@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_wmrl.data.dataset_source import DatasetSource
-from lerobot_wmrl.data.episode_table import read_episodes
+from lerobot_wmrl.data.episodes import DatasetSource, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames, cached_tokens, frames_to_tensor
 from lerobot_wmrl.data.frames import NO_CONTEXT
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv

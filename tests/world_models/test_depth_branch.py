@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from lerobot_wmrl.data.clip import Clip
+from lerobot_wmrl.data.clips import Clip
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig
 from lerobot_wmrl.world_models.decoding import DECODINGS
 from lerobot_wmrl.world_models.depth_branch import FAR

@@ -15,8 +15,8 @@ from lerobot.rewards.factory import make_reward_model
 from lerobot.utils.random_utils import set_seed
 
 from lerobot_wmrl.common.tracking import read_metrics
-from lerobot_wmrl.data.episode_table import EpisodeTable
-from lerobot_wmrl.data.samplers import ClipSampler, FrameSampler
+from lerobot_wmrl.data.clips import ClipSampler, FrameSampler
+from lerobot_wmrl.data.episodes import EpisodeTable
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig, TextWorldModelConfig
 from lerobot_wmrl.world_models.training import train
 from tests.trained import TINY, small_tokenizer, tokenizer_config
@@ -42,10 +42,10 @@ def made_up_episodes() -> EpisodeTable:
     action = rng.normal(size=(rows, 7)).astype(np.float32)
     done = np.tile(np.arange(2 * ROWS) >= 2 * ROWS - 3, EPISODES // 2)
     start, length = np.arange(EPISODES) * ROWS, np.full(EPISODES, ROWS)
-    kind = scene = task = np.zeros(EPISODES, int)
     instructions = ["push the can", "pull the box"] * (EPISODES // 2)
     dataset: Any = SimpleNamespace(root="made up")
-    return EpisodeTable(dataset, state, action, done, start, length, kind, scene, task, instructions)
+    optimal = {"start.kind": np.zeros(EPISODES, int)}
+    return EpisodeTable(dataset, state, action, done, start, length, instructions, optimal)
 
 
 def made_up_sampler(model: str) -> ClipSampler | FrameSampler:

@@ -11,8 +11,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.scripts import lerobot_train
 from safetensors.torch import load_file
 
-from lerobot_wmrl.data.episode_table import open_dataset, read_episodes
-from lerobot_wmrl.data.windows import clip_from_windows
+from lerobot_wmrl.data.clips import clip_from_windows
+from lerobot_wmrl.data.episodes import open_dataset, read_episodes
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig
 from lerobot_wmrl.world_models.open_loop import open_loop

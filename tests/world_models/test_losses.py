@@ -2,7 +2,7 @@ from types import SimpleNamespace
 
 import torch
 
-from lerobot_wmrl.data.clip import Clip
+from lerobot_wmrl.data.clips import Clip
 from lerobot_wmrl.world_models.codebook import CodeBook
 from lerobot_wmrl.world_models.frame_network import Prediction
 from lerobot_wmrl.world_models.losses import (

@@ -7,9 +7,8 @@ import pytest
 import torch
 from lerobot.rewards.factory import make_reward_model
 
-from lerobot_wmrl.data.clip import Clip
-from lerobot_wmrl.data.episode_table import read_episodes
-from lerobot_wmrl.data.samplers import ClipSampler
+from lerobot_wmrl.data.clips import Clip, ClipSampler
+from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.world_models.losses import (
     SELF_ROLLOUT_FROM,
     next_frame_loss,

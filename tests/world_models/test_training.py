@@ -13,16 +13,20 @@ from safetensors.torch import load_file
 
 from lerobot_wmrl.common.presets import PRESETS, preset_flags
 from lerobot_wmrl.common.tracking import read_metrics
-from lerobot_wmrl.data.dataset_source import DatasetSource, TrainingData
-from lerobot_wmrl.data.episode_table import golden_episodes, open_dataset, read_episodes
+from lerobot_wmrl.data.clips import ClipSampler, InTurn
+from lerobot_wmrl.data.episodes import (
+    DatasetSource,
+    TrainingData,
+    open_dataset,
+    read_episodes,
+)
 from lerobot_wmrl.data.frame_cache import cached_frames, cached_tokens
-from lerobot_wmrl.data.samplers import ClipSampler, InTurn
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.temporal_memory import ClipMemory
-from lerobot_wmrl.world_models.training import descend, make_joint_sampler, make_sampler
+from lerobot_wmrl.world_models.training import descend, golden_episodes, make_joint_sampler, make_sampler
 from tests.relabelled import UNLABELLED, relabelled
 from tests.trained import action_config, run_training, text_config, tokenizer_config, train_tokenizer
 

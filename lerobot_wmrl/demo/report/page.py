@@ -11,10 +11,10 @@ import numpy as np
 from lerobot_wmrl.common.constants import KINDS
 from lerobot_wmrl.common.files import write_json, write_text
 from lerobot_wmrl.common.statistics import PairedChange, Proportion
-from lerobot_wmrl.data.recorded_episodes import recorded_episodes
 from lerobot_wmrl.demo.report import figures, results
 from lerobot_wmrl.demo.report.results import EPISODES, POLICIES, Rates, Summary
 from lerobot_wmrl.demo.stages import DemoConfig
+from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
 SIGNIFICANCE = 0.05
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from lerobot_wmrl.common.precision import compute_in, imagination_dtype
-from lerobot_wmrl.data.clip import Clip
+from lerobot_wmrl.data.clips import Clip
 from lerobot_wmrl.data.frames import Context
 from lerobot_wmrl.world_models.anchored import AnchoredNetwork
 from lerobot_wmrl.world_models.frame_network import Prediction

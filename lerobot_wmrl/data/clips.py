@@ -1,0 +1,223 @@
+"""Clips, from which world models learn: drawn from a recording, or made of lerobot-train's windows.
+
+Training batches are pure functions of (seed, step): a resumed training repeats and skips no sample. Processes
+that train together have seeds of their own.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from lerobot.utils.constants import ACTION, DONE, OBS_STATE
+from torch import Tensor
+
+from lerobot_wmrl.data.episodes import EpisodeTable
+from lerobot_wmrl.data.frame_cache import frames_to_tensor
+from lerobot_wmrl.data.frames import NO_CONTEXT, Context
+
+
+class Clip(NamedTuple):
+    """T consecutive frames of B episodes: what is seen, what is done, and what that leads to.
+
+    Args:
+        tokens: (B, T, S).
+        state: (B, T, P), in dataset units.
+        action: (B, T, A), in dataset units.
+        done: (B, T), 1 where success holds at frame t + 1.
+        valid: (B, T), False where the episode is padded.
+        done_known: (B, T), whether `done` says what happened.
+        instructions: B of them.
+        depth: (B, T, S) metres of each token, for models that look at depth.
+        context: of the B episodes' first frames, for models that look at it.
+    """
+
+    tokens: Tensor
+    state: Tensor
+    action: Tensor
+    done: Tensor
+    valid: Tensor
+    done_known: Tensor
+    instructions: list[str]
+    depth: Tensor | None = None
+    context: Context = NO_CONTEXT
+
+
+def take_rows(values: Tensor, index: Tensor) -> Tensor:
+    """Take the rows `index` (B, K) of every clip: values (B, T, …) → (B, K, …)."""
+    return values[torch.arange(len(values), device=values.device)[:, None], index]
+
+
+def known_transitions(valid: Tensor) -> Tensor:
+    """Mark where a valid frame follows a valid one: (B, T) → (B, T − 1)."""
+    return valid[:, 1:] & valid[:, :-1]
+
+
+@dataclass
+class ClipSampler:
+    """Draw clips of tokens for the world models.
+
+    Success can depend on where the episode began (an object pushed 10 cm), so only clips that begin with
+    their episode carry done labels, unless the context shows the beginning to all.
+
+    Args:
+        table: the episodes.
+        tokens: (rows, S), a memory map.
+        episodes: indices of the episodes to draw from.
+        clip_length: T.
+        from_start: share of clips that begin with their episode.
+        batch_size: B.
+        seed: of the draws, another one in every process.
+        device: where the clips go.
+        depth: (rows, S) metres of each token, for models that look at depth.
+        context: (E, N, C, g, g) of the episodes' first frames, for models that look at it.
+        done_known: whether the table's done says what happened.
+    """
+
+    table: EpisodeTable
+    tokens: np.ndarray
+    episodes: np.ndarray
+    clip_length: int
+    from_start: float
+    batch_size: int
+    seed: int
+    device: str
+    depth: np.ndarray | None = None
+    context: np.ndarray | None = None
+    done_known: bool = True
+
+    def __call__(self, step: int) -> Clip:
+        """Draw the batch of one training step."""
+        rng = np.random.default_rng([self.seed, step])
+        episodes = rng.choice(self.episodes, self.batch_size)
+        room = np.maximum(self.table.length[episodes] - 2, 1)
+        offsets = np.where(rng.random(self.batch_size) < self.from_start, 0, rng.integers(0, room))
+        return self.clips(episodes, offsets)
+
+    def clips(self, episodes: np.ndarray, offsets: np.ndarray) -> Clip:
+        """Return rows `offset … offset + clip_length − 1` of each episode, padded with its last row."""
+        rows = offsets[:, None] + np.arange(self.clip_length)
+        valid = rows < self.table.length[episodes][:, None]
+        rows = self.table.start[episodes][:, None] + np.minimum(
+            rows, self.table.length[episodes][:, None] - 1
+        )
+        whole = self.context is not None
+        known = valid & self.done_known & (whole | (offsets == 0))[:, None]
+        context = NO_CONTEXT if self.context is None else Context((self._tensor(self.context[episodes]),))
+        return Clip(
+            self._tensor(self.tokens[rows]).long(),
+            self._tensor(self.table.state[rows]),
+            self._tensor(self.table.action[rows]),
+            self._tensor(self.table.done[rows]).float(),
+            self._tensor(valid),
+            self._tensor(known),
+            [self.table.instructions[episode] for episode in episodes],
+            None if self.depth is None else self._tensor(self.depth[rows]),
+            context,
+        )
+
+    def _tensor(self, array: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array)).to(self.device)
+
+
+@dataclass
+class FrameSampler:
+    """Draw single frames, each with its episode's first frame, for the tokenizer.
+
+    Args:
+        table: the episodes.
+        frames: (rows, N, H, W, 3) uint8, a memory map.
+        episodes: indices of the episodes to draw from.
+        cameras: N names.
+        batch_size: B.
+        seed: of the draws, another one in every process.
+        device: where the frames go.
+    """
+
+    table: EpisodeTable
+    frames: np.ndarray
+    episodes: np.ndarray
+    cameras: list[str]
+    batch_size: int
+    seed: int
+    device: str
+
+    def __call__(self, step: int) -> dict[str, Tensor]:
+        """Draw the batch of one step: `observation.images.*` and `reference.*`, (B, 3, H, W) each."""
+        rng = np.random.default_rng([self.seed, step])
+        episodes = rng.choice(self.episodes, self.batch_size)
+        start = self.table.start[episodes]
+        rows = start + rng.integers(0, self.table.length[episodes])
+        images, reference = (frames_to_tensor(self.frames[index]).to(self.device) for index in (rows, start))
+        batch = {}
+        for index, camera in enumerate(self.cameras):
+            batch[f"observation.images.{camera}"] = images[:, index]
+            batch[f"reference.{camera}"] = reference[:, index]
+        return batch
+
+
+@dataclass
+class InTurn:
+    """Take every second batch from `first`, the ones in between from the others in turn."""
+
+    first: ClipSampler | FrameSampler
+    others: Sequence[ClipSampler | FrameSampler]
+
+    def __call__(self, step: int) -> Any:
+        """Draw the batch of one step from the sampler whose turn it is."""
+        if step % 2 == 0:
+            return self.first(step)
+        return self.others[step // 2 % len(self.others)](step)
+
+
+def clip_from_windows(
+    tokens: Tensor, batch: Mapping[str, Any], camera_key: str, state_size: int, depth: Tensor | None = None
+) -> Clip:
+    """Make clips of windows as lerobot-train gives them.
+
+    A window ends at its row of the dataset. LeRobot fills a window that would begin before its episode with
+    copies of the first row. They are moved behind the window's end, where they count for nothing: else the
+    model would learn that actions at the start of an episode do nothing. Only the last row's `next.done` is
+    in the batch, and as in `ClipSampler` only windows that hold their episode's start have it as a label.
+
+    Args:
+        tokens: (B, T, S), of the windows' frames.
+        batch: action (B, T, A), observation.state (B, T, P), either (B, T) where it has one component;
+            next.done (B,) or (B, 1), task, `*_is_pad` (B, T); all but the action may be missing.
+        camera_key: the camera whose padding counts.
+        state_size: P, 0 for a model without proprioception.
+        depth: (B, T, S) metres, of the windows' frames.
+
+    Raises:
+        ValueError: the action is missing or has another length than the frames; NaN or infinity in a number.
+    """
+    (rows, length), device = tokens.shape[:2], tokens.device
+    action = batch.get(ACTION)
+    if action is not None and action.shape == (rows, length):
+        action = action[..., None]
+    if action is None or action.ndim != 3 or action.shape[1] != length:
+        found = "none" if action is None else f"shape {tuple(action.shape)}"
+        raise ValueError(f"action: {found}, but the batch has windows of {length} frames; give one a frame")
+    state = action.new_zeros(rows, length, 0)
+    if state_size:
+        state = batch[OBS_STATE].reshape(rows, length, -1)
+    for name, values in ((ACTION, action), (OBS_STATE, state)):
+        if not torch.isfinite(values).all():
+            raise ValueError(f"{name}: holds NaN or infinity; remove the episodes that do from the dataset")
+    padded = batch.get(f"{camera_key}_is_pad", torch.zeros(rows, length, dtype=torch.bool)).to(device)
+    before, index = padded.sum(1, keepdim=True), unpadded_rows(padded)
+    valid = torch.arange(length, device=device) < length - before
+    last = torch.arange(length, device=device) == length - 1 - before
+    done, known = torch.zeros(rows, length, device=device), torch.zeros_like(last)
+    if isinstance(batch.get(DONE), Tensor):  # LeRobot's processors put False where the dataset has none
+        done, known = last * batch[DONE].reshape(rows, 1).float(), last & (before > 0)
+    tokens, state, action = (take_rows(values, index) for values in (tokens, state, action))
+    depth = depth if depth is None else take_rows(depth, index)
+    return Clip(tokens, state, action, done, valid, known, list(batch.get("task", [""] * rows)), depth)
+
+
+def unpadded_rows(padded: Tensor) -> Tensor:
+    """Return where in windows, of which the first rows are padding, to take a clip's rows. (B, T) → (B, T)"""
+    length = padded.shape[1]
+    return (torch.arange(length, device=padded.device) + padded.sum(1, keepdim=True)).clamp(max=length - 1)

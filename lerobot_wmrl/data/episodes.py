@@ -1,0 +1,326 @@
+"""Episodes of a LeRobotDataset: where they are, their numbers without pictures, whether they fit a model."""
+
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.utils.constants import ACTION, DONE, OBS_IMAGES, OBS_STATE
+from numpy.typing import ArrayLike
+
+from lerobot_wmrl.common.errors import FieldError
+
+VIDEO_BACKEND: Final = "pyav"
+"""Ships its own FFmpeg; torchcodec needs the system's, and frames are decoded only once anyway."""
+
+VALIDATION_EVERY: Final = 20
+"""Every twentieth episode is held out from the training of tokenizers and world models."""
+
+SUCCESS_COLUMNS: Final = ("next.success", DONE)
+"""Where success is looked for. Beside the first, LeRobot's `next.done` may be the mere end of an episode."""
+
+OWN_COLUMNS: Final = ("index", "episode_index", "frame_index", "task_index")
+"""LeRobot's integer columns, which say nothing about an episode."""
+
+
+@dataclass
+class DatasetSource:
+    """A LeRobotDataset on disk.
+
+    Args:
+        root: its folder.
+        repo_id: the name it was published under, if it was.
+    """
+
+    root: str = ""
+    repo_id: str | None = None
+
+
+@dataclass
+class TrainingData(DatasetSource):
+    """A dataset to learn from.
+
+    Args:
+        episodes: indices of the episodes to learn from, as in lerobot-train; by default all. Episodes that
+            are held out stay held out.
+        more: roots of further datasets to learn from: every second step's batch is of one of them, in turn
+            (half old, half new: Ball et al. 2023).
+    """
+
+    episodes: list[int] | None = None
+    more: list[str] = field(default_factory=list)
+
+
+def success_column(columns: Container[str]) -> str | None:
+    """Return the column that says whether success holds, None if there is none."""
+    return next((name for name in SUCCESS_COLUMNS if name in columns), None)
+
+
+@dataclass
+class EpisodeTable:
+    """The numbers of a dataset: N rows of frames and E episodes.
+
+    Args:
+        dataset: where they come from.
+        state: (N, P), P = 0 where the dataset has none.
+        action: (N, A).
+        done: (N,), whether success holds at the frame; False everywhere where the dataset does not say.
+        start: (E,), row of each episode's first frame.
+        length: (E,), frames of each episode.
+        instructions: one an episode.
+        columns: the dataset's further integer columns by name, (E,): their values at the first frames.
+    """
+
+    dataset: LeRobotDataset
+    state: np.ndarray
+    action: np.ndarray
+    done: np.ndarray
+    start: np.ndarray
+    length: np.ndarray
+    instructions: list[str]
+    columns: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    def column(self, name: str) -> np.ndarray:
+        """Return an integer column's values, −1 where the dataset has no such column. (E,)"""
+        return self.columns.get(name, np.full(len(self.start), -1))
+
+    @property
+    def done_known(self) -> bool:
+        """Whether the dataset says where success holds; else done is False everywhere."""
+        return success_column(self.dataset.features) is not None
+
+    @property
+    def success(self) -> np.ndarray:
+        """Whether success was ever reached. (E,)"""
+        return np.array([self.done[a : a + n].any() for a, n in zip(self.start, self.length, strict=True)])
+
+    @property
+    def validation(self) -> np.ndarray:
+        """Held-out episodes. (E,)"""
+        return np.arange(len(self.start)) % VALIDATION_EVERY == VALIDATION_EVERY - 1
+
+    def among(self, chosen: Sequence[int] | None) -> np.ndarray:
+        """Mark the episodes that are `chosen`, all if None. FieldError names one that does not exist. (E,)"""
+        indices = np.arange(len(self.start))
+        for episode in chosen or ():
+            if not 0 <= episode < len(indices):
+                raise FieldError(
+                    "dataset.episodes", list(chosen or ()),
+                    f"there is no episode {episode} in {self.dataset.root}",
+                    f"it has episodes 0 to {len(indices) - 1}",
+                )  # fmt: skip
+        return indices >= 0 if chosen is None else np.isin(indices, chosen)
+
+
+def open_dataset(root: str | Path, repo_id: str | None = None) -> LeRobotDataset:
+    """Open a local LeRobotDataset. FieldError if there is none at `root`, or it is not whole."""
+    if not (Path(root) / "meta" / "info.json").is_file():
+        raise FieldError(
+            "dataset.root", root, "no LeRobotDataset there (meta/info.json is missing)", "record one first"
+        )
+    name = repo_id or Path(root).name
+    try:
+        missing = missing_files(LeRobotDatasetMetadata(name, root=root))
+        if not missing:
+            return LeRobotDataset(name, root=root, video_backend=VIDEO_BACKEND)
+    except Exception as error:  # parquet, JSON, datasets and the hub each raise their own
+        reason = str(error).strip().splitlines()[0]
+        raise FieldError(
+            "dataset.root",
+            root,
+            f"cannot be opened ({reason}): it is corrupted",
+            "remove it and record it again",
+        ) from error
+    raise FieldError(
+        "dataset.root", root, f"{len(missing)} files are missing, the first is {missing[0]}",
+        "copy the dataset again, or remove it and record it again",
+    )  # fmt: skip
+
+
+def missing_files(meta: LeRobotDatasetMetadata) -> list[Path]:
+    """Return files that the metadata names and that are not there; LeRobot would ask the hub for them."""
+    named = set()
+    for episode in range(meta.total_episodes):
+        named.add(meta.get_data_file_path(episode))
+        named.update(meta.get_video_file_path(episode, key) for key in meta.video_keys)
+    return sorted(path for path in named if not (Path(meta.root) / path).is_file())
+
+
+def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
+    """Read the columns that models train on. FieldError names a missing one, or one with NaN or infinity."""
+    if ACTION not in dataset.features:
+        raise FieldError(
+            "dataset.root", dataset.root,
+            f"the feature {ACTION!r} is missing (it has {', '.join(dataset.features)})",
+            "world models need what was done beside what was seen",
+        )  # fmt: skip
+    success = success_column(dataset.features)
+    labels = () if success is None else (success,)
+    measured = [name for name in (ACTION, OBS_STATE, *labels) if name in dataset.features]
+    further = episode_columns(dataset.features)
+    rows = dataset.hf_dataset.with_format("numpy", columns=["episode_index", *measured, *further])[:]
+    for column in measured:
+        check_finite(dataset, column, np.asarray(rows[column]), rows["episode_index"])
+    frames = len(rows["episode_index"])
+    _, start, length = np.unique(rows["episode_index"], return_index=True, return_counts=True)
+    done = np.asarray(rows[success]).reshape(-1) if success else np.zeros(frames, bool)
+    return EpisodeTable(
+        dataset=dataset,
+        state=as_columns(rows[OBS_STATE]) if OBS_STATE in rows else np.zeros((frames, 0), np.float32),
+        action=as_columns(rows[ACTION]),
+        done=done.astype(bool),
+        start=start,
+        length=length,
+        instructions=[episode["tasks"][0] for episode in dataset.meta.episodes],
+        columns={name: np.asarray(rows[name]).reshape(-1)[start] for name in further},
+    )
+
+
+def episode_columns(features: Mapping[str, Any]) -> list[str]:
+    """Return the integer columns of one component that a recorder has added to LeRobot's own."""
+    return [
+        name
+        for name, feature in features.items()
+        if feature["dtype"] == "int64" and tuple(feature["shape"]) == (1,) and name not in OWN_COLUMNS
+    ]
+
+
+def as_columns(values: ArrayLike) -> np.ndarray:
+    """Return N rows as float32 (N, K); LeRobot stores vectors of one component as scalars, (N,)."""
+    columns = np.asarray(values, np.float32)
+    return columns.reshape(len(columns), -1)
+
+
+def check_finite(dataset: LeRobotDataset, column: str, values: np.ndarray, episode: np.ndarray) -> None:
+    """Raise FieldError with the first episode and frame at which values (N, …) hold NaN or infinity."""
+    finite = np.isfinite(values.astype(np.float64).reshape(len(values), -1)).all(1)
+    if not finite.all():
+        row = int(np.argmin(finite))
+        frame = row - int(np.argmax(episode == episode[row]))
+        raise FieldError(
+            "dataset.root", dataset.root,
+            f"{column} of episode {episode[row]}, frame {frame}, is {values[row].tolist()}",
+            "remove the episode with lerobot-edit-dataset --operation.type=delete_episodes "
+            f"--operation.episode_indices=[{episode[row]}]",
+        )  # fmt: skip
+
+
+def parquet_files(root: Path) -> list[Path]:
+    """Return the files that hold a dataset's rows, in order."""
+    return sorted((root / "data").rglob("*.parquet"))
+
+
+def choose_episodes(
+    table: EpisodeTable, split: str, at_most: int, further: Mapping[str, np.ndarray] | None = None,
+    wanted: np.ndarray | None = None,
+) -> np.ndarray:  # fmt: skip
+    """Choose at most `at_most` episodes, evenly spread, that belong to every split named in `split`.
+
+    Args:
+        table: the episodes.
+        split: names joined by commas: `train`, `validation` (as in the training of world models), `all`, or
+            one of `further`.
+        at_most: how many.
+        further: further splits by name, each a mask (E,).
+        wanted: a mask (E,) that leaves the others out.
+
+    Returns:
+        Indices of the episodes. (K,)
+
+    Raises:
+        FieldError: there is no such split, or no episode in it.
+    """
+    masks = {"train": ~table.validation, "validation": table.validation, "all": table.length > 0}
+    masks |= further or {}
+    names = split.split(",")
+    for name in names:
+        if name not in masks:
+            raise FieldError("split", split, f"choose one of {', '.join(masks)}, or several joined by commas")
+    chosen = [masks[name] for name in names] + ([] if wanted is None else [wanted])
+    episodes = np.logical_and.reduce(chosen).nonzero()[0]
+    if not len(episodes):
+        those = "" if wanted is None else " of those that are asked for"
+        raise FieldError("split", split, f"dataset {table.dataset.root} has no episode{those} in it")
+    return episodes[evenly_spread(len(episodes), at_most)]
+
+
+def evenly_spread(count: int, at_most: int) -> np.ndarray:
+    """Return at most `at_most` of the indices below `count`, the first and the last among them."""
+    return np.linspace(0, count - 1, min(count, at_most)).astype(int)
+
+
+def frame_size(feature: Mapping[str, Any]) -> tuple[int, int]:
+    """Return (H, W) of a camera's feature, whose shape is (H, W, 3) or, by its names, (3, H, W)."""
+    names = feature.get("names") or ("height", "width", "channels")
+    height, width = feature["shape"][:2] if names[2].startswith("channel") else feature["shape"][1:]
+    return height, width
+
+
+def check_cameras(features: Mapping[str, Any], camera_keys: Sequence[str], image_size: int) -> None:
+    """Raise FieldError unless the dataset has these cameras at that image size."""
+    for key in camera_keys:
+        if key not in features:
+            cameras = ", ".join(name for name in features if name.startswith(OBS_IMAGES)) or "none"
+            raise FieldError(
+                "tokenizer.cameras", camera_names(camera_keys),
+                f"the dataset has no {key} (its cameras: {cameras})",
+                "set `tokenizer.cameras` to match, or use a dataset with this camera",
+            )  # fmt: skip
+        height, width = frame_size(features[key])
+        if (height, width) != (image_size, image_size):
+            raise FieldError(
+                "tokenizer.image_size", image_size, f"the dataset's {key} is {height}x{width}",
+                f"train a tokenizer with `tokenizer.image_size`={height} or record at {image_size}",
+            )  # fmt: skip
+
+
+def camera_names(camera_keys: Sequence[str]) -> list[str]:
+    """Return the cameras' names without the prefix of their keys."""
+    return [key.removeprefix(f"{OBS_IMAGES}.") for key in camera_keys]
+
+
+def depth_key(camera_key: str) -> str:
+    """Return the dataset's key of a camera's depth."""
+    return f"{camera_key}_depth"
+
+
+def check_depth(features: Mapping[str, Any], camera_keys: Sequence[str], image_size: int) -> None:
+    """Raise FieldError unless the dataset has the depth of these cameras, at their image size."""
+    for key in map(depth_key, camera_keys):
+        found = frame_size(features[key]) if key in features else None
+        if found != (image_size, image_size):
+            size = "none" if found is None else f"one of {found[0]}x{found[1]}"
+            raise FieldError(
+                "depth", True,
+                f"the world model looks at {key} of {image_size} x {image_size} pixels, the dataset has "
+                f"{size}",
+                "record it with lerobot-wmrl-record --depth=true",
+            )  # fmt: skip
+
+
+def check_dataset(config: Any, features: Mapping[str, Any]) -> None:
+    """Raise ValueError unless a trained model can learn from, start in or replay the dataset's episodes."""
+    sizes = config.tokenizer
+    check_cameras(features, sizes.camera_keys, sizes.image_size)
+    if getattr(config, "depth", False):
+        check_depth(features, sizes.camera_keys, sizes.image_size)
+    widths = {OBS_STATE: getattr(config, "state_size", 0), ACTION: getattr(config, "action_size", 0)}
+    for name, wanted in widths.items():
+        found = features[name]["shape"][0] if name in features else 0
+        if wanted and found != wanted:
+            raise ValueError(
+                f"{name}: the world model was trained with {wanted} components, the dataset has "
+                f"{found or 'none'}; use a dataset like the one it was trained on"
+            )
+
+
+def check_episode_lengths(meta: Any) -> None:
+    """Raise FieldError if no episode has a second frame to predict."""
+    if meta.total_frames <= meta.total_episodes:
+        raise FieldError(
+            "dataset.root", meta.root, f"{meta.total_episodes} episodes of {meta.total_frames} frames in all",
+            "a world model learns from episodes of two frames or more: record longer ones",
+        )  # fmt: skip

@@ -1,0 +1,53 @@
+"""What the columns that our recorder adds say about episodes. Imports no simulator and decodes no video."""
+
+from collections.abc import Collection
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+
+from lerobot_wmrl.common.constants import START_COLUMNS
+from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.data.episodes import parquet_files
+from lerobot_wmrl.maniskill.scenes import scenes_of
+
+
+def recorded_episodes(root: Path) -> dict[str, np.ndarray]:
+    """Read columns (E,): episode, task, scene, seed, kind, length in frames, success at any frame."""
+    columns = ["episode_index", *START_COLUMNS, "next.success"]
+    rows = [pq.read_table(path, columns=columns).to_pydict() for path in parquet_files(root)]
+    stacked = {
+        name: np.concatenate([np.asarray(part[name]).reshape(-1) for part in rows]) for name in columns
+    }
+    episodes, first, inverse = np.unique(stacked["episode_index"], return_index=True, return_inverse=True)
+    success = np.zeros(len(episodes), dtype=bool)
+    np.logical_or.at(success, inverse, stacked["next.success"].astype(bool))
+    started = {name.removeprefix("start."): stacked[name][first] for name in START_COLUMNS}
+    return {"episode": episodes, **started, "length": np.bincount(inverse), "success": success}
+
+
+def scene_splits(
+    scene: np.ndarray, split: str, unseen: Collection[int] | None = None
+) -> dict[str, np.ndarray]:
+    """Mark the episodes in scenes that training may see, `ind`, and in those held out, `ood`.
+
+    Args:
+        scene: index of each episode's scene, −1 where it is not known. (E,)
+        split: what is asked for.
+        unseen: indices of the scenes that are held out, by default those of `scenes.SCENES`.
+
+    Returns:
+        The two masks, (E,) each.
+
+    Raises:
+        FieldError: `split` asks for one of them, and no episode's scene is known.
+    """
+    asked = {"ind", "ood"} & {*split.split(",")}
+    if asked and (scene < 0).all():
+        raise FieldError(
+            "split", split,
+            "the dataset does not say which scenes its episodes are in (no column start.scene)",
+            "choose all, train or validation",
+        )  # fmt: skip
+    held_out = np.isin(scene, [each.index for each in scenes_of("ood")] if unseen is None else list(unseen))
+    return {"ind": (scene >= 0) & ~held_out, "ood": (scene >= 0) & held_out}
