@@ -106,7 +106,7 @@ def test_a_batch_of_lerobot_train_has_the_depth_of_the_cache(deep_dataset, model
     np.testing.assert_allclose(clip.depth[1], depth[:10], atol=1e-3)
     assert torch.isfinite(model(batch)[0])
     del batch[f"{CAMERA}_depth"]
-    with pytest.raises(ValueError, match=r"depth=true: the batch lacks .*third_view_depth"):
+    with pytest.raises(ValueError, match=r"^depth=True: the batch lacks .*third_view_depth"):
         model.clip_from_batch(batch)
 
 
