@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import draccus
-from lerobot.common.train_utils import get_step_identifier
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from lerobot.utils.random_utils import get_rng_state, set_rng_state
@@ -21,6 +20,7 @@ from lerobot.utils.utils import flatten_dict
 
 from lerobot_wmrl.common.distributed import rank_and_size, wait_for_all
 from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.common.lerobot_compat import checkpoint_name
 from lerobot_wmrl.common.presets import Flags, format_flags
 from lerobot_wmrl.common.subcommand import run_subcommand
 from lerobot_wmrl.common.tracking import Tracker
@@ -106,7 +106,7 @@ class Callbacks:
                     with preserved_randomness():
                         write_json(folder / RECORD_FILE, callback.run(iteration, checkpoint, folder))
                 wait_for_all()
-                record = json.loads((folder / RECORD_FILE).read_text())
+                record = read_record(self.output_dir, callback.name, iteration, self.total)
                 self.records[callback.name][iteration] = record
                 self._log(callback.name, iteration)
                 self._apply(callback)
@@ -128,12 +128,18 @@ class Callbacks:
 
 def record_folder(output_dir: Path, name: str, iteration: int, total: int) -> Path:
     """Return the folder of a callback's record, which is called like the iteration's checkpoint."""
-    return output_dir / name / get_step_identifier(iteration, total)
+    return output_dir / name / checkpoint_name(iteration, total)
 
 
 def has_record(output_dir: Path, name: str, iteration: int, total: int) -> bool:
     """Return whether the callback of this name has a record of the iteration."""
     return (record_folder(output_dir, name, iteration, total) / RECORD_FILE).is_file()
+
+
+def read_record(output_dir: Path, name: str, iteration: int, total: int) -> Record:
+    """Return the record of the callback of this name."""
+    record: Record = json.loads((record_folder(output_dir, name, iteration, total) / RECORD_FILE).read_text())
+    return record
 
 
 def numbers(name: str, record: Record) -> dict[str, float]:
@@ -186,11 +192,11 @@ class RolloutRecorder:
 def env_flags(env: EnvConfig) -> Flags:
     """Return `env.type` and the settings that differ from their defaults, as a command takes them."""
     given, default = (flatten_dict(draccus.encode(each, EnvConfig), sep=".") for each in (env, type(env)()))
-    return {
-        "env.type": env.type,
-        **{
-            f"env.{name}": value
-            for name, value in given.items()
-            if name.split(".")[0] not in DERIVED and value != default.get(name)
-        },
+    differing = [name for name in given if given[name] != default.get(name)]
+    chosen = {
+        name
+        for name in given
+        if name.endswith(".type") and any(each.startswith(name.removesuffix("type")) for each in differing)
     }
+    kept = [name for name in given if name in {*differing, *chosen} and name.split(".")[0] not in DERIVED]
+    return {"env.type": env.type, **{f"env.{name}": given[name] for name in kept}}

@@ -12,27 +12,31 @@ RATIOS: Final = ("action", "token")
 
 @dataclass
 class PolicyGradientConfig(RLAlgorithmConfig):
-    """Options that PPO and GRPO share: ascent on a clipped objective, several epochs a rollout."""
+    """Options that PPO and GRPO share: ascent on a clipped objective, several epochs a rollout.
 
-    # `--help` finds the description of an inherited field only below the field itself, not in Args.
+    Args:
+        epochs: passes over the decisions of each rollout.
+        minibatch_size: decisions of one optimiser step, in each process of `torchrun`.
+        micro_batch_size: decisions in memory at once, if a whole minibatch does not fit; the gradient stays
+            the same.
+        policy_lr: learning rate of the policy (AdamW).
+        ratio: probability ratio that is clipped: of the whole `action`, or of each `token` (component) of it.
+        reference_coefficient: weight of the KL penalty towards the SFT policy that training starts from.
+        target_kl: KL to the policy that collected the rollout, in nats a decision, beyond which its updates
+            end early.
+        max_reference_kl: KL to the SFT policy, in nats a decision, beyond which training stops.
+        initial_std: standard deviation of exploration in normalised actions; by default the policy's own.
+    """
+
     epochs: int = 3
-    """Passes over the decisions of each rollout."""
     minibatch_size: int = 384
-    """Decisions of one optimiser step, in each process of `torchrun`."""
     micro_batch_size: int | None = None
-    """Decisions in memory at once, if a whole minibatch does not fit; the gradient stays the same."""
     policy_lr: float = 1e-4
-    """Learning rate of the policy (AdamW)."""
     ratio: str = "action"
-    """Probability ratio that is clipped: of the whole `action`, or of each `token` (component) of it."""
     reference_coefficient: float = 0.02
-    """Weight of the KL penalty towards the SFT policy that training starts from."""
     target_kl: float = 0.015
-    """KL to the policy that collected the rollout beyond which its updates end early."""
     max_reference_kl: float = 20.0
-    """KL to the SFT policy, in nats a decision, beyond which training stops."""
     initial_std: float | None = None
-    """Standard deviation of exploration in normalised actions; by default the policy's own."""
 
     def __post_init__(self) -> None:
         require_positive(self, "epochs", "minibatch_size", "policy_lr", "target_kl")

@@ -4,10 +4,9 @@ import logging
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from lerobot.common.train_utils import get_step_checkpoint_dir
-
 from lerobot_wmrl.common.checkpoints import BEST_CHECKPOINT_LINK, link_checkpoint
 from lerobot_wmrl.common.distributed import rank_and_size
+from lerobot_wmrl.common.lerobot_compat import checkpoint_dir
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.evaluation.agreement import Evaluated
 from lerobot_wmrl.rl.callbacks import REAL_STEPS, Record
@@ -58,7 +57,7 @@ class Selection:
             TrainingStopped: real success has fallen while imagined success has not.
         """
         best = best_iteration(records, self.judge)
-        checkpoint = get_step_checkpoint_dir(self.output_dir, self.total, best)
+        checkpoint = checkpoint_dir(self.output_dir, best, self.total)
         if rank_and_size()[0] == 0:
             link_checkpoint(checkpoint, BEST_CHECKPOINT_LINK)
         latest = max(records)

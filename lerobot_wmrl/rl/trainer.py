@@ -7,13 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-from lerobot.common.train_utils import (
-    get_step_checkpoint_dir,
-    load_training_num_processes,
-    load_training_state,
-    save_training_state,
-    should_save_checkpoint,
-)
 from lerobot.utils.constants import ALGORITHM_DIR, PRETRAINED_MODEL_DIR
 from lerobot.utils.logging_utils import MetricsTracker
 from tqdm import tqdm
@@ -21,7 +14,13 @@ from tqdm import tqdm
 from lerobot_wmrl.common.checkpoints import latest_checkpoint, read_weights, write_checkpoint
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.distributed import rank_and_size, wait_for_all
-from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.lerobot_compat import (
+    checkpoint_dir,
+    gather_random_states,
+    load_training_state,
+    save_training_state,
+    should_save_checkpoint,
+)
 from lerobot_wmrl.common.tracking import Tracker
 from lerobot_wmrl.rl.callbacks import Callback, Callbacks
 from lerobot_wmrl.rl.configuration_algorithms import GRPOConfig, PolicyGradientConfig
@@ -152,18 +151,17 @@ def save(
     algorithm: PolicyGradient, output_dir: Path, total: int, save_pretrained: Callable[[Path], None]
 ) -> Path:
     """Write a whole checkpoint or none: policy, algorithm, optimiser, random states, iteration."""
+    random_states = gather_random_states()
 
     def write(folder: Path) -> None:
         save_pretrained(folder / PRETRAINED_MODEL_DIR)
         algorithm.save_pretrained(folder / ALGORITHM_DIR)
-        save_training_state(
-            folder, algorithm.iteration, algorithm.optimizer, num_processes=rank_and_size()[1]
-        )
+        save_training_state(folder, algorithm.iteration, random_states, algorithm.optimizer)
 
     if rank_and_size()[0] == 0:
         write_checkpoint(output_dir, total, algorithm.iteration, write)
     wait_for_all()
-    return get_step_checkpoint_dir(output_dir, total, algorithm.iteration)
+    return checkpoint_dir(output_dir, algorithm.iteration, total)
 
 
 def resume(algorithm: PolicyGradient, output_dir: Path) -> Path | None:
@@ -171,13 +169,7 @@ def resume(algorithm: PolicyGradient, output_dir: Path) -> Path | None:
     checkpoint = latest_checkpoint(output_dir)
     if checkpoint is None:
         return None
-    began_with, size = load_training_num_processes(checkpoint) or 1, rank_and_size()[1]
-    if began_with != size:
-        raise FieldError(
-            "output_dir", output_dir, f"this run began with {began_with} processes, here are {size}",
-            f"continue it with torchrun --nproc_per_node={began_with}",
-        )  # fmt: skip
+    algorithm.iteration = load_training_state(checkpoint, algorithm.optimizer)
     algorithm.load_weights(read_weights(checkpoint))
     algorithm.load_state_dict(read_weights(checkpoint, ALGORITHM_DIR))
-    algorithm.iteration, _, _ = load_training_state(checkpoint, algorithm.optimizer, None)
     return checkpoint

@@ -1,44 +1,72 @@
-"""lerobot-wmrl-train: improve a policy by reinforcement learning, inside a world model or in ManiSkill.
+"""lerobot-wmrl-train: train a policy further by reinforcement learning, in a world model or in ManiSkill.
 
     lerobot-wmrl-train --policy.path=outputs/sft --env.type=world_model --env.world_model_path=W \\
         --env.text_world_model_path=X --env.dataset.root=D --gate.dataset.root=ROLLOUTS --output_dir=rl
     lerobot-wmrl-train --policy.path=outputs/sft --env.type=wmrl_maniskill --num_envs=2 --output_dir=rl
 
-Before the first update the gate asks how many real failures the world model calls successes:
-`--gate.dataset.root=ROLLOUTS` (with labels), or `--real_env.type=wmrl_maniskill …` for fresh ones.
+Before the first update the gate counts how many failures the world model calls successes, in
+`--gate.dataset.root=ROLLOUTS` (with labels) or in fresh rollouts, `--real_env.type=wmrl_maniskill …`.
 `--selection.freq=5` measures success on seeds of its own, in `--real_env` too, and keeps `checkpoints/best`.
-`--dyna.rounds=2` refreshes the world model with what the policy does by then.
+`--dyna.rounds=2` trains the world model further on what the policy does by then.
+`--policy.push_to_hub=true --policy.repo_id=USER/NAME` publishes the best checkpoint, else the last one.
 
 Running the same command again continues from the last checkpoint. `--preset=demo` sets the sizes.
 `lerobot-eval --policy.path=outputs/rl/checkpoints/best/pretrained_model …` evaluates the result.
 """
 
+import shlex
+import shutil
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from tempfile import TemporaryDirectory
+from typing import Any, ClassVar, Final
 
 import draccus
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.configs.default import PeftConfig, WandBConfig
 from lerobot.envs.configs import EnvConfig
 from lerobot.rl.algorithms.configs import RLAlgorithmConfig
+from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
 
+from lerobot_wmrl.common.checkpoints import BEST_CHECKPOINT_LINK
 from lerobot_wmrl.common.command_line import RunConfig, claim_output_dir, run_command
 from lerobot_wmrl.common.constants import ACTION_NAMES, EVALUATION_SEED
 from lerobot_wmrl.common.distributed import LONGEST_WAIT, rank_and_size, wait_for_all
+from lerobot_wmrl.common.errors import FieldError, require_at_least
 from lerobot_wmrl.common.malloc import keep_freed_memory
-from lerobot_wmrl.common.presets import expand_preset
+from lerobot_wmrl.common.presets import expand_preset, format_flags
 from lerobot_wmrl.rl.configuration_algorithms import GRPOConfig, PolicyGradientConfig, PPOConfig
 from lerobot_wmrl.rl.configuration_callbacks import CallbackSettings
 
-MAY_DIFFER = ("resume", "job_name", "log_freq", "wandb", "gate.action", "dyna.dataset")
-"""Settings that a continued run may have otherwise than when it began."""
+PUBLISHING = ("push_to_hub", "repo_id", "private", "license", "tags")
+"""Settings of the policy that only matter when it is published."""
+
+MAY_DIFFER = (
+    "resume", "job_name", "log_freq", "wandb", "gate.action", "dyna.dataset",
+    *(f"policy.{name}" for name in PUBLISHING),
+)  # fmt: skip
+"""Settings that may be others when a run is continued."""
+
+
+CARD: Final = """---
+{metadata}
+---
+
+# {name}
+
+A `{type}` policy of LeRobot, trained further by reinforcement learning with lerobot-wmrl-train:
+
+{told}
+
+`train_config.json` has the settings of the training. Evaluate the policy with `lerobot-eval
+--policy.path={name} --env.type=…`.
+"""
 
 
 @dataclass
 class TrainConfig(CallbackSettings, RunConfig):
-    """Improve a policy by reinforcement learning.
+    """Train a policy further by reinforcement learning.
 
     `--preset=tiny|demo|cpu` stands for the flags of that size; flags further right override it.
 
@@ -47,22 +75,23 @@ class TrainConfig(CallbackSettings, RunConfig):
         env: `--env.type=world_model|wmrl_maniskill` and its settings.
         algorithm: `--algorithm.type=ppo|grpo` and its settings.
         peft: `--peft.method_type=LORA --peft.r=32`, as in lerobot-train: train new adapters and the value
-            alone. A policy that has adapters is trained in them without this.
+            function alone. If the policy has adapters already, they are trained without this.
         output_dir: where checkpoints and metrics go; continues if it holds this run already.
         num_envs: environments stepped together, in each process of `torchrun`.
-        rollout_steps: steps of each of them an iteration; by default the longest episode.
+        rollout_steps: steps of each environment in a rollout; by default the longest episode.
         iterations: rollouts, each followed by an update.
         save_freq, log_freq: iterations between checkpoints, and between lines in the terminal.
         seed: of sampling and of the episodes; below the evaluation seeds.
-        resume: there must be a checkpoint in `output_dir` to go on from, as in lerobot-train, also with
-            `--config_path=outputs/rl/train_config.json` in place of all other flags. Without, it may be new.
+        resume: continue from the last checkpoint in `output_dir`, which must exist, as in lerobot-train; also
+            with `--config_path=outputs/rl/train_config.json` in place of all other flags. Without this the
+            same command continues too, but may also begin.
         wandb: `--wandb.enable=true` also sends the metrics there, as lerobot-train does.
-        job_name: of the run in wandb.
-        real_env, real_num_envs: `--real_env.type=wmrl_maniskill` and its settings, where success is real;
-            simulators at once.
-        selection: which checkpoint is kept as `checkpoints/best`.
-        gate: whether the world model may be trusted with a policy (`--gate.action=stop|warn|off`).
-        dyna: rounds that refresh the world model with what the policy does by then (`--dyna.rounds`).
+        job_name: name of the run in wandb.
+        real_env: environment outside the world model, `--real_env.type=wmrl_maniskill` and its settings.
+        real_num_envs: simulators at once in `real_env`.
+        selection: how the checkpoint that is kept as `checkpoints/best` is chosen.
+        gate: whether a policy may be trained in the world model (`--gate.action=stop|warn|off`).
+        dyna: rounds that train the world model further on what the policy does by then (`--dyna.rounds`).
     """
 
     path_fields: ClassVar[list[str]] = ["policy"]
@@ -91,52 +120,62 @@ class TrainConfig(CallbackSettings, RunConfig):
 
 
 def check_config(cfg: TrainConfig) -> PolicyGradientConfig:
-    """ValueError names the setting that cannot be."""
+    """Return the algorithm's configuration. FieldError names the first setting that cannot be."""
     if not isinstance(cfg.algorithm, PolicyGradientConfig):
-        raise ValueError(f"--algorithm.type={cfg.algorithm.type}: this command trains with: ppo, grpo")
+        raise FieldError("algorithm.type", cfg.algorithm.type, "this command trains with ppo or grpo")
     if cfg.env is None or not hasattr(cfg.env, "create_tensor_env"):
-        raise ValueError("--env.type: choose world_model or wmrl_maniskill")
-    for name in ("num_envs", "iterations", "save_freq", "log_freq"):
-        if getattr(cfg, name) < 1:
-            raise ValueError(f"--{name}={getattr(cfg, name)}: must be at least 1")
+        raise FieldError("env.type", cfg.env and cfg.env.type, "choose world_model or wmrl_maniskill")
+    require_at_least(cfg, 1, "num_envs", "iterations", "save_freq", "log_freq")
     if isinstance(cfg.algorithm, GRPOConfig) and cfg.num_envs % cfg.algorithm.group_size:
-        raise ValueError(
-            f"--num_envs={cfg.num_envs}: must be a multiple of --algorithm.group_size="
-            f"{cfg.algorithm.group_size}, whose environments begin alike"
-        )
+        raise FieldError(
+            "num_envs", cfg.num_envs,
+            f"must be a multiple of `algorithm.group_size={cfg.algorithm.group_size}`, the environments that "
+            "start from the same state",
+        )  # fmt: skip
     if not 0 <= cfg.seed < EVALUATION_SEED:
-        raise ValueError(
-            f"--seed={cfg.seed}: must be from 0 to {EVALUATION_SEED - 1}; those above are for evaluation"
+        raise FieldError(
+            "seed", cfg.seed, f"must be from 0 to {EVALUATION_SEED - 1}; those above are for evaluation"
         )
     cfg.check_callbacks(cfg.env, cfg.iterations)
     return cfg.algorithm
 
 
 def rollout_length(cfg: TrainConfig, longest: int) -> int:
-    """Steps a rollout. ValueError if the end of an episode would never be seen."""
+    """Return the steps of a rollout. FieldError if episodes could not end within it."""
     steps = cfg.rollout_steps or longest
     if steps < longest:
-        raise ValueError(
-            f"--rollout_steps={steps}: episodes last up to {longest} steps and every rollout starts anew, so "
-            "their ends would never be trained on; raise it, or lower --env.episode_length"
-        )
+        raise FieldError(
+            "rollout_steps", steps,
+            f"episodes last up to {longest} steps and every rollout starts new ones, so their ends would "
+            "never be trained on", "raise it, or lower `env.episode_length`",
+        )  # fmt: skip
     return steps
 
 
 def load_config(cfg: TrainConfig) -> PreTrainedConfig:
-    """The policy's configuration, also kept in `cfg`. ValueError if no policy is given."""
+    """Read the policy's configuration into `cfg` and return it.
+
+    Whether and where it is published is not taken from the checkpoint, which would overwrite the SFT policy
+    on the hub, but from the command line or a resumed run's configuration.
+    """
     from lerobot_wmrl.common.policy_checkpoints import read_policy_config
 
     path = parser.get_path_arg("policy") or (cfg.policy and cfg.policy.pretrained_path)
     if not path:
-        raise ValueError("--policy.path: give the checkpoint of the policy to improve")
-    cfg.policy = read_policy_config(str(path), parser.get_cli_overrides("policy") or [])
-    cfg.policy.push_to_hub = False
+        raise ValueError("--policy.path: give the checkpoint of the policy to train")
+    stored = cfg.policy
+    typed = parser.get_cli_overrides("policy") or []
+    cfg.policy = read_policy_config(str(path), ["--push_to_hub=false", "--repo_id=null", *typed])
+    if stored is not None:
+        for name in PUBLISHING:
+            setattr(cfg.policy, name, getattr(stored, name))
+    if cfg.policy.push_to_hub and not cfg.policy.repo_id:
+        raise FieldError("policy.push_to_hub", True, "give its name on the hub, --policy.repo_id=user/name")
     return cfg.policy
 
 
 def train_policy(cfg: TrainConfig) -> None:
-    """Load the policy, build the environment, see that they fit, train."""
+    """Load the policy, build the environment, train, publish, and say what was made."""
     from accelerate import PartialState
     from lerobot.utils.random_utils import set_seed
 
@@ -150,28 +189,32 @@ def train_policy(cfg: TrainConfig) -> None:
     if done:
         claim_output_dir(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER)
         print(f"{cfg.output_dir}: already trained for {cfg.iterations} iterations")
-        return
-    set_seed(cfg.seed)
-    policy, processors = load_policy(config), load_processors(config)
-    env: Any = cfg.env.create_tensor_env(cfg.num_envs, config.device)  # type: ignore[union-attr]
-    try:
-        train_in(env, cfg, algorithm, policy, processors)
-    finally:
-        env.close()
+    else:
+        set_seed(cfg.seed)
+        policy, processors = load_policy(config), load_processors(config)
+        env: Any = cfg.env.create_tensor_env(cfg.num_envs, config.device)  # type: ignore[union-attr]
+        try:
+            train_in(env, cfg, algorithm, policy, processors)
+        finally:
+            env.close()
+    if rank_and_size()[0] == 0:
+        lines = summary(cfg)
+        print("\n".join(lines))
+        publish(cfg, lines)
 
 
 def finished(cfg: TrainConfig) -> bool:
-    """Whether there is nothing left to do. ValueError if there is nothing to resume."""
+    """Return whether there is nothing left to train. FieldError if there is nothing to resume."""
     from lerobot_wmrl.common.checkpoints import latest_checkpoint
     from lerobot_wmrl.rl.callbacks import has_record
     from lerobot_wmrl.rl.selection import Selection
 
     last = latest_checkpoint(cfg.output_dir)
     if cfg.resume and last is None:
-        raise ValueError(
-            f"--resume=true: there is no checkpoint in --output_dir={cfg.output_dir} to go on from; leave "
-            "the flag out to begin"
-        )
+        raise FieldError(
+            "resume", True, f"there is no checkpoint in `output_dir={cfg.output_dir}` to continue from",
+            "leave the flag out to begin",
+        )  # fmt: skip
     if last is None or int(last.name) < cfg.iterations:
         return False
     return not cfg.selection.freq or has_record(
@@ -180,7 +223,7 @@ def finished(cfg: TrainConfig) -> bool:
 
 
 def make_wandb(cfg: TrainConfig) -> Any:
-    """LeRobot's logger if it is asked for; of a run that wandb knows already, it goes on with that one."""
+    """Return LeRobot's logger if it is enabled; it continues a run that wandb knows already."""
     if not cfg.wandb.enable or rank_and_size()[0] > 0:
         return None
     from lerobot.common.wandb_utils import WandBLogger
@@ -196,7 +239,7 @@ def train_in(
     policy: Any,
     processors: tuple[Any, Any],
 ) -> None:
-    """See that policy and environment fit, then train."""
+    """Check that policy and environment fit, then train."""
     from lerobot_wmrl.common.adapters import with_new_adapters
     from lerobot_wmrl.common.policy_checkpoints import adopt_features, check_fit
     from lerobot_wmrl.rl.make_callbacks import Trained, make_callbacks
@@ -229,6 +272,66 @@ def train_in(
         env, algorithm, make_pipeline(config, *processors), buffer, schedule, cfg.output_dir, save_pretrained,
         callbacks, make_wandb(cfg),
     )  # fmt: skip
+
+
+def chosen_checkpoint(cfg: TrainConfig) -> Path:
+    """Return the best checkpoint, or the last one of a training without selection."""
+    checkpoints = cfg.output_dir / CHECKPOINTS_DIR
+    return checkpoints / (BEST_CHECKPOINT_LINK if cfg.selection.freq else LAST_CHECKPOINT_LINK)
+
+
+def summary(cfg: TrainConfig) -> list[str]:
+    """Return lines that say what was made, how good it is, and how to evaluate it."""
+    from lerobot_wmrl.common.tracking import read_metrics
+    from lerobot_wmrl.rl.callbacks import env_flags, read_record
+    from lerobot_wmrl.rl.selection import Selection, success
+
+    iterations = [line for line in read_metrics(cfg.output_dir) if "success_rate" in line]
+    first, last, checkpoint = iterations[0], iterations[-1], chosen_checkpoint(cfg)
+    policy, env, algorithm = cfg.policy.type, cfg.env.type, cfg.algorithm.type.upper()  # type: ignore[union-attr]
+    lines = [
+        f"{cfg.output_dir}: {policy} policy after {last['step']} iterations of {algorithm}, "
+        f"{last['env_steps']:,} steps in {env}",
+        f"success in {env} with exploration: {first['success_rate']:.0%} in iteration {first['step']}, "
+        f"{last['success_rate']:.0%} in iteration {last['step']}",
+    ]
+    if cfg.selection.freq:
+        best = int(checkpoint.resolve().name)
+        record = read_record(cfg.output_dir, Selection.name, best, cfg.iterations)
+        measured = [place for place in ("real", "imagined") if place in record]
+        found = ", ".join(f"{place} success {success(record, place)}" for place in measured)
+        lines.append(f"best checkpoint: iteration {best}, {found}")
+    evaluated: Any = cfg.real_env or cfg.env
+    flags = {
+        "policy.path": str(checkpoint / PRETRAINED_MODEL_DIR), **env_flags(evaluated), "eval.n_episodes": 100,
+        "seed": EVALUATION_SEED,
+    }  # fmt: skip
+    return [*lines, f"next: {shlex.join(['lerobot-eval', *format_flags(flags)])}"]
+
+
+def publish(cfg: TrainConfig, lines: list[str]) -> None:
+    """Upload the chosen checkpoint with a model card if `policy.push_to_hub`. `lines` describe it."""
+    config: Any = cfg.policy
+    if not config.push_to_hub:
+        return
+    from huggingface_hub import HfApi, ModelCardData
+
+    api = HfApi()
+    name = api.create_repo(config.repo_id, private=config.private, exist_ok=True).repo_id
+    data = ModelCardData(
+        license=config.license or "apache-2.0", library_name="lerobot", pipeline_tag="robotics",
+        tags=sorted({*(config.tags or []), "robotics", "lerobot", config.type}), model_name=name,
+    )  # fmt: skip
+    told = "\n".join(f"- {line}" for line in lines[:-1])
+    card = CARD.format(metadata=data.to_yaml(), name=name, type=config.type, told=told)
+    with TemporaryDirectory() as temporary:
+        folder = Path(temporary) / "policy"
+        shutil.copytree(chosen_checkpoint(cfg) / PRETRAINED_MODEL_DIR, folder)
+        (folder / "README.md").write_text(card)
+        api.upload_folder(
+            repo_id=name, folder_path=folder, commit_message="Policy trained by reinforcement learning"
+        )
+    print(f"{cfg.output_dir}: published as {name}")
 
 
 def main() -> None:

@@ -17,6 +17,7 @@ from safetensors.torch import load_file
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.rl.configuration_algorithms import GRPOConfig
 from lerobot_wmrl.scripts.train import TrainConfig, check_config, main, rollout_length
+from tests.hub_server import Hub
 from tests.rl.checkpoints import save_untrained_policy
 from tests.rl.point_env import PointEnv
 
@@ -110,6 +111,32 @@ def test_an_interrupted_training_ends_as_if_nothing_had_happened(
     assert all(torch.equal(tensor, continued[name]) for name, tensor in uninterrupted.items())
 
 
+def test_it_says_what_it_made_and_publishes_it_if_asked(
+    hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Never where the SFT policy was published, although its configuration says so."""
+    policy = save_untrained_policy(tmp_path / "policy")
+    settings = json.loads((policy / "config.json").read_text())
+    (policy / "config.json").write_text(json.dumps({**settings, "push_to_hub": True, "repo_id": "me/sft"}))
+    out = tmp_path / "rl"
+    flags = [f"--policy.path={policy}", *POINT, *SHORT, f"--output_dir={out}"]
+    improve(monkeypatch, *flags)
+    told = capsys.readouterr().out
+    assert f"{out}: cnn policy after 2 iterations of PPO, 8 steps in test_point" in told
+    assert "success in test_point with exploration: " in told
+    last = out / "checkpoints" / "last" / "pretrained_model"
+    assert f"next: lerobot-eval --policy.path={last} --env.type=test_point" in told
+    assert not hub.repos
+    improve(monkeypatch, *flags, "--policy.push_to_hub=true", "--policy.repo_id=me/improved")
+    published = hub.repos["models", "me/improved"].head
+    assert published["model.safetensors"] == (last / "model.safetensors").read_bytes()
+    assert {"config.json", "policy_preprocessor.json", "train_config.json"} <= published.keys()
+    card = published["README.md"].decode()
+    assert "library_name: lerobot" in card
+    assert "2 iterations of PPO" in card
+    assert list(hub.repos) == [("models", "me/improved")]
+
+
 def test_grpo_trains_by_the_same_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     policy, output_dir = save_untrained_policy(tmp_path / "policy"), tmp_path / "rl"
     flags = [
@@ -139,8 +166,9 @@ def test_a_finished_training_of_something_else_is_refused(
 @pytest.mark.parametrize(("flags", "message"), [
     (["--policy.path={tmp}/policy", *POINT], "needs observation.images.wrist, which"),
     (["--policy.path={tmp}/policy", *POINT, "--output_dir={tmp}/policy"], "holds something else"),
-    (["--policy.path={tmp}/policy", *POINT, "--algorithm.clip=0"], "algorithm.clip=0"),
+    (["--policy.path={tmp}/policy", *POINT, "--algorithm.clip=0"], "--algorithm.clip=0"),
     (POINT, "--policy.path: give the checkpoint"),
+    (["--policy.path={tmp}/policy", *POINT, "--policy.push_to_hub=true"], "hub, --policy.repo_id"),
 ])  # fmt: skip
 def test_bad_input_is_named_and_nothing_is_written(
     flags: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
@@ -157,9 +185,9 @@ def test_bad_input_is_named_and_nothing_is_written(
 
 
 @pytest.mark.parametrize(("settings", "message"), [
-    ({"env": None}, r"--env\.type"), ({"num_envs": 0}, "--num_envs=0"), ({"seed": -1}, "--seed=-1"),
-    ({"seed": 1_000_000}, "--seed=1000000"),
-    ({"num_envs": 12, "algorithm": GRPOConfig(group_size=8)}, r"--num_envs=12: must be a multiple of"),
+    ({"env": None}, r"env\.type"), ({"num_envs": 0}, "num_envs=0"), ({"seed": -1}, "seed=-1"),
+    ({"seed": 1_000_000}, "seed=1000000"),
+    ({"num_envs": 12, "algorithm": GRPOConfig(group_size=8)}, r"num_envs=12: must be a multiple of"),
 ])  # fmt: skip
 def test_impossible_settings_are_named(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
@@ -168,5 +196,5 @@ def test_impossible_settings_are_named(settings: dict[str, Any], message: str) -
 
 def test_a_rollout_reaches_the_end_of_an_episode() -> None:
     assert rollout_length(TrainConfig(), longest=4) == 4
-    with pytest.raises(ValueError, match=r"--rollout_steps=2: episodes last up to 4"):
+    with pytest.raises(ValueError, match=r"rollout_steps=2: episodes last up to 4"):
         rollout_length(TrainConfig(rollout_steps=2), longest=4)

@@ -140,7 +140,7 @@ def test_the_gate_is_asked_before_the_first_update(improve: Any, capsys: pytest.
     with pytest.raises(SystemExit) as stopped:
         improve(*flags, "--env.done_threshold=0.0001")
     assert stopped.value.code == 1
-    assert "the world model calls real failures successes" in capsys.readouterr().err
+    assert "the world model calls failures successes" in capsys.readouterr().err
     out = improve(*flags, "--env.done_threshold=0.0001", "--gate.action=warn")
     assert (out / "checkpoints" / "last").resolve().name == "000002"
     assert [line["step"] for line in read_metrics(out)] == [0, 1, 2]
@@ -162,7 +162,7 @@ def test_gate_and_selection_in_the_simulator(improve: Any) -> None:
 
 
 @pytest.mark.parametrize(("flags", "message"), [
-    (PUSH, "--gate.action=stop: nothing says what is real"),
+    (PUSH, "--gate.action=stop: no episode says what success is"),
     ([*PUSH, "--gate.action=halt"], "--gate.action=halt: choose one of stop"),
     ([*PUSH, "--gate.limit=2"], "--gate.limit=2"),
     ([*PUSH, "--env.done_frames=5"], "no episode could succeed"),
@@ -170,7 +170,7 @@ def test_gate_and_selection_in_the_simulator(improve: Any) -> None:
     ([*PUSH, *SIMULATOR, "--real_env.image_size=64"], "the environment has (3, 64, 64)"),
     ([*PUSH, *SIMULATOR, "--real_env.cameras=[wrist]"], "which the environment does not have"),
     ([*PUSH, *SIMULATOR, "--dyna.rounds=2"], "--dyna.rounds=2: there is room for 1"),
-    ([*PUSH, "--gate.action=off", "--dyna.rounds=1"], "give a simulator to record in"),
+    ([*PUSH, "--gate.action=off", "--dyna.rounds=1"], "give a simulator to record in (--real_env.type"),
     (["--policy.path={pointing}", *IMAGINED, "--gate.action=off"], "has 3 action components, the environ"),
     ([*POINT, "--dyna.rounds=1"], "no world model to refresh"),
     ([*POINT, "--selection.freq=-1"], "--selection.freq=-1: must be at least 0"),
