@@ -19,8 +19,7 @@ from typing import Any
 from lerobot_dataset_maniskill import recorder
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.manifest import planned_parts
-from lerobot_dataset_maniskill.quiet import silence_libraries
-from lerobot_dataset_maniskill.worker import PartRecorder
+from lerobot_dataset_maniskill.worker import PartRecorder, silence_libraries
 from lerobot_wmrl.common.constants import KINDS, PLAY, TASKS
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv

@@ -1,47 +1,57 @@
-"""The dataset card, README.md: what was recorded, what it looks like, what the columns mean, how to load it.
+"""The dataset card, README.md, with a picture of each task: one episode from its start to success.
 
 Everything in it is read from the dataset's own files, so that it can be written again under another name.
 """
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_dataset_maniskill.examples import chosen_examples, write_pictures
 from lerobot_dataset_maniskill.writer import VOCABULARY_FILE
 from lerobot_wmrl.common.constants import FPS, KINDS, TASKS
 from lerobot_wmrl.common.files import write_text
+from lerobot_wmrl.common.frame_strips import enlarged, evenly_spaced, in_a_row
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
 CARD_FILE = Path("README.md")
 
 KIND_MEANINGS = {
-    "optimal": "a planner's straight way",
-    "waypoint": "a planner's way by an unrelated point",
-    "interpolated": "a planner's way off the straight lines",
-    "noisy": "a planner whose points are a little off, so that some episodes fail",
+    "optimal": "a planner's straight trajectory",
+    "waypoint": "a planner's trajectory with a detour",
+    "interpolated": "a planner's trajectory off the straight lines",
+    "noisy": "a planner whose waypoints are noisy, so that some episodes fail",
     "near_miss": "a planner that misses on purpose",
-    "policy": "a policy's attempts",
-    "play": "wandering, pushing and lifting without a reset",
+    "policy": "a policy's rollouts",
+    "play": "moving, pushing and lifting at random, without a reset",
 }
-"""How the actions of each of `constants.KINDS` were made."""
+"""Kind, one of `constants.KINDS` → how its actions were made."""
+
+MEDIA: Final = Path("media")
+FRAMES: Final = 6
+WIDTH: Final = 192
+"""Pixels that a frame is enlarged to, as far as a whole factor allows."""
 
 
 def name_card(root: Path, repo_id: str) -> None:
-    """Write pictures and card, unless the card is of this name already: somebody may have added to it."""
+    """Write pictures and card, unless the card has this name already: somebody may have edited it."""
     card = root / CARD_FILE
     if not card.is_file() or title(repo_id) not in card.read_text().splitlines():
         write_card(root, repo_id, recorded_episodes(root))
 
 
 def write_card(root: Path, repo_id: str, table: Mapping[str, np.ndarray]) -> None:
-    """The pictures, then the card, of the dataset at `root`, called `repo_id`.
+    """Write the pictures, then the card, of a dataset.
 
-    `table` is `lerobot_wmrl.maniskill.recordings.recorded_episodes`.
+    Args:
+        root: of the dataset.
+        repo_id: its name.
+        table: its episodes, as `lerobot_wmrl.maniskill.recordings.recorded_episodes` reads them.
     """
     write_pictures(root, repo_id, table)
     vocabulary = json.loads((root / VOCABULARY_FILE).read_text())
@@ -70,11 +80,12 @@ def write_card(root: Path, repo_id: str, table: Mapping[str, np.ndarray]) -> Non
 
 
 def title(repo_id: str) -> str:
+    """Return the card's first line."""
     return f"# {repo_id}"
 
 
 def recorded_kinds(table: Mapping[str, np.ndarray]) -> list[str]:
-    """Names of the kinds of which there are episodes."""
+    """Return the names of the kinds that have episodes."""
     return [KINDS[kind] for kind in np.unique(table["kind"])]
 
 
@@ -82,7 +93,7 @@ SUCCESS_HEAD = ("task", "kind", "episodes", "successful", "success rate (95 % in
 
 
 def success_rows(table: Mapping[str, np.ndarray]) -> Iterator[tuple[Any, ...]]:
-    """A row for each task and kind of which there are episodes."""
+    """Yield a row for each task and kind that has episodes."""
     for task, kind in sorted({*zip(table["task"].tolist(), table["kind"].tolist(), strict=True)}):
         success = table["success"][(table["task"] == task) & (table["kind"] == kind)]
         rate = Proportion(int(success.sum()), len(success))
@@ -92,7 +103,7 @@ def success_rows(table: Mapping[str, np.ndarray]) -> Iterator[tuple[Any, ...]]:
 
 
 def picture_lines(table: Mapping[str, np.ndarray]) -> Iterator[str]:
-    """Every example's picture, with what it shows."""
+    """Yield every example's picture with its caption."""
     for example in chosen_examples(table):
         end = "from its start to success" if example.success else "which fails"
         caption = f"`{example.task}`: episode {example.episode} ({example.kind}), {end}"
@@ -105,21 +116,86 @@ SCENES_HEAD = ("scene", "object", "container", "table", "split", "episodes")
 def scene_rows(
     table: Mapping[str, np.ndarray], scenes: Sequence[Mapping[str, Any]]
 ) -> Iterator[tuple[Any, ...]]:
-    """A row for each scene that was recorded. `scenes` is the vocabulary's, by index."""
+    """Yield a row for each recorded scene. `scenes` is the vocabulary's, by index."""
     for index, episodes in zip(*np.unique(table["scene"], return_counts=True), strict=True):
         scene = scenes[index]
         yield index, *(scene[part] for part in ("object", "container", "table", "split")), episodes
 
 
 def markdown_table(head: Sequence[str], rows: Iterator[tuple[Any, ...]]) -> str:
-    """Head and rows, one a line."""
+    """Return a table in Markdown."""
     cells = [head, ["---"] * len(head), *rows]
     return "\n".join(f"| {' | '.join(str(cell) for cell in row)} |" for row in cells)
 
 
+def success_by_kind(table: Mapping[str, np.ndarray]) -> dict[str, tuple[int, int]]:
+    """Count by kind. Returns kind → (successful episodes, episodes)."""
+    kinds, success = table["kind"], table["success"]
+    return {
+        name: (int(success[kinds == index].sum()), int(np.sum(kinds == index)))
+        for index, name in enumerate(KINDS)
+        if np.any(kinds == index)
+    }
+
+
+@dataclass(frozen=True)
+class Example:
+    """An episode whose picture shows its task."""
+
+    task: str
+    episode: int
+    kind: str
+    success: bool
+
+    @property
+    def path(self) -> Path:
+        """Path of the picture, from the dataset's root."""
+        return MEDIA / f"{self.task}.png"
+
+
+def chosen_examples(table: Mapping[str, np.ndarray]) -> list[Example]:
+    """Choose an episode of each task: its first success, optimal if possible, else its first failure."""
+    best = np.lexsort((table["episode"], table["kind"], ~table["success"]))
+    rows = [best[table["task"][best] == task][0] for task in np.unique(table["task"])]
+    return [
+        Example(
+            TASKS[table["task"][row]],
+            int(table["episode"][row]),
+            KINDS[table["kind"][row]],
+            bool(table["success"][row]),
+        )
+        for row in rows
+    ]
+
+
+def write_pictures(root: Path, repo_id: str, table: Mapping[str, np.ndarray]) -> None:
+    """Write the picture of every example into the folder `media` of the dataset at `root`."""
+    (root / MEDIA).mkdir(exist_ok=True)
+    for example in chosen_examples(table):
+        dataset = LeRobotDataset(repo_id, root=root, episodes=[example.episode], return_uint8=True)
+        frames = frames_to_success(dataset)
+        enlarged(in_a_row(frames), max(1, WIDTH // frames.shape[2])).save(root / example.path)
+
+
+def frames_to_success(dataset: LeRobotDataset) -> np.ndarray:
+    """Return frames of a dataset of one episode, evenly spaced from its start to success, or to its end.
+
+    Returns:
+        (N, C·H, W, 3) uint8, the C cameras below each other.
+    """
+    success = dataset.hf_dataset.with_format("numpy")["next.success"][:].reshape(-1)
+    end = len(success)
+    if success.any():
+        end = min(int(success.argmax()) + 2, end)  # success shows in the frame after its row
+    rows = [dataset[int(index)] for index in evenly_spaced(end, FRAMES)]
+    coloured = [name for name in dataset.meta.camera_keys if name not in dataset.meta.depth_keys]
+    cameras = [np.stack([row[name].numpy() for row in rows]) for name in coloured]
+    return np.concatenate(cameras, 2).transpose(0, 2, 3, 1)
+
+
 DEPTH = "- `observation.images.<camera>_depth`: LeRobot depth maps, millimetres along the camera's axis.\n"
 
-IMAGINED = "A policy's episodes, imagined by a world model from the first frames of real ones,"
+IMAGINED = "A policy's episodes, imagined by a world model from the first frames of recorded ones,"
 
 CARD = """---
 license: apache-2.0

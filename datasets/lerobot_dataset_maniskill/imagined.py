@@ -1,4 +1,4 @@
-"""A policy's imagined episodes: a part's are imagined at once, and written as simulated ones are."""
+"""A policy's imagined episodes: a part is imagined in one batch, and written like simulated episodes."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,11 +10,11 @@ from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
-from lerobot_dataset_maniskill.drivers import ExplorationNoise
 from lerobot_dataset_maniskill.manifest import EpisodePlan, Part
-from lerobot_dataset_maniskill.worker import EpisodeResult, Report, whole_part
+from lerobot_dataset_maniskill.worker import EpisodeResult, ExplorationNoise, Report, whole_part
 from lerobot_dataset_maniskill.writer import Outcome, StartColumns, add_step
 from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW, ACTION_NAMES, STATE_NAMES
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.policy_checkpoints import check_fit, load_policy, load_processors
 from lerobot_wmrl.envs.evaluation_adapter import images_to_numpy
 from lerobot_wmrl.maniskill.episode import Frame
@@ -25,7 +25,7 @@ Row = tuple[Frame, np.ndarray, Outcome]
 
 
 class ImaginedPartRecorder:
-    """A world model and a policy that record parts one after the other."""
+    """Records parts one after the other, with one world model and one policy."""
 
     def __init__(self, config: RecordConfig, folder: Path) -> None:
         assert config.imagination is not None
@@ -34,9 +34,11 @@ class ImaginedPartRecorder:
         self.env: Any = config.imagination.create_tensor_env(min(config.part_episodes, config.num_episodes))
         shown = {name: tuple(space.shape) for name, space in self.env.single_observation_space.items()}
         if shown.get(OBS_STATE) != (len(STATE_NAMES),):
-            raise ValueError(
-                f"--env.world_model_path={config.imagination.world_model_path}: imagines no state like the "
-                f"recorder's ({len(STATE_NAMES)} numbers); train it on what lerobot-wmrl-record recorded"
+            raise FieldError(
+                "env.world_model_path",
+                config.imagination.world_model_path,
+                f"does not imagine the recorder's state ({len(STATE_NAMES)} values)",
+                "train it on a dataset that lerobot-wmrl-record recorded",
             )
         check_fit(config.policy, shown, len(ACTION_NAMES))
         self.policy: Any = load_policy(config.policy).eval()
@@ -44,7 +46,7 @@ class ImaginedPartRecorder:
         self.pipeline = make_pipeline(config.policy, *self.processors)
 
     def record(self, part: Part, report: Report) -> None:
-        """Record `part`; its folder appears under its final name only when it is whole."""
+        """Record a part. Its folder appears under its final name only when it is whole."""
         model = self.env.model.config
         with whole_part(self.config, self.folder, part, model.cameras, model.image_size) as dataset:
             for plan, (instruction, rows) in zip(part.episodes, self._imagine(part.episodes), strict=True):
@@ -56,7 +58,7 @@ class ImaginedPartRecorder:
 
     @torch.no_grad()
     def _imagine(self, plans: Sequence[EpisodePlan]) -> list[tuple[str, list[Row]]]:
-        """Each episode's instruction and rows, to the k-frame done or to the horizon."""
+        """Return each episode's instruction and rows, to the k-frame done or to the horizon."""
         count = self.env.num_envs
         noises = [ExplorationNoise(self.config.exploration, plan.seed) for plan in plans]
         torch.manual_seed(plans[0].seed)
@@ -81,14 +83,14 @@ class ImaginedPartRecorder:
         return list(zip(instructions, rows, strict=False))
 
     def _act(self, observation: dict[str, Any], noises: list[ExplorationNoise]) -> np.ndarray:
-        """(B, 7) in the action box."""
+        """Return actions (B, 7) inside the action box."""
         chosen = self.policy.select_action(self.pipeline.prepare(observation))
         action = self.pipeline.to_action(chosen).cpu().numpy()
         action[: len(noises), :3] += np.stack([noise() for noise in noises])
         return np.clip(action, ACTION_LOW, ACTION_HIGH).astype(np.float32)
 
     def _frames(self, observation: dict[str, Any], reward: Tensor, success: Tensor) -> list[Frame]:
-        """What each environment shows, as the simulator has it."""
+        """Return what each environment shows, in the simulator's form."""
         images = images_to_numpy(observation)
         state = observation[OBS_STATE].cpu().numpy()
         return [

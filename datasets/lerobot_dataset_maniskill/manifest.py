@@ -1,4 +1,5 @@
-"""Which episodes a recording consists of: a pure function of its configuration, so it can be resumed."""
+"""The list of episodes of a recording: a pure function of its configuration, so a recording can be
+resumed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,15 +9,21 @@ import numpy as np
 
 from lerobot_dataset_maniskill.configuration import POLICY_KIND, RecordConfig
 from lerobot_wmrl.common.constants import KINDS, START_COLUMNS, TASKS
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 from lerobot_wmrl.maniskill.scenes import SCENES, Scene, scene_for_seed
 
 
 @dataclass(frozen=True)
 class EpisodePlan:
-    """One episode to record: task, scene and seed rebuild its start.
+    """One episode to record.
 
-    `start`: of an imagined one, which of the environment's start frames that is.
+    Args:
+        task: with `scene` and `seed`, decides the start.
+        kind: how its actions are made, one of `constants.KINDS`.
+        scene: what is on the table.
+        seed: of the episode.
+        start: for an imagined episode, the index of the environment's start frame.
     """
 
     task: str
@@ -28,18 +35,19 @@ class EpisodePlan:
 
 @dataclass(frozen=True)
 class Part:
-    """A sub-dataset: the piece of work of one worker."""
+    """A sub-dataset: what a worker records at a time."""
 
     index: int
     episodes: tuple[EpisodePlan, ...]
 
     @property
     def name(self) -> str:
+        """Name of its folder."""
         return f"part-{self.index:05d}"
 
 
 def planned_parts(config: RecordConfig) -> list[Part]:
-    """All parts of the shard in order."""
+    """Return all parts of the shard in order."""
     episodes = simulated_episodes(config) if config.imagination is None else imagined_episodes(config)
     size, (shard, shards) = config.part_episodes, config.shard_of
     parts = [
@@ -50,7 +58,7 @@ def planned_parts(config: RecordConfig) -> list[Part]:
 
 
 def simulated_episodes(config: RecordConfig) -> list[EpisodePlan]:
-    """Episode i of the whole has the seed `config.seed + i`.
+    """List the episodes to simulate. Episode i has the seed `config.seed + i`.
 
     Consecutive seeds visit scenes and tasks in turn; every round of the scenes gives each the next task.
     """
@@ -63,8 +71,11 @@ def simulated_episodes(config: RecordConfig) -> list[EpisodePlan]:
 
 
 def imagined_episodes(config: RecordConfig) -> list[EpisodePlan]:
-    """From the environment's start frames in turn. Task, scene and seed are those of the real episodes that
-    began so: an imagined episode can be repeated for real."""
+    """List the episodes to imagine, from the environment's start frames in turn.
+
+    Task, scene and seed are those of the recorded episodes that the frames are from, so that an imagined
+    episode can be repeated in ManiSkill.
+    """
     from lerobot_wmrl.data.episodes import open_dataset, read_episodes
     from lerobot_wmrl.envs.start_frames import chosen_episodes
 
@@ -73,9 +84,11 @@ def imagined_episodes(config: RecordConfig) -> list[EpisodePlan]:
     table = read_episodes(open_dataset(source.root, source.repo_id))
     missing = [name for name in START_COLUMNS if name not in table.dataset.features]
     if missing:
-        raise ValueError(
-            f"--env.dataset.root={source.root}: does not say how its episodes began ({', '.join(missing)}); "
-            "imagined episodes are recorded from the starts of what lerobot-wmrl-record recorded"
+        raise FieldError(
+            "env.dataset.root",
+            source.root,
+            f"does not say how its episodes began ({', '.join(missing)})",
+            "give a dataset that lerobot-wmrl-record recorded: imagined episodes start like its episodes",
         )
     starts, real = chosen_episodes(table, source), recorded_episodes(Path(source.root))
     plans = []
@@ -87,12 +100,12 @@ def imagined_episodes(config: RecordConfig) -> list[EpisodePlan]:
 
 
 def task_for_seed(tasks: Sequence[str], scenes: int, seed: int) -> str:
-    """The task of an episode seed where `scenes` scenes are visited in turn."""
+    """Return the task of an episode seed where `scenes` scenes are visited in turn."""
     return tasks[(seed % scenes + seed // scenes) % len(tasks)]
 
 
 def planned_kinds(config: RecordConfig) -> list[str]:
-    """The kind of each episode: the configured shares, exactly (largest remainders), in random order."""
+    """Return the kinds of the episodes: exactly the shares (largest remainders), in random order."""
     if config.policy is not None:
         return [POLICY_KIND] * config.num_episodes
     names = sorted(config.kinds, key=KINDS.index)

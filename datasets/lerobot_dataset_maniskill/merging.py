@@ -1,20 +1,26 @@
-"""From many sub-datasets to one, with LeRobot's own tool."""
+"""Finished recordings: sub-datasets and shards put together, and the recognition of what is complete."""
 
+import json
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from lerobot.datasets.aggregate import aggregate_datasets
 
-from lerobot_dataset_maniskill.card import write_card
-from lerobot_dataset_maniskill.writer import write_vocabulary
-from lerobot_wmrl.common.constants import KINDS
+from lerobot_dataset_maniskill.card import CARD_FILE, success_by_kind, write_card
+from lerobot_dataset_maniskill.writer import VOCABULARY_FILE, find_damage, write_vocabulary
+from lerobot_wmrl.common.constants import FPS
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
+
+WHOLE: Final = [0, 1]
+"""Value of `shard` for a recording that is not split."""
 
 
 def merge_folders(folders: Sequence[Path], target: Path, repo_id: str) -> None:
-    """All episodes of `folders`, in order, as a dataset at `target`, which must not exist."""
+    """Put all episodes of `folders`, in order, into a dataset at `target`, which must not exist."""
     aggregate_datasets(
         repo_ids=[repo_id] * len(folders), aggr_repo_id=repo_id, roots=list(folders), aggr_root=target,
         concatenate_videos=False, concatenate_data=False,  # appending rewrites the whole file for every part
@@ -22,21 +28,123 @@ def merge_folders(folders: Sequence[Path], target: Path, repo_id: str) -> None:
 
 
 def finish(merged: Path, output_dir: Path, repo_id: str, content: Mapping[str, Any]) -> None:
-    """Add vocabulary, pictures and card, move the whole into place at once, and say what it holds."""
+    """Add vocabulary, pictures and card, move the whole into place at once, and report it.
+
+    Args:
+        merged: the dataset, in a temporary folder.
+        output_dir: where it is to be.
+        repo_id: its name.
+        content: the settings that decide its episodes, written into its vocabulary.
+    """
     write_vocabulary(merged, content)
     table = recorded_episodes(merged)
     write_card(merged, repo_id, table)
     merged.replace(output_dir)
-    rates = success_by_kind(table)
-    summary = ", ".join(f"{kind} {wins}/{total}" for kind, (wins, total) in rates.items())
-    print(f"{output_dir}: {len(table['episode'])} episodes; successful: {summary}")
+    print(report(output_dir, table))
 
 
-def success_by_kind(table: Mapping[str, np.ndarray]) -> dict[str, tuple[int, int]]:
-    """Kind → (successful episodes, episodes), of `lerobot_wmrl.maniskill.recordings.recorded_episodes`."""
-    kinds, success = table["kind"], table["success"]
-    return {
-        name: (int(success[kinds == index].sum()), int(np.sum(kinds == index)))
-        for index, name in enumerate(KINDS)
-        if np.any(kinds == index)
-    }
+def report(output_dir: Path, table: Mapping[str, np.ndarray]) -> str:
+    """Return what was recorded, how often each kind succeeded, and the next command.
+
+    `table` is `lerobot_wmrl.maniskill.recordings.recorded_episodes`.
+    """
+    frames = int(table["length"].sum())
+    rates = (f"{kind} {wins}/{total}" for kind, (wins, total) in success_by_kind(table).items())
+    command = "lerobot-wmrl-train-world-model --model.type=frame_tokenizer"
+    return (
+        f"{output_dir}: {len(table['episode'])} episodes, {frames} frames ({frames / FPS / 60:.1f} minutes)\n"
+        f"successful: {', '.join(rates)}\n"
+        f"the card with pictures: {output_dir / CARD_FILE}\n"
+        f"next: {command} --dataset.root={output_dir} --output_dir=outputs/frame_tokenizer"
+    )
+
+
+def already_recorded(output_dir: Path, content: Mapping[str, Any], episodes: int) -> bool:
+    """Whether `output_dir` holds exactly this recording. Raises FieldError if it holds anything else."""
+    if not output_dir.exists() or (output_dir.is_dir() and not any(output_dir.iterdir())):
+        return False
+    vocabulary = output_dir / VOCABULARY_FILE
+    if not vocabulary.is_file():
+        raise FieldError("output_dir", output_dir, "holds something else", "choose a new folder")
+    require_same(json.loads(vocabulary.read_text())["recording"], content, output_dir)
+    problem = find_damage(output_dir, episodes)
+    if problem:
+        raise FieldError("output_dir", output_dir, problem, "remove the folder and record again")
+    print(f"{output_dir} is already recorded: {episodes} episodes")
+    return True
+
+
+def require_same(stored: Mapping[str, Any], content: Mapping[str, Any], folder: Path) -> None:
+    """Raise FieldError unless both settings describe the same episodes."""
+    differing = [
+        f"{key} {stored.get(key)!r} → {value!r}" for key, value in content.items() if stored.get(key) != value
+    ]
+    if differing:
+        raise FieldError(
+            "output_dir",
+            folder,
+            f"holds a recording with other settings ({'; '.join(differing)})",
+            "choose another folder, or repeat the first settings to continue it",
+        )
+
+
+def merge_shards(shards: Sequence[Path], output_dir: Path, repo_id: str) -> None:
+    """Merge the recordings with `shard` 0/n … n-1/n into one dataset, or report that it is complete.
+
+    Args:
+        shards: folders of all shards, in any order.
+        output_dir: where the dataset is to be.
+        repo_id: its name.
+
+    Raises:
+        FieldError: if they are no such set, or if `output_dir` holds anything else.
+    """
+    contents = [read_content(shard) for shard in shards]
+    check_set(shards, contents)
+    content = {**contents[0], "shard": WHOLE}
+    if already_recorded(output_dir, content, content["num_episodes"]):
+        return
+    order = sorted(range(len(shards)), key=lambda index: contents[index]["shard"][0])
+    merged = output_dir.with_name(f".{output_dir.name}.merging")
+    shutil.rmtree(merged, ignore_errors=True)
+    merge_folders([shards[index] for index in order], merged, repo_id)
+    problem = find_damage(merged, content["num_episodes"])
+    if problem:
+        raise FieldError("merge_shards", _listed(shards), problem, "record the incomplete shards again")
+    finish(merged, output_dir, repo_id, content)
+
+
+def read_content(shard: Path) -> dict[str, Any]:
+    """Return the settings that a shard was recorded with. Raises FieldError if it is no recording."""
+    vocabulary = shard / VOCABULARY_FILE
+    if not vocabulary.is_file():
+        problem = f"is no finished recording ({VOCABULARY_FILE} is missing)"
+        raise FieldError("merge_shards", shard, problem, "give the folders of finished shards")
+    return json.loads(vocabulary.read_text())["recording"]
+
+
+def check_set(shards: Sequence[Path], contents: Sequence[Mapping[str, Any]]) -> None:
+    """Raise FieldError for a shard of another recording, one that occurs twice, or one that is missing."""
+    if not shards:
+        raise FieldError("merge_shards", "[]", "give the folders of all shards")
+    first = contents[0]
+    for shard, content in zip(shards, contents, strict=True):
+        differing = [key for key in first if key != "shard" and content.get(key) != first[key]]
+        if differing or content["shard"][1] != first["shard"][1]:
+            raise FieldError(
+                "merge_shards",
+                shard,
+                f"belongs to another recording than {shards[0]} "
+                f"({', '.join(differing) or 'number of shards'} differ)",
+            )
+    count, numbers = first["shard"][1], [content["shard"][0] for content in contents]
+    twice = sorted({number for number in numbers if numbers.count(number) > 1})
+    missing = sorted(set(range(count)) - set(numbers))
+    if twice or missing:
+        named = [f"{what} {', '.join(f'{number}/{count}' for number in which)}"
+                 for what, which in (("twice:", twice), ("missing:", missing)) if which]  # fmt: skip
+        raise FieldError("merge_shards", _listed(shards), "; ".join(named), "give each shard once")
+
+
+def _listed(folders: Sequence[Path]) -> str:
+    return f"[{','.join(map(str, folders))}]"

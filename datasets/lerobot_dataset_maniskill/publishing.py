@@ -1,7 +1,9 @@
-"""A finished recording on the Hugging Face hub, with its own card, which LeRobot's push would replace."""
+"""Publishes a finished recording on the Hugging Face hub, with its own card, which LeRobot's push would
+replace."""
 
 from contextlib import suppress
 from pathlib import Path
+from typing import Final
 
 import httpx
 from huggingface_hub import HfApi
@@ -9,20 +11,27 @@ from huggingface_hub.constants import REPO_TYPE_DATASET
 from huggingface_hub.errors import HfHubHTTPError, RevisionNotFoundError
 from lerobot.datasets.dataset_metadata import CODEBASE_VERSION
 
-from lerobot_dataset_maniskill.card import CARD_FILE, name_card
-from lerobot_dataset_maniskill.examples import MEDIA
+from lerobot_dataset_maniskill.card import CARD_FILE, MEDIA, name_card
+from lerobot_wmrl.common.errors import FieldError
 
-PUBLISHED = [str(CARD_FILE), *(f"{folder}/*" for folder in ("data", "meta", "videos", MEDIA))]
-"""What a dataset consists of: it is uploaded, and removed from the hub where it is not here."""
+PUBLISHED: Final = [str(CARD_FILE), *(f"{folder}/*" for folder in ("data", "meta", "videos", MEDIA))]
+"""The files of a dataset: they are uploaded, and removed from the hub where the recording has them not."""
 
-DENIED = (401, 403, 404)
-"""HTTP's answers to a token that may not write; the hub does not say that what one may not see exists."""
+DENIED: Final = (401, 403, 404)
+"""HTTP statuses for a token that may not write. The hub answers 404 for what the token may not see."""
 
 
 def publish(api: HfApi, root: Path, repo_id: str, private: bool) -> None:
-    """Make the hub's dataset `repo_id` the one at `root`. Published already: changes nothing there.
+    """Make the hub's dataset `repo_id` equal to the one at `root`; nothing changes if it is equal already.
 
-    ValueError says what the hub refuses, or that it cannot be reached.
+    Args:
+        api: the client.
+        root: of the dataset.
+        repo_id: its name on the hub.
+        private: whether it must be private there.
+
+    Raises:
+        FieldError: says what the hub refuses, or that it cannot be reached.
     """
     name_card(root, repo_id)
     try:
@@ -33,23 +42,27 @@ def publish(api: HfApi, root: Path, repo_id: str, private: bool) -> None:
         )  # fmt: skip
         tag_version(api, repo_id)
     except (httpx.HTTPError, OSError, RuntimeError) as error:
-        raise ValueError(
-            f"--push_to_hub=true: {repo_id} is not published: {reason(error)}. "
-            f"The recording is whole in {root}; the same command again only publishes it"
+        raise FieldError(
+            "push_to_hub",
+            "true",
+            f"{repo_id} is not published: {reason(error)}",
+            f"the recording is whole in {root}, the same command again only publishes it",
         ) from error
     print(f"published: {api.endpoint}/datasets/{repo_id}")
 
 
 def create(api: HfApi, repo_id: str, private: bool) -> None:
-    """Make sure of the repository. ValueError if it is public already and was to be private.
+    """Create the repository unless it exists. Raises FieldError if it is public and must be private.
 
-    Unless it is to be private, a new one is as visible as its organisation makes new ones.
+    Without `private`, a new repository gets the visibility that its organisation gives new ones.
     """
     api.create_repo(repo_id, repo_type=REPO_TYPE_DATASET, private=private or None, exist_ok=True)
     if private and not api.dataset_info(repo_id).private:
-        raise ValueError(
-            f"--private=true: {repo_id} is public on the hub already; make it private there, "
-            "or choose another --repo_id"
+        raise FieldError(
+            "private",
+            "true",
+            f"{repo_id} is public on the hub already",
+            "make it private there, or choose another `repo_id`",
         )
 
 
@@ -61,7 +74,7 @@ def tag_version(api: HfApi, repo_id: str) -> None:
 
 
 def reason(error: Exception) -> str:
-    """Why publishing failed, and what helps."""
+    """Return why publishing failed, and what helps."""
     if isinstance(error, (httpx.TransportError, ConnectionError)):
         return f"the hub cannot be reached ({error})"
     if not isinstance(error, HfHubHTTPError):

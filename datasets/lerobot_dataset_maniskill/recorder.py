@@ -9,30 +9,29 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from tqdm import tqdm
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.imagined import ImaginedPartRecorder
-from lerobot_dataset_maniskill.integrity import whole_dataset
 from lerobot_dataset_maniskill.manifest import Part, planned_parts
-from lerobot_dataset_maniskill.merging import finish, merge_folders
+from lerobot_dataset_maniskill.merging import already_recorded, finish, merge_folders, require_same
 from lerobot_dataset_maniskill.worker import EpisodeResult, PartRecorder, Report, serve_parts
-from lerobot_dataset_maniskill.writer import VOCABULARY_FILE
+from lerobot_dataset_maniskill.writer import find_damage
 from lerobot_wmrl.common.constants import ACTION_NAMES, KINDS
 from lerobot_wmrl.common.files import foreign_files, write_json, writing
 from lerobot_wmrl.common.policy_checkpoints import check_fit, check_weights
 from lerobot_wmrl.maniskill.backend import render_backend, simulating_context
 
-CONTENT_FILE = "recording.json"
-POLL_SECONDS = 1.0
-GRACE_SECONDS = 10.0
-"""How long a worker may take to leave when its work is done."""
+CONTENT_FILE: Final = "recording.json"
+POLL_SECONDS: Final = 1.0
+GRACE_SECONDS: Final = 10.0
+"""Time that a worker may take to exit when its work is done."""
 
 
 def record(config: RecordConfig) -> None:
-    """Record everything that is missing, then merge. Complete already: says so."""
+    """Record everything that is missing, then merge; or report that the recording is complete."""
     config.validate()
     root, content = config.root, config.recorded_content()
     work, parts = root.parent / f".{root.name}.recording", planned_parts(config)
@@ -50,49 +49,22 @@ def record(config: RecordConfig) -> None:
 
 
 def check_simulation(config: RecordConfig) -> None:
-    """ValueError unless there is a renderer, and it shows what the policy looks at."""
+    """Raise ValueError unless there is a renderer, and the cameras show what the policy needs."""
     render_backend()
     if config.policy is not None:
         check_fit(config.policy, config.maniskill.observation_shapes(), len(ACTION_NAMES))
 
 
-def already_recorded(output_dir: Path, content: Mapping[str, Any], episodes: int) -> bool:
-    """Whether `output_dir` holds exactly this recording. ValueError if it holds anything else."""
-    if not output_dir.exists() or (output_dir.is_dir() and not any(output_dir.iterdir())):
-        return False
-    vocabulary = output_dir / VOCABULARY_FILE
-    if not vocabulary.is_file():
-        raise ValueError(f"--output_dir={output_dir} holds something else; choose a new folder")
-    require_same(json.loads(vocabulary.read_text())["recording"], content, output_dir)
-    problem = whole_dataset(output_dir, episodes)
-    if problem:
-        raise ValueError(f"--output_dir={output_dir}: {problem}; remove the folder and record again")
-    print(f"{output_dir} is already recorded: {episodes} episodes")
-    return True
-
-
 def discard(work: Path, content: Mapping[str, Any]) -> None:
-    """Remove what a command that was killed between finishing and tidying up has left."""
+    """Remove the work folder that a command left that was killed just after finishing."""
     stored = work / CONTENT_FILE
     if stored.is_file() and json.loads(stored.read_text()) == content:
         shutil.rmtree(work, ignore_errors=True)
 
 
-def require_same(stored: Mapping[str, Any], content: Mapping[str, Any], folder: Path) -> None:
-    """ValueError unless both describe the same episodes."""
-    differing = [
-        f"{key} {stored.get(key)!r} → {value!r}" for key, value in content.items() if stored.get(key) != value
-    ]
-    if differing:
-        raise ValueError(
-            f"--output_dir={folder} holds a recording with other settings ({'; '.join(differing)}): "
-            "choose another folder, or repeat the first settings to continue it"
-        )
-
-
 @contextmanager
 def claimed(work: Path, content: Mapping[str, Any]) -> Iterator[None]:
-    """Hold the folder of unfinished work, which belongs to one configuration and one running command."""
+    """Lock the folder of unfinished work, which belongs to one configuration and one running command."""
     work.mkdir(parents=True, exist_ok=True)
     with (work / "lock").open("w") as lock:
         try:
@@ -110,13 +82,13 @@ def claimed(work: Path, content: Mapping[str, Any]) -> Iterator[None]:
 
 
 def missing_parts(work: Path, parts: list[Part]) -> list[Part]:
-    """The parts without a whole sub-dataset; torn and corrupted ones are dropped."""
+    """Return the parts without a whole sub-dataset, and remove damaged sub-datasets."""
     for torn in work.glob(".part-*.partial"):
         shutil.rmtree(torn, ignore_errors=True)
     missing = []
     for part in parts:
         folder = work / part.name
-        problem = whole_dataset(folder, len(part.episodes)) if folder.exists() else "not recorded yet"
+        problem = find_damage(folder, len(part.episodes)) if folder.exists() else "not recorded yet"
         if problem and folder.exists():
             logging.warning("%s is recorded again: %s", part.name, problem)
             shutil.rmtree(folder)
@@ -143,7 +115,7 @@ def record_parts(config: RecordConfig, work: Path, parts: list[Part]) -> None:
 
 @contextmanager
 def progress_bar(episodes: int, missing: list[Part]) -> Iterator[Report]:
-    """Shows what it is told of: episodes, time left, and the share of each kind that succeeded."""
+    """Show the episodes that are reported to it, the time left, and each kind's success rate."""
     done = episodes - count_episodes(missing)
     seen: Counter[str] = Counter()
     won: Counter[str] = Counter()
@@ -161,7 +133,7 @@ def progress_bar(episodes: int, missing: list[Part]) -> Iterator[Report]:
 def record_in_parallel(
     config: RecordConfig, work: Path, missing: list[Part], count: int, report: Report
 ) -> None:
-    """Let `count` processes share the parts."""
+    """Record the parts in `count` processes."""
     context = simulating_context()
     jobs, results = context.Queue(), context.Queue()
     for item in [*missing, *[None] * count]:
@@ -182,9 +154,10 @@ def record_in_parallel(
 
 
 def follow_workers(open_parts: set[int], results: Any, workers: list[Any], report: Report) -> None:
-    """Until every open part is whole. A worker's error is raised here.
+    """Wait until every open part is whole. Raises a worker's error here.
 
-    So is its death, as soon as the others are silent: it may have held a lock that they wait for.
+    A worker's death is raised too, as soon as the others are silent: it may have held a lock that they wait
+    for.
     """
     while open_parts:
         try:
@@ -206,15 +179,16 @@ def follow_workers(open_parts: set[int], results: Any, workers: list[Any], repor
 
 
 def merge(config: RecordConfig, work: Path, parts: list[Part]) -> None:
-    """Put the parts together and move the whole into place at once."""
+    """Merge the parts and move the whole into place at once."""
     merged = work / "merged"
     shutil.rmtree(merged, ignore_errors=True)
     merge_folders([work / part.name for part in parts], merged, config.dataset_id)
-    problem = whole_dataset(merged, count_episodes(parts))
+    problem = find_damage(merged, count_episodes(parts))
     if problem:
         raise ValueError(f"{work}: merging failed: {problem}; remove the folder and record again")
     finish(merged, config.root, config.dataset_id, config.recorded_content())
 
 
 def count_episodes(parts: list[Part]) -> int:
+    """Return the number of episodes of all parts."""
     return sum(len(part.episodes) for part in parts)

@@ -1,30 +1,130 @@
-"""What a recording process does: simulate a part's episodes into a sub-dataset, renamed when it is whole."""
+"""What a recording process does: choose the actions of its episodes, simulate them, write them.
 
+Actions come from a planner or a policy. Each part becomes a sub-dataset, renamed when it is whole.
+"""
+
+import logging
 import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
+import av
+import datasets
+import numpy as np
+import torch
+from lerobot.configs.policies import PreTrainedConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
-from lerobot_dataset_maniskill.drivers import Driver, PlannerDriver, PolicyDriver
 from lerobot_dataset_maniskill.manifest import EpisodePlan, Part
+from lerobot_dataset_maniskill.planners import MOTIONS, follow_plan
 from lerobot_dataset_maniskill.planners.kinds import PLAY_STEPS
-from lerobot_dataset_maniskill.quiet import silence_libraries
 from lerobot_dataset_maniskill.writer import HOLD_FRAMES, Outcome, StartColumns, add_step, create_dataset
-from lerobot_wmrl.common.constants import PLAY
+from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW, KINDS, PLAY
+from lerobot_wmrl.common.policy_checkpoints import load_policy, load_processors
 from lerobot_wmrl.common.progress import own_progress_lock
 from lerobot_wmrl.maniskill.backend import leave_with_command
+from lerobot_wmrl.maniskill.episode import Frame
 from lerobot_wmrl.maniskill.tasks import task_of
+
+if TYPE_CHECKING:
+    from lerobot_wmrl.maniskill.simulation import Simulation
+
+EXPLORATION_STREAM: Final = 1 << 20
+"""Separates the random stream of this noise from that of the starts, seeded by (seed, task, scene)."""
+
+NOISE_MEMORY: Final = 0.9
+"""Autocorrelation of exploration noise from one step to the next: it lasts about ten steps."""
+
+
+class Driver(Protocol):
+    """Chooses the actions of an episode: (7,) float32, inside the action box."""
+
+    def begin(self, simulation: "Simulation", plan: EpisodePlan) -> None:
+        """Prepare for an episode that has just been reset."""
+
+    def act(self, simulation: "Simulation", frame: Frame) -> np.ndarray:
+        """Return the action for this frame."""
+
+
+class PlannerDriver:
+    """Follows a plan that depends only on the episode's start and kind, with one of `planners.MOTIONS`."""
+
+    def __init__(self, planner: str) -> None:
+        self.motion = MOTIONS[planner]()
+
+    def begin(self, simulation: "Simulation", plan: EpisodePlan) -> None:
+        rng = np.random.default_rng((plan.seed, KINDS.index(plan.kind), simulation.task.index))
+        start = simulation.current_start
+        self.follower = follow_plan(simulation.task.name, plan.scene, start, plan.kind, rng, self.motion)
+
+    def act(self, simulation: "Simulation", frame: Frame) -> np.ndarray:
+        return self.follower.act(simulation.tcp_position, simulation.object_position)
+
+
+class ExplorationNoise:
+    """First-order autoregressive noise on the translations, its level drawn once an episode.
+
+    Independent noise averages out within a few steps. This noise leads an episode away from the policy's
+    trajectory, to where the policy may be once it has changed.
+
+    Args:
+        largest: of the levels, as a share of the action box.
+        seed: of the episode.
+    """
+
+    def __init__(self, largest: float, seed: int) -> None:
+        self.rng = np.random.default_rng((seed, EXPLORATION_STREAM))
+        self.level = self.rng.uniform(0.0, largest) * np.array(ACTION_HIGH[:3])
+        self.state = self.rng.normal(size=3)
+
+    def __call__(self) -> np.ndarray:
+        """Return what to add to the next action (3,), metres."""
+        offset = self.level * self.state
+        fresh = np.sqrt(1.0 - NOISE_MEMORY**2) * self.rng.normal(size=3)
+        self.state = NOISE_MEMORY * self.state + fresh
+        return offset
+
+
+class PolicyDriver:
+    """Acts by a LeRobot policy with its own pre- and postprocessors, and exploration noise on its actions."""
+
+    def __init__(self, config: PreTrainedConfig, exploration: float) -> None:
+        self.policy: Any = load_policy(config).eval()
+        self.preprocess, self.postprocess = load_processors(config)
+        self.exploration = exploration
+
+    def begin(self, simulation: "Simulation", plan: EpisodePlan) -> None:
+        torch.manual_seed(plan.seed)
+        self.noise = ExplorationNoise(self.exploration, plan.seed)
+        self.policy.reset()
+        self.preprocess.reset()
+        self.postprocess.reset()
+
+    @torch.no_grad()
+    def act(self, simulation: "Simulation", frame: Frame) -> np.ndarray:
+        batch = self.preprocess(policy_observation(frame, simulation.instruction))
+        action = self.postprocess(self.policy.select_action(batch)).squeeze(0).cpu().numpy()
+        action[:3] += self.noise()
+        return np.clip(action, ACTION_LOW, ACTION_HIGH).astype(np.float32)
+
+
+def policy_observation(frame: Frame, instruction: str) -> dict[str, Any]:
+    """Return a batch of one in LeRobot's names: images (1, 3, H, W) in [0, 1], state (1, 8), task."""
+    images = {
+        f"observation.images.{camera}": torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255.0
+        for camera, image in frame.images.items()
+    }
+    return {**images, "observation.state": torch.from_numpy(frame.state)[None], "task": [instruction]}
 
 
 @dataclass(frozen=True)
 class EpisodeResult:
-    """What the progress bar and the card need of an episode."""
+    """What the progress bar shows of an episode."""
 
     part: int
     kind: str
@@ -38,7 +138,7 @@ Report = Callable[[EpisodeResult], None]
 def whole_part(
     config: RecordConfig, folder: Path, part: Part, cameras: Sequence[str], image_size: int
 ) -> Iterator[LeRobotDataset]:
-    """An empty dataset to fill; it then stands in `folder` under the part's name, unless that fails."""
+    """Yield an empty dataset to fill; unless an error is raised, move it to `folder` as the part."""
     partial = folder / f".{part.name}.{os.getpid()}.partial"
     shutil.rmtree(partial, ignore_errors=True)
     dataset = create_dataset(partial, config.dataset_id, cameras, image_size, config.depth)
@@ -48,7 +148,7 @@ def whole_part(
 
 
 class PartRecorder:
-    """A simulation and a driver that record parts one after the other."""
+    """Records parts one after the other, with one simulation and one driver."""
 
     def __init__(self, config: RecordConfig, folder: Path) -> None:
         env = config.maniskill
@@ -61,22 +161,25 @@ class PartRecorder:
         )
 
     def record(self, part: Part, report: Report) -> None:
-        """Record `part`; its folder appears under its final name only when it is whole."""
+        """Record a part. Its folder appears under its final name only when it is whole."""
         env = self.config.maniskill
         with whole_part(self.config, self.folder, part, env.cameras, env.image_size) as dataset:
             for plan in part.episodes:
                 report(EpisodeResult(part.index, plan.kind, self._record_episode(dataset, plan)))
 
     def _steps(self, plan: EpisodePlan) -> int:
-        """At most so many rows."""
+        """Return the largest number of rows of an episode."""
         if plan.kind == PLAY:
             return PLAY_STEPS
         return self.config.maniskill.episode_length or self.simulation.task.horizon
 
     def _record_episode(self, dataset: LeRobotDataset, plan: EpisodePlan) -> bool:
-        """Simulate and store one episode: to HOLD_FRAMES after success first holds, or to the horizon.
+        """Simulate and store one episode, to HOLD_FRAMES after success first holds, or to the horizon.
 
-        Play goes on whatever happens. Returns whether the episode succeeded.
+        Play goes on whatever happens.
+
+        Returns:
+            Whether the episode succeeded.
         """
         simulation = self.simulation
         simulation.task = task_of(plan.task)
@@ -99,9 +202,14 @@ class PartRecorder:
 
 
 def serve_parts(config: RecordConfig, folder: Path, parts: Any, results: Any) -> None:
-    """A worker process: take parts from the queue until None comes, or until the command is gone."""
-    import torch
+    """Record parts from the queue until None comes, or until the command is gone. Runs in a worker process.
 
+    Args:
+        config: of the recording.
+        folder: for the sub-datasets.
+        parts: queue of `Part`, ended by None.
+        results: queue for `EpisodeResult`, the index of each whole part, and errors.
+    """
     torch.set_num_threads(1)
     leave_with_command()
     own_progress_lock()
@@ -116,3 +224,10 @@ def serve_parts(config: RecordConfig, folder: Path, parts: Any, results: Any) ->
     except Exception as error:
         results.put(error)
         raise
+
+
+def silence_libraries() -> None:
+    """Turn off FFmpeg's reports, Hugging Face's progress bars and LeRobot's information messages."""
+    av.logging.set_libav_level(av.logging.ERROR)
+    datasets.disable_progress_bars()
+    logging.getLogger("lerobot").setLevel(logging.ERROR)

@@ -7,9 +7,15 @@ import pytest
 from huggingface_hub import DatasetCard
 from PIL import Image
 
-from lerobot_dataset_maniskill.card import KIND_MEANINGS, name_card, scene_rows
+from lerobot_dataset_maniskill.card import (
+    FRAMES,
+    KIND_MEANINGS,
+    WIDTH,
+    chosen_examples,
+    name_card,
+    scene_rows,
+)
 from lerobot_dataset_maniskill.configuration import RecordConfig
-from lerobot_dataset_maniskill.examples import FRAMES, WIDTH, chosen_examples
 from lerobot_wmrl.common.constants import KINDS
 from lerobot_wmrl.common.frame_strips import GAP
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv

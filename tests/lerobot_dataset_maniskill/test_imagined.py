@@ -79,9 +79,9 @@ def test_the_same_command_again_finds_it_complete_and_other_settings_are_refused
 
 def test_what_a_world_model_cannot_do_is_refused(config, make_synthetic_dataset, tmp_path):
     config.depth = True
-    with pytest.raises(ValueError, match="--depth=True: cannot be chosen in a world model"):
+    with pytest.raises(ValueError, match="depth=True: cannot be chosen in a world model"):
         record(config)
     config.depth, config.policy = False, None
-    with pytest.raises(ValueError, match=r"--env\.type=world_model: give the policy"):
+    with pytest.raises(ValueError, match=r"env\.type=world_model: needs a policy; give `policy\.path`"):
         record(config)
     assert not config.root.exists()

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_dataset_maniskill.integrity import whole_dataset
 from lerobot_dataset_maniskill.manifest import planned_parts
 from lerobot_dataset_maniskill.recorder import count_episodes, merge
+from lerobot_dataset_maniskill.writer import find_damage
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 from tests.lerobot_dataset_maniskill.killed_writers import ADVISED, Order, Writers, running_writers
 from tests.lerobot_dataset_maniskill.made_up import ROWS, write_missing
@@ -39,7 +39,7 @@ def test_a_disk_that_is_full_costs_only_the_unfinished_part(tmp_path: Path, writ
             part.name for part in parts[:finished]
         ]
     assert (work / parts[0].name / "meta" / "info.json").stat().st_mtime_ns == first
-    assert all(whole_dataset(work / part.name, 1) is None for part in parts)
+    assert all(find_damage(work / part.name, 1) is None for part in parts)
 
 
 def test_twenty_kills_cost_nothing_that_was_finished(tmp_path: Path, writers: Writers) -> None:
@@ -56,12 +56,12 @@ def test_twenty_kills_cost_nothing_that_was_finished(tmp_path: Path, writers: Wr
         info = {part.name: work / part.name / "meta" / "info.json" for part in parts}
         now = {name: path.stat().st_mtime_ns for name, path in info.items() if path.exists()}
         assert finished.items() <= now.items(), "a finished part was lost or written again"
-        assert all(whole_dataset(work / name, 2) is None for name in now.keys() - finished.keys())
+        assert all(find_damage(work / name, 2) is None for name in now.keys() - finished.keys())
         finished = now
     assert len(finished) < len(parts), "it was never interrupted"
     write_missing(order.config, work)
     merge(order.config, work, parts)
-    assert whole_dataset(tmp_path / "dataset", count_episodes(parts)) is None
+    assert find_damage(tmp_path / "dataset", count_episodes(parts)) is None
     table = recorded_episodes(tmp_path / "dataset")
     assert sorted(table["seed"]) == list(range(90))
     assert set(table["length"]) == {ROWS}

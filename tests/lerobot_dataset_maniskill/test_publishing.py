@@ -150,14 +150,14 @@ def test_files_of_an_earlier_recording_are_gone(hub: Hub, root: Path) -> None:
 
 @pytest.mark.usefixtures("without_xet")
 @pytest.mark.parametrize(("token", "message"), [
-    ("hf_unknown", r"--push_to_hub=true: .* \(401, Invalid username or password\.\).*`hf auth login`"),
-    (READ_TOKEN, r"--push_to_hub=true: .* \(403, .*`hf auth login`"),
+    ("hf_unknown", r"push_to_hub=true: .* \(401, Invalid username or password\.\).*`hf auth login`"),
+    (READ_TOKEN, r"push_to_hub=true: .* \(403, .*`hf auth login`"),
 ])  # fmt: skip
 def test_without_permission_the_recording_stays_and_can_be_published_later(
     hub: Hub, root: Path, token: str, message: str
 ) -> None:
     before = digests(local_files(root))
-    with pytest.raises(ValueError, match=rf"{message}.*The recording is whole in .*only publishes it"):
+    with pytest.raises(ValueError, match=rf"{message}.*the recording is whole in .*only publishes it"):
         publish(HfApi(hub.url, token), root, NAME, private=False)
     assert not hub.repos
     publish(HfApi(hub.url, WRITE_TOKEN), root, NAME, private=False)
@@ -167,23 +167,23 @@ def test_without_permission_the_recording_stays_and_can_be_published_later(
 def test_a_hub_that_cannot_be_reached_is_named_as_the_reason(hub: Hub, root: Path) -> None:
     with running_hub() as gone:
         pass
-    with pytest.raises(ValueError, match=r"--push_to_hub=true: .*cannot be reached .*only publishes it"):
+    with pytest.raises(ValueError, match=r"push_to_hub=true: .*cannot be reached .*only publishes it"):
         publish(HfApi(gone.url, WRITE_TOKEN), root, NAME, private=False)
 
 
 def test_what_is_public_is_not_called_private(hub: Hub, root: Path) -> None:
     api = HfApi(hub.url, WRITE_TOKEN)
     api.create_repo(NAME, repo_type="dataset")
-    with pytest.raises(ValueError, match=r"--private=true: somebody/pushes is public"):
+    with pytest.raises(ValueError, match=r"private=true: somebody/pushes is public"):
         publish(api, root, NAME, private=True)
     assert list(hub.dataset(NAME).head) == [".gitattributes"]
 
 
 @pytest.mark.parametrize(("repo_id", "message"), [
-    (None, "called local/dataset; give its name on the hub, --repo_id=user/name"),
+    (None, "called local/dataset; give its name on the hub, user/name, as `repo_id`"),
     ("pushes", "called pushes; give its name"),
-    ("somebody/push/es", "--repo_id=somebody/push/es"),
-    (NAME, "nobody is logged in to the hub here; run `hf auth login`"),
+    ("somebody/push/es", "repo_id=somebody/push/es"),
+    (NAME, "nobody is logged in to the hub here; run hf auth login"),
 ])  # fmt: skip
 def test_what_cannot_be_published_is_refused_before_it_is_recorded(
     repo_id: str | None, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -16,10 +16,9 @@ import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
-from lerobot_dataset_maniskill.integrity import whole_dataset
 from lerobot_dataset_maniskill.manifest import planned_parts
 from lerobot_dataset_maniskill.recorder import follow_workers, missing_parts, record
-from lerobot_dataset_maniskill.writer import HOLD_FRAMES
+from lerobot_dataset_maniskill.writer import HOLD_FRAMES, find_damage
 from lerobot_wmrl.common.constants import KINDS, STATE_NAMES
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
@@ -97,7 +96,7 @@ def test_every_planned_episode_is_there_once_in_order(recorded: Path, dataset: L
     assert column(dataset, "start.scene")[first].ravel().tolist() == [plan.scene.index for plan in plans]
     kinds = [KINDS[kind] for kind in column(dataset, "start.kind")[first].ravel()]
     assert kinds == [plan.kind for plan in plans]
-    assert whole_dataset(recorded / "dataset", EPISODES) is None
+    assert find_damage(recorded / "dataset", EPISODES) is None
 
 
 def test_columns_and_types_are_those_of_the_contract(dataset: LeRobotDataset) -> None:

@@ -6,7 +6,7 @@ import pytest
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.manifest import planned_parts
-from lerobot_dataset_maniskill.shards import check_set, merge_shards
+from lerobot_dataset_maniskill.merging import check_set, merge_shards
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 from tests.lerobot_dataset_maniskill.made_up import record_made_up
 
@@ -31,7 +31,7 @@ def test_shards_are_disjoint_and_together_the_whole() -> None:
 
 @pytest.mark.parametrize("shard", ["3/3", "1", "a/b", "-1/2", "1/0"])
 def test_what_is_no_shard_is_named(shard: str) -> None:
-    with pytest.raises(ValueError, match=f"--shard={shard}: write i/n"):
+    with pytest.raises(ValueError, match=f"shard={shard}: must be i/n"):
         config(shard).validate()
 
 
@@ -47,8 +47,8 @@ def test_a_complete_set_may_come_in_any_order() -> None:
 @pytest.mark.parametrize(("described", "message"), [
     (contents((0, 3), (1, 3)), "missing: 2/3"),
     (contents((0, 3), (1, 3), (1, 3)), "twice: 1/3; missing: 2/3"),
-    (contents((0, 2), (1, 2), seed=7), r"b is of another recording than a \(seed differ\)"),
-    (contents((0, 2), (1, 3)), r"b is of another recording than a \(number of shards differ\)"),
+    (contents((0, 2), (1, 2), seed=7), r"b: belongs to another recording than a \(seed differ\)"),
+    (contents((0, 2), (1, 3)), r"b: belongs to another recording than a \(number of shards differ\)"),
 ])  # fmt: skip
 def test_what_is_no_set_is_named(described: list[dict[str, object]], message: str) -> None:
     with pytest.raises(ValueError, match=message):
@@ -68,5 +68,5 @@ def test_merged_shards_are_the_whole_and_merged_again_say_so(
     capsys.readouterr()
     merge_shards(shards, tmp_path / "whole", "local/whole")
     assert "is already recorded: 5 episodes" in capsys.readouterr().out
-    with pytest.raises(ValueError, match=r"shard-1 holds a recording with other settings"):
+    with pytest.raises(ValueError, match=r"shard-1: holds a recording with other settings"):
         merge_shards(shards, shards[1], "local/whole")

@@ -28,8 +28,8 @@ ROLL_OUT = ["--policy.path={policy}", *SIMULATOR, "--num_episodes=1"]
 @pytest.mark.parametrize(("command", "flags", "message"), [
     (record, [*SIMULATOR, "--env.task=juggle"], "task=juggle: unknown; choose one of push"),
     (record, ["--preset=huge"], "--preset=huge: unknown preset; choose one of cpu, demo"),
-    (record, ["--push_to_hub=true"], "called local/new; give its name on the hub, --repo_id=user/name"),
-    (record, ["--output_dir={foreign}"], "foreign holds something else"),
+    (record, ["--push_to_hub=true"], "called local/new; give its name on the hub, user/name, as"),
+    (record, ["--output_dir={foreign}"], "foreign: holds something else"),
     (record, ROLL_OUT, "observation.images.third_view of shape (3, 32, 32), the environment has"),
     (record, ["--policy.path={action_world_model}"], "no policy can be loaded from it"),
     (record, ["--policy.path={foreign}"], "config.json is missing"),

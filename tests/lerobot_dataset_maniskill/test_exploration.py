@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
-from lerobot_dataset_maniskill.drivers import ExplorationNoise
+from lerobot_dataset_maniskill.worker import ExplorationNoise
 from lerobot_wmrl.common.constants import ACTION_HIGH
 
 STEPS = 400
@@ -41,5 +41,5 @@ def test_noise_lasts_about_ten_steps() -> None:
 
 @pytest.mark.parametrize("exploration", [-0.1, 1.5, 0.3])
 def test_a_share_outside_the_box_or_without_a_policy_is_refused(exploration: float, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=rf"--exploration={exploration}: .*--policy\.path only"):
+    with pytest.raises(ValueError, match=rf"exploration={exploration}: .*rollouts only; give `policy\.path`"):
         RecordConfig(output_dir=tmp_path, exploration=exploration).validate()

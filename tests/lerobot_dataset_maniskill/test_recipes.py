@@ -8,7 +8,7 @@ import pytest
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.manifest import planned_parts
-from lerobot_dataset_maniskill.recipe_files import expand_recipes, packaged_recipe, recipe_flags
+from lerobot_dataset_maniskill.record import expand_recipes, packaged_recipe, recipe_flags
 
 SIZES = ("tiny", "demo", "cpu", "gpu", "paper")
 
