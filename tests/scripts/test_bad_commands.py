@@ -26,9 +26,9 @@ ROLL_OUT = ["--policy.path={policy}", *SIMULATOR, "--num_episodes=1"]
 
 
 @pytest.mark.parametrize(("command", "flags", "message"), [
-    (record, [*SIMULATOR, "--env.task=juggle"], "task=juggle: unknown; choose one of push"),
+    (record, [*SIMULATOR, "--env.task=juggle"], "--env.task=juggle: unknown; choose one of push"),
     (record, ["--preset=huge"], "--preset=huge: unknown preset; choose one of cpu, demo"),
-    (record, ["--push_to_hub=true"], "called local/new; give its name on the hub, user/name, as"),
+    (record, ["--push_to_hub=true"], "called local/new; give its name on the hub, user/name, as --repo_id"),
     (record, ["--output_dir={foreign}"], "foreign: holds something else"),
     (record, ROLL_OUT, "observation.images.third_view of shape (3, 32, 32), the environment has"),
     (record, ["--policy.path={action_world_model}"], "no policy can be loaded from it"),
