@@ -1,4 +1,4 @@
-.PHONY: setup demo test lint lock
+.PHONY: setup demo test lint docs lock
 
 # What `lerobot-wmrl-demo` gets besides its preset: make demo DEMO_FLAGS="--seed=1 --output_dir=outputs/demo-1"
 DEMO_FLAGS ?=
@@ -18,6 +18,10 @@ lint: setup
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
 	.venv/bin/lint-imports
+
+docs: setup  ## docs/results.md from docs/results/*.json, docs/reference from --help
+	.venv/bin/python -m experiments.tables
+	.venv/bin/python tools/reference_pages.py
 
 UV ?= $(or $(wildcard .uv/bin/uv),uv)
 
