@@ -161,8 +161,7 @@ def show(study: Study) -> None:
         print(f"writes docs/{result}")
 
 
-def main() -> None:
-    """Entry point."""
+def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -171,7 +170,12 @@ def main() -> None:
     parser.add_argument("--dry_run", action="store_true", help="print the commands and stop")
     parser.add_argument("--repeat", action="store_true", help="run steps again whose commands have changed")
     parser.add_argument("--docs", type=Path, default=ROOT / "docs", help="where results/ and images/ are")
-    given = parser.parse_args()
+    return parser
+
+
+def main() -> None:
+    """Entry point."""
+    given = make_parser().parse_args()
     try:
         study = read_study(given.study, given.variables)
         if given.dry_run:

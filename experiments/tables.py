@@ -99,14 +99,19 @@ def origin(study: Study, load: Load) -> str:
     return f"*Commit {commits}{where}; {files}; `python -m experiments.run experiments/{study.name}.yaml`*"
 
 
-def main() -> None:
-    """Entry point."""
+def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--check", action="store_true", help="only say whether the page is current")
+    return parser
+
+
+def main() -> None:
+    """Entry point."""
+    given = make_parser().parse_args()
     target, page = DOCS / "results.md", results_page()
-    if parser.parse_args().check:
+    if given.check:
         if not target.exists() or target.read_text() != page:
             sys.exit("docs/results.md is not what the JSON says: run python -m experiments.tables")
         return

@@ -1,6 +1,6 @@
 """Write docs/reference/*.md: what every console command says with `--help`.
 
-    python tools/reference_pages.py
+python tools/reference_pages.py
 """
 
 import os
@@ -38,7 +38,9 @@ def help_of(module: str, flags: list[str]) -> str:
     """Return what a command says, with a fixed width and without folders of this machine."""
     environment = {**os.environ, "COLUMNS": "100", "TERM": "dumb"}
     code = f"import sys; sys.argv = [{module!r}, *{flags!r}]; from {module} import main; main()"
-    found = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, cwd=ROOT)
+    found = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, cwd=ROOT
+    )
     if found.returncode:
         raise RuntimeError(f"{module} {' '.join(flags)}: {found.stderr[-1000:]}")
     text = re.sub(r"\x1b\[[0-9;]*m", "", found.stdout)

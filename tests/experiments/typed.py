@@ -1,0 +1,107 @@
+"""Parse commands as a user types them, without running them."""
+
+import re
+import shlex
+import sys
+import tomllib
+from contextlib import suppress
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import draccus
+from lerobot.configs.eval import EvalPipelineConfig
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.scripts.lerobot_edit_dataset import EditDatasetConfig
+from lerobot.utils.import_utils import register_third_party_plugins
+
+import lerobot_env_wmrl  # noqa: F401 (registers what LeRobot is to know)
+from lerobot_wmrl.common.command_line import parse_flags, without_help_texts
+from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
+from lerobot_wmrl.rewards.configuration_rewards import EmbeddingConfig
+
+ROOT = Path(__file__).parents[2]
+SCRIPTS: dict[str, str] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+LEROBOT: dict[str, type[Any]] = {
+    "lerobot-train": TrainPipelineConfig,
+    "lerobot-eval": EvalPipelineConfig,
+    "lerobot-edit-dataset": EditDatasetConfig,
+}
+SHELL = {"cp", "source", "pip", "make", "hf", "apt", "lerobot-record", ".uv/bin/uv"}
+
+
+class Stopped(BaseException):
+    """A command has said how it parses its flags."""
+
+
+def words_of(command: str) -> list[str]:
+    """Split a command, the last one of a list. What the shell would insert is the number 0 here."""
+    inserted = re.sub(r"\$\([^)]*\)|\$episodes", "0", command)
+    words = shlex.split(inserted.rpartition("&&")[2])
+    return words[2:] if words[0] == "env" else words
+
+
+def check(command: str) -> None:
+    """Raise an error if the program of a command would not take its flags.
+
+    Checkpoints need not be there: nothing looks into its world model here.
+    """
+    program, *flags = words_of(command)
+    unseen = {"__post_init__": lambda self: None}
+    with patch.multiple(WorldModelEnv, **unseen), patch.multiple(EmbeddingConfig, **unseen):
+        if program == "torchrun":
+            at = flags.index("-m")
+            check_ours(flags[at + 1], flags[at + 2 :])
+        elif program == "python":
+            check_module(flags)
+        elif program in SCRIPTS:
+            check_ours(SCRIPTS[program].partition(":")[0], flags)
+        elif program in LEROBOT:
+            register_third_party_plugins()
+            with without_help_texts():
+                draccus.parse(LEROBOT[program], args=without_paths(flags))
+        else:
+            assert program in SHELL, f"{program}: not a command that is known here"
+
+
+def without_paths(flags: list[str]) -> list[str]:
+    """Replace a policy's checkpoint by its type, and leave out a file of meshes: neither need be there."""
+    own = {"--policy.sampling": "openvla", "--policy.camera": "openvla", "--policy.n_action_steps": "act"}
+    kinds = [own[name] for flag in flags if (name := flag.partition("=")[0]) in own]
+    kind = f"--policy.type={kinds[0] if kinds else 'cnn'}"
+    return [
+        kind if flag.startswith("--policy.path") else flag
+        for flag in flags
+        if not flag.startswith("--env.assets")
+    ]
+
+
+def check_ours(module_name: str, flags: list[str]) -> None:
+    """Parse as a console command does, with its own presets, up to the point at which it would begin."""
+    module, said = import_module(module_name), {}
+
+    def run_command(function: Any, config_class: type[Any], expand: Any) -> None:
+        said.update(config_class=config_class, expand=expand)
+        raise Stopped
+
+    with patch.object(sys, "argv", [module_name, *without_paths(flags)]):
+        with patch.object(module, "run_command", run_command), suppress(Stopped):
+            module.main()
+        sys.argv[1:] = said["expand"](sys.argv[1:])
+        parse_flags(said["config_class"])
+
+
+def check_module(arguments: list[str]) -> None:
+    """`python -m experiments.NAME …` and `python benchmarks/NAME.py …`: their parsers take the flags."""
+    if arguments[0] == "-m":
+        module_name, flags = arguments[1], arguments[2:]
+        if not module_name.startswith("experiments"):
+            return
+    else:
+        sys.path[:0] = [str(ROOT / "benchmarks"), str(ROOT / "tools")]
+        module_name, flags = Path(arguments[0]).stem, arguments[1:]
+    try:
+        import_module(module_name).make_parser().parse_known_args(flags)
+    except SystemExit as stopped:
+        raise AssertionError(f"{module_name} does not take {flags}") from stopped

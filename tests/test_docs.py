@@ -1,0 +1,82 @@
+"""README and docs: their commands are today's, their Python runs, their links and figures are right."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from experiments.cells import points
+from tests.experiments.typed import ROOT, check
+
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+WRITTEN = [page for page in PAGES if page.name != "results.md"]
+NAMES = [str(page.relative_to(ROOT)) for page in WRITTEN]
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    """Return the fenced blocks of a page in this language; "" is what a user types into a shell."""
+    fenced = re.findall(r"^```(\w*)\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL)
+    return [text for found, text in fenced if found == language]
+
+
+def commands(page: Path) -> list[str]:
+    lines = [line.partition("  #")[0] for block in blocks(page, "") for line in block.splitlines()]
+    inline = re.findall(r"`((?:python|lerobot-[a-z-]+) [^`…]*=[^`…]*)`", page.read_text())
+    return [line for line in [*lines, *inline] if line.strip() and not re.search(r"=[A-Z]{2}", line)]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_todays_commands_take_the_flags_of_the_page(name: str) -> None:
+    for command in commands(ROOT / name):
+        check(command)
+
+
+def test_the_readmes_python_runs(
+    trained_models: dict[str, Path], small_dataset: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (code,) = blocks(ROOT / "README.md", "python")
+    for name in ("action_world_model", "text_world_model"):
+        assert f"outputs/demo/{name}" in code
+        code = code.replace(f"outputs/demo/{name}", str(trained_models[name]))
+    exec(code.replace("outputs/demo/dataset", str(small_dataset.root)), {})
+    assert "torch.Size([16, 3, 32, 32]) tensor([" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", [str(page.relative_to(ROOT)) for page in PAGES])
+def test_links_lead_somewhere(name: str) -> None:
+    page = ROOT / name
+    for target in re.findall(r"\]\(([^)#]*)(#[^)]*)?\)", page.read_text()):
+        path, anchor = target
+        if path.startswith("http"):
+            continue
+        linked = page.parent / path if path else page
+        assert linked.exists(), f"{name}: {path}"
+        if anchor and linked.suffix == ".md":
+            text = linked.read_text()
+            titles = re.findall(r"^#+ (.*?)(?:<a|$)", text, re.MULTILINE)
+            anchors = {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
+            anchors |= set(re.findall(r'<a id="(.*?)">', text))
+            assert anchor[1:] in anchors, f"{name}: {path}{anchor}"
+
+
+def test_the_readme_is_short() -> None:
+    assert len((ROOT / "README.md").read_text().split()) < 1000
+
+
+def test_the_readme_says_what_the_demo_measured() -> None:
+    text, results = (ROOT / "README.md").read_text(), ROOT / "docs" / "results"
+    for stem in ("demo", "demo_unseen"):
+        change = json.loads((results / f"{stem}.json").read_text())["mean_change"]
+        mean, low, high = (round(100 * change[name]) for name in ("mean", "low", "high"))
+        assert f"by {mean} " in text, points(change)
+        assert re.search(rf"\((95 %: )?{low} to {high}\)", text), points(change)
+    best = json.loads((results / "cloning_control.json").read_text())["cloned_from"]["180"]
+    known, unseen = (round(100 * best[domain]["share"]) for domain in ("ind", "ood"))
+    assert f"{known} % in known and {unseen} % in unseen scenes" in text
+    gates = {"world_model_gate_anchored": 19, "world_model_gate_one_scene": 3}
+    for stem, percent in gates.items():
+        gate = json.loads((results / f"{stem}.json").read_text())["known"]
+        assert round(100 * gate["false_positive_rate"]["share"]) == percent
+        assert f"{percent} %" in text
