@@ -1,1 +1,1 @@
-"""The demo: real commands one after another, measured and resumable."""
+"""The demo: console commands one after another, measured and resumable, and a report."""

@@ -35,7 +35,7 @@ from lerobot_wmrl.common.progress import own_progress_lock
 MARKER = "settings.json"
 
 SAMPLE_SECONDS = 1.0
-"""How often memory is sampled and progress is reported."""
+"""Seconds between two samples of memory and two reports of progress."""
 
 PRELOADED = (
     "lerobot.scripts.lerobot_train",

@@ -90,13 +90,13 @@ def evaluate_within(
 
 @dataclass(frozen=True)
 class Agreement:
-    """Success of each policy by name, (imagined, real): in the world model and in the other environment."""
+    """Success of each policy by name: in the world model, and in the environment `real_env`."""
 
     policies: Mapping[str, tuple[Proportion, Proportion]]
 
     @classmethod
     def of_outcomes(cls, outcomes: Mapping[str, tuple[Sequence[bool], Sequence[bool]]]) -> "Agreement":
-        """Count the successes of each policy's episodes, imagined and real."""
+        """Count successes from the outcomes of each policy's episodes in both environments."""
 
         def share(successes: Sequence[bool]) -> Proportion:
             return Proportion(sum(successes), len(successes))

@@ -25,7 +25,7 @@ from lerobot_wmrl.world_models.open_loop import open_loop
 
 MAX_FALSE_POSITIVE_RATE: Final = 0.05
 MIN_RECALL: Final = 0.9
-"""What it takes to pass the gate."""
+"""Limits within which the gate is passed."""
 
 SWEEP_THRESHOLDS = tuple(round(0.3 + 0.05 * step, 2) for step in range(14))
 SWEEP_FRAMES = tuple(range(1, 7))

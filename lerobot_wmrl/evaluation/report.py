@@ -80,7 +80,7 @@ TITLES = {
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What one pass over recorded episodes leaves.
+    """Measures of one pass over recorded episodes.
 
     Args:
         accuracy: of every episode, in order.
@@ -183,7 +183,7 @@ def report_goals(
 
 
 def report_agreement(agreement: Agreement, folder: Path) -> Report:
-    """Report how far policies succeed alike in both environments, and save policies.png in `folder`."""
+    """Report the success of policies in both environments, and save policies.png in `folder`."""
     pictures.save_agreement(agreement, folder / "policies.png")
     return Report({"policies": agreement.as_json()}, agreement_table(agreement))
 
