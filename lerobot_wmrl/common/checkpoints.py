@@ -10,6 +10,7 @@ from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETR
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.lerobot_compat import checkpoint_dir
 
 ADAPTERS_FILE = "adapter_model.safetensors"
@@ -68,3 +69,12 @@ def latest_checkpoint(output_dir: Path) -> Path | None:
     folder = output_dir / CHECKPOINTS_DIR
     steps = [path for path in folder.glob("*") if path.name.isdigit()] if folder.is_dir() else []
     return max(steps, key=lambda path: int(path.name), default=None)
+
+
+def require_resumable(output_dir: Path) -> None:
+    """Raise FieldError if `resume` is asked for and there is no checkpoint to go on from."""
+    if latest_checkpoint(output_dir) is None:
+        raise FieldError(
+            "resume", True, f"there is no checkpoint in {output_dir} to go on from",
+            "leave `resume` out to begin",
+        )  # fmt: skip

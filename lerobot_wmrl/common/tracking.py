@@ -3,6 +3,7 @@
 import json
 import logging
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,23 @@ def read_metrics(output_dir: Path) -> list[dict[str, Any]]:
             continue
         lines.setdefault(line["step"], {}).update(line)
     return [lines[step] for step in sorted(lines)]
+
+
+def make_wandb(cfg: Any) -> Any:
+    """Return LeRobot's WandBLogger if `cfg.wandb.enable`, else None. Of several processes the first logs.
+
+    A run that wandb knows already is continued.
+
+    Args:
+        cfg: a command's dataclass, with what LeRobot's logger reads: wandb, output_dir, job_name, resume,
+            seed, env, dataset, policy or reward_model, is_reward_model_training, to_dict.
+    """
+    if not cfg.wandb.enable or rank_and_size()[0] > 0:
+        return None
+    from lerobot.common.wandb_utils import WandBLogger
+
+    known = (cfg.output_dir / "wandb" / "latest-run").exists()
+    return WandBLogger(replace(cfg, resume=known, job_name=cfg.job_name or cfg.output_dir.name))
 
 
 class Tracker:

@@ -1,5 +1,6 @@
 """Reconstruction by a tokenizer: PSNR of recorded frames, camera by camera, and its use of the codes."""
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -106,15 +107,22 @@ def code_use(codebook: CodeBook, tokens: Tensor) -> dict[str, Any]:
     }
 
 
-def write_reconstruction(model: TokenizingModel, table: EpisodeTable, output_dir: Path) -> None:
-    """Write `reconstruction.json`, unless it exists, for held-out episodes, or all if none is held out."""
-    if (output_dir / RECONSTRUCTION_FILE).is_file():
-        return
+def write_reconstruction(model: TokenizingModel, table: EpisodeTable, output_dir: Path) -> dict[str, Any]:
+    """Write `reconstruction.json`, unless it exists, for held-out episodes, or all if none is held out.
+
+    Returns:
+        What the file holds: split, and what `reconstruction_metrics` returns.
+    """
+    path = output_dir / RECONSTRUCTION_FILE
+    if path.is_file():
+        known: dict[str, Any] = json.loads(path.read_text())
+        return known
     split = "validation" if table.validation.any() else "all"
     episodes = choose_episodes(table, split, MAX_FRAMES)
     frames = cached_frames(table.dataset, model.config.tokenizer.camera_keys)
     measured = {"split": split, **reconstruction_metrics(model.eval(), table, frames, episodes)}
-    write_json(output_dir / RECONSTRUCTION_FILE, measured)
+    write_json(path, measured)
+    return measured
 
 
 def _rows(table: EpisodeTable, episodes: np.ndarray, at_most: int) -> tuple[np.ndarray, np.ndarray]:

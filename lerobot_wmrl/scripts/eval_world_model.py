@@ -120,7 +120,7 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     from lerobot_wmrl.world_models.checkpoint import load_model
 
     cfg.check()
-    model = load_model(cfg.model.path, "action_world_model", cfg.device)
+    model = load_model(cfg.model.path, "action_world_model", cfg.device, "model.path")
     table = read_episodes(open_dataset(cfg.dataset.root, cfg.dataset.repo_id))
     check_dataset(model.config, table.dataset.features)
     text_model = load_text_model(cfg, model)
@@ -179,7 +179,9 @@ def load_text_model(
 
     if not cfg.text_model.path:
         return None
-    text_model: TextWorldModelRewardModel = load_model(cfg.text_model.path, "text_world_model", cfg.device)
+    text_model: TextWorldModelRewardModel = load_model(
+        cfg.text_model.path, "text_world_model", cfg.device, "text_model.path"
+    )
     check_same_tokenizer(model, text_model, f"--text_model.path={cfg.text_model.path}")
     return text_model
 

@@ -16,7 +16,7 @@ Running the same command again continues from the last checkpoint. `--preset=dem
 
 import shlex
 import shutil
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -36,6 +36,7 @@ from lerobot_wmrl.common.distributed import LONGEST_WAIT, rank_and_size, wait_fo
 from lerobot_wmrl.common.errors import FieldError, require_at_least
 from lerobot_wmrl.common.malloc import keep_freed_memory
 from lerobot_wmrl.common.presets import expand_preset, format_flags
+from lerobot_wmrl.common.tracking import make_wandb
 from lerobot_wmrl.rl.configuration_algorithms import GRPOConfig, PolicyGradientConfig, PPOConfig
 from lerobot_wmrl.rl.configuration_callbacks import CallbackSettings
 
@@ -205,31 +206,18 @@ def train_policy(cfg: TrainConfig) -> None:
 
 def finished(cfg: TrainConfig) -> bool:
     """Return whether there is nothing left to train. FieldError if there is nothing to resume."""
-    from lerobot_wmrl.common.checkpoints import latest_checkpoint
+    from lerobot_wmrl.common.checkpoints import latest_checkpoint, require_resumable
     from lerobot_wmrl.rl.callbacks import has_record
     from lerobot_wmrl.rl.selection import Selection
 
     last = latest_checkpoint(cfg.output_dir)
-    if cfg.resume and last is None:
-        raise FieldError(
-            "resume", True, f"there is no checkpoint in `output_dir={cfg.output_dir}` to continue from",
-            "leave the flag out to begin",
-        )  # fmt: skip
+    if cfg.resume:
+        require_resumable(cfg.output_dir)
     if last is None or int(last.name) < cfg.iterations:
         return False
     return not cfg.selection.freq or has_record(
         cfg.output_dir, Selection.name, cfg.iterations, cfg.iterations
     )
-
-
-def make_wandb(cfg: TrainConfig) -> Any:
-    """Return LeRobot's logger if it is enabled; it continues a run that wandb knows already."""
-    if not cfg.wandb.enable or rank_and_size()[0] > 0:
-        return None
-    from lerobot.common.wandb_utils import WandBLogger
-
-    known = (cfg.output_dir / "wandb" / "latest-run").exists()
-    return WandBLogger(replace(cfg, resume=known, job_name=cfg.job_name or cfg.output_dir.name))
 
 
 def train_in(

@@ -17,40 +17,51 @@ from typing import Any, ClassVar
 import draccus
 from accelerate import PartialState
 from lerobot.configs import parser
+from lerobot.configs.default import WandBConfig
 from lerobot.configs.rewards import RewardModelConfig
 
 from lerobot_wmrl.common.command_line import RunConfig, claim_output_dir, require_free, run_command
 from lerobot_wmrl.common.distributed import LONGEST_WAIT
-from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
 from lerobot_wmrl.common.malloc import keep_freed_memory
 from lerobot_wmrl.common.precision import PRECISIONS, training_dtype
 from lerobot_wmrl.common.presets import expand_preset
-from lerobot_wmrl.data.episodes import TrainingData
+from lerobot_wmrl.common.tracking import make_wandb
+from lerobot_wmrl.data.episodes import EpisodeTable, TrainingData
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
 
 TRAINED = ("frame_tokenizer", "action_world_model", "text_world_model")
+
+MAY_DIFFER = ("resume", "job_name", "log_freq", "wandb")
+"""Settings that a continued run may have otherwise than when it began."""
+
+HELD_OUT_FILE = "held_out.json"
 
 
 @dataclass
 class TrainWorldModelConfig(RunConfig):
     """Train a tokenizer or world model.
 
-    `--preset=tiny|demo|cpu|gpu|paper` stands for the flags of that size; flags further right override it.
-
     Args:
         model: `--model.type=frame_tokenizer|action_world_model|text_world_model` and its settings; or
             `--model.path=`, a trained one to begin with, and those of its settings that are to be others.
         dataset: the LeRobotDataset to learn from, or some of its episodes; and `more` of them.
         output_dir: where checkpoints and metrics go; continues if it holds this run already.
-        steps, batch_size: optimiser steps, and frames (tokenizer) or clips (world models) a step.
+        steps, batch_size: optimizer steps, and frames (tokenizer) or clips (world models) a step.
             Under `torchrun --nproc_per_node=N` every process has `batch_size` of them.
         save_freq, log_freq: steps between checkpoints and between lines of metrics.jsonl.
         seed: of initial weights and batches.
         precision: `float32`, `bfloat16` (mixed: weights and losses stay in float32), or `auto`: bfloat16 if
             the device multiplies in it. The checkpoints' train_config.json tells which it was.
+        resume: there must be a checkpoint in `output_dir` to go on from, as in lerobot-train, also with
+            `--config_path=outputs/tokenizer/train_config.json` in place of all other flags.
+        wandb: `--wandb.enable=true` also sends the metrics there, as lerobot-train does.
+        job_name: of the run in wandb, by default that of `output_dir`.
     """
 
     path_fields: ClassVar[list[str]] = ["model"]
+    env: ClassVar[None] = None
+    is_reward_model_training: ClassVar[bool] = True
 
     model: RewardModelConfig = field(default_factory=FrameTokenizerConfig)
     dataset: TrainingData = field(default_factory=TrainingData)
@@ -61,76 +72,143 @@ class TrainWorldModelConfig(RunConfig):
     log_freq: int = 20
     seed: int = 0
     precision: str = "auto"
+    resume: bool = False
+    wandb: WandBConfig = field(default_factory=WandBConfig)
+    job_name: str | None = None
+
+    @property
+    def reward_model(self) -> RewardModelConfig:
+        """The model, by the name that LeRobot's WandBLogger has for it."""
+        return self.model
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the settings as LeRobot's WandBLogger asks for them."""
+        return draccus.encode(self)
 
 
 def check_config(cfg: TrainWorldModelConfig) -> None:
-    """ValueError names the setting that cannot be."""
+    """Raise FieldError for a setting that cannot be."""
     if cfg.model.type not in TRAINED:
-        raise ValueError(f"--model.type={cfg.model.type}: this command trains {', '.join(TRAINED)}")
-    for name in ("steps", "batch_size", "save_freq", "log_freq"):
-        if getattr(cfg, name) < 1:
-            raise ValueError(f"--{name}={getattr(cfg, name)}: must be at least 1")
-    if cfg.precision not in PRECISIONS:
-        raise ValueError(f"--precision={cfg.precision}: choose one of {', '.join(PRECISIONS)}")
+        raise FieldError("model.type", cfg.model.type, f"this command trains {', '.join(TRAINED)}")
+    require_at_least(cfg, 1, "steps", "batch_size", "save_freq", "log_freq")
+    require_choice(cfg, "precision", PRECISIONS)
     if cfg.model.push_to_hub and not cfg.model.repo_id:
-        raise ValueError("--model.push_to_hub=true: give its name on the hub, --model.repo_id=user/name")
+        raise FieldError("model.push_to_hub", True, "needs a name on the hub", "give `model.repo_id`")
 
 
 def check_processes(cfg: TrainWorldModelConfig, processes: int) -> None:
-    """ValueError for what cannot be shared: LFQ's entropy is of the whole batch, and the library's is not."""
-    if (
-        processes > 1
-        and isinstance(cfg.model, FrameTokenizerConfig)
-        and cfg.model.tokenizer.quantizer == "lfq"
-    ):
+    """Raise FieldError for LFQ in several processes: its entropy is that of the whole batch."""
+    tokenizer = cfg.model.tokenizer if isinstance(cfg.model, FrameTokenizerConfig) else None
+    if processes > 1 and tokenizer is not None and tokenizer.quantizer == "lfq":
         raise FieldError(
             "tokenizer.quantizer", "lfq", "trains in one process only", "leave torchrun out, or take fsq"
         )
 
 
-def publish(model: Any, cfg: TrainWorldModelConfig) -> None:
-    """Upload the trained model if `--model.push_to_hub=true`."""
-    if cfg.model.push_to_hub and PartialState().is_main_process:
-        model.push_model_to_hub(cfg)
-        print(f"{cfg.output_dir}: published as {cfg.model.repo_id}")
-
-
 def train_world_model(cfg: TrainWorldModelConfig) -> None:
-    """Build or reload the model, cache the data, train; a tokenizer's held-out accuracy goes beside it."""
+    """Build or reload the model, train it, measure it on held-out episodes, publish it."""
     from lerobot.utils.random_utils import set_seed
 
-    from lerobot_wmrl.common.checkpoints import latest_checkpoint
+    from lerobot_wmrl.common.checkpoints import latest_checkpoint, require_resumable
     from lerobot_wmrl.data.episodes import open_dataset, read_episodes
-    from lerobot_wmrl.evaluation.reconstruction import write_reconstruction
     from lerobot_wmrl.world_models.checkpoint import config_to_continue
-    from lerobot_wmrl.world_models.training import build_model, make_joint_sampler, train
+    from lerobot_wmrl.world_models.training import build_model
 
     if path := parser.get_path_arg("model"):
         cfg.model = config_to_continue(path, parser.get_cli_overrides("model") or [])
     check_config(cfg)
+    if cfg.resume:
+        require_resumable(cfg.output_dir)
     processes = PartialState(cpu=cfg.model.device == "cpu", timeout=LONGEST_WAIT)
     check_processes(cfg, processes.num_processes)
     table = read_episodes(open_dataset(cfg.dataset.root, cfg.dataset.repo_id))
     given = draccus.encode(cfg)
     checkpoint = latest_checkpoint(cfg.output_dir)
     set_seed(cfg.seed)
-    model = build_model(cfg.model, table, cfg.output_dir)
-    require_free(cfg.output_dir, given)
+    model: Any = build_model(cfg.model, table, cfg.output_dir)
+    require_free(cfg.output_dir, given, MAY_DIFFER)
     if checkpoint is not None and int(checkpoint.name) >= cfg.steps:
-        claim_output_dir(cfg.output_dir, given)
+        claim_output_dir(cfg.output_dir, given, MAY_DIFFER)
         print(f"{cfg.output_dir}: already trained for {cfg.steps} steps")
     else:
-        with processes.main_process_first():
-            seed = cfg.seed + processes.process_index
-            sampler = make_joint_sampler(model, table, cfg.dataset, cfg.batch_size, seed)
-            if processes.is_main_process:
-                claim_output_dir(cfg.output_dir, given)
-        dtype = training_dtype(cfg.precision, cfg.model.device)
-        used = replace(cfg, precision=str(dtype).removeprefix("torch."))
-        train(model, sampler, used, used.save_pretrained)
-    if isinstance(cfg.model, FrameTokenizerConfig) and processes.is_main_process:
-        write_reconstruction(model, table, cfg.output_dir)
-    publish(model, cfg)
+        run_training(cfg, model, table, given, processes)
+    if processes.is_main_process:
+        print(f"\n{conclusion(cfg, model, table)}")
+        if cfg.model.push_to_hub:
+            model.push_model_to_hub(cfg)
+            print(f"Published as {cfg.model.repo_id}.")
+
+
+def run_training(
+    cfg: TrainWorldModelConfig, model: Any, table: EpisodeTable, given: dict[str, Any],
+    processes: PartialState,
+) -> None:  # fmt: skip
+    """Cache the data, in the first process before the others, and train."""
+    from lerobot_wmrl.world_models.training import make_joint_sampler, train
+
+    with processes.main_process_first():
+        seed = cfg.seed + processes.process_index
+        sampler = make_joint_sampler(model, table, cfg.dataset, cfg.batch_size, seed)
+        if processes.is_main_process:
+            claim_output_dir(cfg.output_dir, given, MAY_DIFFER)
+    dtype = training_dtype(cfg.precision, cfg.model.device)
+    used = replace(cfg, precision=str(dtype).removeprefix("torch."))
+    train(model, sampler, used, used.save_pretrained, make_wandb(cfg))
+
+
+def conclusion(cfg: TrainWorldModelConfig, model: Any, table: EpisodeTable) -> str:
+    """Measure the trained model and say what was made, how good it is and what comes next."""
+    from lerobot_wmrl.common.checkpoints import resolve_checkpoint
+
+    size = sum(path.stat().st_size for path in resolve_checkpoint(cfg.output_dir).glob("*.safetensors"))
+    parameters = sum(parameter.numel() for parameter in model.parameters())
+    made = f"{parameters / 1e6:.1f} million parameters, {size / 1e6:.1f} MB"
+    return (
+        f"{cfg.output_dir}: a {cfg.model.type} of {made}.\n{quality(cfg, model, table)}\n"
+        f"Next:\n  {next_command(cfg)}"
+    )
+
+
+def quality(cfg: TrainWorldModelConfig, model: Any, table: EpisodeTable) -> str:
+    """Say how good the model is on episodes that are held out, or in training if none is."""
+    from lerobot_wmrl.common.files import write_json
+    from lerobot_wmrl.common.tracking import read_metrics
+    from lerobot_wmrl.evaluation.reconstruction import write_reconstruction
+    from lerobot_wmrl.world_models.training import held_out_metrics
+
+    if isinstance(cfg.model, FrameTokenizerConfig):
+        measured = write_reconstruction(model, table, cfg.output_dir)
+        psnr = ", ".join(f"{camera} {value:.1f} dB" for camera, value in measured["psnr"].items())
+        split = "held-out episodes" if measured["split"] == "validation" else "the episodes it was trained on"
+        return f"PSNR on {split}: {psnr}."
+    measured = held_out_metrics(model, table, cfg.batch_size)
+    if measured:
+        write_json(cfg.output_dir / HELD_OUT_FILE, measured)
+    where = "held-out episodes" if measured else "the last training batch (no episode is held out)"
+    measured = measured or read_metrics(cfg.output_dir)[-1]
+    shown = ("loss", "token_accuracy", "moving_token_accuracy", "done_loss", "state_loss")
+    said = ", ".join(f"{name.replace('_', ' ')} {measured[name]:.3f}" for name in shown if name in measured)
+    return f"On {where}: {said}."
+
+
+def next_command(cfg: TrainWorldModelConfig) -> str:
+    """Return the command that usually follows."""
+    root, folder = cfg.dataset.root, cfg.output_dir.parent
+    if cfg.model.type == "frame_tokenizer":
+        return (
+            "lerobot-wmrl-train-world-model --model.type=action_world_model "
+            f"--model.tokenizer_path={cfg.output_dir} --dataset.root={root} "
+            f"--output_dir={folder / 'action_world_model'}"
+        )
+    if cfg.model.type == "text_world_model":
+        return (
+            f"lerobot-wmrl-eval-world-model --model.path={folder / 'action_world_model'} "
+            f"--text_model.path={cfg.output_dir} --dataset.root={root} --output_dir={folder / 'check'}"
+        )
+    return (
+        f"lerobot-wmrl-eval-world-model --model.path={cfg.output_dir} --dataset.root={root} "
+        f"--output_dir={folder / 'check'}"
+    )
 
 
 def main() -> None:

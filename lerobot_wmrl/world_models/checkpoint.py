@@ -6,58 +6,78 @@ from pathlib import Path
 from typing import Any, Final
 
 import torch
+from draccus.utils import ParsingError
 from lerobot.configs.rewards import RewardModelConfig
 from lerobot.rewards.factory import get_reward_model_class
 from safetensors import SafetensorError
 
 from lerobot_wmrl.common.checkpoints import resolve_checkpoint
+from lerobot_wmrl.common.errors import FieldError
 
-FLAGS: Final = {
-    "frame_tokenizer": "--model.tokenizer_path",
-    "action_world_model": "--env.world_model_path / --model.path",
-    "text_world_model": "--env.text_world_model_path / --text_model.path",
+FIELDS: Final = {
+    "frame_tokenizer": "tokenizer_path",
+    "action_world_model": "world_model_path",
+    "text_world_model": "text_world_model_path",
 }
-"""How the commands call the path of a model of each type."""
+"""Field that holds the path of a model of each type, where the caller does not say."""
 
 
-def read_config(path: str | Path, expected_type: str, device: str | None = "cpu") -> RewardModelConfig:
-    """The configuration of a checkpoint of exactly `expected_type`, else ValueError. No device: the best."""
-    flag = FLAGS.get(expected_type, "--env.reward.pretrained_path")
+def read_config(
+    path: str | Path, expected_type: str, device: str | None = "cpu", field: str | None = None
+) -> RewardModelConfig:
+    """Read the configuration of a checkpoint.
+
+    Args:
+        path: a training's output folder, one of its checkpoints, or a hub id.
+        expected_type: the type that it must have.
+        device: where the model goes; None for the best device there is.
+        field: where the path was given, for errors.
+
+    Raises:
+        FieldError: there is none, or it is of another type or of an earlier version of this package.
+    """
+    field = field or FIELDS.get(expected_type, "reward.pretrained_path")
     folder = resolve_checkpoint(path)
     if not (folder / "config.json").is_file():
         if folder.is_dir() or str(path).startswith((".", "/", "outputs")) or str(path).count("/") != 1:
-            raise ValueError(
-                f"{flag}={path}: no {expected_type} there; give its training's output folder, or a hub id"
+            raise FieldError(
+                field, path, f"no {expected_type} there", "give its training's output folder, or a hub id"
             )
     else:
         found = _stored_type(folder / "config.json")
         if found != expected_type:
-            raise ValueError(
-                f"{flag}={path}: is a checkpoint of type {found!r}, but {expected_type!r} is needed here: "
-                f"give the output folder of a training with that type"
-            )
+            raise FieldError(
+                field, path, f"is a checkpoint of type {found!r}, but {expected_type!r} is needed here",
+                "give the output folder of a training with that type",
+            )  # fmt: skip
     if device is None:
         accelerator = torch.accelerator.current_accelerator(check_available=True)
         device = accelerator.type if accelerator else "cpu"
-    return RewardModelConfig.from_pretrained(str(folder), cli_overrides=[f"--device={device}"])
+    try:
+        return RewardModelConfig.from_pretrained(str(folder), cli_overrides=[f"--device={device}"])
+    except (ParsingError, TypeError, KeyError) as error:
+        raise FieldError(
+            field, path, f"its configuration is of an earlier version of this package ({_first_line(error)})",
+            "train the model again",
+        ) from error  # fmt: skip
 
 
 def config_to_continue(path: str, overrides: Sequence[str]) -> RewardModelConfig:
-    """The settings of a trained model, `overrides` on top, to train it further (`--model.path`).
-
-    ValueError if there is none.
-    """
+    """Read the settings of a trained model, `overrides` on top, to train it further. FieldError if none."""
     folder = resolve_checkpoint(path)
     try:
         config = RewardModelConfig.from_pretrained(str(folder), cli_overrides=list(overrides))
     except Exception as error:  # draccus, the hub and json each raise their own
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise ValueError(
-            f"--model.path={path}: no model can be loaded from it ({reason}); give the output folder of a "
-            "training, or a hub id"
-        ) from error
+        raise FieldError(
+            "model.path", path, f"no model can be loaded from it ({_first_line(error)})",
+            "give the output folder of a training with this version of the package, or a hub id",
+        ) from error  # fmt: skip
     config.pretrained_path = str(folder)
     return config
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip() or type(error).__name__).splitlines()[0]
 
 
 def _stored_type(path: Path) -> Any:
@@ -69,13 +89,15 @@ def _stored_type(path: Path) -> Any:
         ) from error
 
 
-def load_model(path: str | Path, expected_type: str, device: str | None = "cpu") -> Any:
-    """Load a checkpoint of exactly `expected_type` in evaluation mode. None: on the best device there is.
+def load_model(
+    path: str | Path, expected_type: str, device: str | None = "cpu", field: str | None = None
+) -> Any:
+    """Load a checkpoint in evaluation mode; arguments as of `read_config`.
 
     Raises:
-        ValueError: not found, of another type, truncated, or with other tensors than its config.
+        ValueError: not found, of another type or version, truncated, or with other tensors than its config.
     """
-    config = read_config(path, expected_type, device)
+    config = read_config(path, expected_type, device, field)
     folder = resolve_checkpoint(path)
     try:
         return get_reward_model_class(config.type).from_pretrained(str(folder), config=config, strict=True)
@@ -86,11 +108,11 @@ def load_model(path: str | Path, expected_type: str, device: str | None = "cpu")
         ) from error
 
 
-def check_same_tokenizer(model: Any, text_model: Any, flag: str) -> None:
-    """ValueError unless both world models, the second given by `flag`, speak of frames in the same tokens."""
+def check_same_tokenizer(model: Any, text_model: Any, where: str) -> None:
+    """Raise ValueError unless both world models have the same tokenizer; `where` says which the second is."""
     own, other = model.tokenizer.state_dict(), text_model.tokenizer.state_dict()
     if own.keys() != other.keys() or not all(torch.equal(own[name], other[name]) for name in own):
         raise ValueError(
-            f"{flag}: trained on another tokenizer than the action world model; train both with the same "
-            "--model.tokenizer_path"
+            f"{where}: trained on another tokenizer than the action world model; train both with the same "
+            "tokenizer_path"
         )

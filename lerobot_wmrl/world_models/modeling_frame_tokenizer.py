@@ -18,7 +18,7 @@ from lerobot_wmrl.world_models.perceptual import PerceptualLoss, lpips_network, 
 
 
 def stack_cameras(batch: dict[str, Tensor], keys: Sequence[str], size: int) -> Tensor:
-    """Camera images (…, 3, H, W) of a batch → (…, N, 3, H, W). ValueError if one is missing or no `size`."""
+    """Stack camera images (…, 3, H, W) of a batch → (…, N, 3, H, W). ValueError if one is not there."""
     missing = [key for key in keys if key not in batch]
     if missing:
         present = [key for key in batch if "images" in key]
@@ -35,7 +35,7 @@ def stack_cameras(batch: dict[str, Tensor], keys: Sequence[str], size: int) -> T
 
 
 class FrameTokenizerRewardModel(HubCard, PreTrainedRewardModel):
-    """Frames to tokens and back; its reward is 1 − distance to a goal frame in feature space (eq. 5)."""
+    """Frame tokenizer as a reward model: 1 − distance to a goal frame in feature space (eq. 5)."""
 
     config_class = FrameTokenizerConfig
     name = "frame_tokenizer"
@@ -54,8 +54,12 @@ class FrameTokenizerRewardModel(HubCard, PreTrainedRewardModel):
                 require_backbone("vgg", "perceptual_weight", config.perceptual_weight, "0")
         self.tokenizer = FrameTokenizer(sizes)
 
-    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
-        """Reconstruction loss of images (B, 3, H, W); `reference.*`: the episodes' first frames, if known."""
+    def forward(self, batch: dict[str, Tensor], progress: float = 1.0) -> tuple[Tensor, dict[str, float]]:
+        """Return the reconstruction loss of `observation.images.*` (B, 3, H, W) and metrics.
+
+        `reference.*` are the episodes' first frames, needed with the option `context`. The loss is the same
+        at any `progress` of the training.
+        """
         images, reference = self._stack(batch, "observation.images"), self._reference(batch)
         weight, context = None, NO_CONTEXT
         if reference is not None:
@@ -68,7 +72,7 @@ class FrameTokenizerRewardModel(HubCard, PreTrainedRewardModel):
         return stack_cameras(batch, keys, self.config.tokenizer.image_size)
 
     def _reference(self, batch: dict[str, Tensor]) -> Tensor | None:
-        """The first frames of the episodes, if the batch has them. ValueError if they are needed."""
+        """Return the first frames of the episodes, None if the batch lacks them and they are not needed."""
         missing = [
             key
             for key in (f"reference.{camera}" for camera in self.config.tokenizer.cameras)
@@ -84,13 +88,13 @@ class FrameTokenizerRewardModel(HubCard, PreTrainedRewardModel):
         return None
 
     def _perceptual_loss(self, device: torch.device) -> ImageLoss | None:
-        """Not a module of this model: a checkpoint neither contains nor needs LPIPS's network."""
+        """Return LPIPS. It is no module of this model, so that a checkpoint does not contain its network."""
         weight = self.config.perceptual_weight
         return PerceptualLoss(lpips_network("vgg", device), weight) if weight else None
 
     @torch.no_grad()
     def compute_reward(self, batch: dict[str, Tensor]) -> Tensor:
-        """Similarity in [0, 1] of `observation.images.*` (B, 3, H, W) to `goal.*`. → (B,)
+        """Return the similarity in [0, 1] of `observation.images.*` (B, 3, H, W) to `goal.*`, (B,).
 
         A context-conditioned tokenizer also needs `reference.*`, the first frames of the episodes.
         """

@@ -1,4 +1,4 @@
-"""The one training loop of tokenizer and world models: seeded, resumable, logged, on one or more devices.
+"""The training loop of tokenizer and world models: seeded, resumable, logged, on one or more devices.
 
 Under `torchrun` every process draws batches of `batch_size` from a seed of its own, DistributedDataParallel
 averages the gradients, and the first process alone writes.
@@ -9,7 +9,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -27,6 +27,7 @@ from tqdm import tqdm
 from lerobot_wmrl.common.checkpoints import latest_checkpoint, write_checkpoint
 from lerobot_wmrl.common.constants import KINDS, START_KIND
 from lerobot_wmrl.common.distributed import mean_over_processes
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.lerobot_compat import (
     gather_random_states,
     load_training_state,
@@ -48,9 +49,23 @@ from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import cosine_schedule
 from lerobot_wmrl.world_models.configuration_world_model import TextWorldModelConfig
 
+HELD_OUT_BATCHES = 8
+"""Batches on which a trained world model is measured: a few seconds."""
+
+
+class TrainingSettings(Protocol):
+    """What the loop needs of a command's configuration."""
+
+    output_dir: Path
+    steps: int
+    save_freq: int
+    log_freq: int
+    seed: int
+    precision: str
+
 
 def build_model(config: RewardModelConfig, table: EpisodeTable, output_dir: Path) -> PreTrainedRewardModel:
-    """A fresh model with the dataset's statistics, or the latest checkpoint of this run."""
+    """Return a fresh model with the dataset's statistics, or the latest checkpoint of this run."""
     checkpoint, meta = latest_checkpoint(output_dir), table.dataset.meta
     if checkpoint is not None:
         model = load_model(checkpoint, config.type, config.device or "cpu")
@@ -76,53 +91,73 @@ def make_sampler(
     seed: int,
     done_known: bool = True,
 ) -> ClipSampler | FrameSampler:
-    """Batches for this kind of model from the episodes that are not held out, and `chosen` if some are.
+    """Make the sampler of training batches for this kind of model.
 
-    `done_known`: as in `ClipSampler`.
+    Args:
+        model: a frame tokenizer or a world model.
+        table: the dataset.
+        chosen: indices of episodes to learn from, all by default; held-out episodes are left out.
+        batch_size: frames (tokenizer) or clips (world models) a batch.
+        seed: of the draws.
+        done_known: whether the table's done says what happened.
+
+    Raises:
+        FieldError: there is no episode to learn from.
     """
-    config: Any = model.config
     episodes = ~table.validation & table.among(chosen)
     if not episodes.any():
-        raise ValueError(
-            f"dataset.root={table.dataset.root}: has no episode to train on; record some first, or choose "
-            "others with --dataset.episodes: every twentieth is held out"
-        )
+        raise FieldError(
+            "dataset.root", table.dataset.root, "has no episode to train on",
+            "record some first, or choose others with `dataset.episodes`: every twentieth is held out",
+        )  # fmt: skip
+    config: Any = model.config
     if model.name == "frame_tokenizer":
         frames = cached_frames(table.dataset, config.tokenizer.camera_keys)
-        return FrameSampler(
-            table, frames, episodes.nonzero()[0], config.tokenizer.cameras, batch_size, seed, config.device
-        )
+        cameras = config.tokenizer.cameras
+        return FrameSampler(table, frames, episodes.nonzero()[0], cameras, batch_size, seed, config.device)
     if isinstance(config, TextWorldModelConfig):
         episodes = episodes & golden_episodes(table)
         if not episodes.any():
-            raise ValueError(
-                "the text world model learns from successful optimal episodes; the dataset has none"
-            )
+            raise FieldError(
+                "dataset.root", table.dataset.root, "has no successful optimal episode",
+                "the text world model learns from nothing else: record some",
+            )  # fmt: skip
     elif not table.done_known:
         logging.warning(
             "dataset.root=%s: has neither next.success nor next.done: the model cannot learn from it what "
             "success is, and from it alone learns that nothing succeeds",
             table.dataset.root,
         )
-    tokenizer: Any = model.tokenizer
+    return make_clip_sampler(model, table, episodes.nonzero()[0], batch_size, seed, done_known)
+
+
+def make_clip_sampler(
+    model: Any, table: EpisodeTable, episodes: np.ndarray, batch_size: int, seed: int, done_known: bool = True
+) -> ClipSampler:
+    """Make a sampler of clips from these episodes, with what the world model looks at."""
+    config, tokenizer, dataset = model.config, model.tokenizer, table.dataset
     cameras = config.tokenizer.camera_keys
-    tokens = cached_tokens(table.dataset, cameras, tokenizer)
-    depth = cached_depth(table.dataset, cameras, tokenizer.grid) if config.depth else None
-    context = None
-    if config.context_channels:
-        context = cached_context(table.dataset, cameras, tokenizer)
     return ClipSampler(
-        table, tokens, episodes.nonzero()[0], config.clip_length, config.from_start, batch_size, seed,
-        config.device, depth, context, done_known,
-    )  # fmt: skip
+        table,
+        cached_tokens(dataset, cameras, tokenizer),
+        episodes,
+        config.clip_length,
+        config.from_start,
+        batch_size,
+        seed,
+        config.device,
+        depth=cached_depth(dataset, cameras, tokenizer.grid) if config.depth else None,
+        context=cached_context(dataset, cameras, tokenizer) if config.context_channels else None,
+        done_known=done_known,
+    )
 
 
 def make_joint_sampler(
     model: PreTrainedRewardModel, table: EpisodeTable, data: TrainingData, batch_size: int, seed: int
 ) -> ClipSampler | FrameSampler | InTurn:
-    """Batches from the episodes of `data`, which are in `table`, and from its further datasets.
+    """Make the sampler for the episodes of `data`, which are in `table`, and for its further datasets.
 
-    Where some of them say what success is, those that do not leave done alone.
+    If some of the datasets say what success is, done is not learnt from the others.
     """
     more = [read_episodes(open_dataset(root)) for root in data.more]
     for other in more:
@@ -137,21 +172,33 @@ def make_joint_sampler(
 
 def train(
     model: PreTrainedRewardModel,
-    sampler: ClipSampler | FrameSampler | InTurn,
-    cfg: Any,
+    sampler: Callable[[int], Any],
+    settings: TrainingSettings,
     save_config: Callable[[Path], None],
+    wandb: Any = None,
 ) -> None:
-    """Optimise from the last checkpoint to `cfg.steps`. ValueError (and no new checkpoint) on a NaN loss."""
+    """Train from the last checkpoint in `output_dir` to `steps`.
+
+    Args:
+        model: is trained in place.
+        sampler: step → batch.
+        settings: steps, folder, seed and precision.
+        save_config: writes the command's configuration into a checkpoint.
+        wandb: LeRobot's WandBLogger, None without.
+
+    Raises:
+        ValueError: the loss or its gradient is not finite; no new checkpoint is written.
+    """
     processes = PartialState()
-    set_seed(cfg.seed + processes.process_index)
+    set_seed(settings.seed + processes.process_index)
     preset: Any = model.config.get_optimizer_preset()
     optimizer = preset.build([p for p in model.parameters() if p.requires_grad])
-    scheduler = cosine_schedule(preset.lr, cfg.steps).build(optimizer, cfg.steps)
-    checkpoint = latest_checkpoint(cfg.output_dir)
+    scheduler = cosine_schedule(preset.lr, settings.steps).build(optimizer, settings.steps)
+    checkpoint = latest_checkpoint(settings.output_dir)
     first = 0 if checkpoint is None else load_training_state(checkpoint, optimizer, scheduler)
     network = DistributedDataParallel(model) if processes.num_processes > 1 else model
     device: str = model.config.device
-    dtype = training_dtype(cfg.precision, device)
+    dtype = training_dtype(settings.precision, device)
 
     def save(folder: Path) -> None:
         model.save_pretrained(folder / PRETRAINED_MODEL_DIR)
@@ -160,37 +207,42 @@ def train(
 
     model.train()
     began = time.monotonic()
-    progress = tqdm(total=cfg.steps, initial=first, desc=f"Training {model.name}", unit="step",
+    progress = tqdm(total=settings.steps, initial=first, desc=f"Training {model.name}", unit="step",
                     disable=not processes.is_main_process)  # fmt: skip
-    for step in range(first + 1, cfg.steps + 1):
-        model.training_progress = (step - 1) / cfg.steps
+    for step in range(first + 1, settings.steps + 1):
         with compute_in(dtype, device):
-            loss, metrics = network(sampler(step - 1))
-        metrics |= descend(model, loss, optimizer, preset.grad_clip_norm)
+            loss, metrics = network(sampler(step - 1), (step - 1) / settings.steps)
+        metrics |= optimizer_step(model, loss, optimizer, preset.grad_clip_norm)
         scheduler.step()
-        if step % cfg.log_freq == 0 or step == cfg.steps:
+        if step % settings.log_freq == 0 or step == settings.steps:
             metrics = mean_over_processes(metrics, device)
             metrics["steps_per_s"] = (step - first) / (time.monotonic() - began)
-            log(cfg.output_dir, step, metrics, progress)
-        if should_save_checkpoint(step, cfg.save_freq, cfg.steps):
+            log(settings.output_dir, step, metrics, progress, wandb)
+        if should_save_checkpoint(step, settings.save_freq, settings.steps):
             random_states = gather_random_states()
             if processes.is_main_process:
-                write_checkpoint(cfg.output_dir, cfg.steps, step, save)
+                write_checkpoint(settings.output_dir, settings.steps, step, save)
         progress.update()
     progress.close()
 
 
-def log(output_dir: Path, step: int, metrics: dict[str, float], progress: tqdm) -> None:
-    """Show the loss, and let the first process write a line of metrics."""
+def log(output_dir: Path, step: int, metrics: dict[str, float], progress: tqdm, wandb: Any) -> None:
+    """Show the loss beside the bar, and let the first process write a line of metrics."""
     progress.set_postfix(loss=f"{metrics['loss']:.3f}")
     if PartialState().is_main_process:
         append_metrics(output_dir, step, metrics)
+        if wandb is not None:
+            wandb.log_dict(metrics, step)
 
 
-def descend(
+def optimizer_step(
     model: torch.nn.Module, loss: Tensor, optimizer: Optimizer, grad_clip_norm: float
 ) -> dict[str, float]:
-    """One optimiser step. → the loss and the norm of its gradient. ValueError, and no step, if one is NaN."""
+    """Take one optimizer step and return the loss and the norm of its gradient.
+
+    Raises:
+        ValueError: one of them is not finite. The weights are left as they are.
+    """
     value = mean_over_processes({"loss": loss.item()}, loss.device)["loss"]
     require_finite("loss", value)
     optimizer.zero_grad()
@@ -202,6 +254,23 @@ def descend(
 
 
 def require_finite(name: str, value: float) -> None:
-    """ValueError on a NaN or infinity."""
+    """Raise ValueError on a NaN or infinity."""
     if not math.isfinite(value):
-        raise ValueError(f"the {name} is {value}; the last checkpoint is kept: lower --model.learning_rate")
+        raise ValueError(f"the {name} is {value}; the last checkpoint is kept: lower the learning rate")
+
+
+@torch.no_grad()
+def held_out_metrics(model: Any, table: EpisodeTable, batch_size: int) -> dict[str, float]:
+    """Average a world model's losses over clips of episodes that are held out; empty if there are none."""
+    episodes = table.validation & (
+        golden_episodes(table) if isinstance(model.config, TextWorldModelConfig) else True
+    )
+    if not episodes.any():
+        return {}
+    sampler = make_clip_sampler(model, table, episodes.nonzero()[0], batch_size, seed=0)
+    model.eval()
+    every = []
+    for batch in range(HELD_OUT_BATCHES):
+        loss, metrics = model(sampler(batch), 0.0)
+        every.append({"loss": loss.item(), **metrics})
+    return {name: float(np.mean([metrics[name] for metrics in every])) for name in every[0]}

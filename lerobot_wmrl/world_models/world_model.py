@@ -159,8 +159,12 @@ class WorldModelRewardModel(HubCard, Imagination, PreTrainedRewardModel):
         """Eqs. 2-4 on a clip of tokens."""
         return self.dynamics.loss(self, clip)
 
-    def forward(self, batch: Clip | dict[str, Any]) -> tuple[Tensor, dict[str, float]]:
-        """The loss on a clip, or on LeRobot's batch, of which `clip_from_windows` has the shapes."""
+    def forward(self, batch: Clip | dict[str, Any], progress: float = 1.0) -> tuple[Tensor, dict[str, float]]:
+        """Return the loss and its parts on a clip, or on LeRobot's batch (see `clip_from_windows`).
+
+        progress: share of the training that is over, on which some losses depend.
+        """
+        self.training_progress = progress
         return self.loss(batch if isinstance(batch, Clip) else self.clip_from_batch(batch))
 
     @torch.no_grad()

@@ -67,12 +67,11 @@ def averaged_training(cfg: TrainWorldModelConfig) -> tuple[dict[str, torch.Tenso
         set_seed(cfg.seed + rank)
         states.append(get_rng_state())
     for step in range(cfg.steps):
-        model.training_progress = step / cfg.steps
         optimizer.zero_grad()
         means = []
         for rank, sampler in enumerate(samplers):
             set_rng_state(states[rank])
-            loss, _ = model(sampler(step))
+            loss, _ = model(sampler(step), step / cfg.steps)
             (loss / PROCESSES).backward()
             states[rank] = get_rng_state()
             means.append(loss.item() / PROCESSES)

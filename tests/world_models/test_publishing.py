@@ -7,6 +7,7 @@ import pytest
 import torch
 from lerobot.rewards.factory import get_reward_model_class
 
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.world_models.checkpoint import load_model
 from tests.trained import action_config, run_training, text_config, tokenizer_config
 
@@ -55,6 +56,6 @@ def test_what_was_trained_but_not_published_is_published_by_the_same_command(hub
 def test_a_model_without_a_name_is_not_trained_in_order_to_be_published(small_dataset, tmp_path):
     config = tokenizer_config()
     config.push_to_hub = True
-    with pytest.raises(ValueError, match=r"--model\.push_to_hub=true: .*--model\.repo_id=user/name"):
+    with pytest.raises(FieldError, match=r"^model\.push_to_hub=True: .*`model\.repo_id`"):
         run_training(config, Path(small_dataset.root), tmp_path / "run")
     assert not (tmp_path / "run").exists()

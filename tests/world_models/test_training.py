@@ -26,7 +26,12 @@ from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConf
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.temporal_memory import ClipMemory
-from lerobot_wmrl.world_models.training import descend, golden_episodes, make_joint_sampler, make_sampler
+from lerobot_wmrl.world_models.training import (
+    golden_episodes,
+    make_joint_sampler,
+    make_sampler,
+    optimizer_step,
+)
 from tests.relabelled import UNLABELLED, relabelled
 from tests.trained import action_config, run_training, text_config, tokenizer_config, train_tokenizer
 
@@ -233,5 +238,5 @@ def test_weights_are_left_as_they_are_where_the_loss_has_no_gradient():
     torch.nn.init.zeros_(model.weight)
     optimizer = torch.optim.AdamW(model.parameters(), lr=0.1)
     with pytest.raises(ValueError, match=r"gradient's norm is inf; the last checkpoint is kept"):
-        descend(model, model.weight.sqrt().sum(), optimizer, 1.0)
+        optimizer_step(model, model.weight.sqrt().sum(), optimizer, 1.0)
     assert model.weight.item() == 0
