@@ -1,14 +1,19 @@
-"""`--model.path`: a trained world model is trained further."""
+"""Training by the command: further with `--model.path`, resumed, tracked, and concluded."""
 
 import json
+import shutil
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from safetensors.torch import load_file
 
+from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.scripts.train_world_model import main
+from lerobot_wmrl.world_models.checkpoint import load_model
 
 TRAINED = "checkpoints/last/pretrained_model"
 
@@ -48,3 +53,92 @@ def test_a_path_without_a_model_is_named(
     assert stopped.value.code == 1
     assert f"--model.path={tmp_path}: no model can be loaded from it" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
+
+
+def flags(root: Path, output_dir: Path, *more: str) -> list[str]:
+    return [
+        "lerobot-wmrl-train-world-model", "--model.type=frame_tokenizer", "--model.device=cpu",
+        "--model.tokenizer.image_size=32", "--model.tokenizer.widths=[8,16]",
+        "--model.tokenizer.levels=[5,4]", f"--dataset.root={root}", f"--output_dir={output_dir}",
+        "--steps=2", "--batch_size=2", *more,
+    ]  # fmt: skip
+
+
+def test_a_training_ends_with_what_it_made_how_good_it_is_and_what_comes_next(
+    trained_models: dict[str, Path], make_synthetic_dataset, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    """Of twenty episodes the last is held out."""
+    root, tokenizer = (
+        Path(make_synthetic_dataset(tmp_path / "data", episodes=20).root),
+        tmp_path / "tokenizer",
+    )
+    monkeypatch.setattr(sys, "argv", flags(root, tokenizer))
+    main()
+    said = capsys.readouterr().out
+    assert f"{tokenizer}: a frame_tokenizer of 0.0 million parameters, 0.1 MB." in said
+    psnr = json.loads((tokenizer / "reconstruction.json").read_text())["psnr"]["third_view"]
+    assert f"PSNR on held-out episodes: third_view {psnr:.1f} dB." in said
+    following = said.strip().splitlines()[-1].split()
+    assert following[:2] == ["lerobot-wmrl-train-world-model", "--model.type=action_world_model"]
+    assert f"--model.tokenizer_path={tokenizer}" in following
+    tiny = ["--preset=tiny", "--steps=1", "--batch_size=2", "--model.device=cpu"]
+    monkeypatch.setattr(sys, "argv", [*following, *tiny])
+    main()
+    said = capsys.readouterr().out
+    measured = json.loads((tmp_path / "action_world_model" / "held_out.json").read_text())
+    assert f"On held-out episodes: loss {measured['loss']:.3f}, " in said
+    assert f"lerobot-wmrl-eval-world-model --model.path={tmp_path / 'action_world_model'}" in said
+
+
+def test_a_run_is_resumed_where_there_is_one(
+    small_dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = flags(Path(small_dataset.root), tmp_path / "run")
+    monkeypatch.setattr(sys, "argv", [*given, "--resume=true"])
+    with pytest.raises(SystemExit):
+        main()
+    assert "--resume=true: there is no checkpoint in" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+    monkeypatch.setattr(sys, "argv", given)
+    main()
+    stored = tmp_path / "run" / "train_config.json"
+    monkeypatch.setattr(
+        sys, "argv", [given[0], f"--config_path={stored}", "--resume=true", "--job_name=again"]
+    )
+    main()
+    assert f"{tmp_path / 'run'}: already trained for 2 steps" in capsys.readouterr().out
+
+
+def test_wandb_gets_the_metrics_of_the_file(
+    small_dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    logged = []
+
+    class Logger:
+        def __init__(self, cfg: Any) -> None:
+            assert (cfg.job_name, cfg.resume, cfg.reward_model.type) == ("run", False, "frame_tokenizer")
+            assert cfg.to_dict()["wandb"]["enable"]
+
+        def log_dict(self, metrics: dict[str, float], step: int) -> None:
+            logged.append({"step": step, **metrics})
+
+    monkeypatch.setattr("lerobot.common.wandb_utils.WandBLogger", Logger)
+    given = flags(Path(small_dataset.root), tmp_path / "run", "--wandb.enable=true", "--log_freq=1")
+    monkeypatch.setattr(sys, "argv", given)
+    main()
+    assert logged == read_metrics(tmp_path / "run")
+
+
+def test_a_checkpoint_of_an_earlier_version_is_named(
+    trained_models: dict[str, Path], tmp_path: Path, small_dataset
+) -> None:
+    shutil.copytree(trained_models["action_world_model"] / TRAINED, tmp_path / "old")
+    path = tmp_path / "old" / "config.json"
+    settings = json.loads(path.read_text())
+    settings |= {"image_size": 32, "tokenizer_widths": [8, 16], "levels": [5, 4]}
+    del settings["tokenizer"]
+    path.write_text(json.dumps(settings))
+    message = r"^world_model_path=.*of an earlier version of this package .*; train the model again"
+    with pytest.raises(FieldError, match=message):
+        load_model(tmp_path / "old", "action_world_model")
