@@ -127,7 +127,8 @@ def test_without_any_success_rates_are_no_numbers():
 
 
 def test_every_task_has_a_gate_of_its_own(outcomes):
-    table: Any = SimpleNamespace(task=np.array([0, 0, 1, 1, -1]))
+    columns = {"start.task": np.array([0, 0, 1, 1, -1])}
+    table: Any = SimpleNamespace(column=columns.__getitem__)
     gates = gates_by_task(outcomes, table, 0.5, 3)
     assert list(gates) == ["push", "pull"]
     assert (gates["push"].recall.k, gates["push"].recall.n, gates["push"].false_positives.n) == (
