@@ -27,8 +27,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from torch.utils.flop_counter import FlopCounterMode
 
 from lerobot_wmrl.common.files import write_json
-from lerobot_wmrl.common.malloc import keep_freed_memory
-from lerobot_wmrl.common.precision import imagination_dtype
+from lerobot_wmrl.common.precision import imagination_dtype, keep_freed_memory
 from lerobot_wmrl.common.presets import preset_flags, presets_of
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig

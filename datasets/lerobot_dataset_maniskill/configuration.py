@@ -16,7 +16,7 @@ from lerobot_dataset_maniskill.planners import MOTIONS
 from lerobot_wmrl.common.command_line import RunConfig
 from lerobot_wmrl.common.constants import EVALUATION_SEED, KINDS
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
-from lerobot_wmrl.common.policy_checkpoints import read_policy_config
+from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.maniskill.tasks import task_of

@@ -15,7 +15,7 @@ from lerobot_dataset_maniskill.worker import EpisodeResult, ExplorationNoise, Re
 from lerobot_dataset_maniskill.writer import Outcome, StartColumns, add_step
 from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW, ACTION_NAMES, STATE_NAMES
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.policy_checkpoints import check_fit, load_policy, load_processors
+from lerobot_wmrl.common.policies import check_fit, load_policy, load_processors
 from lerobot_wmrl.envs.evaluation_adapter import images_to_numpy
 from lerobot_wmrl.maniskill.episode import Frame
 from lerobot_wmrl.maniskill.tasks import task_of

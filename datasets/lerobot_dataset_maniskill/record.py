@@ -20,9 +20,9 @@ from typing import Final
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_wmrl.common.command_line import run_command
+from lerobot_wmrl.common.errors import suggestion
 from lerobot_wmrl.common.files import writing
 from lerobot_wmrl.common.presets import format_flags, read_settings
-from lerobot_wmrl.common.suggestion import suggestion
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.maniskill.scenes import describe_scenes
 

@@ -21,7 +21,7 @@ from lerobot_dataset_maniskill.worker import EpisodeResult, PartRecorder, Report
 from lerobot_dataset_maniskill.writer import find_damage
 from lerobot_wmrl.common.constants import ACTION_NAMES, KINDS
 from lerobot_wmrl.common.files import foreign_files, write_json, writing
-from lerobot_wmrl.common.policy_checkpoints import check_fit, check_weights
+from lerobot_wmrl.common.policies import check_fit, check_weights
 from lerobot_wmrl.maniskill.backend import render_backend, simulating_context
 
 CONTENT_FILE: Final = "recording.json"

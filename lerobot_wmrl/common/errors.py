@@ -1,7 +1,8 @@
 """Errors that know the field they are about; the command that was called knows its flag."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from difflib import get_close_matches
 
 
 class FieldError(ValueError):
@@ -55,3 +56,9 @@ def within(group: str) -> Iterator[None]:
         yield
     except FieldError as error:
         raise FieldError(f"{group}.{error.field}", error.value, error.problem, error.remedy) from None
+
+
+def suggestion(name: str, known: Sequence[str], prefix: str = "") -> str:
+    """Return the known name nearest to a wrong one, with `prefix` before it; all of them if none is near."""
+    near = get_close_matches(name, known, 1)
+    return f"did you mean {prefix}{near[0]}?" if near else f"choose from {', '.join(known)}"

@@ -26,11 +26,10 @@ from typing import Any, BinaryIO
 
 import psutil
 
-from lerobot_wmrl.common.die_with_parent import die_with
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.files import foreign_files, write_json
-from lerobot_wmrl.common.malloc import keep_freed_memory
-from lerobot_wmrl.common.progress import own_progress_lock
+from lerobot_wmrl.common.precision import keep_freed_memory
+from lerobot_wmrl.common.processes import die_with, own_progress_lock
 
 MARKER = "settings.json"
 

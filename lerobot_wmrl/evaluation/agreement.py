@@ -16,7 +16,7 @@ from lerobot.utils.constants import CHECKPOINTS_DIR
 from scipy.stats import pearsonr
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.policy_checkpoints import load_policy, load_processors, read_policy_config
+from lerobot_wmrl.common.policies import load_policy, load_processors, read_policy_config
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter, StepCounter
 

@@ -11,8 +11,7 @@ from typing import Any, Final, Literal
 import numpy as np
 import yaml
 
-from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.suggestion import suggestion
+from lerobot_wmrl.common.errors import FieldError, suggestion
 from lerobot_wmrl.maniskill.backend import require_simulator
 
 Shape = Literal["box", "cylinder", "ellipsoid", "revolved", "mesh"]

@@ -22,7 +22,7 @@ from lerobot_wmrl.common.distributed import rank_and_size, wait_for_all
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.lerobot_compat import checkpoint_name
 from lerobot_wmrl.common.presets import Flags, format_flags
-from lerobot_wmrl.common.subcommand import run_subcommand
+from lerobot_wmrl.common.processes import run_subcommand
 from lerobot_wmrl.common.tracking import Tracker
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 

@@ -14,7 +14,7 @@ from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.presets import Flags, format_flags
-from lerobot_wmrl.common.subcommand import run_subcommand
+from lerobot_wmrl.common.processes import run_subcommand
 from lerobot_wmrl.data.episodes import DatasetSource, open_dataset
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.rl.callbacks import REAL_STEPS, Record, RolloutRecorder, record_folder

@@ -12,8 +12,8 @@ from lerobot.utils.constants import OBS_IMAGES
 from torch import Tensor, nn
 from torch.distributions import Normal
 
-from lerobot_wmrl.common.adapters import unwrapped
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.policies import unwrapped
 from lerobot_wmrl.rl.protocol import Observation, StochasticPolicy
 
 INITIAL_STD = 0.1

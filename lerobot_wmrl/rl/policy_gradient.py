@@ -17,7 +17,6 @@ from lerobot.rl.algorithms.configs import TrainingStats
 from torch import Tensor, nn
 from torch.optim import AdamW, Optimizer
 
-from lerobot_wmrl.common.adapters import load_trained_weights
 from lerobot_wmrl.common.distributed import (
     average_gradients,
     gather_counts,
@@ -26,6 +25,7 @@ from lerobot_wmrl.common.distributed import (
     mean_over_processes,
 )
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.policies import load_trained_weights
 from lerobot_wmrl.common.precision import require_exact_updates
 from lerobot_wmrl.rl.configuration_algorithms import PolicyGradientConfig
 from lerobot_wmrl.rl.policy_adapters import as_stochastic

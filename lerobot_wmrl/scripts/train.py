@@ -34,7 +34,7 @@ from lerobot_wmrl.common.command_line import RunConfig, claim_output_dir, run_co
 from lerobot_wmrl.common.constants import ACTION_NAMES, EVALUATION_SEED
 from lerobot_wmrl.common.distributed import LONGEST_WAIT, rank_and_size, wait_for_all
 from lerobot_wmrl.common.errors import FieldError, require_at_least
-from lerobot_wmrl.common.malloc import keep_freed_memory
+from lerobot_wmrl.common.precision import keep_freed_memory
 from lerobot_wmrl.common.presets import expand_preset, format_flags
 from lerobot_wmrl.common.tracking import make_wandb
 from lerobot_wmrl.rl.configuration_algorithms import GRPOConfig, PolicyGradientConfig, PPOConfig
@@ -159,7 +159,7 @@ def load_config(cfg: TrainConfig) -> PreTrainedConfig:
     Whether and where it is published is not taken from the checkpoint, which would overwrite the SFT policy
     on the hub, but from the command line or a resumed run's configuration.
     """
-    from lerobot_wmrl.common.policy_checkpoints import read_policy_config
+    from lerobot_wmrl.common.policies import read_policy_config
 
     path = parser.get_path_arg("policy") or (cfg.policy and cfg.policy.pretrained_path)
     if not path:
@@ -180,7 +180,7 @@ def train_policy(cfg: TrainConfig) -> None:
     from accelerate import PartialState
     from lerobot.utils.random_utils import set_seed
 
-    from lerobot_wmrl.common.policy_checkpoints import load_policy, load_processors
+    from lerobot_wmrl.common.policies import load_policy, load_processors
 
     algorithm = check_config(cfg)
     config = load_config(cfg)
@@ -228,8 +228,7 @@ def train_in(
     processors: tuple[Any, Any],
 ) -> None:
     """Check that policy and environment fit, then train."""
-    from lerobot_wmrl.common.adapters import with_new_adapters
-    from lerobot_wmrl.common.policy_checkpoints import adopt_features, check_fit
+    from lerobot_wmrl.common.policies import adopt_features, check_fit, with_new_adapters
     from lerobot_wmrl.rl.make_callbacks import Trained, make_callbacks
     from lerobot_wmrl.rl.protocol import make_pipeline
     from lerobot_wmrl.rl.rollout import RolloutBuffer

@@ -23,8 +23,7 @@ from lerobot.configs.rewards import RewardModelConfig
 from lerobot_wmrl.common.command_line import RunConfig, claim_output_dir, require_free, run_command
 from lerobot_wmrl.common.distributed import LONGEST_WAIT
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
-from lerobot_wmrl.common.malloc import keep_freed_memory
-from lerobot_wmrl.common.precision import PRECISIONS, training_dtype
+from lerobot_wmrl.common.precision import PRECISIONS, keep_freed_memory, training_dtype
 from lerobot_wmrl.common.presets import expand_preset
 from lerobot_wmrl.common.tracking import make_wandb
 from lerobot_wmrl.data.episodes import EpisodeTable, TrainingData

@@ -6,7 +6,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 PROBE = """
 import ctypes, os, platform
-from lerobot_wmrl.common.malloc import SETTINGS, keep_freed_memory
+from lerobot_wmrl.common.precision import MALLOC_SETTINGS, keep_freed_memory
 
 keep_freed_memory()
 if platform.libc_ver()[0] == "glibc":

@@ -22,7 +22,7 @@ from made_up import write_missing
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_wmrl.common.files import writing
-from lerobot_wmrl.common.progress import own_progress_lock
+from lerobot_wmrl.common.processes import own_progress_lock
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 
 ADVISED, NOT_ADVISED = 3, 4

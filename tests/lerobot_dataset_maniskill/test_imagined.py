@@ -10,7 +10,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.recorder import record
 from lerobot_wmrl.common.constants import KINDS
-from lerobot_wmrl.common.policy_checkpoints import read_policy_config
+from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig

@@ -22,12 +22,12 @@ from safetensors.torch import load_file
 from lerobot_policy_openvla.modeling_openvla import OpenVLAPolicy
 from lerobot_policy_openvla.processor_openvla import make_openvla_pre_post_processors
 from lerobot_policy_openvla.statistics import dataset_statistics
-from lerobot_wmrl.common.adapters import unwrapped
-from lerobot_wmrl.common.policy_checkpoints import (
+from lerobot_wmrl.common.policies import (
     check_weights,
     load_policy,
     load_processors,
     read_policy_config,
+    unwrapped,
 )
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.rl.policy_gradient import frozen_copy

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import torch
 
-from lerobot_wmrl.common.policy_checkpoints import load_processors, read_policy_config
+from lerobot_wmrl.common.policies import load_processors, read_policy_config
 from lerobot_wmrl.rl.protocol import make_pipeline
 from tests.rl.checkpoints import save_untrained_policy
 

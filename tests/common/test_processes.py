@@ -10,8 +10,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from lerobot_wmrl.common import subcommand
-from lerobot_wmrl.common.subcommand import run_subcommand
+from lerobot_wmrl.common import processes
+from lerobot_wmrl.common.processes import run_subcommand
 
 PATIENCE_S = 60
 
@@ -19,7 +19,7 @@ PATIENCE_S = 60
 @pytest.fixture
 def python(monkeypatch: pytest.MonkeyPatch) -> str:
     """The name of a command that is this interpreter."""
-    monkeypatch.setattr(subcommand, "find_program", lambda name: sys.executable)
+    monkeypatch.setattr(processes, "find_program", lambda name: sys.executable)
     return "python"
 
 
@@ -64,9 +64,11 @@ def test_it_is_killed_with_the_command_that_runs_it(tmp_path: Path) -> None:
         f"os.rename({str(pid_file)!r} + '.new', {str(pid_file)!r}); time.sleep({PATIENCE_S})"
     )
     outer = (
-        "import sys; from lerobot_wmrl.common import subcommand; "
-        "subcommand.find_program = lambda name: sys.executable; "
-        f"subcommand.run_subcommand(['python', '-c', {inner!r}])"
+        "import sys; from importlib.util import module_from_spec, spec_from_file_location; "
+        f"spec = spec_from_file_location('processes', {processes.__file__!r}); "
+        "processes = module_from_spec(spec); spec.loader.exec_module(processes); "
+        "processes.find_program = lambda name: sys.executable; "
+        f"processes.run_subcommand(['python', '-c', {inner!r}])"
     )
     process = subprocess.Popen([sys.executable, "-c", outer])
     end = time.monotonic() + PATIENCE_S

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
-from lerobot_wmrl.common.policy_checkpoints import check_fit, check_weights, load_policy, read_policy_config
+from lerobot_wmrl.common.policies import check_fit, check_weights, load_policy, read_policy_config
 from tests.rl.checkpoints import save_untrained_policy
 
 IMAGE = "observation.images.third_view"

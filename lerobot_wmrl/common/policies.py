@@ -1,0 +1,196 @@
+"""Checkpoints of policies, with adapters (PEFT) or without, loaded to act in an environment."""
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
+from lerobot.configs import PreTrainedConfig
+from lerobot.configs.default import PeftConfig as AdapterSettings
+from lerobot.configs.types import FeatureType, PolicyFeature
+from lerobot.utils.constants import OBS_IMAGES
+from safetensors import SafetensorError, safe_open
+
+from lerobot_wmrl.common.checkpoints import ADAPTERS_FILE, resolve_checkpoint
+from lerobot_wmrl.common.errors import FieldError
+
+
+def read_policy_config(path: str, overrides: list[str]) -> PreTrainedConfig:
+    """Read the configuration of a policy's checkpoint. Raises FieldError if it is none."""
+    folder = resolve_checkpoint(path)
+    if not (folder / "config.json").is_file() and (folder.exists() or path.startswith((".", "/"))):
+        raise FieldError(
+            "policy.path", path, "no checkpoint there (config.json is missing)",
+            "give the output folder of a policy's training, or a hub id",
+        )  # fmt: skip
+    try:
+        config = PreTrainedConfig.from_pretrained(str(folder), cli_overrides=overrides)
+    except Exception as error:  # draccus, the hub and json each raise their own
+        raise FieldError(
+            "policy.path", path, f"no policy can be loaded from it ({_first_line(error)})",
+            "give the output folder of a policy's training, or a hub id",
+        ) from error  # fmt: skip
+    config.pretrained_path = folder
+    return config
+
+
+def check_weights(config: PreTrainedConfig) -> None:
+    """Raise FieldError if the weights of a checkpoint on disk are missing or truncated; do not read them."""
+    if config.pretrained_path is None or not config.pretrained_path.is_dir():
+        return
+    try:
+        with safe_open(config.pretrained_path / weights_file(config), framework="pt"):
+            pass
+    except (SafetensorError, OSError) as error:
+        raise _unreadable(config, error) from error
+
+
+def weights_file(config: PreTrainedConfig) -> str:
+    """Return the name of the file with a checkpoint's trained weights."""
+    return ADAPTERS_FILE if config.use_peft else SAFETENSORS_SINGLE_FILE
+
+
+def load_policy(config: PreTrainedConfig) -> Any:
+    """Load a policy with its weights, in evaluation mode. Raises FieldError if they do not fit."""
+    from lerobot.policies.factory import get_policy_class
+
+    try:
+        if config.use_peft:
+            return load_with_adapters(config).eval()
+        policy_class = get_policy_class(config.type)
+        return policy_class.from_pretrained(str(config.pretrained_path), config=config, strict=True)
+    except (SafetensorError, RuntimeError, OSError) as error:
+        raise _unreadable(config, error) from error
+
+
+def load_processors(config: PreTrainedConfig) -> tuple[Any, Any]:
+    """Load the checkpoint's pre- and postprocessor, on the policy's device."""
+    from lerobot.policies.factory import make_pre_post_processors
+
+    overrides = {"device_processor": {"device": config.device}}
+    return make_pre_post_processors(config, str(config.pretrained_path), preprocessor_overrides=overrides)
+
+
+def adopt_features(config: PreTrainedConfig, shown: Mapping[str, tuple[int, ...]]) -> None:
+    """Let a policy that saw no dataset yet see what the environment shows, as lerobot-eval does."""
+    if config.input_features:
+        return
+    kinds = {name: FeatureType.VISUAL if name.startswith(OBS_IMAGES) else FeatureType.STATE for name in shown}
+    config.input_features = {
+        name: PolicyFeature(type=kinds[name], shape=shape) for name, shape in shown.items()
+    }
+    config.validate_features()
+
+
+def check_fit(config: PreTrainedConfig, shown: Mapping[str, tuple[int, ...]], action_size: int) -> None:
+    """Raise FieldError unless an environment shows what the policy looks at, in the same sizes.
+
+    Args:
+        config: the policy's.
+        shown: the environment's observations by LeRobot's names with their shapes, images (3, H, W).
+        action_size: components of the environment's actions.
+    """
+    cameras = ", ".join(name for name in shown if name.startswith(OBS_IMAGES)) or "none"
+    path = config.pretrained_path
+    for name, feature in (config.input_features or {}).items():
+        if name not in shown:
+            raise FieldError(
+                "policy.path", path,
+                f"the policy needs {name}, which the environment does not have (its cameras: {cameras})",
+                "use an environment made from the policy's cameras and state, or train the policy on what "
+                "this one shows",
+            )  # fmt: skip
+        if shown[name] != tuple(feature.shape):
+            needed = f"the policy needs {name} of shape {tuple(feature.shape)}"
+            raise FieldError(
+                "policy.path", path, f"{needed}, the environment has {shown[name]}",
+                "use the image size that the policy was trained on",
+            )  # fmt: skip
+    if config.action_feature is None:
+        raise FieldError(
+            "policy.path", path, "does not say how many components an action has",
+            "train it on a dataset with the environment's actions",
+        )  # fmt: skip
+    wanted = config.action_feature.shape[0]
+    if wanted != action_size:
+        raise FieldError(
+            "policy.path", path, f"the policy has {wanted} action components, the environment {action_size}",
+            "train it on a dataset with the environment's actions",
+        )  # fmt: skip
+
+
+def with_new_adapters(policy: Any, settings: AdapterSettings) -> Any:
+    """Add adapters to a policy as lerobot-train does. Raises FieldError if it has some already."""
+    if has_adapters(policy):
+        raise FieldError("peft", None, "the policy has adapters, which are trained further; leave it out")
+    return policy.wrap_with_peft(peft_cli_overrides=asdict(settings))
+
+
+def load_with_adapters(config: PreTrainedConfig, **options: Any) -> Any:
+    """Load the policy that an adapter was trained on, with the adapter, ready to be trained further.
+
+    Args:
+        config: of the checkpoint that holds the adapter.
+        options: for the policy's `from_pretrained`.
+
+    Raises:
+        ValueError: the policy that was adapted is not there.
+    """
+    from lerobot.policies.factory import get_policy_class
+    from peft import PeftConfig, PeftModel
+
+    path = str(config.pretrained_path)
+    adapter = PeftConfig.from_pretrained(path)
+    base = adapter.base_model_name_or_path
+    if not may_be_on_hub(base) and not Path(base).is_dir():
+        raise ValueError(
+            f"{path}: adapts the policy in {base}, which is not there; put it back, start this where its "
+            "training was started, or write where it is now into adapter_config.json, base_model_name_or_path"
+        )
+    policy_class = get_policy_class(config.type)
+    policy = policy_class.from_pretrained(
+        base, config=config, revision=adapter.revision, strict=True, **options
+    )
+    return PeftModel.from_pretrained(policy, path, config=adapter, is_trainable=True)
+
+
+def may_be_on_hub(name: str) -> bool:
+    """Return whether a name can be one of the hub's, `model` or `owner/model`. All others are paths."""
+    return len(Path(name).parts) <= 2 and not name.startswith((".", "/"))
+
+
+def unwrapped(policy: Any) -> Any:
+    """Return the policy inside its adapters."""
+    return policy.get_base_model() if has_adapters(policy) else policy
+
+
+def has_adapters(policy: Any) -> bool:
+    """Return whether a policy is wrapped in PEFT's adapters."""
+    from peft import PeftModel
+
+    return isinstance(policy, PeftModel)
+
+
+def load_trained_weights(policy: Any, weights: dict[str, Any]) -> None:
+    """Load all weights of a checkpoint, or its adapters' alone. Raises RuntimeError if they do not fit."""
+    from peft import set_peft_model_state_dict
+
+    if not has_adapters(policy):
+        policy.load_state_dict(weights)
+        return
+    unexpected = set_peft_model_state_dict(policy, weights).unexpected_keys
+    if unexpected:
+        raise RuntimeError(f"the adapters do not fit the policy: {unexpected[0]} is unknown")
+
+
+def _unreadable(config: PreTrainedConfig, error: Exception) -> FieldError:
+    return FieldError(
+        "policy.path", config.pretrained_path,
+        f"{weights_file(config)} cannot be read ({_first_line(error)})",
+        "it is missing, truncated or of another version: use an earlier checkpoint or train again",
+    )  # fmt: skip
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip() or type(error).__name__).splitlines()[0]
