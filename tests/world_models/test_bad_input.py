@@ -79,7 +79,7 @@ def test_impossible_sizes_are_named(setting, message, small_dataset, trained_mod
 
 @pytest.mark.parametrize("name", ["steps", "batch_size", "save_freq", "log_freq"])
 def test_impossible_schedules_are_named(name, small_dataset, tmp_path):
-    with pytest.raises(ValueError, match=f"--{name}=0: must be at least 1"):
+    with pytest.raises(FieldError, match=f"^{name}=0: must be at least 1"):
         train_tokenizer(Path(small_dataset.root), tmp_path / "out", **{name: 0})
 
 
@@ -227,5 +227,5 @@ def test_batches_that_do_not_fit_are_named(trained_models):
 
 
 def test_another_precision_is_named(small_dataset, tmp_path):
-    with pytest.raises(ValueError, match="--precision=half: choose one of auto, float32, bfloat16"):
+    with pytest.raises(FieldError, match=r"^precision=half: choose one of auto, float32, bfloat16"):
         run_training(tokenizer_config(), Path(small_dataset.root), tmp_path / "run", precision="half")
