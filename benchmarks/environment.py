@@ -44,7 +44,7 @@ def learned_rewards(model: ActionWorldModelRewardModel) -> dict[str, PreTrainedR
     config, device = model.config, model.state_mean.device.type
     sizes = config.tokenizer
     proxy = ProxyConfig(device=device, cameras=sizes.cameras, image_size=sizes.image_size)
-    embedding = EmbeddingConfig(device=device, world_model="untrained", hidden_size=config.width)
+    embedding = EmbeddingConfig(device=device, world_model="untrained", hidden_size=config.dynamics.width)
     return {
         "proxy": ProxyRewardModel(proxy).to(device).eval(),
         "embedding": EmbeddingRewardModel(embedding).to(device).eval(),

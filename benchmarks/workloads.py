@@ -9,8 +9,9 @@ from torch import Tensor
 
 from lerobot_wmrl.common.precision import compute_in
 from lerobot_wmrl.data.clips import Clip
-from lerobot_wmrl.data.frames import Context
-from lerobot_wmrl.world_models.imagination import ImaginationState
+from lerobot_wmrl.data.frames import Context, Frames
+from lerobot_wmrl.world_models.autoregressive.dynamics import AutoregressiveImagination
+from lerobot_wmrl.world_models.dynamics import Imagination as RunningImagination
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 
 STEPS = 8
@@ -32,15 +33,15 @@ class Imagination:
         self.action = self.model.action_mean.expand(self.batch, -1).clone()
         self.state = self._running()
 
-    def _running(self) -> ImaginationState:
+    def _running(self) -> RunningImagination:
         tokens = torch.zeros(
             self.batch, self.model.tokenizer.tokens_per_frame, dtype=torch.long, device=self.device
         )
-        state = self.model.start(
-            tokens, self.model.state_mean.expand(self.batch, -1), dtype=self.dtype,
-            depth=torch.ones(tokens.shape, device=self.device),
-            context=black_context(self.model, self.batch, self.device),
+        frames = Frames(
+            tokens, self.model.state_mean.expand(self.batch, -1),
+            black_context(self.model, self.batch, self.device), torch.ones(tokens.shape, device=self.device),
         )  # fmt: skip
+        state = self.model.start(frames, dtype=self.dtype)
         for _ in range(self.frames):
             self.model.step(state, self.action)
         return state
@@ -49,7 +50,7 @@ class Imagination:
     def frames(self) -> int:
         """That are remembered in the long run: the window, or half of what an anchor is kept for."""
         config = self.model.config
-        return config.clip_length // 2 if config.dynamics == "anchored" else config.window
+        return config.clip_length // 2 if config.dynamics.type == "anchored" else config.memory
 
     def step(self) -> Tensor:
         """Tokens of one more frame, (B, S)."""
@@ -65,22 +66,21 @@ class Imagination:
         model, state, frames = self.model, self.state, self.frames
         condition = model.encode_actions(self.action[:, None].expand(-1, frames, -1))
         with compute_in(self.dtype, self.device):
-            if model.config.dynamics == "anchored":
-                last = torch.full((self.batch, 1), frames - 1, device=self.device)
-                prediction = model.network(
-                    state.digits, state.proprioception, *condition, length=frames, frames=last,
-                    context=state.context,
-                )  # fmt: skip
-            else:
-                seen = (x.expand(-1, frames, *x.shape[2:]) for x in (state.digits, state.proprioception))
+            if isinstance(state, AutoregressiveImagination):
+                seen = (x.expand(-1, frames, *x.shape[2:]) for x in (state.codes, state.proprioception))
                 depth = state.depth.expand(-1, frames, -1)
-                prediction = model.network(*seen, *condition, depth=depth)
-        return model.network.codebook.sample(prediction.logits[:, -1], 0.0, None)
+                prediction, _ = model.dynamics.network(*seen, condition, depth=depth)
+            else:
+                last = torch.full((self.batch, 1), frames - 1, device=self.device)
+                prediction = model.dynamics.network(
+                    state.codes, state.proprioception, condition, frames, last, state.context
+                )
+        return model.dynamics.network.codebook.sample(prediction.logits[:, -1], 0.0, None)
 
     def bytes_a_frame(self) -> float:
         """Weights, shared by the batch, and what one imagination remembers, each read once."""
-        weights = sum(parameter.numel() for parameter in self.model.network.parameters())
-        return (weights / self.batch + self.state.cache.numbers / self.batch) * self.dtype.itemsize
+        weights = sum(parameter.numel() for parameter in self.model.dynamics.network.parameters())
+        return (weights / self.batch + self.state.num_elements / self.batch) * self.dtype.itemsize
 
 
 def repeated(work: Work, graphed: bool) -> Work:

@@ -57,7 +57,7 @@ def measure_batch(
     dtype = imagination_dtype(device)
     fast, plain = (Imagination(model, batch, kind, device) for kind in (dtype, torch.float32))
     frames = batch * model.config.clip_length
-    graphed = device.type == "cuda" and model.config.dynamics == "autoregressive"
+    graphed = device.type == "cuda" and model.config.dynamics.type == "autoregressive"
     works: dict[str, tuple[float, Work]] = {
         "imagined": (batch * STEPS, repeated(fast.step, graphed)),
         "imagined_and_decoded": (batch * STEPS, repeated(fast.step_and_decode, graphed)),
@@ -165,7 +165,7 @@ def main() -> None:
             for name in ("dynamics", "layers", "width", "heads", "patch", "window", "clip_length")
         }
         | {"cameras": config.tokenizer.cameras},
-        "transformer_tokens": model.network.transformer_tokens,
+        "transformer_tokens": model.dynamics.network.tokens_per_frame,
         "matmul_gflop_per_s": round(matmul / 1e9, 1),
         "stream_gbyte_per_s": round(stream / 1e9, 1),
         "by_batch": [measure_batch(model, batch, matmul, stream) for batch in given.batches],

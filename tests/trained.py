@@ -1,21 +1,28 @@
 """Small models trained for a few steps by the real training code, for tests that need trained ones."""
 
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from lerobot_wmrl.data.episodes import TrainingData
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig, train_world_model
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig, TokenizerConfig
-from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig, TextWorldModelConfig
+from lerobot_wmrl.world_models.configuration_world_model import (
+    ActionWorldModelConfig,
+    DynamicsConfig,
+    TextWorldModelConfig,
+)
 
-TINY: dict[str, Any] = {
-    "layers": 1,
-    "width": 32,
-    "heads": 2,
-    "window": 24,
-    "clip_length": 10,
-    "code_width": 8,
-}
+SIZES: dict[str, Any] = {"layers": 1, "width": 32, "heads": 2, "code_width": 8}
+CLIP_LENGTH = 10
+
+
+def nested(settings: dict[str, Any]) -> dict[str, Any]:
+    """Settings of a world model, of which those that are its dynamics' are given beside the others."""
+    kind = DynamicsConfig.get_choice_class(settings.get("dynamics", "anchored"))
+    own = {field.name for field in fields(kind)} & settings.keys()
+    others = {name: value for name, value in settings.items() if name not in own}
+    return {**others, "dynamics": kind(**{name: settings[name] for name in own})}
 
 
 def run_training(config: Any, root: Path, output_dir: Path, steps: int = 3, **settings: Any) -> Path:
@@ -45,12 +52,15 @@ def train_tokenizer(root: Path, output_dir: Path, **settings: Any) -> Path:
 
 
 def action_config(tokenizer: Path, **settings: Any) -> ActionWorldModelConfig:
-    """A small action world model."""
-    return ActionWorldModelConfig(tokenizer_path=str(tokenizer), device="cpu", **{**TINY, **settings})
+    """A small action world model; settings of its dynamics stand beside the others."""
+    options = {**SIZES, "clip_length": CLIP_LENGTH, **settings}
+    return ActionWorldModelConfig(tokenizer_path=str(tokenizer), device="cpu", **nested(options))
 
 
 def text_config(tokenizer: Path, **settings: Any) -> TextWorldModelConfig:
-    """A small text world model."""
-    return TextWorldModelConfig(
-        tokenizer_path=str(tokenizer), device="cpu", goal_horizon=6, **{**TINY, **settings}
-    )
+    """A small autoregressive text world model; settings of its dynamics stand beside the others."""
+    options = {
+        **SIZES, "clip_length": CLIP_LENGTH, "goal_horizon": 6, "dynamics": "autoregressive",
+        "conditioning": "cross_attention", **settings,
+    }  # fmt: skip
+    return TextWorldModelConfig(tokenizer_path=str(tokenizer), device="cpu", **nested(options))

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from lerobot_wmrl.data.episodes import EpisodeTable
 from lerobot_wmrl.data.frame_cache import frames_to_tensor
-from lerobot_wmrl.data.frames import NO_CONTEXT, Context
+from lerobot_wmrl.data.frames import NO_CONTEXT, Context, Frames
 
 
 class Clip(NamedTuple):
@@ -42,6 +42,11 @@ class Clip(NamedTuple):
     instructions: list[str]
     depth: Tensor | None = None
     context: Context = NO_CONTEXT
+
+    def first(self) -> Frames:
+        """Return the clips' first frames."""
+        depth = None if self.depth is None else self.depth[:, 0]
+        return Frames(self.tokens[:, 0], self.state[:, 0], self.context, depth)
 
 
 def take_rows(values: Tensor, index: Tensor) -> Tensor:

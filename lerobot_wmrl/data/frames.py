@@ -9,17 +9,17 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Context:
-    """Of B first frames, maps (B, N, C, h, w); without the option none.
+    """What the tokenizer keeps of B first frames, maps (B, N, C, h, w); no map without its option `context`.
 
-    The first map are their features at the coarsest scale. The others are what each fusion of the tokenizer
+    The first map holds their features at the coarsest scale. The others are what each fusion of the tokenizer
     adds to its features, which is the same for every frame of an episode: the encoder's, then the decoder's
-    from coarse to fine. Who only asks the dynamics can leave these out.
+    from coarse to fine. Callers that only ask the dynamics can leave these out.
     """
 
     maps: tuple[Tensor, ...] = ()
 
     def __getitem__(self, rows: Any) -> "Context":
-        """The context of some of the B frames: an index, mask or slice of the first dimension."""
+        """Return some of the B rows: an index, mask or slice of the first dimension."""
         return Context(tuple(each[rows] for each in self.maps))
 
     def __len__(self) -> int:
@@ -27,11 +27,11 @@ class Context:
 
     @property
     def features(self) -> Tensor:
-        """(B, N, C, h, w)."""
+        """Coarsest features, (B, N, C, h, w)."""
         return self.maps[0]
 
     def replaced(self, mask: Tensor, new: "Context") -> "Context":
-        """The rows of `new` where `mask` (B,) is True, else one's own."""
+        """Return a copy with the rows of `new` where `mask` (B,) is True."""
         return Context(
             tuple(
                 torch.where(mask[:, None, None, None, None], b, a)
@@ -45,3 +45,48 @@ class Context:
 
 
 NO_CONTEXT: Final = Context()
+
+
+@dataclass(frozen=True)
+class Frames:
+    """What an imagination knows of the moment it begins at, for B episodes.
+
+    Args:
+        tokens: (B, S), the tokenizer's.
+        proprioception: (B, P), in the dataset's units.
+        context: of the first frames of the B episodes, where the tokenizer is conditioned on them.
+        depth: (B, S) metres of each token, for world models that look at depth.
+    """
+
+    tokens: Tensor
+    proprioception: Tensor
+    context: Context = NO_CONTEXT
+    depth: Tensor | None = None
+
+    def __getitem__(self, rows: Any) -> "Frames":
+        """Return some of the B rows: an index, mask or slice of the first dimension."""
+        depth = None if self.depth is None else self.depth[rows]
+        return Frames(self.tokens[rows], self.proprioception[rows], self.context[rows], depth)
+
+    def __len__(self) -> int:
+        return len(self.tokens)
+
+
+@dataclass(frozen=True)
+class Past:
+    """The H frames before those with which B imaginations begin, oldest first, and the action after each.
+
+    Args:
+        frames: H of them, without context: an episode has one, which the frames after the past carry.
+        actions: H of (B, A), in the dataset's units.
+    """
+
+    frames: tuple[Frames, ...] = ()
+    actions: tuple[Tensor, ...] = ()
+
+    def __getitem__(self, rows: Any) -> "Past":
+        """Return some of the B rows: an index, mask or slice of the first dimension."""
+        return Past(tuple(each[rows] for each in self.frames), tuple(each[rows] for each in self.actions))
+
+
+NO_PAST: Final = Past()

@@ -6,6 +6,7 @@ K is the number of starts, T the frames of each (all but the last are the past),
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 from zipfile import BadZipFile
@@ -26,7 +27,7 @@ from lerobot_wmrl.data.episodes import (
     read_episodes,
 )
 from lerobot_wmrl.data.frame_cache import cached_frames, depth_at, frames_to_tensor
-from lerobot_wmrl.data.frames import Context
+from lerobot_wmrl.data.frames import Frames, Past
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.maniskill.recordings import scene_splits
@@ -38,7 +39,6 @@ from lerobot_wmrl.world_models.modeling_world_model import (
     ActionWorldModelRewardModel,
     TextWorldModelRewardModel,
 )
-from lerobot_wmrl.world_models.past import Frames, Past
 
 GOAL_BATCH = 64
 """Goal frames that are imagined at once."""
@@ -77,13 +77,12 @@ class FirstFrames(NamedTuple):
 
 
 class Starts(NamedTuple):
-    """K starts, tokenised: the frames before (past), the first frames (now), the images (K, N, 3, H, W) that
-    these decode to, the tokenizer's context of the earliest frame, K instructions."""
+    """K starts, tokenised: the first frames (now), the images (K, N, 3, H, W) that these decode to, the
+    frames before (past), K instructions. The context of `now` is that of the earliest frame."""
 
     now: Frames
     images: Tensor
     past: Past
-    context: Context
     instructions: list[str]
 
     def __len__(self) -> int:
@@ -266,36 +265,36 @@ def load_starts(
         images = frames_to_tensor(frames.images[:, row]).to(device)
         known = None if depth is None else depth[:, row]
         tokens = model.tokenizer.encode(images, context)
-        seen.append(Frames(tokens, state[:, row, : model.config.state_size], known))
-    *before, now = seen
+        seen.append(Frames(tokens, state[:, row, : model.config.state_size], depth=known))
+    *before, last = seen
+    now = replace(last, context=context)
     decoded = model.tokenizer.decode_with_features(now.tokens, context)
     past = Past(tuple(before), actions.unbind(1))
-    starts = Starts(now, decoded.images, past, context, frames.instructions)
+    starts = Starts(now, decoded.images, past, frames.instructions)
     if text_model is None:
         return starts, None
     depth = frames.depth(text_model)
-    last = depth if depth is None else depth[:, -1]
-    return starts, imagine_goals(text_model, starts, measure.features(decoded), measure, state[:, -1], last)
+    begin = Frames(now.tokens, state[:, -1], context, depth if depth is None else depth[:, -1])
+    goals = imagine_goals(text_model, begin, frames.instructions, measure.features(decoded), measure)
+    return starts, goals
 
 
 @torch.no_grad()
 def imagine_goals(
-    model: TextWorldModelRewardModel, starts: Starts, features: Features, measure: Similarity,
-    state: Tensor, depth: Tensor | None,
+    model: TextWorldModelRewardModel, frames: Frames, instructions: list[str], features: Features,
+    measure: Similarity,
 ) -> Goals:  # fmt: skip
     """Imagine the goal frame of every start, GOAL_BATCH at once.
 
     Args:
+        frames: the first frames of the K starts, as the text model is given them.
+        instructions: one for each.
         features: of the first frames, as `measure` computes them, [(K·N, …)].
-        state: (K, P) in the dataset's units. depth: (K, S) in metres if the model looks at it.
     """
     goals = [
-        imagine_goal(
-            model, starts.now.tokens[part], state[part], starts.instructions[part], starts.context[part],
-            depth if depth is None else depth[part],
-        )
-        for part in (slice(i, i + GOAL_BATCH) for i in range(0, len(state), GOAL_BATCH))
-    ]  # fmt: skip
+        imagine_goal(model, frames[part], instructions[part])
+        for part in (slice(i, i + GOAL_BATCH) for i in range(0, len(frames), GOAL_BATCH))
+    ]
     parts = zip(*(measure.features(goal.decoded) for goal in goals), strict=True)
     goal_features = [torch.cat(part) for part in parts]
     similarity = measure(features, goal_features, model.tokenizer.num_cameras)

@@ -11,7 +11,7 @@ from torch.distributions import Bernoulli
 from lerobot_wmrl.common.errors import FieldError
 
 if TYPE_CHECKING:
-    from lerobot_wmrl.world_models.imagination import Imagined
+    from lerobot_wmrl.world_models.dynamics import Imagined
 
 SIGNALS: Final = ("token_entropy", "done_entropy")
 EFFECTS: Final = ("end", "weight")

@@ -21,13 +21,12 @@ from lerobot_wmrl.rewards.general import consecutive_count, sparse_reward
 from lerobot_wmrl.rewards.loading import Reward, load_reward
 from lerobot_wmrl.rewards.similarity import Similarity, make_similarity, select_features
 from lerobot_wmrl.world_models.checkpoint import check_same_tokenizer, load_model
+from lerobot_wmrl.world_models.dynamics import Imagined
 from lerobot_wmrl.world_models.frame_tokenizer import Decoded
-from lerobot_wmrl.world_models.imagination import Imagined
 from lerobot_wmrl.world_models.modeling_world_model import (
     ActionWorldModelRewardModel,
     TextWorldModelRewardModel,
 )
-from lerobot_wmrl.world_models.past import restart_after, start_after
 
 Observation = dict[str, Any]
 
@@ -91,7 +90,7 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         drawn = self._seeded_starts(seed)
         self._begin_at(drawn)
         starts, now = self.starts, self.starts.now[drawn]
-        self._imagination = start_after(self.model, starts.past[drawn], now, starts.context[drawn])
+        self._imagination = self.model.start(now, past=starts.past[drawn])
         self._elapsed = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
         self._done_streak = torch.zeros_like(self._elapsed)
         if self.goals is not None:
@@ -106,7 +105,7 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
             ValueError: the actions have another shape, or contain NaN; then reset before the next step.
         """
         clipped = self._clip(actions)
-        imagined = self.model.step(self._imagination, clipped, self.generator)
+        imagined = self.model.step(self._imagination, clipped)
         uncertainty = entropies(imagined)
         terminated, truncated = self._advance(imagined, uncertainty)
         decoded = self.model.decode(imagined.tokens, self._imagination.context)
@@ -150,8 +149,8 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         """Begin new episodes where `mask` (B,) is True. Return the observation with these rows replaced."""
         self._begin_at(torch.where(mask, self._draw_starts(), self._start_index))
         index, starts = self._start_index, self.starts
-        past, now, context = starts.past[index], starts.now[index], starts.context[index]
-        restart_after(self.model, self._imagination, mask, past, now, context)
+        now = starts.now[index]
+        self.model.restart(self._imagination, mask, now, starts.past[index])
         self._elapsed = self._elapsed.masked_fill(mask, 0)
         self._done_streak = self._done_streak.masked_fill(mask, 0)
         if self.goals is not None:

@@ -209,15 +209,14 @@ def robustness(
         first frame, both decoded.
     """
     episodes, device = episodes[:BATCH], model.state_mean.device
-    tokens, context = recording.first_frames(episodes, model.tokenizer)
-    state, own = recording.first_state(episodes, device), recording.actions(episodes, HORIZON, device)
-    depth = recording.first_depth(model, episodes)
+    starts, own = recording.starts(model, episodes), recording.actions(episodes, HORIZON, device)
     low, high = recording.table.action.min(0), recording.table.action.max(0)
     result: dict[str, Any] = {"episodes": len(episodes), "frames": HORIZON}
     for name, actions in extreme_actions(own, low, high).items():
-        imagined = imagine_frames(model, tokens, state, actions, depth, context)
+        imagined = imagine_frames(model, starts, actions)
         predicted = first_run((imagined.done_probability >= threshold).cpu().numpy(), frames) >= 0
-        first, last = (model.tokenizer.decode(t, context) for t in (tokens, imagined.tokens[:, -1]))
+        pair = starts.tokens, imagined.tokens[:, -1]
+        first, last = (model.tokenizer.decode(tokens, starts.context) for tokens in pair)
         result[name] = {
             "predicted_success": Proportion(int(predicted.sum()), len(predicted)).as_json(),
             "psnr_to_start": Estimate.mean(psnr(last, first).cpu().numpy()).as_json(),

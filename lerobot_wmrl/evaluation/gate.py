@@ -21,7 +21,6 @@ from lerobot_wmrl.data.episodes import EpisodeTable, check_dataset, open_dataset
 from lerobot_wmrl.data.frame_cache import cached_frames
 from lerobot_wmrl.evaluation.replay import MAX_ACTIONS, EpisodeReplay, Recording, in_batches
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
-from lerobot_wmrl.world_models.open_loop import open_loop
 
 MAX_FALSE_POSITIVE_RATE: Final = 0.05
 MIN_RECALL: Final = 0.9
@@ -181,10 +180,8 @@ def predict_done(model: ActionWorldModelRewardModel, recording: Recording) -> It
     """Predict done for all episodes open loop, short ones first, without drawing frames."""
     device, length = model.state_mean.device, recording.table.length
     for batch in in_batches(np.argsort(length, kind="stable")):
-        tokens, context = recording.first_frames(batch, model.tokenizer)
-        state, depth = recording.first_state(batch, device), recording.first_depth(model, batch)
         actions = recording.actions(batch, min(int(length[batch].max()), MAX_ACTIONS), device)
-        probability = open_loop(model, tokens, state, actions, context, depth).done_logit.sigmoid()
+        probability = model.open_loop(recording.starts(model, batch), actions).done_logit.sigmoid()
         for row, episode in enumerate(batch.tolist()):
             done = recording.table.done[recording.rows(episode)]
             yield PredictedDone(episode, probability[row, : len(done)], done)

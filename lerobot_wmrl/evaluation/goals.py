@@ -82,17 +82,18 @@ class Goals:
 @torch.no_grad()
 def imagine_goals(model: TextWorldModelRewardModel, recording: Recording, episodes: np.ndarray) -> Goals:
     """Imagine goals from the first frames of at most `MAX_GOALS` episodes and find the nearest finals."""
-    table, device, tokenizer = recording.table, model.state_mean.device, model.tokenizer
-    starts = episodes[:MAX_GOALS]
-    tokens, context = recording.first_frames(starts, tokenizer)
-    instructions = [table.instructions[episode] for episode in starts]
-    state, depth = recording.first_state(starts, device), recording.first_depth(model, starts)
-    goal = imagine_goal(model, tokens, state, instructions, context, depth)
-    start, finals = tokenizer.decode_with_features(tokens, context), final_frames(tokenizer, recording)
+    tokenizer, starts = model.tokenizer, episodes[:MAX_GOALS]
+    frames = recording.starts(model, starts)
+    instructions = [recording.table.instructions[episode] for episode in starts]
+    goal = imagine_goal(model, frames, instructions)
+    start = tokenizer.decode_with_features(frames.tokens, frames.context)
+    finals = final_frames(tokenizer, recording)
     nearest, distance = np.full(len(starts), -1), np.full(len(starts), np.nan)
     start_distance = distance
     if finals is not None:
-        same = np.array([[table.instructions[f] == text for f in finals.episodes] for text in instructions])
+        same = np.array(
+            [[recording.table.instructions[f] == text for f in finals.episodes] for text in instructions]
+        )
         pairs = feature_distances(goal.decoded.features, finals.features, tokenizer.num_cameras)
         distance, nearest = least(pairs, same)
         pairs = feature_distances(start.features, finals.features, tokenizer.num_cameras)

@@ -16,7 +16,7 @@ from lerobot_wmrl.data.frame_cache import cached_frames, frames_to_tensor
 from lerobot_wmrl.evaluation.image_metrics import motion_mask, psnr_from_mse
 from lerobot_wmrl.world_models.codebook import CodeBook, make_codebook
 from lerobot_wmrl.world_models.modeling_frame_tokenizer import FrameTokenizerRewardModel
-from lerobot_wmrl.world_models.world_model import WorldModelRewardModel
+from lerobot_wmrl.world_models.modeling_world_model import WorldModelRewardModel
 
 RECONSTRUCTION_FILE = "reconstruction.json"
 MAX_FRAMES = 2000

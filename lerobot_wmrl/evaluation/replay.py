@@ -11,11 +11,12 @@ from tqdm import tqdm
 
 from lerobot_wmrl.data.episodes import EpisodeTable
 from lerobot_wmrl.data.frame_cache import depth_at, frames_to_tensor
-from lerobot_wmrl.data.frames import NO_CONTEXT, Context
+from lerobot_wmrl.data.frames import Context, Frames
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
-from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
-from lerobot_wmrl.world_models.open_loop import imagined_steps
-from lerobot_wmrl.world_models.world_model import WorldModelRewardModel
+from lerobot_wmrl.world_models.modeling_world_model import (
+    ActionWorldModelRewardModel,
+    WorldModelRewardModel,
+)
 
 DELTA_PSNR_STEP = 15
 """Imagined frames after which delta-PSNR is measured, as in RoboScape."""
@@ -50,13 +51,12 @@ class Recording:
         context = tokenizer.context(images)
         return tokenizer.encode(images, context), context
 
-    def first_state(self, episodes: np.ndarray, device: torch.device) -> Tensor:
-        """Return the proprioception of the first frames, (E, P)."""
-        return torch.from_numpy(self.table.state[self.table.start[episodes]]).to(device)
-
-    def first_depth(self, model: WorldModelRewardModel, episodes: np.ndarray) -> Tensor | None:
-        """Return the depth of the first frames, (E, S) metres, if the model looks at depth."""
-        return depth_at(model, self.table.dataset, self.table.start[episodes])
+    def starts(self, model: WorldModelRewardModel, episodes: np.ndarray) -> Frames:
+        """Return the first frames of E episodes as the model sees them."""
+        tokens, context = self.first_frames(episodes, model.tokenizer)
+        rows = self.table.start[episodes]
+        state = torch.from_numpy(self.table.state[rows]).to(tokens.device)
+        return Frames(tokens, state, context, depth_at(model, self.table.dataset, rows))
 
     def actions(self, episodes: np.ndarray, steps: int, device: torch.device) -> Tensor:
         """Return the first `steps` actions of E episodes; short episodes repeat their last. (E, steps, A)"""
@@ -71,13 +71,13 @@ class ImaginedFrames(NamedTuple):
         tokens: (B, T, S).
         done_probability: (B, T).
         proprioception: (B, T, P).
-        depth: (B, T, S) metres of each token, (B, T, 0) if the model does not predict it.
+        depth: (B, T, S) metres of each token, None if the model does not predict it.
     """
 
     tokens: Tensor
     done_probability: Tensor
     proprioception: Tensor
-    depth: Tensor
+    depth: Tensor | None
 
 
 @dataclass(frozen=True)
@@ -108,21 +108,15 @@ class EpisodeReplay:
 
 
 @torch.no_grad()
-def imagine_frames(
-    model: ActionWorldModelRewardModel, tokens: Tensor, state: Tensor, actions: Tensor,
-    depth: Tensor | None = None, context: Context = NO_CONTEXT,
-) -> ImaginedFrames:  # fmt: skip
-    """Imagine every frame from tokens (B, S), state (B, P), depth (B, S) and context with actions (B, T, A).
-
-    The noise is the same at every call.
-    """
-    generator = torch.Generator(tokens.device).manual_seed(0)
-    steps = imagined_steps(model, tokens, state, actions, context, depth, generator)
+def imagine_frames(model: ActionWorldModelRewardModel, frames: Frames, actions: Tensor) -> ImaginedFrames:
+    """Imagine every frame from B first ones on, with actions (B, T, A)."""
+    steps = model.imagine(frames, actions)
+    depth = [step.depth for step in steps if step.depth is not None]
     return ImaginedFrames(
         torch.stack([step.tokens for step in steps], 1),
         torch.stack([step.done_logit.sigmoid() for step in steps], 1),
         torch.stack([step.proprioception for step in steps], 1),
-        torch.stack([step.depth for step in steps], 1),
+        torch.stack(depth, 1) if depth else None,
     )
 
 
@@ -152,36 +146,37 @@ def _replay_batch(
 ) -> Iterator[EpisodeReplay]:
     device, table = model.state_mean.device, recording.table
     longest = min(int(table.length[episodes].max()), MAX_ACTIONS)
-    tokens, context = recording.first_frames(episodes, model.tokenizer)
-    state, depth = recording.first_state(episodes, device), recording.first_depth(model, episodes)
-    own = imagine_frames(model, tokens, state, recording.actions(episodes, longest, device), depth, context)
+    frames = recording.starts(model, episodes)
+    own = imagine_frames(model, frames, recording.actions(episodes, longest, device))
     comparable = (table.length[episodes] > DELTA_PSNR_STEP) & (episodes != others)
     if comparable.any():
         actions = recording.actions(others, DELTA_PSNR_STEP, device)
-        shuffled = imagine_frames(model, tokens, state, actions, depth, context).tokens[:, -1]
+        shuffled = imagine_frames(model, frames, actions).tokens[:, -1]
     for row, episode in enumerate(episodes.tolist()):
         rows = recording.rows(episode)
         steps = slice(0, rows.stop - rows.start)
         yield EpisodeReplay(
-            episode, context[[row]], own.tokens[row, steps], own.done_probability[row, steps],
+            episode, frames.context[[row]], own.tokens[row, steps], own.done_probability[row, steps],
             own.proprioception[row, steps], shuffled[row] if comparable[row] else None, table.done[rows],
-            recorded_and_imagined_depth(model, recording, rows, own.depth[row, steps]),
+            recorded_and_imagined_depth(
+                model, recording, rows, None if own.depth is None else own.depth[row, steps]
+            ),
         )  # fmt: skip
 
 
 def recorded_and_imagined_depth(
-    model: ActionWorldModelRewardModel, recording: Recording, rows: slice, imagined: Tensor
+    model: ActionWorldModelRewardModel, recording: Recording, rows: slice, imagined: Tensor | None
 ) -> tuple[Tensor, Tensor] | None:
     """Return the depth of the frames after the first of these rows on the tokens' grids.
 
     Args:
-        imagined: metres after each row's action, (T, S).
+        imagined: metres after each row's action, (T, S), if the model predicts depth.
 
     Returns:
         Recorded and imagined depth, each (T − 1, N, g, g); None unless the model looks at depth.
     """
     recorded = depth_at(model, recording.table.dataset, rows)
-    if recorded is None:
+    if recorded is None or imagined is None:
         return None
     grids = (model.tokenizer.num_cameras, model.tokenizer.grid, model.tokenizer.grid)
     return recorded[1:].unflatten(1, grids), imagined[:-1].unflatten(1, grids)

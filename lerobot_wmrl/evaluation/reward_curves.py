@@ -8,6 +8,7 @@ from torch import Tensor
 
 from lerobot_wmrl.data.clips import Clip
 from lerobot_wmrl.data.frame_cache import depth_at, frames_to_tensor
+from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.evaluation.replay import Recording
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rewards.general import consecutive_count, general_reward, sparse_reward
@@ -49,7 +50,7 @@ def reward_along_episode(
     )
     done_logit = model.predict(clip, drawn=False).done_logit[0, :-1]
     first_depth = depth_at(text_model, table.dataset, slice(rows.start, rows.start + 1))
-    goal = imagine_goal(text_model, tokens[:1], state[:1], instruction, start, first_depth)
+    goal = imagine_goal(text_model, Frames(tokens[:1], state[:1], start, first_depth), instruction)
     measure, cameras = make_similarity(reward.similarity, device), model.tokenizer.num_cameras
     features = measure.features(model.tokenizer.decode_with_features(tokens, context))
     every = torch.zeros(len(tokens), dtype=torch.long, device=device)

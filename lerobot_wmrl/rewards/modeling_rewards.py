@@ -111,7 +111,7 @@ class EmbeddingRewardModel(HubCard, PreTrainedRewardModel):
         self._world_model: list[ActionWorldModelRewardModel] = []  # in a list it is no submodule
         if not config.world_model:
             config.world_model = weights_digest(self.world_model)
-            config.hidden_size = self.world_model.config.width
+            config.hidden_size = self.world_model.config.dynamics.width
         self.head = nn.Sequential(
             nn.LayerNorm(config.hidden_size), nn.Linear(config.hidden_size, config.hidden), nn.SiLU(),
             nn.Linear(config.hidden, 1),

@@ -1,20 +1,23 @@
 """Goal frames (eq. 6) and the similarity to them (eq. 5)."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import torch
 from torch import Tensor
 
-from lerobot_wmrl.data.frames import NO_CONTEXT, Context
+from lerobot_wmrl.data.frames import NO_CONTEXT, Context, Frames
 from lerobot_wmrl.world_models.frame_tokenizer import Decoded, FrameTokenizer, feature_distance
 
 if TYPE_CHECKING:
     from lerobot_wmrl.world_models.modeling_world_model import TextWorldModelRewardModel
 
+GOAL_THRESHOLD: Final = 0.5
+"""θ of eq. 6, the done probability at which a frame becomes the goal frame."""
+
 
 class Goal(NamedTuple):
-    """tokens (B, S); the decoded frame; reached (B,), False where θ was never reached."""
+    """Goal frames: tokens (B, S); the frames decoded; reached (B,), False where θ was never reached."""
 
     tokens: Tensor
     decoded: Decoded
@@ -23,31 +26,30 @@ class Goal(NamedTuple):
 
 @torch.no_grad()
 def imagine_goal(
-    model: "TextWorldModelRewardModel",
-    tokens: Tensor,
-    proprioception: Tensor,
-    instructions: Sequence[str],
-    context: Context = NO_CONTEXT,
-    depth: Tensor | None = None,
-) -> Goal:
+    model: "TextWorldModelRewardModel", frames: Frames, instructions: Sequence[str],
+    threshold: float = GOAL_THRESHOLD,
+) -> Goal:  # fmt: skip
     """Eq. 6: the first imagined frame whose done probability reaches θ, else the one of the largest.
 
-    tokens (B, S) of the start frames, proprioception (B, P), one instruction each, the start frames' context
-    if the tokenizer is conditioned on it, and their depth (B, S) in metres if the model looks at it.
+    Args:
+        model: imagines `goal_horizon` frames at most.
+        frames: where the imaginations begin.
+        instructions: one for each.
+        threshold: θ.
     """
-    state = model.start(tokens, proprioception, instructions, depth=depth, context=context)
+    imagination, tokens = model.start(frames, instructions), frames.tokens
     goal, best = tokens, torch.full((tokens.shape[0],), -1.0, device=tokens.device)
     reached = torch.zeros_like(best, dtype=torch.bool)
     for _ in range(model.config.goal_horizon):
-        imagined = model.step(state)
+        imagined = model.step(imagination)
         probability = imagined.done_logit.sigmoid()
         better = (probability > best) & ~reached
         goal = torch.where(better[:, None], imagined.tokens, goal)
         best = torch.where(better, probability, best)
-        reached = reached | (probability >= model.config.goal_threshold)
+        reached = reached | (probability >= threshold)
         if bool(reached.all()):
             break
-    return Goal(goal, model.tokenizer.decode_with_features(goal, context), reached)
+    return Goal(goal, model.tokenizer.decode_with_features(goal, frames.context), reached)
 
 
 def similarity_to_goal(

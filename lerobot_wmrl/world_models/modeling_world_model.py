@@ -1,25 +1,318 @@
-"""The two world models (eq. 1) as LeRobot reward models: one architecture, two conditions."""
+"""The two world models (eq. 1) as LeRobot reward models: one architecture, two conditions.
 
+A checkpoint holds tokenizer, dynamics and statistics. Trained from token clips, or from a LeRobotDataset's
+batches; imagination begins with `start` or `restart` and goes on with `step`.
+"""
+
+import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import torch
 from lerobot.configs.rewards import RewardModelConfig
-from lerobot.utils.constants import ACTION
+from lerobot.rewards.pretrained import PreTrainedRewardModel
+from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 
-from lerobot_wmrl.data.clips import Clip
+from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.precision import compute_in, imagination_dtype
+from lerobot_wmrl.data.clips import Clip, clip_from_windows
+from lerobot_wmrl.data.episodes import (
+    check_cameras,
+    check_dataset,
+    check_depth,
+    check_episode_lengths,
+    success_column,
+)
+from lerobot_wmrl.data.frame_cache import depth_of_windows
+from lerobot_wmrl.data.frames import NO_CONTEXT, NO_PAST, Context, Frames, Past
+from lerobot_wmrl.world_models.anchored.dynamics import AnchoredDynamics
+from lerobot_wmrl.world_models.autoregressive.dynamics import AutoregressiveDynamics
+from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.configuration_world_model import (
     ActionWorldModelConfig,
+    AnchoredConfig,
+    AutoregressiveConfig,
     TextWorldModelConfig,
+    WorldModelConfig,
 )
-from lerobot_wmrl.world_models.decoding import Condition
-from lerobot_wmrl.world_models.frozen_t5 import CHECKPOINT_FOLDER, FrozenT5
+from lerobot_wmrl.world_models.dynamics import (
+    Condition,
+    Dynamics,
+    Imagination,
+    Imagined,
+    OpenLoopPrediction,
+    Prediction,
+)
+from lerobot_wmrl.world_models.frame_tokenizer import Decoded, FrameTokenizer
 from lerobot_wmrl.world_models.goal import imagine_goal, similarity_to_goal
-from lerobot_wmrl.world_models.instructions import check_one_each
-from lerobot_wmrl.world_models.text_encoder import make_text_encoder
-from lerobot_wmrl.world_models.world_model import WorldModelRewardModel
+from lerobot_wmrl.world_models.hub_card import HubCard
+from lerobot_wmrl.world_models.layers import FrameSizes
+from lerobot_wmrl.world_models.modeling_frame_tokenizer import stack_cameras
+from lerobot_wmrl.world_models.text import CHECKPOINT_FOLDER, FrozenT5, check_one_each, make_text_encoder
+
+CONDITION_TOKENS: Final = 4
+"""Tokens that an action is embedded into."""
+
+MIN_SPREAD: Final = 1e-3
+"""Components that vary less than this are constants, and left alone by normalisation."""
+
+STATE_SPREAD: Final = 0.02
+"""In the dataset's units: what varies less (a closed gripper's opening, the rotation of a hand that is held
+upright) is scaled as if it varied so much, lest its noise weigh as much as centimetres."""
+
+STATE_LIMIT: Final = 5.0
+"""In standard deviations."""
+
+NEVER: Final = -5.0
+"""Logit of done with which a model begins whose dataset does not say what success is: else it would stay at
+chance, and every second imagination would succeed."""
+
+
+def make_dynamics(config: WorldModelConfig, grid: int) -> Dynamics:
+    """Make the dynamics that the configuration chooses, untrained, for a tokenizer with this grid."""
+    tokenizer, chosen = config.tokenizer, config.dynamics
+    assert tokenizer is not None
+    if grid % chosen.patch:
+        raise FieldError("dynamics.patch", chosen.patch, f"must divide the tokenizer's grid, {grid}")
+    sizes = FrameSizes(
+        tokenizer.levels, tokenizer.quantizer, grid, len(tokenizer.cameras), config.state_size,
+        config.clip_length, config.context_channels,
+    )  # fmt: skip
+    if isinstance(chosen, AnchoredConfig):
+        return AnchoredDynamics(chosen, sizes)
+    assert isinstance(chosen, AutoregressiveConfig)
+    return AutoregressiveDynamics(chosen, sizes)
+
+
+def check_tokenizer_source(config: WorldModelConfig) -> None:
+    """Raise FieldError unless the model gets its tokenizer from exactly one place."""
+    if config.tokenizer_path and config.pretrained_path:
+        raise FieldError(
+            "tokenizer_path", config.tokenizer_path,
+            f"the world model at {config.pretrained_path} carries the tokenizer whose codes it has learnt",
+            "leave one of the two out",
+        )  # fmt: skip
+    if config.tokenizer_path and config.tokenizer is not None:
+        raise FieldError(
+            "tokenizer", config.tokenizer, "is that of the checkpoint at `tokenizer_path`",
+            "leave its settings out",
+        )  # fmt: skip
+    if not config.tokenizer_path and config.tokenizer is None:
+        raise FieldError(
+            "tokenizer_path", config.tokenizer_path, "is missing",
+            "give the output folder of a training with type=frame_tokenizer",
+        )  # fmt: skip
+
+
+class WorldModelRewardModel(HubCard, PreTrainedRewardModel):
+    """Base of both world models: what they learn from, and imagination in the dataset's units."""
+
+    config_class = WorldModelConfig
+    name = "world_model"
+    state_mean: Tensor
+    state_std: Tensor
+
+    def __init__(
+        self, config: WorldModelConfig, dataset_stats: Any = None, dataset_meta: Any = None, **kwargs: Any
+    ) -> None:
+        super().__init__(config)
+        self.config: Any = config
+        check_tokenizer_source(config)
+        if dataset_meta is not None:
+            check_episode_lengths(dataset_meta)
+        source = self._adopt_tokenizer() if config.tokenizer_path else None
+        if dataset_meta is not None:
+            self._adopt_features(dataset_meta.features)
+        sizes: Any = config.tokenizer  # given, or adopted above
+        self.tokenizer = FrameTokenizer(sizes).requires_grad_(False)
+        if source is not None:
+            self.tokenizer.load_state_dict(source.tokenizer.state_dict())
+        self.tokenizer.eval()
+        self.dynamics = make_dynamics(config, self.tokenizer.grid)
+        if dataset_meta is not None and success_column(dataset_meta.features) is None:
+            last: Any = self.dynamics.network.done[-1]
+            nn.init.constant_(last.bias, NEVER)
+        self._register_statistics("state", OBS_STATE, config.state_size, dataset_stats, STATE_SPREAD)
+
+    def train(self, mode: bool = True) -> "WorldModelRewardModel":
+        """Keep the tokenizer, which is fixed, in evaluation mode."""
+        super().train(mode)
+        self.tokenizer.eval()
+        return self
+
+    def _adopt_tokenizer(self) -> Any:
+        """Take the tokenizer's settings into the config; a trained checkpoint no longer needs its path."""
+        source = load_model(self.config.tokenizer_path, "frame_tokenizer")
+        self.config.tokenizer = source.config.tokenizer
+        self.config.tokenizer_path = None
+        return source
+
+    def _adopt_features(self, features: dict[str, Any]) -> None:
+        """Take the widths from the dataset; a trained model must find its own there."""
+        if self.config.pretrained_path:
+            check_dataset(self.config, features)
+        sizes = self.config.tokenizer
+        check_cameras(features, sizes.camera_keys, sizes.image_size)
+        if self.config.depth:
+            check_depth(features, sizes.camera_keys, sizes.image_size)
+        if self.config.state_size and OBS_STATE not in features:
+            logging.info("the dataset has no observation.state: the world model does without proprioception")
+        if self.config.state_size:
+            self.config.state_size = features[OBS_STATE]["shape"][0] if OBS_STATE in features else 0
+
+    def _register_statistics(self, name: str, key: str, size: int, stats: Any, least: float = 0.0) -> None:
+        """Keep mean and standard deviation of the feature `key`, the latter at least `least`."""
+        mean, std = torch.zeros(size), torch.ones(size)
+        if stats is not None and size:
+            mean = torch.as_tensor(stats[key]["mean"], dtype=torch.float32)
+            std = torch.as_tensor(stats[key]["std"], dtype=torch.float32)
+            std = torch.where(std < MIN_SPREAD, 1.0, std).clamp_min(least)
+        self.register_buffer(f"{name}_mean", mean)
+        self.register_buffer(f"{name}_std", std)
+
+    def normalize_state(self, state: Tensor) -> Tensor:
+        """Dataset units (…, P) to zero mean and unit spread.
+
+        Clipped, so that rare collisions do not outweigh the rest.
+        Components beyond the model's `state_size` are dropped.
+        """
+        state = state[..., : self.config.state_size]
+        return ((state - self.state_mean) / self.state_std).clamp(-STATE_LIMIT, STATE_LIMIT)
+
+    def denormalize_state(self, state: Tensor) -> Tensor:
+        """Back to dataset units. (…, P) → (…, P)"""
+        return state * self.state_std + self.state_mean
+
+    def _normalized(self, frames: Frames) -> Frames:
+        return replace(frames, proprioception=self.normalize_state(frames.proprioception))
+
+    def condition(self, clip: Clip) -> Condition:
+        """Eq. 1's c, of every row of a clip."""
+        raise NotImplementedError
+
+    def forward(self, batch: Clip | dict[str, Any], progress: float = 1.0) -> tuple[Tensor, dict[str, float]]:
+        """Return the loss and its parts on a clip, or on LeRobot's batch (see `clip_from_windows`).
+
+        progress: share of the training that is over, on which some losses depend.
+        """
+        return self.loss(batch if isinstance(batch, Clip) else self.clip_from_batch(batch), progress)
+
+    def loss(self, clip: Clip, progress: float = 1.0) -> tuple[Tensor, dict[str, float]]:
+        """Eqs. 2-4 on a clip of tokens."""
+        return self.dynamics.loss(self._normalized_clip(clip), self.condition(clip), progress)
+
+    @torch.no_grad()
+    def predict(self, clip: Clip, drawn: bool = True) -> Prediction:
+        """Predict the frame after every row of a clip, normalised; no prediction is fed back.
+
+        Where its tokens are not needed, `drawn` = False is faster.
+        """
+        return self.dynamics.predict(self._normalized_clip(clip), self.condition(clip), drawn)
+
+    def _normalized_clip(self, clip: Clip) -> Clip:
+        return clip._replace(state=self.normalize_state(clip.state))
+
+    @torch.no_grad()
+    def clip_from_batch(self, batch: dict[str, Any]) -> Clip:
+        """Tokenise a batch of LeRobot's windows, beside their first frames: they lack their episodes'."""
+        sizes = self.config.tokenizer
+        images = stack_cameras(batch, sizes.camera_keys, sizes.image_size)
+        shape = images.shape[:2]
+        context = self.tokenizer.context(images[:, 0])
+        rows = torch.arange(shape[0]).repeat_interleave(shape[1])
+        tokens = self.tokenizer.encode(images.flatten(0, 1), context[rows]).unflatten(0, shape)
+        depth = None
+        if self.config.depth:
+            depth = depth_of_windows(batch, sizes.camera_keys, self.tokenizer.grid)
+        clip = clip_from_windows(tokens, batch, sizes.camera_keys[0], self.config.state_size, depth)
+        return clip._replace(context=context)
+
+    @torch.no_grad()
+    def start(
+        self, frames: Frames, instructions: Sequence[str] | None = None, past: Past = NO_PAST,
+        dtype: torch.dtype | None = None,
+    ) -> Imagination:  # fmt: skip
+        """Begin to imagine at B frames.
+
+        Args:
+            frames: where the imaginations begin. ValueError if depth that the model looks at is missing; a
+                missing context raises it in the first step.
+            instructions: one an imagination, of a model that is conditioned on text.
+            past: frames before these, which are remembered as if they had been imagined.
+            dtype: what the network computes in, by default the fastest format; what is returned is float32.
+        """
+        first = replace((*past.frames, frames)[0], context=frames.context)
+        imagination = self.dynamics.start(self._normalized(first), dtype)
+        if instructions is not None:
+            imagination.condition = self.encode_instructions(instructions, len(frames))
+        self._watch(imagination, past, frames)
+        return imagination
+
+    @torch.no_grad()
+    def restart(self, imagination: Imagination, mask: Tensor, frames: Frames, past: Past = NO_PAST) -> None:
+        """Begin anew at frames (as in `start`, of all B) in the environments in `mask` (B,).
+
+        With a past they are begun apart, as many frames ago as they have a past, and take their places when
+        they are as far as the others.
+        """
+        if not past.frames:
+            self.dynamics.restart(imagination, mask, self._normalized(frames))
+            return
+        rows = mask.nonzero().squeeze(1)
+        first = replace(past.frames[0][rows], context=frames.context[rows])
+        apart = self.dynamics.start(self._normalized(first), imagination.dtype)
+        apart.rewind(imagination, len(past.frames))
+        self._watch(apart, past[rows], frames[rows])
+        imagination.put(rows, apart)
+
+    def _watch(self, imagination: Imagination, past: Past, now: Frames) -> None:
+        """Bring an imagination from the first of the past frames to `now`, showing it what happened."""
+        everyone = torch.ones(len(now), dtype=torch.bool, device=now.tokens.device)
+        for action, after in zip(past.actions, (*past.frames, now)[1:], strict=True):
+            self.step(imagination, action)
+            self.dynamics.show(imagination, everyone, self._normalized(after))
+
+    @torch.no_grad()
+    def step(self, imagination: Imagination, action: Tensor | None = None) -> Imagined:
+        """Imagine the next frame of every environment: action (B, A) in the dataset's units."""
+        condition = imagination.condition if action is None else self.encode_actions(action[:, None])
+        if condition is None:
+            raise ValueError("this imagination needs an action each step, or an instruction at the start")
+        imagined = self.dynamics.step(imagination, condition)
+        return imagined._replace(proprioception=self.denormalize_state(imagined.proprioception))
+
+    @torch.no_grad()
+    def imagine(self, frames: Frames, actions: Tensor) -> list[Imagined]:
+        """Imagine the frame after each of the actions (B, T, A)."""
+        imagination = self.start(frames)
+        return [self.step(imagination, action) for action in actions.unbind(1)]
+
+    @torch.no_grad()
+    def open_loop(self, frames: Frames, actions: Tensor) -> OpenLoopPrediction:
+        """Predict what follows actions (B, T, A).
+
+        No frame but the last is drawn where the dynamics can do without, so it is much faster than `imagine`.
+        """
+        prediction = self.dynamics.open_loop(self._normalized(frames), actions, self.encode_actions)
+        return prediction._replace(proprioception=self.denormalize_state(prediction.proprioception))
+
+    @torch.no_grad()
+    def decode(self, tokens: Tensor, context: Context = NO_CONTEXT) -> Decoded:
+        """Tokens (B, S) → images and features of the frames, computed as fast as imagination, as float32."""
+        with compute_in(imagination_dtype(tokens.device), tokens.device):
+            images, features = self.tokenizer.decode_with_features(tokens, context)
+        return Decoded(images.float(), [feature.float() for feature in features])
+
+    def encode_actions(self, actions: Tensor) -> Condition:
+        """Actions (B, T, A) in dataset units → condition."""
+        raise NotImplementedError(f"{self.name} is not conditioned on actions")
+
+    def encode_instructions(self, instructions: Sequence[str], batch: int) -> Condition:
+        """One instruction for each of `batch` episodes → condition."""
+        raise NotImplementedError(f"{self.name} is not conditioned on text")
 
 
 class ActionWorldModelRewardModel(WorldModelRewardModel):
@@ -37,9 +330,9 @@ class ActionWorldModelRewardModel(WorldModelRewardModel):
     def __init__(self, config: ActionWorldModelConfig, dataset_stats: Any = None, **kwargs: Any) -> None:
         super().__init__(config, dataset_stats, **kwargs)
         self._register_statistics("action", ACTION, config.action_size, dataset_stats)
-        width, count = config.width, config.condition_tokens
+        width = config.dynamics.width
         self.embed_action = nn.Sequential(
-            nn.Linear(config.action_size, width), nn.SiLU(), nn.Linear(width, count * width)
+            nn.Linear(config.action_size, width), nn.SiLU(), nn.Linear(width, CONDITION_TOKENS * width)
         )
 
     def _adopt_features(self, features: dict[str, Any]) -> None:
@@ -53,7 +346,7 @@ class ActionWorldModelRewardModel(WorldModelRewardModel):
                 f"{self.config.action_size}; use a dataset or policy with the same actions"
             )
         normalised = (actions - self.action_mean) / self.action_std
-        return self.embed_action(normalised).unflatten(-1, (self.config.condition_tokens, -1)), None
+        return Condition(self.embed_action(normalised).unflatten(-1, (CONDITION_TOKENS, -1)))
 
     def condition(self, clip: Clip) -> Condition:
         return self.encode_actions(clip.action)
@@ -84,7 +377,7 @@ class TextWorldModelRewardModel(WorldModelRewardModel):
         if config.text_encoder is not None:
             t5 = t5 or FrozenT5.load(config.text_encoder)
             config.text_encoder = CHECKPOINT_FOLDER
-        self.text_encoder = make_text_encoder(config.width, t5)
+        self.text_encoder = make_text_encoder(config.dynamics.width, t5)
         if dataset_meta is not None:
             self.text_encoder.check(dataset_meta.tasks.index)
 
@@ -113,6 +406,5 @@ class TextWorldModelRewardModel(WorldModelRewardModel):
     def compute_reward(self, batch: dict[str, Any]) -> Tensor:
         """Similarity of the window's last frame to the goal imagined from its first one. → (B,)"""
         clip = self.clip_from_batch(batch)
-        depth = clip.depth if clip.depth is None else clip.depth[:, 0]
-        goal = imagine_goal(self, clip.tokens[:, 0], clip.state[:, 0], clip.instructions, clip.context, depth)
+        goal = imagine_goal(self, clip.first(), clip.instructions)
         return similarity_to_goal(self.tokenizer, clip.tokens[:, -1], goal.decoded.features, clip.context)

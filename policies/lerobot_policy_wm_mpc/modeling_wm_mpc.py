@@ -10,11 +10,10 @@ from torch import Tensor
 from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
 from lerobot_policy_wm_mpc.planning import Objective, interpolate_knots, plan_knots, success_logit
 from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW
-from lerobot_wmrl.data.frames import NO_CONTEXT, Context
+from lerobot_wmrl.data.frames import Context, Frames
 from lerobot_wmrl.world_models.checkpoint import check_same_tokenizer, load_model
 from lerobot_wmrl.world_models.goal import imagine_goal, similarity_to_goal
 from lerobot_wmrl.world_models.modeling_frame_tokenizer import stack_cameras
-from lerobot_wmrl.world_models.open_loop import open_loop
 
 Observation = dict[str, Any]
 
@@ -75,6 +74,8 @@ class WmMpcPolicy(PreTrainedPolicy):
         if self._context is None:
             self._context = model.tokenizer.context(images)
         tokens = model.tokenizer.encode(images, self._context)
+        state = batch.get(OBS_STATE, tokens.new_zeros(len(tokens), 0, dtype=torch.float32))
+        frames, instructions = Frames(tokens, state, self._context), list(batch.get("task", []))
         # Statistics hold a std of 1 for components that never vary: these stay at their mean.
         std = torch.where(model.action_std == 1, 0.0, model.action_std)
         start = self._remaining_plans() if self._knots is not None else None
@@ -82,7 +83,7 @@ class WmMpcPolicy(PreTrainedPolicy):
         for row in range(len(tokens)):
             mean = model.action_mean.expand(config.knots, -1) if start is None else start[row]
             plans.append(plan_knots(
-                self._objective(batch, tokens, row), mean, std, self.low, self.high,
+                self._objective(frames[[row]], instructions[row : row + 1]), mean, std, self.low, self.high,
                 horizon=config.horizon, samples=config.samples, elites=config.elites,
                 iterations=config.iterations, generator=self._generator,
             ))  # fmt: skip
@@ -97,23 +98,19 @@ class WmMpcPolicy(PreTrainedPolicy):
         ahead = torch.linspace(config.execute, config.execute + config.horizon - 1, config.knots)
         return plans[:, ahead.round().long().clamp(max=config.horizon - 1)]
 
-    def _objective(self, batch: Observation, tokens: Tensor, row: int) -> Objective:
-        """Return the objective of action sequences in environment `row`."""
+    def _objective(self, frame: Frames, instruction: list[str]) -> Objective:
+        """Return the objective of action sequences that begin at one frame."""
         model, config = self._model[0], self.config
-        context = self._context[[row]] if self._context else NO_CONTEXT
-        state = batch.get(OBS_STATE, tokens.new_zeros(len(tokens), 0, dtype=torch.float32))[[row]]
         goal = None
         if config.objective == "goal":
-            instruction = [batch["task"][row]]
-            goal = imagine_goal(self._text_model[0], tokens[[row]], state, instruction, context).decoded
+            goal = imagine_goal(self._text_model[0], frame, instruction).decoded
 
         def value(actions: Tensor) -> Tensor:
-            every = [0] * len(actions)
-            seen = context[every] if len(context) else NO_CONTEXT
-            ahead = open_loop(model, tokens[[row] * len(actions)], state[every], actions, seen)
+            frames = frame[[0] * len(actions)]
+            ahead = model.open_loop(frames, actions)
             if goal is None:
                 return success_logit(ahead.done_logit, config.done_frames)
             features = [layer.repeat(len(actions), 1, 1, 1) for layer in goal.features]
-            return similarity_to_goal(model.tokenizer, ahead.tokens, features, seen)
+            return similarity_to_goal(model.tokenizer, ahead.tokens, features, frames.context)
 
         return value

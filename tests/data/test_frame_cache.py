@@ -17,6 +17,7 @@ from lerobot_wmrl.data.episodes import DatasetSource
 from lerobot_wmrl.data.frame_cache import cached_depth, token_depth
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
+from lerobot_wmrl.world_models.autoregressive.depth import metres
 from lerobot_wmrl.world_models.checkpoint import load_model
 from tests.trained import action_config, run_training, text_config
 
@@ -88,7 +89,7 @@ def test_training_reads_depth_and_a_checkpoint_keeps_its_branch(deep_dataset, mo
         assert read_metrics(folder)[0]["depth_error_mm"] > 0
         model = load_model(folder, name)
         assert model.config.depth
-        assert model.network.depth.fusion[0].weight.abs().sum() > 0, "three steps have moved it"
+        assert model.dynamics.network.depth.fusion[0].weight.abs().sum() > 0, "three steps have moved it"
 
 
 def test_a_batch_of_lerobot_train_has_the_depth_of_the_cache(deep_dataset, models):
@@ -138,7 +139,7 @@ def test_the_environment_begins_with_the_depth_of_its_starts(deep_dataset, model
     starts = np.asarray(deep_dataset.meta.episodes["dataset_from_index"])
 
     def begun() -> np.ndarray:
-        return env.model.network.depth.metres(env._imagination.depth[:, 0]).numpy()
+        return metres(env._imagination.depth[:, 0]).numpy()
 
     np.testing.assert_allclose(begun(), first[starts[[1, 4]]], atol=1e-4)
     for _ in range(3):

@@ -10,7 +10,7 @@ from lerobot_wmrl.envs.start_frames import read_first_frames
 from lerobot_wmrl.maniskill.scenes import SCENES
 from lerobot_wmrl.maniskill.tasks import task_of
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
-from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig
+from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig, AutoregressiveConfig
 
 
 def test_they_are_what_the_simulator_shows(recwarn):
@@ -30,6 +30,6 @@ def test_they_are_what_the_simulator_shows(recwarn):
     assert np.array_equal(found.state[3, 0], frame.state)
     assert found.instructions[3] == simulation.instruction
     simulation.close()
-    config.depth = True
+    config.dynamics = AutoregressiveConfig(depth=True)
     with pytest.raises(ValueError, match=r"^dataset\.root=None: .*looks at depth.*give a dataset"):
         found.depth(type("Model", (), {"config": config}))

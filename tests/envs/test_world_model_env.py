@@ -379,7 +379,7 @@ def test_a_step_asks_the_device_only_whether_an_episode_has_ended(config, reward
 
 
 def test_learned_rewards_ask_nothing_more(env):
-    width, cameras = env.model.config.width, env.model.config.tokenizer.cameras
+    width, cameras = env.model.config.dynamics.width, env.model.config.tokenizer.cameras
     for reward in (
         ProxyRewardModel(ProxyConfig(device="cpu", cameras=cameras, image_size=32)),
         EmbeddingRewardModel(EmbeddingConfig(device="cpu", world_model="untrained", hidden_size=width)),

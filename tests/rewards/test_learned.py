@@ -8,6 +8,7 @@ import pytest
 import torch
 from lerobot.scripts import lerobot_train
 
+from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.rewards.configuration_rewards import EmbeddingConfig, ProxyConfig
 from lerobot_wmrl.rewards.modeling_rewards import EmbeddingRewardModel, ProxyRewardModel, weights_digest
@@ -103,7 +104,7 @@ def test_windows_and_imagination_meet_the_same_hidden_states(embedding, trained_
     whole = reward.compute_reward({**batch, "task": [""]})
     images = batch[IMAGE][:, -3:]
     tokens = model.tokenizer.encode(images[:, 0][:, None])
-    imagination = model.start(tokens, batch["observation.state"][:, -3])
+    imagination = model.start(Frames(tokens, batch["observation.state"][:, -3]))
     steps = [model.step(imagination, action) for action in batch["action"][:, -3:].unbind(1)]
     stepped = torch.cat([reward.compute_reward({"hidden": step.hidden}) for step in steps])
     batch["next.reward"] = torch.arange(length)[None].float()

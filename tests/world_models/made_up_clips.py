@@ -8,7 +8,7 @@ from torch import Tensor
 from lerobot_wmrl.data.clips import Clip
 from lerobot_wmrl.world_models.configuration_world_model import TextWorldModelConfig
 from lerobot_wmrl.world_models.modeling_world_model import TextWorldModelRewardModel
-from tests.trained import small_tokenizer
+from tests.trained import SIZES, nested, small_tokenizer
 
 LEVELS = [5, 4]
 TOKENS = 16
@@ -24,9 +24,11 @@ def text_model(**settings: Any) -> TextWorldModelRewardModel:
     """A small text world model with random weights; no tokenizer is trained, as no picture is looked at."""
     torch.manual_seed(0)
     config = TextWorldModelConfig(
-        tokenizer=small_tokenizer(levels=LEVELS), state_size=STATE, layers=1, width=32, heads=2,
-        window=8, code_width=8, device="cpu", self_forcing=0.0, token_noise=0.0,
-        **{"goal_horizon": 6, **settings},
+        tokenizer=small_tokenizer(levels=LEVELS), state_size=STATE, device="cpu",
+        **nested({
+            **SIZES, "dynamics": "autoregressive", "conditioning": "cross_attention", "window": 8,
+            "self_forcing": 0.0, "goal_horizon": 6, **settings,
+        }),
     )  # fmt: skip
     return TextWorldModelRewardModel(config)
 

@@ -4,25 +4,31 @@ from typing import Any
 
 import pytest
 import torch
+from draccus import parse
+from draccus.utils import DecodingError
 from torch import Tensor
 
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.clips import Clip
-from lerobot_wmrl.data.frames import NO_CONTEXT, Context
+from lerobot_wmrl.data.frames import NO_CONTEXT, Context, Frames
+from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig
+from lerobot_wmrl.world_models import losses
+from lerobot_wmrl.world_models.anchored import dynamics as anchored_dynamics
+from lerobot_wmrl.world_models.anchored.dynamics import draw_rows, frames_after
+from lerobot_wmrl.world_models.anchored.network import Dropout
 from lerobot_wmrl.world_models.codebook import CodeBook
-from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig, TextWorldModelConfig
-from lerobot_wmrl.world_models.imagination import Imagined
-from lerobot_wmrl.world_models.losses import (
-    draw_rows,
-    frames_since_start,
+from lerobot_wmrl.world_models.configuration_world_model import (
+    ActionWorldModelConfig,
+    AnchoredConfig,
+    TextWorldModelConfig,
 )
+from lerobot_wmrl.world_models.dynamics import Imagined
 from lerobot_wmrl.world_models.modeling_world_model import (
+    STATE_SPREAD,
     ActionWorldModelRewardModel,
     TextWorldModelRewardModel,
 )
-from lerobot_wmrl.world_models.open_loop import open_loop
-from lerobot_wmrl.world_models.st_transformer import Dropout
-from lerobot_wmrl.world_models.world_model import STATE_SPREAD
-from tests.trained import small_tokenizer
+from tests.trained import nested, small_tokenizer
 
 BATCH, LENGTH, TOKENS, CODES = 3, 6, 32, 20
 CAMERAS = ["third_view", "wrist"]
@@ -36,7 +42,7 @@ SIZES: dict[str, Any] = {
 def world_model(**settings: Any) -> ActionWorldModelRewardModel:
     """With random weights everywhere, so that everything matters."""
     torch.manual_seed(0)
-    model = ActionWorldModelRewardModel(ActionWorldModelConfig(**SIZES | settings)).eval()
+    model = ActionWorldModelRewardModel(ActionWorldModelConfig(**nested(SIZES | settings))).eval()
     for parameter in model.parameters():
         torch.nn.init.normal_(parameter, std=0.2)
     return model
@@ -54,7 +60,7 @@ def random_clip(seed: int = 0, length: int = LENGTH) -> Clip:
 
 def imagine(model: ActionWorldModelRewardModel, clip: Clip) -> list[Imagined]:
     """Step by step from the clip's first frame."""
-    state = model.start(clip.tokens[:, 0], clip.state[:, 0], dtype=torch.float32, context=clip.context)
+    state = model.start(clip.first(), dtype=torch.float32)
     return [model.step(state, action) for action in clip.action.unbind(1)]
 
 
@@ -65,7 +71,7 @@ def over_time(steps: list[Imagined], name: str) -> Tensor:
 def test_steps_are_one_pass_over_the_clip():
     model, clip = world_model(), random_clip()
     steps, whole = imagine(model, clip), model.predict(clip)
-    codebook = model.network.codebook
+    codebook = model.dynamics.network.codebook
     assert torch.equal(over_time(steps, "tokens"), codebook.tokens(codebook.sample(whole.logits, 0.0, None)))
     torch.testing.assert_close(over_time(steps, "done_logit"), whole.done_logit, atol=1e-4, rtol=0)
     torch.testing.assert_close(over_time(steps, "hidden"), whole.hidden, atol=1e-4, rtol=0)
@@ -85,7 +91,7 @@ def test_looking_ahead_ends_where_steps_do(length):
     """In one pass, and by steps where imagination begins anew on the way."""
     model, clip = world_model(), random_clip(length=length)
     steps = imagine(model, clip)
-    ahead = open_loop(model, clip.tokens[:, 0], clip.state[:, 0], clip.action, clip.context)
+    ahead = model.open_loop(clip.first(), clip.action)
     assert torch.equal(ahead.tokens, steps[-1].tokens)
     for name in ("done_logit", "proprioception"):
         torch.testing.assert_close(getattr(ahead, name), over_time(steps, name), atol=1e-3, rtol=1e-4)
@@ -110,7 +116,7 @@ def test_whoever_has_imagined_a_clip_begins_anew_at_its_last_frame():
     model, clip = world_model(), random_clip(length=2 * LENGTH)
     steps = imagine(model, clip)
     last = steps[LENGTH - 1]
-    again = model.start(last.tokens, last.proprioception, dtype=torch.float32, context=clip.context)
+    again = model.start(Frames(last.tokens, last.proprioception, clip.context), dtype=torch.float32)
     for step, action in zip(steps[LENGTH:], clip.action[:, LENGTH:].unbind(1), strict=True):
         anew = model.step(again, action)
         assert torch.equal(anew.tokens, step.tokens)
@@ -120,10 +126,9 @@ def test_whoever_has_imagined_a_clip_begins_anew_at_its_last_frame():
 def test_a_restarted_imagination_is_a_new_one():
     model, clip, new = world_model(), random_clip(length=2 * LENGTH), random_clip(seed=1)
     whole = over_time(imagine(model, clip), "tokens")
-    running = model.start(clip.tokens[:, 0], clip.state[:, 0], dtype=torch.float32, context=clip.context)
+    running = model.start(clip.first(), dtype=torch.float32)
     before = [model.step(running, action) for action in clip.action[:, :4].unbind(1)]
-    mask, first = torch.tensor([True, False, False]), (new.tokens[:, 0], new.state[:, 0])
-    model.restart(running, mask, *first, context=new.context)
+    model.restart(running, torch.tensor([True, False, False]), new.first())
     after = [model.step(running, action) for action in clip.action[:, 4:].unbind(1)]
     assert torch.equal(over_time(before + after, "tokens")[1:], whole[1:])
     fresh = new._replace(action=clip.action[:, 4:])
@@ -132,12 +137,11 @@ def test_a_restarted_imagination_is_a_new_one():
 
 def test_the_text_model_imagines_the_same_way():
     torch.manual_seed(0)
-    model = TextWorldModelRewardModel(TextWorldModelConfig(**SIZES, dynamics="anchored")).eval()
-    for parameter in model.network.parameters():
+    model = TextWorldModelRewardModel(TextWorldModelConfig(**nested(SIZES))).eval()
+    for parameter in model.dynamics.network.parameters():
         torch.nn.init.normal_(parameter, std=0.2)
     clip = random_clip()._replace(instructions=["push the can", "pull the box", "push the can"])
-    first = clip.tokens[:, 0], clip.state[:, 0], clip.instructions
-    state = model.start(*first, torch.float32, context=clip.context)
+    state = model.start(clip.first(), clip.instructions, dtype=torch.float32)
     steps = [model.step(state) for _ in range(LENGTH)]
     expected = model.predict(clip).done_logit
     torch.testing.assert_close(over_time(steps, "done_logit"), expected, atol=1e-4, rtol=0)
@@ -167,14 +171,14 @@ def reached(clip: Clip) -> Clip:
     return clip._replace(tokens=tokens, state=state, done=done.float())
 
 
-def test_frames_done_and_state_are_learnt_though_few_frames_are_drawn():
+def test_frames_done_and_state_are_learnt_though_few_frames_are_drawn(monkeypatch):
+    monkeypatch.setattr(anchored_dynamics, "DRAWN_FRAMES", 1)
+    monkeypatch.setattr(losses, "TOKEN_NOISE", 0.0)
     torch.manual_seed(0)
-    model = ActionWorldModelRewardModel(
-        ActionWorldModelConfig(**SIZES | {"state_size": 1, "drawn_frames": 1, "token_noise": 0.0})
-    ).train()
+    model = ActionWorldModelRewardModel(ActionWorldModelConfig(**nested(SIZES | {"state_size": 1}))).train()
     clip = reached(random_clip())
     assert 0 < clip.done.mean() < 1
-    optimizer = torch.optim.Adam(model.network.parameters(), 3e-3)
+    optimizer = torch.optim.Adam(model.dynamics.network.parameters(), 3e-3)
     for _ in range(300):
         loss, _ = model.loss(clip)
         optimizer.zero_grad()
@@ -208,46 +212,41 @@ def test_rows_are_drawn_among_those_with_a_valid_next_one():
     ]
 
 
-def test_tokens_that_are_not_as_at_the_start_count_more_and_padding_nothing():
+def test_tokens_that_are_not_as_at_the_start_count_more_and_padding_nothing(monkeypatch):
+    monkeypatch.setattr(losses, "MOTION_WEIGHT", 2.0)
     codebook, clip = CodeBook([5, 4]), random_clip()
     valid = clip.valid.clone()
     valid[1, 2:] = False
     tokens = clip.tokens.clone()
     tokens[0, 3] = tokens[0, 0]
-    clip = clip._replace(tokens=tokens, valid=valid)
-    frames = frames_since_start(codebook, codebook.codes(tokens), clip, 2.0, torch.tensor([[2], [1], [0]]))
-    assert torch.equal(frames.digits[0], codebook.codes(tokens[0, 3:4]))
+    frames = frames_after(torch.tensor([[2], [1], [0]]), codebook.codes(tokens), valid, codebook)
+    assert torch.equal(frames.codes[0], codebook.codes(tokens[0, 3:4]))
     assert torch.equal(frames.weight[0], torch.ones(1, TOKENS))
     assert torch.equal(frames.weight[1], torch.zeros(1, TOKENS))
     assert set(frames.weight[2].unique().tolist()) == {1.0, 3.0}
     assert torch.equal(frames.moved, frames.weight == 3)
 
 
-@pytest.mark.parametrize(
-    ("setting", "value"),
-    [("decoding", "maskgit"), ("depth", True), ("self_rollout", 0.5), ("keypoint_weight", 1.0)],
-)
-def test_what_anchored_dynamics_do_not_have_is_named(setting, value):
-    with pytest.raises(ValueError, match=rf"--model.{setting}={value}: anchored dynamics do not have it"):
-        ActionWorldModelConfig(**SIZES | {setting: value})
+@pytest.mark.parametrize("setting", ["window", "depth", "self_rollout", "maskgit_steps", "keypoint_weight"])
+def test_what_anchored_dynamics_do_not_have_cannot_be_set(setting):
+    flags = ["--model.type=action_world_model", "--model.device=cpu", f"--model.dynamics.{setting}=1"]
+    with pytest.raises(DecodingError, match=setting):
+        parse(TrainWorldModelConfig, args=flags)
 
 
-@pytest.mark.parametrize("setting", [{"dropout": 1.0}, {"dropout": -0.1}, {"from_start": 1.5}])
+@pytest.mark.parametrize("setting", [{"dropout": 1.0}, {"dropout": -0.1}])
 def test_shares_that_are_none_are_named(setting):
     name, value = next(iter(setting.items()))
-    with pytest.raises(ValueError, match=rf"--model.{name}={value}: must be a share"):
-        ActionWorldModelConfig(**setting)
-
-
-def test_unknown_dynamics_are_named():
-    with pytest.raises(ValueError, match=r"--model.dynamics=still: choose one of autoregressive, anchored"):
-        world_model(dynamics="still")
+    with pytest.raises(FieldError, match=rf"^dynamics.{name}={value}: must be a share"):
+        AnchoredConfig(**setting)
+    with pytest.raises(FieldError, match=r"^from_start=1.5: must be between 0 and 1"):
+        ActionWorldModelConfig(device="cpu", from_start=1.5)
 
 
 def test_noise_of_what_hardly_varies_does_not_weigh_as_much_as_motion():
     spread = torch.tensor([0.07, 0.002, 0.0, 0.03, 0.03, 0.03, 0.03, 0.4])
     model = ActionWorldModelRewardModel(
-        ActionWorldModelConfig(**SIZES),
+        ActionWorldModelConfig(**nested(SIZES)),
         dataset_stats={
             "observation.state": {"mean": torch.zeros(8), "std": spread},
             "action": {"mean": torch.zeros(7), "std": torch.full((7,), 0.01)},

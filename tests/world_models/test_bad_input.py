@@ -64,8 +64,8 @@ def test_another_dataset_than_the_tokenizers_is_named(
 
 
 @pytest.mark.parametrize(("setting", "message"), [
-    ({"patch": 3}, r"--model\.patch=3: must divide"), ({"heads": 3}, r"--model\.width=32: must be"),
-    ({"clip_length": 1}, r"--model\.clip_length=1"), ({"state_size": -1}, r"--model\.state_size=-1"),
+    ({"patch": 3}, r"dynamics\.patch=3: must divide"), ({"heads": 3}, r"dynamics\.width=32: must be"),
+    ({"clip_length": 1}, r"clip_length=1: must be"), ({"state_size": -1}, r"state_size=-1: must be"),
 ])  # fmt: skip
 def test_impossible_sizes_are_named(setting, message, small_dataset, trained_models, tmp_path):
     with pytest.raises(ValueError, match=message):

@@ -155,7 +155,7 @@ def test_environments_decode_beside_their_own_start_also_after_a_restart(models,
     )  # fmt: skip
     env = config.create_tensor_env(4)
     starts = env.starts
-    assert len(starts.context) == len(starts)
+    assert len(starts.now.context) == len(starts)
     env.reset(seed=0)
     before = env._start_index.clone()
     for step in range(4):
@@ -163,10 +163,10 @@ def test_environments_decode_beside_their_own_start_also_after_a_restart(models,
         if step == 2:
             assert torch.equal(observation[CAMERA], starts.images[env._start_index][:, 0])
             observation = info["final_obs"]
-        tokens = env.model.network.codebook.tokens(env._imagination.digits[:, 0])
+        tokens = env.model.dynamics.network.codebook.tokens(env._imagination.codes[:, 0])
         start = before if step < 3 else env._start_index
         if step != 2:
-            expected = env.model.decode(tokens, starts.context[start]).images[:, 0]
+            expected = env.model.decode(tokens, starts.now.context[start]).images[:, 0]
             torch.testing.assert_close(observation[CAMERA], expected)
     assert not torch.equal(before, env._start_index)
 

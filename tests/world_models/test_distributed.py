@@ -27,14 +27,14 @@ SIZES = {
         "--model.tokenizer.levels=[5,4]",
     ],
     "action_world_model": [
-        "--model.layers=1", "--model.width=32", "--model.heads=2", "--model.clip_length=14",
-        "--model.code_width=8", "--model.self_rollout=0.5",
-        "--model.keypoint_weight=1", "--model.dynamics=autoregressive",
+        "--model.dynamics.type=autoregressive", "--model.dynamics.layers=1", "--model.dynamics.width=32",
+        "--model.dynamics.heads=2", "--model.dynamics.code_width=8", "--model.clip_length=14",
+        "--model.dynamics.self_rollout=0.5", "--model.dynamics.keypoint_weight=1",
     ],
     "text_world_model": [
-        "--model.layers=1", "--model.width=32", "--model.heads=2", "--model.clip_length=14",
-        "--model.code_width=8", "--model.state_size=0", "--model.dynamics=anchored",
-        "--model.dropout=0.1",
+        "--model.dynamics.type=anchored", "--model.dynamics.layers=1", "--model.dynamics.width=32",
+        "--model.dynamics.heads=2", "--model.dynamics.code_width=8", "--model.clip_length=14",
+        "--model.dynamics.dropout=0.1", "--model.state_size=0",
     ],
 }  # fmt: skip
 

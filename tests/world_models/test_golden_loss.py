@@ -17,9 +17,10 @@ from lerobot.utils.random_utils import set_seed
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data.clips import ClipSampler, FrameSampler
 from lerobot_wmrl.data.episodes import EpisodeTable
+from lerobot_wmrl.world_models import losses
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig, TextWorldModelConfig
 from lerobot_wmrl.world_models.training import train
-from tests.trained import TINY, small_tokenizer, tokenizer_config
+from tests.trained import CLIP_LENGTH, SIZES, nested, small_tokenizer, tokenizer_config
 
 EPISODES, ROWS, TOKENS, CODES = 4, 14, 16, 20
 GOLDEN = {
@@ -30,9 +31,10 @@ GOLDEN = {
     "text_world_model": [3.7513, 3.5552, 3.3833, 3.4729, 3.4508, 3.4538, 3.2883, 3.4127],
 }
 WORLD_MODEL: dict[str, Any] = {
-    "device": "cpu", "tokenizer": small_tokenizer(), "token_noise": 0.1,
-    **TINY,
+    "device": "cpu", "tokenizer": small_tokenizer(), "clip_length": CLIP_LENGTH, **SIZES,
 }  # fmt: skip
+AUTOREGRESSIVE = {"dynamics": "autoregressive", "window": 24}
+CROSS_ATTENTION = {**AUTOREGRESSIVE, "conditioning": "cross_attention"}
 
 
 def made_up_episodes() -> EpisodeTable:
@@ -42,9 +44,9 @@ def made_up_episodes() -> EpisodeTable:
     action = rng.normal(size=(rows, 7)).astype(np.float32)
     done = np.tile(np.arange(2 * ROWS) >= 2 * ROWS - 3, EPISODES // 2)
     start, length = np.arange(EPISODES) * ROWS, np.full(EPISODES, ROWS)
+    optimal = {"start.kind": np.zeros(EPISODES, int)}
     instructions = ["push the can", "pull the box"] * (EPISODES // 2)
     dataset: Any = SimpleNamespace(root="made up")
-    optimal = {"start.kind": np.zeros(EPISODES, int)}
     return EpisodeTable(dataset, state, action, done, start, length, instructions, optimal)
 
 
@@ -58,19 +60,18 @@ def made_up_sampler(model: str) -> ClipSampler | FrameSampler:
         )
         return FrameSampler(table, frames, episodes, ["third_view"], batch_size=4, seed=0, device="cpu")
     tokens = rng.integers(0, CODES, TOKENS) + (rng.random((EPISODES * ROWS, TOKENS)) < 0.1).cumsum(0)
-    return ClipSampler(table, tokens % CODES, episodes, TINY["clip_length"], 0.75, 4, seed=0, device="cpu")
+    return ClipSampler(table, tokens % CODES, episodes, CLIP_LENGTH, 0.75, 4, seed=0, device="cpu")
 
 
 @pytest.mark.parametrize("model", GOLDEN)
-def test_the_loss_of_a_short_training_is_the_golden_one(model, tmp_path: Path):
+def test_the_loss_of_a_short_training_is_the_golden_one(model, tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(losses, "TOKEN_NOISE", 0.1)
     configs = {
         "frame_tokenizer": tokenizer_config,
-        "action_world_model": partial(ActionWorldModelConfig, **WORLD_MODEL),
-        "autoregressive": partial(ActionWorldModelConfig, **WORLD_MODEL, dynamics="autoregressive"),
-        "cross_attention": partial(
-            ActionWorldModelConfig, **WORLD_MODEL, dynamics="autoregressive", conditioning="cross_attention"
-        ),
-        "text_world_model": partial(TextWorldModelConfig, **WORLD_MODEL),
+        "action_world_model": partial(ActionWorldModelConfig, **nested(WORLD_MODEL)),
+        "autoregressive": partial(ActionWorldModelConfig, **nested(WORLD_MODEL | AUTOREGRESSIVE)),
+        "cross_attention": partial(ActionWorldModelConfig, **nested(WORLD_MODEL | CROSS_ATTENTION)),
+        "text_world_model": partial(TextWorldModelConfig, **nested(WORLD_MODEL | CROSS_ATTENTION)),
     }
     set_seed(0)
     config = configs[model]()

@@ -3,8 +3,7 @@ import torch
 from torch import Tensor
 
 from lerobot_wmrl.common.precision import compute_in
-from lerobot_wmrl.world_models.codebook import CodeBook, make_codebook
-from lerobot_wmrl.world_models.keypoints import (
+from lerobot_wmrl.world_models.autoregressive.keypoints import (
     KEYPOINTS,
     Tracks,
     keypoint_loss,
@@ -12,6 +11,7 @@ from lerobot_wmrl.world_models.keypoints import (
     surroundings,
     track_tokens,
 )
+from lerobot_wmrl.world_models.codebook import CodeBook, make_codebook
 
 GRID, TIME, START = 6, 4, 13
 CODEBOOK = CodeBook((5, 5, 5))
@@ -21,15 +21,15 @@ VALID = torch.ones(1, TIME, dtype=torch.bool)
 
 def crossing() -> Tensor:
     """A token unlike any other goes right, one place a frame, over a background that stays. (1, T, S, C)"""
-    digits = torch.ones(1, TIME, GRID**2, 3, dtype=torch.long)
+    codes = torch.ones(1, TIME, GRID**2, 3, dtype=torch.long)
     for time in range(TIME):
-        digits[0, time, START + time] = 4
-    return digits
+        codes[0, time, START + time] = 4
+    return codes
 
 
-def sure(digits: Tensor) -> Tensor:
+def sure(codes: Tensor) -> Tensor:
     """Logits that leave no uncertainty."""
-    return 100 * CODEBOOK.one_hot(digits)
+    return 100 * CODEBOOK.one_hot(codes)
 
 
 def test_a_place_reaches_its_neighbours_in_its_own_camera():
@@ -48,9 +48,9 @@ def test_a_track_follows_what_moves_and_stays_where_nothing_does():
 
 def test_flicker_of_codes_is_no_motion():
     torch.manual_seed(0)
-    digits = torch.full((1, TIME, GRID**2, 3), 2)
-    digits[..., 0] += torch.randint(-1, 2, digits.shape[:-1])
-    places = track_tokens(digits, CODEBOOK, AROUND)
+    codes = torch.full((1, TIME, GRID**2, 3), 2)
+    codes[..., 0] += torch.randint(-1, 2, codes.shape[:-1])
+    places = track_tokens(codes, CODEBOOK, AROUND)
     assert (places == places[:, :1]).all()
 
 
@@ -77,15 +77,15 @@ def test_every_camera_has_keypoints_of_its_own():
 
 
 def test_keypoints_that_look_as_at_the_start_cost_nothing_wherever_they_are():
-    digits = crossing()
-    consistent = sure(digits[:, 1:])
-    assert keypoint_loss(consistent, CODEBOOK, digits, VALID, 1) < 1e-6
-    faded = digits.clone()
+    codes = crossing()
+    consistent = sure(codes[:, 1:])
+    assert keypoint_loss(consistent, CODEBOOK, codes, VALID, 1) < 1e-6
+    faded = codes.clone()
     faded[0, 2, START + 2] = 1
-    assert keypoint_loss(sure(faded[:, 1:]), CODEBOOK, digits, VALID, 1) > 0.1
+    assert keypoint_loss(sure(faded[:, 1:]), CODEBOOK, codes, VALID, 1) > 0.1
     elsewhere = consistent.clone()
     elsewhere[:, :, 0] += torch.randn(15)
-    assert keypoint_loss(elsewhere, CODEBOOK, digits, VALID, 1) < 1e-6
+    assert keypoint_loss(elsewhere, CODEBOOK, codes, VALID, 1) < 1e-6
 
 
 def test_it_is_as_exact_in_a_training_in_bfloat16():
@@ -98,9 +98,9 @@ def test_it_is_as_exact_in_a_training_in_bfloat16():
 
 
 def test_without_motion_there_is_no_keypoint():
-    digits = crossing()[:, :1].expand(-1, TIME, -1, -1)
+    codes = crossing()[:, :1].expand(-1, TIME, -1, -1)
     logits = torch.randn(1, TIME - 1, GRID**2, 15)
-    assert keypoint_loss(logits, CODEBOOK, digits, VALID, 1) == 0
+    assert keypoint_loss(logits, CODEBOOK, codes, VALID, 1) == 0
 
 
 def test_the_loss_pulls_along_the_track_only():
@@ -116,8 +116,8 @@ def test_the_loss_pulls_along_the_track_only():
 @pytest.mark.parametrize(("quantizer", "levels"), [("fsq", (5, 4)), ("lfq", (8, 8))])
 def test_expected_values_are_those_of_a_sure_prediction_and_even_out_when_unsure(quantizer, levels):
     codebook = make_codebook(quantizer, levels)
-    digits = codebook.codes(torch.arange(20))
-    sure_of = codebook.expected_values(100 * codebook.one_hot(digits))
-    torch.testing.assert_close(sure_of, codebook.values(digits).float())
+    codes = codebook.codes(torch.arange(20))
+    sure_of = codebook.expected_values(100 * codebook.one_hot(codes))
+    torch.testing.assert_close(sure_of, codebook.values(codes).float())
     unsure = codebook.expected_values(torch.zeros(3, sum(levels)))
     torch.testing.assert_close(unsure, torch.zeros(3, codebook.channels))

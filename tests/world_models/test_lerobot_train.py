@@ -13,15 +13,17 @@ from safetensors.torch import load_file
 
 from lerobot_wmrl.data.clips import clip_from_windows
 from lerobot_wmrl.data.episodes import open_dataset, read_episodes
+from lerobot_wmrl.data.frames import Frames
+from lerobot_wmrl.world_models import losses
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig
-from lerobot_wmrl.world_models.open_loop import open_loop
 from lerobot_wmrl.world_models.processor_world_model import make_pass_through_processors
 
 SIZE, ACTIONS, LENGTHS = 32, 3, (9, 14, 2)
 LAST = Path("checkpoints") / "last" / "pretrained_model"
-SMALL = ["--reward_model.layers=1", "--reward_model.width=32", "--reward_model.heads=2",
-         "--reward_model.clip_length=6", "--reward_model.code_width=8"]  # fmt: skip
+SMALL = ["--reward_model.dynamics.layers=1", "--reward_model.dynamics.width=32",
+         "--reward_model.dynamics.heads=2", "--reward_model.dynamics.code_width=8",
+         "--reward_model.clip_length=6"]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -76,9 +78,10 @@ def test_a_world_model_of_any_dataset_goes_on_bit_for_bit(
     foreign_dataset, foreign_tokenizer, monkeypatch, tmp_path
 ):
     """As `lerobot-train --resume=true` continues it: with its samples, but not with its random numbers."""
+    monkeypatch.setattr(losses, "TOKEN_NOISE", 0.0)
     flags = ["--reward_model.type=action_world_model", f"--reward_model.tokenizer_path={foreign_tokenizer}",
-             "--reward_model.dynamics=autoregressive", "--reward_model.token_noise=0",
-             "--reward_model.self_forcing=0"]  # fmt: skip
+             "--reward_model.dynamics.type=autoregressive",
+             "--reward_model.dynamics.self_forcing=0"]  # fmt: skip
     whole = lerobot_trained(monkeypatch, tmp_path / "run", *on(foreign_dataset, 4), *flags, *SMALL)
     expected = load_file(whole / LAST / "model.safetensors")
     (whole / "checkpoints" / "000004").rename(tmp_path / "lost")
@@ -95,7 +98,7 @@ def test_a_world_model_of_any_dataset_goes_on_bit_for_bit(
     assert model.config.tokenizer.cameras == ["top", "left.fisheye"]
     assert (model.config.action_size, model.config.state_size) == (ACTIONS, 0)
     first = torch.zeros(2, model.tokenizer.tokens_per_frame, dtype=torch.long)
-    ahead = open_loop(model, first, torch.empty(2, 0), torch.randn(2, 5, ACTIONS))
+    ahead = model.open_loop(Frames(first, torch.empty(2, 0)), torch.randn(2, 5, ACTIONS))
     assert (ahead.done_logit.sigmoid() < 0.01).all(), "the dataset does not say what success is"
 
 

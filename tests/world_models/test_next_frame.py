@@ -2,26 +2,30 @@ import torch
 from torch.nn import functional as F
 from vector_quantize_pytorch import FSQ
 
+from lerobot_wmrl.world_models.autoregressive.network import NextFrameNetwork
 from lerobot_wmrl.world_models.codebook import CodeBook
-from lerobot_wmrl.world_models.next_frame import NextFrameNetwork
+from lerobot_wmrl.world_models.configuration_world_model import AutoregressiveConfig
+from lerobot_wmrl.world_models.dynamics import Condition
+from lerobot_wmrl.world_models.layers import FrameSizes
 
 LEVELS = (8, 5, 3)
 
 
 def network() -> NextFrameNetwork:
     torch.manual_seed(0)
-    return NextFrameNetwork(
-        levels=LEVELS, grid=4, num_cameras=2, state_size=3, patch=2, layers=2, width=16, heads=2, window=4,
-        code_width=8,
-    )  # fmt: skip
+    config = AutoregressiveConfig(
+        layers=2, width=16, heads=2, window=4, code_width=8, conditioning="cross_attention"
+    )
+    sizes = FrameSizes(LEVELS, "fsq", grid=4, num_cameras=2, state_size=3, clip_length=4)
+    return NextFrameNetwork(config, sizes)
 
 
-def test_digits_are_those_of_the_quantizer_and_make_the_token_again():
+def test_codes_are_those_of_the_quantizer_and_make_the_token_again():
     codebook, quantizer = CodeBook(LEVELS), FSQ(list(LEVELS))
     tokens = torch.arange(8 * 5 * 3)
-    digits = codebook.codes(tokens)
-    assert torch.equal(digits, quantizer.indices_to_level_indices(tokens).long())
-    assert torch.equal(codebook.tokens(digits), tokens)
+    codes = codebook.codes(tokens)
+    assert torch.equal(codes, quantizer.indices_to_level_indices(tokens).long())
+    assert torch.equal(codebook.tokens(codes), tokens)
 
 
 def test_factorised_cross_entropy_equals_that_of_the_product_distribution():
@@ -47,9 +51,9 @@ def test_sampling_follows_the_distribution_at_the_temperature():
 
 def test_an_untrained_network_prefers_to_leave_the_frame_as_it_is():
     model = network()
-    digits = model.codebook.codes(torch.randint(0, 8 * 5 * 3, (2, 3, 32)))
-    prediction = model(digits, torch.zeros(2, 3, 3), torch.zeros(2, 3, 1, 16))
-    kept = model.codebook.sample(prediction.logits, 0.0, None) == digits
+    codes = model.codebook.codes(torch.randint(0, 8 * 5 * 3, (2, 3, 32)))
+    prediction, _ = model(codes, torch.zeros(2, 3, 3), Condition(torch.zeros(2, 3, 1, 16)))
+    kept = model.codebook.sample(prediction.logits, 0.0, None) == codes
     assert kept.float().mean() > 0.6
 
 
@@ -59,7 +63,8 @@ def test_every_input_reaches_the_prediction():
         torch.nn.init.normal_(parameter, std=0.3)
     state = torch.randn(1, 2, 3, requires_grad=True)
     condition = torch.randn(1, 2, 1, 16, requires_grad=True)
-    prediction = model(model.codebook.codes(torch.randint(0, 120, (1, 2, 32))), state, condition)
+    codes = model.codebook.codes(torch.randint(0, 120, (1, 2, 32)))
+    prediction, _ = model(codes, state, Condition(condition))
     for output in (prediction.logits, prediction.done_logit, prediction.proprioception):
         gradients = torch.autograd.grad(output[:, 1].sum(), (state, condition), retain_graph=True)
         assert all(gradient[:, 0].abs().sum() > 0 for gradient in gradients)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from lerobot_wmrl.world_models.past import Frames, Past, restart_after, start_after
+from lerobot_wmrl.data.frames import Frames, Past
 from tests.trained import small_tokenizer
 from tests.world_models.test_anchored import BATCH, CAMERAS, random_clip, world_model
 
@@ -12,7 +12,7 @@ AGO = 2
 
 
 def frames_of(clip, row: int) -> Frames:
-    return Frames(clip.tokens[:, row], clip.state[:, row], None)
+    return Frames(clip.tokens[:, row], clip.state[:, row], clip.context)
 
 
 def past_of(clip, first: int) -> Past:
@@ -22,25 +22,25 @@ def past_of(clip, first: int) -> Past:
 
 @pytest.fixture(params=["autoregressive", "anchored"])
 def model(request):
-    context = request.param == "anchored"
-    return world_model(
-        dynamics=request.param, tokenizer=small_tokenizer(cameras=CAMERAS, context=context), window=4
-    )
+    anchored = request.param == "anchored"
+    memory = {"clip_length": 6} if anchored else {"window": 4}
+    tokenizer = small_tokenizer(cameras=CAMERAS, context=anchored)
+    return world_model(dynamics=request.param, tokenizer=tokenizer, **memory)
 
 
 def begun(model, clip, first: int = 0):
     past, now = past_of(clip, first), frames_of(clip, first + AGO)
-    return start_after(model, past, now, clip.context, torch.float32)
+    return model.start(now, past=past, dtype=torch.float32)
 
 
 def test_it_is_remembered_as_in_one_pass_over_real_frames(model):
     clip = random_clip()
     state = begun(model, clip)
     imagined = model.step(state, clip.action[:, AGO])
-    whole = model.dynamics.predict(model, clip, drawn=True)
+    whole = model.predict(clip)
     torch.testing.assert_close(imagined.done_logit, whole.done_logit[:, AGO], atol=1e-4, rtol=1e-4)
     now = frames_of(clip, AGO)
-    alone = model.start(now.tokens, now.proprioception, dtype=torch.float32, context=clip.context)
+    alone = model.start(now, dtype=torch.float32)
     forgetful = model.step(alone, clip.action[:, AGO])
     assert (forgetful.done_logit - imagined.done_logit).abs().max() > 1e-2
 
@@ -54,7 +54,7 @@ def test_who_begins_anew_among_others_is_as_if_all_began(model, before):
     for row in range(before):
         model.step(running, first.action[:, row])
     past, now = past_of(second, 0), frames_of(second, AGO)
-    restart_after(model, running, mask, past, now, second.context)
+    model.restart(running, mask, now, past)
     together = [model.step(running, second.action[:, AGO + row]) for row in range(5)]
     fresh = begun(model, second)
     alone = [model.step(fresh, second.action[:, AGO + row]) for row in range(5)]
@@ -74,6 +74,4 @@ def test_a_past_longer_than_the_memory_is_refused(model):
     running = begun(model, clip)
     long = Past(past_of(clip, 0).frames * 2, past_of(clip, 0).actions * 2)
     with pytest.raises(ValueError, match=r"a past of 4 frames.*shorter than both"):
-        restart_after(
-            model, running, torch.ones(BATCH, dtype=torch.bool), long, frames_of(clip, AGO), clip.context
-        )
+        model.restart(running, torch.ones(BATCH, dtype=torch.bool), frames_of(clip, AGO), long)

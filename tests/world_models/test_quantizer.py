@@ -7,12 +7,17 @@ import torch
 from torch.nn import functional as F
 
 from lerobot_wmrl.common.tracking import read_metrics
+from lerobot_wmrl.data.frames import Frames
+from lerobot_wmrl.world_models import losses
+from lerobot_wmrl.world_models.autoregressive.network import NextFrameNetwork
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.codebook import BinaryCodeBook, CodeBook
+from lerobot_wmrl.world_models.configuration_world_model import AutoregressiveConfig
+from lerobot_wmrl.world_models.dynamics import Condition
+from lerobot_wmrl.world_models.layers import FrameSizes
 from lerobot_wmrl.world_models.losses import (
-    corrupt_digits,
+    corrupt_codes,
 )
-from lerobot_wmrl.world_models.next_frame import NextFrameNetwork
 from lerobot_wmrl.world_models.quantizer import COMMITMENT_WEIGHT, ENTROPY_WEIGHT, LookupFreeQuantizer
 from tests.trained import action_config, run_training, tokenizer_config
 
@@ -56,7 +61,8 @@ def test_the_loss_is_eq_4_and_5_of_magvit_2():
 
 
 @pytest.mark.parametrize("codebook", [CodeBook((8, 5, 3)), BinaryCodeBook((8, 8, 8))])
-def test_neighbors_are_one_step_away(codebook):
+def test_neighbors_are_one_step_away(codebook, monkeypatch):
+    monkeypatch.setattr(losses, "TOKEN_NOISE", 0.5)
     codes = codebook.codes(torch.randint(0, 120, (4000,)))
     neighbors = codebook.neighbors(codes)
     factors = len(codebook.level_counts)
@@ -64,7 +70,7 @@ def test_neighbors_are_one_step_away(codebook):
     steps = codebook.distance(alone, codes)
     assert steps.max() == 1
     assert codebook.distance(neighbors, codes).le(factors).all()
-    assert 0.4 < (corrupt_digits(codes, codebook, 0.5) != codes).float().mean() / steps.float().mean() < 0.6
+    assert 0.4 < (corrupt_codes(codes, codebook) != codes).float().mean() / steps.float().mean() < 0.6
 
 
 def test_lfq_neighbors_flip_every_sign_as_often():
@@ -76,13 +82,11 @@ def test_lfq_neighbors_flip_every_sign_as_often():
 
 def test_the_copy_bias_is_that_of_the_present_code():
     torch.manual_seed(0)
-    model = NextFrameNetwork(
-        levels=LEVELS, grid=4, num_cameras=1, state_size=0, patch=2, layers=1, width=16, heads=2, window=4,
-        code_width=8, quantizer="lfq",
-    )  # fmt: skip
+    config = AutoregressiveConfig(layers=1, width=16, heads=2, window=4, code_width=8)
+    model = NextFrameNetwork(config, FrameSizes(LEVELS, "lfq", 4, 1, state_size=0, clip_length=4))
     torch.nn.init.zeros_(model.head.out.weight)
     codes = model.codebook.codes(torch.randint(0, 16**3, (2, 3, 16)))
-    prediction = model(codes, torch.zeros(2, 3, 0), torch.zeros(2, 3, 1, 16))
+    prediction, _ = model(codes, torch.zeros(2, 3, 0), Condition(torch.zeros(2, 3, 1, 16)))
     bias = model.head.out.bias
     present = prediction.logits - bias[: 3 * 16]
     gate = F.softplus(bias[3 * 16 :])
@@ -104,7 +108,7 @@ def test_a_world_model_takes_its_quantizer_from_the_tokenizer(small_dataset, tmp
     images = torch.rand(3, 1, 3, 32, 32)
     tokens = model.tokenizer.encode(images)
     assert torch.equal(tokens, trained.encode(images))
-    imagined = model.step(model.start(tokens, torch.zeros(3, 8)), torch.zeros(3, 7))
+    imagined = model.step(model.start(Frames(tokens, torch.zeros(3, 8))), torch.zeros(3, 7))
     assert imagined.tokens.shape == tokens.shape
     assert imagined.tokens.max() < 16**3
     assert model.tokenizer.decode(imagined.tokens).shape == images.shape

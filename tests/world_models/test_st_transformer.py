@@ -4,8 +4,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from lerobot_wmrl.world_models.conditioning import CONDITIONINGS
-from lerobot_wmrl.world_models.st_transformer import SpatialTemporalTransformer
+from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.world_models.autoregressive.conditioning import CONDITIONINGS
+from lerobot_wmrl.world_models.autoregressive.network import SpatialTemporalTransformer
+from lerobot_wmrl.world_models.dynamics import Condition
+from lerobot_wmrl.world_models.kv_cache import KVCache
+from lerobot_wmrl.world_models.layers import ClipMemory
 
 WINDOW, TOKENS, WIDTH = 5, 6, 16
 
@@ -13,7 +17,7 @@ WINDOW, TOKENS, WIDTH = 5, 6, 16
 @pytest.fixture(params=list(CONDITIONINGS))
 def transformer(request: pytest.FixtureRequest) -> SpatialTemporalTransformer:
     torch.manual_seed(0)
-    model = SpatialTemporalTransformer(2, WIDTH, 2, WINDOW, request.param).eval()
+    model = SpatialTemporalTransformer(2, WIDTH, 2, request.param).eval()
     for parameter in model.parameters():
         torch.nn.init.normal_(parameter, std=0.3)
     return model
@@ -24,13 +28,30 @@ def clips(batch: int, length: int) -> tuple[Tensor, Tensor]:
     return torch.randn(batch, length, TOKENS, WIDTH), torch.randn(batch, length, 2, WIDTH)
 
 
+def make_cache(model: SpatialTemporalTransformer, batch: int, grows: bool = True) -> KVCache:
+    shape = (len(model.blocks), batch, TOKENS, 2, WINDOW, WIDTH // 2)
+    return KVCache.empty(shape, torch.device("cpu"), torch.float32, grows)
+
+
+def whole(
+    model: SpatialTemporalTransformer, x: Tensor, condition: Tensor, mask: Tensor | None = None
+) -> Tensor:
+    """One pass over clips."""
+    memory = ClipMemory(x.shape[1], WINDOW, WIDTH // 2, x.device)
+    return model(x, Condition(condition, mask), memory)
+
+
+def step(model: SpatialTemporalTransformer, x: Tensor, condition: Tensor, cache: KVCache, t: int) -> Tensor:
+    """Frame t of clips against the cache."""
+    return model(x[:, t : t + 1], Condition(condition[:, t : t + 1]), cache.advance())
+
+
 def unroll(
     model: SpatialTemporalTransformer, x: Tensor, condition: Tensor, grows: bool = True, begin: int = 0
 ) -> Tensor:
-    cache = model.make_cache(x.shape[0], x.shape[2], x.device, x.dtype, grows)
+    cache = make_cache(model, len(x), grows)
     cache.position[:] = cache.started[:] = begin
-    steps = [model.step(x[:, t : t + 1], condition[:, t : t + 1], None, cache) for t in range(x.shape[1])]
-    return torch.cat(steps, 1)
+    return torch.cat([step(model, x, condition, cache, t) for t in range(x.shape[1])], 1)
 
 
 def assert_same(actual: Tensor, expected: Tensor) -> None:
@@ -41,7 +62,7 @@ def assert_same(actual: Tensor, expected: Tensor) -> None:
 @torch.no_grad()
 def test_cached_steps_equal_one_long_pass_also_after_the_ring_wraps(transformer, grows):
     x, condition = clips(3, 4 * WINDOW)
-    assert_same(unroll(transformer, x, condition, grows), transformer(x, condition))
+    assert_same(unroll(transformer, x, condition, grows), whole(transformer, x, condition))
 
 
 @torch.no_grad()
@@ -53,7 +74,7 @@ def test_a_sliding_window_computed_anew_is_something_else(transformer):
     x, condition = clips(2, 3 * WINDOW)
     cached = unroll(transformer, x, condition)
     windows = [slice(max(0, t + 1 - WINDOW), t + 1) for t in range(x.shape[1])]
-    anew = torch.stack([transformer(x[:, part], condition[:, part])[:, -1] for part in windows], 1)
+    anew = torch.stack([whole(transformer, x[:, part], condition[:, part])[:, -1] for part in windows], 1)
     assert_same(cached[:, :WINDOW], anew[:, :WINDOW])
     share = (cached - anew)[:, WINDOW:].square().mean().sqrt() / cached[:, WINDOW:].square().mean().sqrt()
     print(f"difference of ring and window computed anew: {share:.3f} of the output's root mean square")
@@ -63,10 +84,10 @@ def test_a_sliding_window_computed_anew_is_something_else(transformer):
 def moved_frames(transformer: SpatialTemporalTransformer, changed: str) -> list[int]:
     """Of 16 frames, those whose output changes with frame 4, or with its condition; all others are equal."""
     x, condition = clips(1, 16)
-    before = transformer(x, condition)
+    before = whole(transformer, x, condition)
     frames = {"frame": x, "condition": condition}[changed]
     frames[:, 4] = torch.randn_like(frames[:, 4])
-    return (transformer(x, condition) != before).any((0, 2, 3)).nonzero().flatten().tolist()
+    return (whole(transformer, x, condition) != before).any((0, 2, 3)).nonzero().flatten().tolist()
 
 
 @torch.no_grad()
@@ -81,7 +102,7 @@ def test_no_frame_sees_the_future_or_beyond_the_receptive_field(transformer):
 def test_only_relative_time_matters(transformer):
     x, condition = clips(2, 3)
     late = unroll(transformer, x, condition, grows=False, begin=1_001)
-    torch.testing.assert_close(late, transformer(x, condition), atol=1e-3, rtol=1e-3)
+    torch.testing.assert_close(late, whole(transformer, x, condition), atol=1e-3, rtol=1e-3)
 
 
 @pytest.mark.parametrize("restart", [3, 2 * WINDOW + 2])
@@ -89,15 +110,15 @@ def test_only_relative_time_matters(transformer):
 def test_a_restarted_environment_forgets_and_the_others_do_not(transformer, restart):
     """Before and after the ring has wrapped, until it wraps again."""
     x, condition = clips(2, restart + 2 * WINDOW)
-    cache = transformer.make_cache(2, TOKENS, x.device, x.dtype)
+    cache = make_cache(transformer, 2)
     steps = []
     for t in range(x.shape[1]):
         if t == restart:
             cache.restart(torch.tensor([True, False]))
-        steps.append(transformer.step(x[:, t : t + 1], condition[:, t : t + 1], None, cache))
+        steps.append(step(transformer, x, condition, cache, t))
     out = torch.cat(steps, 1)
-    assert_same(out[:1, restart:], transformer(x[:1, restart:], condition[:1, restart:]))
-    assert_same(out[1:], transformer(x[1:], condition[1:]))
+    assert_same(out[:1, restart:], whole(transformer, x[:1, restart:], condition[:1, restart:]))
+    assert_same(out[1:], whole(transformer, x[1:], condition[1:]))
 
 
 @torch.no_grad()
@@ -105,22 +126,24 @@ def test_padding_of_the_condition_does_not_count(transformer):
     x = torch.randn(2, 3, TOKENS, WIDTH)
     condition = torch.randn(2, 1, 4, WIDTH)
     mask = torch.tensor([[True, True, False, False], [True] * 4])[:, None, None, None]
-    padded = transformer(x, condition, mask)
-    assert_same(padded[:1], transformer(x[:1], condition[:1, :, :2]))
-    assert_same(padded[1:], transformer(x[1:], condition[1:]))
-    assert (padded[0] - transformer(x[:1], condition[:1])[0]).abs().max() > 1e-2
+    padded = whole(transformer, x, condition, mask)
+    assert_same(padded[:1], whole(transformer, x[:1], condition[:1, :, :2]))
+    assert_same(padded[1:], whole(transformer, x[1:], condition[1:]))
+    assert (padded[0] - whole(transformer, x[:1], condition[:1])[0]).abs().max() > 1e-2
 
 
 def test_adaptive_norms_begin_as_plain_ones_and_learn():
-    model = SpatialTemporalTransformer(1, WIDTH, 2, WINDOW, "adaln")
+    model = SpatialTemporalTransformer(1, WIDTH, 2, "adaln")
     x, condition = clips(2, 3)
-    torch.testing.assert_close(model(x, condition), model(x, torch.zeros_like(condition)))
-    model(x, condition).square().sum().backward()
+    torch.testing.assert_close(whole(model, x, condition), whole(model, x, torch.zeros_like(condition)))
+    whole(model, x, condition).square().sum().backward()
     (block,) = model.blocks
     assert block.condition.modulation.weight.grad.abs().sum() > 0
     assert block.time.out.weight.grad.abs().sum() > 0
 
 
 def test_an_unknown_conditioning_is_named():
-    with pytest.raises(ValueError, match=r"--model\.conditioning=film: choose one of cross_attention, adaln"):
-        SpatialTemporalTransformer(1, WIDTH, 2, WINDOW, "film")
+    with pytest.raises(
+        FieldError, match=r"^dynamics.conditioning=film: .*choose one of cross_attention, adaln"
+    ):
+        SpatialTemporalTransformer(1, WIDTH, 2, "film")

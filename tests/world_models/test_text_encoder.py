@@ -1,9 +1,14 @@
 import pytest
 import torch
 
-from lerobot_wmrl.world_models.frozen_t5 import FrozenT5
-from lerobot_wmrl.world_models.instructions import MAX_TOKENS, check_one_each
-from lerobot_wmrl.world_models.text_encoder import ByteTextEncoder, FrozenTextEncoder, TextEncoder
+from lerobot_wmrl.world_models.text import (
+    MAX_TOKENS,
+    ByteTextEncoder,
+    FrozenT5,
+    FrozenTextEncoder,
+    TextEncoder,
+    check_one_each,
+)
 from tests.world_models.pretrained_t5 import FAMILY, save_t5
 
 WIDTH = 48

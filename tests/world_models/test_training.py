@@ -25,7 +25,7 @@ from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelE
 from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig
 from lerobot_wmrl.world_models.checkpoint import load_model
-from lerobot_wmrl.world_models.temporal_memory import ClipMemory
+from lerobot_wmrl.world_models.layers import ClipMemory
 from lerobot_wmrl.world_models.training import (
     golden_episodes,
     make_joint_sampler,
@@ -84,7 +84,7 @@ def test_the_flags_of_a_preset_fit_together(preset):
     )  # fmt: skip
     assert tokenizer.tokenizer.quantizer == ("lfq" if preset in ("gpu", "paper") else "fsq")
     grid = make_reward_model(tokenizer).tokenizer.grid
-    assert all(grid % config.patch == 0 for config in world_models)
+    assert all(grid % config.dynamics.patch == 0 for config in world_models)
 
 
 def test_only_chosen_episodes_are_learnt_from(small_dataset, trained_models):
@@ -182,15 +182,16 @@ def test_imagination_equals_the_teacher_forced_pass_on_its_own_frames(sampler, t
     torch.manual_seed(0)
     config = action_config(trained_models["frame_tokenizer"], dynamics="autoregressive")
     model = make_reward_model(config).eval()
-    for parameter in model.network.parameters():
+    for parameter in model.dynamics.network.parameters():
         torch.nn.init.normal_(parameter, std=0.2)
     clip = sampler.clips(np.arange(4), np.zeros(4, int))
-    state = model.start(clip.tokens[:, 0], clip.state[:, 0])
+    state = model.start(clip.first())
     steps = [model.step(state, clip.action[:, t]) for t in range(11)]
     frames = torch.stack([clip.tokens[:, 0], *[step.tokens for step in steps]], 1)
     states = torch.stack([clip.state[:, 0], *[step.proprioception for step in steps]], 1)
     prediction = model.predict(clip._replace(tokens=frames, state=states))
-    again = model.network.codebook.tokens(model.network.codebook.sample(prediction.logits, 0.0, None))
+    codebook = model.dynamics.network.codebook
+    again = codebook.tokens(codebook.sample(prediction.logits, 0.0, None))
     assert torch.equal(again[:, :11], frames[:, 1:])
     done = torch.stack([step.done_logit for step in steps], 1)
     torch.testing.assert_close(prediction.done_logit[:, :11], done, atol=1e-4, rtol=1e-4)

@@ -11,13 +11,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lerobot_wmrl.common.distributed import masked_mean
 from lerobot_wmrl.common.precision import compute_in
 from lerobot_wmrl.data.clips import known_transitions
 from lerobot_wmrl.world_models.codebook import CodeBook
-from lerobot_wmrl.world_models.losses import (
-    MOTION_LEVELS,
-)
+from lerobot_wmrl.world_models.losses import MOTION_LEVELS, masked_mean
 
 KEYPOINTS = 16
 """K, the most active tracks a camera and clip. A gripper and an object cover about as many tokens."""
@@ -45,16 +42,16 @@ def surroundings(grid: int, num_cameras: int, device: torch.device) -> Tensor:
     return (camera + row * grid + column).flatten(0, 1)
 
 
-def track_tokens(digits: Tensor, codebook: CodeBook, around: Tensor) -> Tensor:
-    """Where each token of the first frame is later: digits (B, T, S, C), `around` (S, N) → (B, T, S).
+def track_tokens(codes: Tensor, codebook: CodeBook, around: Tensor) -> Tensor:
+    """Where each token of the first frame is later: codes (B, T, S, C), `around` (S, N) → (B, T, S).
 
     Block matching: frame by frame to the code nearest to the first one among those around, if it is nearer
     by `MOTION_LEVELS`.
     """
-    clip = torch.arange(len(digits), device=digits.device)[:, None, None]
-    own = digits[:, 0, :, None]
-    places = [torch.arange(digits.shape[2], device=digits.device).expand(len(digits), -1)]
-    for frame in digits[:, 1:].unbind(1):
+    clip = torch.arange(len(codes), device=codes.device)[:, None, None]
+    own = codes[:, 0, :, None]
+    places = [torch.arange(codes.shape[2], device=codes.device).expand(len(codes), -1)]
+    for frame in codes[:, 1:].unbind(1):
         reachable = around[places[-1]]
         distance = codebook.distance(frame[clip, reachable], own)
         distance[..., 0] -= MOTION_LEVELS - 1
@@ -77,20 +74,20 @@ def most_active(places: Tensor, valid: Tensor, num_cameras: int) -> Tracks:
 
 
 def keypoint_loss(
-    logits: Tensor, codebook: CodeBook, digits: Tensor, valid: Tensor, num_cameras: int
+    logits: Tensor, codebook: CodeBook, codes: Tensor, valid: Tensor, num_cameras: int
 ) -> Tensor:
     """RoboScape's eq. 5: squared distance of the values expected along the tracks from those at their starts.
 
-    logits (B, T − 1, S, V) of frames 1 … T − 1; digits (B, T, S, C) of all frames; valid (B, T) → scalar.
+    logits (B, T − 1, S, V) of frames 1 … T − 1; codes (B, T, S, C) of all frames; valid (B, T) → scalar.
     Computed in float32, whatever the network computes in.
     """
-    grid = math.isqrt(digits.shape[2] // num_cameras)
-    around = surroundings(grid, num_cameras, digits.device)
-    tracks = most_active(track_tokens(digits, codebook, around), valid, num_cameras)
+    grid = math.isqrt(codes.shape[2] // num_cameras)
+    around = surroundings(grid, num_cameras, codes.device)
+    tracks = most_active(track_tokens(codes, codebook, around), valid, num_cameras)
     places = tracks.places[:, 1:, :, None]
     along = logits.gather(2, places.expand(-1, -1, -1, logits.shape[-1]))
     start = tracks.places[:, 0, :, None].expand(-1, -1, codebook.channels)
-    own = codebook.values(digits[:, 0]).gather(1, start)
+    own = codebook.values(codes[:, 0]).gather(1, start)
     with compute_in(torch.float32, logits.device):
         apart = (codebook.expected_values(along.float()) - own[:, None]).square().mean(-1)
     return masked_mean(apart, tracks.moving[:, 1:].float())

@@ -1,0 +1,193 @@
+"""Anchored dynamics: the loss, imagination, and open-loop prediction in one pass."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final
+
+import torch
+from torch import Tensor
+
+from lerobot_wmrl.common.precision import compute_in
+from lerobot_wmrl.data.clips import Clip, known_transitions, take_rows
+from lerobot_wmrl.data.frames import Frames
+from lerobot_wmrl.world_models.anchored.network import AnchoredNetwork, Scene, StateRollout
+from lerobot_wmrl.world_models.codebook import CodeBook
+from lerobot_wmrl.world_models.configuration_world_model import AnchoredConfig
+from lerobot_wmrl.world_models.dynamics import (
+    Condition,
+    Dynamics,
+    Imagination,
+    Imagined,
+    OpenLoopPrediction,
+    Prediction,
+)
+from lerobot_wmrl.world_models.kv_cache import CachedMemory, KVCache
+from lerobot_wmrl.world_models.layers import FrameSizes
+from lerobot_wmrl.world_models.losses import TargetFrames, corrupt_codes, next_frame_loss, weighted_frames
+
+DRAWN_FRAMES: Final = 4
+"""Frames of each clip that a training step draws, at random. Done and state are learnt from all of them."""
+
+
+def draw_rows(valid: Tensor, count: int) -> Tensor:
+    """Draw `count` rows of each clip whose next one is valid too: valid (B, T) → (B, count)."""
+    chance = torch.rand(len(valid), count, device=valid.device)
+    transitions = (valid[:, 1:].sum(1, keepdim=True)).clamp_min(1)
+    return (chance * transitions).long().clamp_max(valid.shape[1] - 2)
+
+
+def frames_after(rows: Tensor, codes: Tensor, valid: Tensor, codebook: CodeBook) -> TargetFrames:
+    """Return the frames after rows (B, K) of clips with codes (B, T, S, C), valid (B, T).
+
+    Tokens that differ from the first frame count more.
+    """
+    known, target = (take_rows(x, rows) for x in (known_transitions(valid), codes[:, 1:]))
+    return weighted_frames(codebook, target, codes[:, :1], known)
+
+
+@dataclass
+class AnchoredImagination(Imagination):
+    """Imaginations that each began at a frame of their own: its scene, and the state rollout since.
+
+    Whoever has imagined as many frames as the cache holds begins anew at the frame that was imagined last.
+    `frame` is the cache's position, known to the host. `phases` are the frames, modulo the cache's window, at
+    which some environment may have begun: at any other frame the device need not be asked who is due.
+    """
+
+    scene: Scene | None = None
+    rollout: StateRollout | None = None
+    frame: int = 0
+    phases: set[int] = field(default_factory=lambda: {0})
+
+    @property
+    def num_elements(self) -> int:
+        held = [*(self.scene or ()), *(self.rollout or ())]
+        return self.cache.num_elements + sum(tensor.numel() for tensor in held)
+
+    def restart(self, mask: Tensor) -> None:
+        self.phases.add(self._phase)
+        super().restart(mask)
+
+    def rewind(self, other: Imagination, frames: int) -> None:
+        assert isinstance(other, AnchoredImagination)
+        super().rewind(other, frames)
+        self.frame = other.frame - frames
+        self.phases = {self._phase}
+
+    def put(self, rows: Tensor, other: Imagination) -> None:
+        assert isinstance(other, AnchoredImagination)
+        assert other.scene is not None
+        assert other.rollout is not None
+        self.begin(rows, other.scene, other.rollout)
+        super().put(rows, other)
+        self.phases |= other.phases
+
+    def due(self) -> Tensor:
+        """Environments that have to begin now: rows (R,).
+
+        Waits for the device to say which, if there may be any.
+        """
+        if self._phase not in self.phases:
+            return self.cache.started.new_empty(0)
+        age = self.cache.position - self.cache.started
+        rows = (age % self.cache.window == 0).nonzero().squeeze(1)
+        if not len(rows):
+            self.phases.remove(self._phase)
+        return rows
+
+    def begin(self, rows: Tensor, scene: Scene, rollout: StateRollout) -> None:
+        """Begin in the environments `rows` (R,) with scenes and state rollouts of R rows."""
+        cache = self.cache
+        cache.started.copy_(cache.started.index_copy(0, rows, cache.position.expand(len(rows))))
+        if self.scene is None or self.rollout is None:
+            self.scene, self.rollout = scene, rollout
+        else:
+            self.scene = put_rows(self.scene, rows, scene)
+            self.rollout = put_rows(self.rollout, rows, rollout)
+
+    def advance(self) -> CachedMemory:
+        """Begin a frame in the cache."""
+        self.frame += 1
+        return self.cache.advance()
+
+    @property
+    def _phase(self) -> int:
+        return self.frame % self.cache.window
+
+
+def put_rows[T: tuple[Tensor, ...]](old: T, rows: Tensor, new: T) -> T:
+    """Return `old` with `new` in the rows `rows` (R,) of every tensor."""
+    replaced = (a.index_copy(0, rows, b.to(a.dtype)) for a, b in zip(old, new, strict=True))
+    return type(old)(*replaced)
+
+
+class AnchoredDynamics(Dynamics):
+    """Every frame from the episode's first one and the actions since: no picture is ever fed back."""
+
+    network: AnchoredNetwork
+
+    def __init__(self, config: AnchoredConfig, sizes: FrameSizes) -> None:
+        super().__init__()
+        self.network = AnchoredNetwork(config, sizes)
+
+    def loss(self, clip: Clip, condition: Condition, progress: float) -> tuple[Tensor, dict[str, float]]:
+        """Eqs. 2-4: the tokens of `DRAWN_FRAMES` frames of a clip, done and state of all of them."""
+        network, codebook = self.network, self.network.codebook
+        codes = codebook.codes(clip.tokens)  # (B, T, S, C)
+        rows = draw_rows(clip.valid, DRAWN_FRAMES)  # (B, K)
+        first = corrupt_codes(codes[:, :1], codebook)
+        prediction = network(first, clip.state[:, :1], condition, codes.shape[1], rows, clip.context)
+        target = frames_after(rows, codes, clip.valid, codebook)
+        return next_frame_loss(prediction, codebook, target, clip)
+
+    @torch.no_grad()
+    def predict(self, clip: Clip, condition: Condition, drawn: bool) -> Prediction:
+        """Predict from the first frame and all actions until then."""
+        codes = self.network.codebook.codes(clip.tokens[:, :1])
+        none = torch.empty(len(codes), 0, dtype=torch.long, device=codes.device)
+        rows, length = None if drawn else none, clip.tokens.shape[1]
+        prediction: Prediction = self.network(codes, clip.state[:, :1], condition, length, rows, clip.context)
+        return prediction
+
+    def start(self, frames: Frames, dtype: torch.dtype | None = None) -> AnchoredImagination:
+        """Begin at these frames. The scene is encoded in the first step, which needs their context."""
+        network = self.network
+        codes, state, dtype = self._first(frames, dtype)
+        shape = (len(network.trajectory), len(codes), 1, network.heads, network.window, network.head_width)
+        return AnchoredImagination(codes, state, KVCache.empty(shape, codes.device, dtype), frames.context)
+
+    @torch.no_grad()
+    def step(self, imagination: Imagination, condition: Condition) -> Imagined:
+        """Draw the next frame; environments that begin encode their newest frame as the scene first."""
+        assert isinstance(imagination, AnchoredImagination)
+        network, codes, state = self.network, imagination.codes, imagination.proprioception
+        with compute_in(imagination.dtype, codes.device):
+            rows = imagination.due()
+            if len(rows):
+                began = network.encode(codes[rows], state[rows], imagination.context[rows])
+                imagination.begin(rows, *began)
+            assert imagination.scene is not None
+            assert imagination.rollout is not None
+            prediction, rollout = network.follow(
+                imagination.scene, imagination.rollout, condition.mean(), imagination.advance(), None
+            )
+            imagination.rollout = rollout.last()
+            drawn = network.codebook.sample(prediction.logits, 0.0, None)
+        return self._advance(imagination, prediction, drawn)
+
+    @torch.no_grad()
+    def open_loop(
+        self, frames: Frames, actions: Tensor, encode: Callable[[Tensor], Condition]
+    ) -> OpenLoopPrediction:
+        """Predict in one pass that draws the last frame alone, unless imagination begins anew on the way."""
+        network, length = self.network, actions.shape[1]
+        if length > network.window:
+            return super().open_loop(frames, actions, encode)
+        codes, state, dtype = self._first(frames, None)
+        last = torch.full((len(codes), 1), length - 1, device=codes.device)
+        with compute_in(dtype, codes.device):
+            prediction = network(codes, state, encode(actions), length, last, frames.context)
+        drawn = network.codebook.sample(prediction.logits.float(), 0.0, None)
+        return OpenLoopPrediction(
+            prediction.done_logit, prediction.proprioception, network.codebook.tokens(drawn[:, 0])
+        )

@@ -1,0 +1,284 @@
+"""The anchored network: a clip's first frame and the actions since give its frame t + 1 (eq. 1).
+
+Four parts. The scene encoder encodes the first frame, once. The state rollout follows the robot's state,
+action by action. The trajectory, one token a frame, attends to its own past and to the scene; done is read
+from it. The renderer draws any frame that is asked for, from the scene and the trajectory's token.
+
+No imagined frame is ever an input. So errors in pictures do not add up, training meets what imagination
+meets, and a training step need not draw every frame that it learns from.
+"""
+
+from collections.abc import Iterable
+from typing import Final, NamedTuple, cast
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from lerobot_wmrl.common.precision import compute_in
+from lerobot_wmrl.data.clips import take_rows
+from lerobot_wmrl.data.frames import NO_CONTEXT, Context
+from lerobot_wmrl.world_models.configuration_world_model import AnchoredConfig
+from lerobot_wmrl.world_models.dynamics import Condition, Prediction
+from lerobot_wmrl.world_models.layers import (
+    STATE_STEP,
+    ClipMemory,
+    CrossAttention,
+    FrameNetwork,
+    FrameSizes,
+    SelfAttention,
+    TemporalMemory,
+    attention,
+    make_mlp,
+)
+
+SUMMARY_CHANNELS: Final = 16
+"""Channels that each token of the scene contributes to its summary."""
+
+
+class Scene(NamedTuple):
+    """First frames of B clips, encoded once.
+
+    codes (B, 1, S, C); tokens (B, 1, M, D), M = 1 + S' of the transformer; keys_values (B, 1, L, 2, h, M, d)
+    for each of the trajectory's L layers; summary (B, 1, D); local features (B, N, code_width, g, g).
+    """
+
+    codes: Tensor
+    tokens: Tensor
+    keys_values: Tensor
+    summary: Tensor
+    local: Tensor
+
+
+class StateRollout(NamedTuple):
+    """The robot's states after each of T actions.
+
+    state (B, T, P), normalised; change (B, T, P) of the last step in `STATE_STEP`s; hidden (B, T, D).
+    """
+
+    state: Tensor
+    change: Tensor
+    hidden: Tensor
+
+    def last(self) -> "StateRollout":
+        """Where the rollout goes on, T = 1."""
+        return StateRollout(*(tensor[:, -1:] for tensor in self))
+
+
+class ContextEmbedding(nn.Module):
+    """The tokenizer's features of an episode's first frame, as transformer tokens.
+
+    They are continuous: they say where things lie twice as exactly as the first frame's codes.
+    """
+
+    def __init__(self, channels: int, patch: int, width: int) -> None:
+        super().__init__()
+        self.norm = nn.GroupNorm(1, channels)
+        self.patches = nn.Conv2d(channels, width, patch, stride=patch)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Coarsest features (B, N, C, g, g) of N cameras → tokens (B, N·(g/patch)², D)."""
+        tokens = self.patches(self.norm(features.flatten(0, 1))).flatten(2).transpose(1, 2)
+        return tokens.unflatten(0, features.shape[:2]).flatten(1, 2)
+
+
+class SceneSummary(nn.Module):
+    """A scene's M tokens as one vector. Each token has weights of its own, as it matters where things are."""
+
+    def __init__(self, tokens: int, width: int) -> None:
+        super().__init__()
+        self.channels = nn.Linear(width, SUMMARY_CHANNELS)
+        self.mix = nn.Linear(tokens * SUMMARY_CHANNELS, width)
+        self.out = nn.Linear(width, width)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """(B, T, M, D) → (B, T, D)"""
+        flat = F.silu(self.channels(tokens)).flatten(2)
+        return self.out(F.silu(self.mix(flat)))
+
+
+class StateRolloutNetwork(nn.Module):
+    """A recurrent network whose outputs are summed to the robot's state. Computes in float32.
+
+    Contact bends the robot's way, and a sum of predicted changes never makes up for that. So each step is
+    given the state that the rollout itself has reached, and the scene's summary. Training goes through all
+    steps, so training and imagination do not differ.
+    """
+
+    def __init__(self, state_size: int, width: int) -> None:
+        super().__init__()
+        self.start = nn.Linear(state_size, width)
+        self.given = nn.Linear(2 * width, width)
+        self.moved = nn.Linear(2 * state_size, width)
+        self.mix = nn.Linear(width, width)
+        self.cell = nn.GRUCell(width, width)
+        self.pull = nn.Linear(width, state_size)
+        self.carry = nn.Linear(state_size, state_size, bias=False)
+        nn.init.zeros_(self.carry.weight)
+        self.push = nn.Linear(width, state_size)
+
+    def begin(self, state: Tensor) -> StateRollout:
+        """Begin in a clip's first state (B, 1, P)."""
+        with compute_in(torch.float32, state.device):
+            return StateRollout(state, torch.zeros_like(state), self.start(state).tanh())
+
+    def forward(self, begin: StateRollout, summary: Tensor, condition: Tensor) -> StateRollout:
+        """Go T steps further under the conditions' means (B, T, D), in a scene of this summary (B, 1, D)."""
+        with compute_in(torch.float32, condition.device):
+            condition = condition.float()
+            given = self.given(torch.cat([condition, summary.float().expand_as(condition)], -1))
+            steps, now = [], StateRollout(*(tensor[:, 0] for tensor in begin))
+            for known, pull in zip(given.unbind(1), self.pull(condition).unbind(1), strict=True):
+                now = self._step(now, known, pull)
+                steps.append(now)
+            return StateRollout(*(torch.stack(tensors, 1) for tensors in zip(*steps, strict=True)))
+
+    def _step(self, now: StateRollout, given: Tensor, pull: Tensor) -> StateRollout:
+        """Go one action further; no tensor has a time dimension."""
+        seen = F.silu(given + self.moved(torch.cat([now.state, now.change], -1)))
+        hidden = self.cell(F.silu(self.mix(seen)), now.hidden)
+        change = pull + self.carry(now.change) + self.push(hidden)
+        return StateRollout(now.state + STATE_STEP * change, change, hidden)
+
+
+class SpatialBlock(nn.Module):
+    """Attention within a frame, then an MLP; between them a projected condition is added, if there is one."""
+
+    def __init__(self, width: int, heads: int, project: nn.Linear | None = None) -> None:
+        super().__init__()
+        self.space = SelfAttention(width, heads)
+        self.project = project
+        self.mlp = make_mlp(width)
+
+    def forward(self, x: Tensor, condition: Tensor | None = None) -> Tensor:
+        """x (B, T, M, D), condition (B, T, D) → like x."""
+        x = x + self.space.merge_heads(attention(*self.space.split_heads(self.space.norm(x))))
+        if self.project is not None:
+            x = x + self.project(condition)[:, :, None]
+        return x + self.mlp(x)
+
+
+class Dropout(nn.Module):
+    """Dropout (Srivastava et al. 2014) whose noise is uniform float32 in every number format."""
+
+    def __init__(self, share: float) -> None:
+        super().__init__()
+        self.share = share
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Drop a share of the elements, in training. (B, …) → same shape."""
+        if not self.training or not self.share:
+            return x
+        kept = torch.rand(x.shape, device=x.device) >= self.share
+        return x * kept / (1 - self.share)
+
+
+class TrajectoryBlock(nn.Module):
+    """Attention along time, cross-attention to the scene, MLP, for one token a frame."""
+
+    def __init__(self, width: int, heads: int, dropout: float) -> None:
+        super().__init__()
+        self.dropout = Dropout(dropout)
+        self.time = SelfAttention(width, heads)
+        self.scene = CrossAttention(width, heads)
+        self.mlp = make_mlp(width)
+
+    def forward(self, x: Tensor, keys_values: Tensor, layer: int, memory: TemporalMemory) -> Tensor:
+        """x (B, 1, T, D) → same; keys_values (B, 1, 2, h, M, d) are this block's projections of the scene."""
+        heads = self.time.split_heads(self.time.norm(x))
+        x = x + self.dropout(self.time.merge_heads(memory.attend(layer, *heads)))
+        x = x + self.dropout(self.scene.cross_attend(x, keys_values))
+        return x + self.dropout(self.mlp(x))
+
+
+class AnchoredNetwork(FrameNetwork):
+    """Scene encoder, state rollout, trajectory and renderer.
+
+    Trajectory and renderer have `config.layers` layers, the scene encoder half as many.
+    """
+
+    def __init__(self, config: AnchoredConfig, sizes: FrameSizes) -> None:
+        super().__init__(sizes, patch=config.patch, width=config.width, code_width=config.code_width)
+        width, heads = config.width, config.heads
+        self.window, self.heads, self.head_width = sizes.clip_length, heads, width // heads
+        self.state_rollout = StateRolloutNetwork(sizes.state_size, width)
+        channels = sizes.context_channels
+        self.context = ContextEmbedding(channels, config.patch, width) if channels else None
+        self.scene = nn.ModuleList(SpatialBlock(width, heads) for _ in range(max(1, config.layers // 2)))
+        self.trajectory = nn.ModuleList(
+            TrajectoryBlock(width, heads, config.dropout) for _ in range(config.layers)
+        )
+        self.motion = nn.Linear(width, width)
+        self.renderer = nn.ModuleList(
+            SpatialBlock(width, heads, nn.Linear(width, width)) for _ in range(config.layers)
+        )
+        self.summary = SceneSummary(self.tokens_per_frame, width)
+        self.scene_norm, self.norm, self.drawn_norm = (nn.LayerNorm(width) for _ in range(3))
+
+    def forward(
+        self, codes: Tensor, state: Tensor, condition: Condition, length: int, rows: Tensor | None = None,
+        context: Context = NO_CONTEXT,
+    ) -> Prediction:  # fmt: skip
+        """Predict the frames after T = `length` rows at once, from the first row's frame.
+
+        Args:
+            codes: of the first frame, (B, 1, S, C).
+            state: of the first frame, (B, 1, P), normalised.
+            condition: of every row, tokens (B, T or 1, M, D).
+            length: rows, T.
+            rows: (B, K), those whose next frame is drawn; by default all.
+            context: of the first frame.
+        """
+        memory = ClipMemory(length, self.window, self.head_width, codes.device)
+        mean = condition.mean().expand(-1, length, -1)  # (B, T, D)
+        scene, begin = self.encode(codes, state, context)
+        return self.follow(scene, begin, mean, memory, rows)[0]
+
+    def encode(self, codes: Tensor, state: Tensor, context: Context) -> tuple[Scene, StateRollout]:
+        """Encode first frames: codes (B, 1, S, C), states (B, 1, P) and their episodes' context.
+
+        ValueError if the network needs a context and has none.
+        """
+        x, local = self.embed(codes, state, 0.0)  # (B, 1, M, D)
+        if self.context is not None:
+            if len(context) != len(codes):
+                raise ValueError(
+                    f"the context of {len(context)} first frames for {len(codes)} imaginations: this world "
+                    "model needs one each; give what its tokenizer's `context` returns"
+                )
+            x = torch.cat([x[:, :, :1], x[:, :, 1:] + self.context(context.features)[:, None]], 2)
+        for block in self.scene:
+            x = block(x)
+        tokens = self.scene_norm(x)
+        blocks = cast(Iterable[TrajectoryBlock], self.trajectory)
+        keys_values = torch.stack([block.scene.project_kv(tokens) for block in blocks], 2)
+        local = local.unflatten(0, (len(codes), -1))  # (B, N, code_width, g, g)
+        scene = Scene(codes, tokens, keys_values, self.summary(tokens), local)
+        return scene, self.state_rollout.begin(state)
+
+    def follow(
+        self, scene: Scene, begin: StateRollout, mean: Tensor, memory: TemporalMemory, rows: Tensor | None
+    ) -> tuple[Prediction, StateRollout]:
+        """Follow the trajectory from where a rollout stands, under the conditions' means (B, T, D)."""
+        rollout = self.state_rollout(begin, scene.summary, mean)
+        x = self.register + mean + self.motion(rollout.hidden) + self.state_in(rollout.state)  # (B, T, D)
+        x = x[:, None]  # (B, 1, T, D): space before time
+        for layer, block in enumerate(self.trajectory):
+            x = block(x, scene.keys_values[:, :, layer], layer, memory)
+        hidden = self.norm(x)[:, 0]  # (B, T, D)
+        logits = self._draw(scene, hidden if rows is None else take_rows(hidden, rows))
+        with compute_in(torch.float32, x.device):
+            hidden = hidden.float()
+            return Prediction(logits, self.done(hidden).squeeze(-1), rollout.state, hidden), rollout
+
+    def _draw(self, scene: Scene, hidden: Tensor) -> Tensor:
+        """Draw frames of the scene from the trajectory's tokens (B, K, D). → logits (B, K, S, V)"""
+        count = hidden.shape[1]
+        if not count:  # convolutions refuse an empty batch
+            sizes = scene.codes.shape[2], len(self.codebook.factor_of_logit)
+            return hidden.new_zeros(len(hidden), 0, *sizes)
+        x = scene.tokens.expand(-1, count, -1, -1)
+        for block in self.renderer:
+            x = block(x, hidden)
+        local = scene.local[:, None].expand(-1, count, *(-1,) * 4).flatten(0, 2)
+        return self.token_logits(self.drawn_norm(x), local, scene.codes.expand(-1, count, -1, -1))

@@ -1,0 +1,106 @@
+"""RoboScape's depth branch: it predicts the next depth, and guides the branch that predicts the tokens.
+
+A transformer of its own, of the same layout, sees depth, the robot's state and the condition; layer by layer
+its hidden states, projected, are added to those of the tokens (additive fusion). The projections begin at
+zero, so the model begins as the one without depth. The tokens' branch never reaches this one.
+"""
+
+import math
+from collections.abc import Sequence
+from functools import partial
+from typing import Final
+
+import torch
+from torch import Tensor, nn
+
+from lerobot_wmrl.data.clips import known_transitions
+from lerobot_wmrl.world_models.autoregressive.network import LayerHook, SpatialTemporalTransformer
+from lerobot_wmrl.world_models.configuration_world_model import AutoregressiveConfig
+from lerobot_wmrl.world_models.dynamics import Condition
+from lerobot_wmrl.world_models.layers import FrameEmbedding, FrameHead, FrameSizes, TemporalMemory
+from lerobot_wmrl.world_models.losses import masked_mean
+
+FAR: Final = 2.5
+"""Metres: what is further away counts as that far, as in the recorder's depth maps."""
+
+
+def normalize_depth(depth: Tensor | None, tokens: Tensor) -> Tensor:
+    """Metres (…, S) of each of the tokens (…, S) → [−1, 1]."""
+    return (require_depth(depth, tokens.shape) / FAR).clamp(0, 1) * 2 - 1
+
+
+def metres(depth: Tensor) -> Tensor:
+    """Return the inverse of `normalize_depth`."""
+    return (depth + 1).clamp_min(0) / 2 * FAR
+
+
+def require_depth(depth: Tensor | None, shape: Sequence[int]) -> Tensor:
+    """Return the depth. ValueError unless it has this shape."""
+    if depth is None or depth.shape != shape:
+        found = "none" if depth is None else f"shape {tuple(depth.shape)}"
+        raise ValueError(
+            f"depth: {found}, but this world model looks at depth (`dynamics.depth`) and needs a number a "
+            f"token, shape {tuple(shape)}; use a dataset recorded with depth"
+        )
+    return depth
+
+
+def add_layer(added: Sequence[Tensor], layer: int, x: Tensor) -> Tensor:
+    """Return x (B, T, S', D) and what is added to it after this layer."""
+    return x + added[layer]
+
+
+class DepthBranch(nn.Module):
+    """Predicts the depth of N cameras, a number a token, from the frame before."""
+
+    def __init__(self, config: AutoregressiveConfig, sizes: FrameSizes) -> None:
+        super().__init__()
+        width, layers = config.width, config.layers
+        self.grid, self.num_cameras = sizes.grid, sizes.num_cameras
+        self.embedding = FrameEmbedding(1, sizes.grid, config.patch, config.code_width, width)
+        self.camera = nn.Parameter(torch.randn(sizes.num_cameras, 1, width) * 0.02)
+        self.transformer = SpatialTemporalTransformer(
+            layers, width, config.heads, config.conditioning, first_layer=layers
+        )
+        self.fusion = nn.ModuleList(nn.Linear(width, width) for _ in range(layers))
+        self.head = FrameHead(0, 1, config.patch, config.code_width, width)  # one number a token, no gate
+        for layer in (*self.fusion, self.head.out):
+            nn.init.zeros_(layer.weight)
+            nn.init.zeros_(layer.bias)
+
+    def forward(
+        self, depth: Tensor | None, register: Tensor, condition: Condition, memory: TemporalMemory
+    ) -> tuple[LayerHook, Tensor]:
+        """Predict the next frames' depth.
+
+        Args:
+            depth: (B, T, S), normalised.
+            register: the frames' register tokens (B, T, 1, D).
+            condition: tokens (B, T or 1, M, D).
+            memory: shared with the tokens' branch.
+
+        Returns:
+            What happens to the tokens' branch after each of its layers, and the depth (B, T, S).
+        """
+        grids = (self.num_cameras, self.grid, self.grid)
+        frames, depth = register.shape[:2], require_depth(depth, (*register.shape[:2], math.prod(grids)))
+        tokens, local = self.embedding(depth.unflatten(2, grids).flatten(0, 2)[:, None])
+        tokens = (tokens.unflatten(0, (*frames, self.num_cameras)) + self.camera).flatten(2, 3)
+        added: list[Tensor] = []
+        x = torch.cat([register, tokens], 2)
+        x = self.transformer(x, condition, memory, partial(self._project, added))
+        change, _ = self.head(x[:, :, 1:].unflatten(2, (self.num_cameras, -1)).flatten(0, 2), local)
+        return partial(add_layer, added), depth + change.float().reshape(depth.shape)
+
+    def _project(self, added: list[Tensor], layer: int, x: Tensor) -> Tensor:
+        """Keep what this layer's hidden states add to the tokens' branch, and hand them on."""
+        added.append(self.fusion[layer](x))
+        return x
+
+
+def depth_loss(predicted: Tensor, depth: Tensor, valid: Tensor) -> tuple[Tensor, dict[str, float]]:
+    """Mean absolute error of predicted (B, T, S) against the next frames' depth where valid (B, T)."""
+    errors = (predicted[:, :-1].float() - depth[:, 1:]).abs()
+    known = known_transitions(valid)[..., None]
+    error = masked_mean(errors, known.expand_as(errors))
+    return error, {"depth_error_mm": 1000 * FAR / 2 * error.item()}

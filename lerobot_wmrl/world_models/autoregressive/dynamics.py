@@ -1,0 +1,175 @@
+"""Autoregressive dynamics: the loss, the inputs that training shows against drift, and imagination."""
+
+from dataclasses import dataclass, field
+from typing import Final
+
+import torch
+from torch import Tensor
+
+from lerobot_wmrl.common.precision import compute_in, computing_dtype
+from lerobot_wmrl.data.clips import Clip, known_transitions
+from lerobot_wmrl.data.frames import Frames
+from lerobot_wmrl.world_models.autoregressive.depth import DepthBranch, depth_loss, metres, normalize_depth
+from lerobot_wmrl.world_models.autoregressive.drift import (
+    Inputs,
+    force_predictions,
+    forced_share,
+    self_rollout_rows,
+)
+from lerobot_wmrl.world_models.autoregressive.keypoints import keypoint_loss
+from lerobot_wmrl.world_models.autoregressive.maskgit import FramesSeen, MaskGit
+from lerobot_wmrl.world_models.autoregressive.network import NextFrameNetwork
+from lerobot_wmrl.world_models.configuration_world_model import AutoregressiveConfig
+from lerobot_wmrl.world_models.dynamics import Condition, Dynamics, Imagination, Imagined, Prediction
+from lerobot_wmrl.world_models.layers import FrameSizes
+from lerobot_wmrl.world_models.losses import corrupt_codes, next_frame_loss, weighted_frames
+
+DEPTH_WEIGHT: Final = 1.0
+"""Of the depth branch's loss."""
+
+
+@dataclass
+class AutoregressiveImagination(Imagination):
+    """Imaginations that see their own frames.
+
+    depth (B, 1, S) is that of the newest ones, normalised; (B, 1, 0) without a depth branch.
+    """
+
+    depth: Tensor = field(default_factory=lambda: torch.empty(0))
+
+    def put(self, rows: Tensor, other: Imagination) -> None:
+        assert isinstance(other, AutoregressiveImagination)
+        super().put(rows, other)
+        self.depth.index_copy_(0, rows, other.depth)
+
+
+class AutoregressiveDynamics(Dynamics):
+    """Each frame from those before it, which in imagination are the dynamics' own."""
+
+    network: NextFrameNetwork
+
+    def __init__(self, config: AutoregressiveConfig, sizes: FrameSizes) -> None:
+        super().__init__()
+        self.config = config
+        self.network = NextFrameNetwork(config, sizes)
+        if config.depth:
+            self.network.depth = DepthBranch(config, sizes)
+        self.maskgit: MaskGit | None = None
+        if config.maskgit_steps:
+            self.maskgit = MaskGit(config, self.network.codebook.channels)
+
+    def loss(self, clip: Clip, condition: Condition, progress: float) -> tuple[Tensor, dict[str, float]]:
+        """Eqs. 2-4, with part of the inputs replaced by the dynamics' own predictions."""
+        network, codebook, config = self.network, self.network.codebook, self.config
+        real = Inputs(codebook.codes(clip.tokens), clip.state, self._depth(clip.depth, clip.tokens))
+        seen = self.inputs(real, clip, condition, progress)
+        torch.clear_autocast_cache()  # older torch keeps the casts made without gradients
+        memory = network.clip_memory(real.codes.shape[1], real.codes.device)
+        prediction, next_depth = network(seen.codes, seen.state, condition, memory, seen.depth)
+        known = known_transitions(clip.valid)  # (B, T − 1)
+        target = weighted_frames(codebook, real.codes[:, 1:], real.codes[:, :-1], known)
+        loss, metrics = next_frame_loss(prediction, codebook, target, clip)
+        if self.maskgit is not None:
+            frames = FramesSeen(seen.codes, condition, prediction, next_depth, memory)
+            draft_loss, parts = self.maskgit.loss(network, frames, target.codes, target.weight)
+            loss, metrics = loss + draft_loss, metrics | parts
+        if network.depth is not None:
+            error, parts = depth_loss(next_depth, real.depth, clip.valid)
+            loss, metrics = loss + DEPTH_WEIGHT * error, metrics | parts
+        if config.keypoint_weight > 0:
+            logits = prediction.logits[:, :-1]
+            error = keypoint_loss(logits, codebook, real.codes, clip.valid, network.num_cameras)
+            loss = loss + config.keypoint_weight * error
+            metrics["keypoint_loss"] = error.item()
+        return loss, metrics
+
+    @torch.no_grad()
+    def inputs(self, real: Inputs, clip: Clip, condition: Condition, progress: float) -> Inputs:
+        """Return what the network sees instead of the real frames.
+
+        Against drift: noise, one-pass predictions of single frames, and whole rollouts from first frames.
+        """
+        seen = real._replace(codes=corrupt_codes(real.codes, self.network.codebook))
+        share = forced_share(self.config.self_forcing, progress)
+        if share > 0:
+            guess, next_depth = self.network(seen.codes, seen.state, condition, depth=seen.depth)
+            seen = force_predictions(guess, next_depth, self.network.codebook, seen, share)
+        rows = self_rollout_rows(self.config.self_rollout, progress, len(real.codes), real.codes.device)
+        if len(rows):
+            rolled = self._roll_out_rows(rows, clip, condition)
+            seen = Inputs(*(a.index_copy(0, rows, b) for a, b in zip(seen, rolled, strict=True)))
+        return seen
+
+    def _roll_out_rows(self, rows: Tensor, clip: Clip, condition: Condition) -> Inputs:
+        """Imagine the clips `rows` (R,) from their first frames, in float32 if training computes in it."""
+        mask = None if condition.mask is None else condition.mask[rows]
+        exact = computing_dtype(clip.tokens.device) == torch.float32
+        depth = None if clip.depth is None else clip.depth[rows, 0]
+        first = Frames(clip.tokens[rows, 0], clip.state[rows, 0], depth=depth)
+        own, steps = Condition(condition.tokens[rows].float(), mask), clip.tokens.shape[1] - 1
+        return self.roll_out(first, own, steps, torch.float32 if exact else None)
+
+    @torch.no_grad()
+    def roll_out(
+        self, first: Frames, condition: Condition, steps: int, dtype: torch.dtype | None = None
+    ) -> Inputs:
+        """Imagine frames 0 … `steps`, from frame 0 on, as the network sees them: T = 1 + `steps`.
+
+        condition (B, `steps` or more, M, D) or (B, 1, M, D), float32. Draws no random number.
+        """
+        imagination, (tokens, mask) = self.start(first, dtype), condition
+        frames = [_newest(imagination)]
+        for step in range(steps):
+            now = tokens[:, step : step + 1] if tokens.shape[1] > 1 else tokens
+            self.step(imagination, Condition(now, mask))
+            frames.append(_newest(imagination))
+        return Inputs(*(torch.cat(parts, 1) for parts in zip(*frames, strict=True)))
+
+    @torch.no_grad()
+    def predict(self, clip: Clip, condition: Condition, drawn: bool) -> Prediction:
+        """Predict from the real frames until then; the logits cost next to nothing."""
+        codes, depth = self.network.codebook.codes(clip.tokens), self._depth(clip.depth, clip.tokens)
+        prediction: Prediction = self.network(codes, clip.state, condition, depth=depth)[0]
+        return prediction
+
+    def start(self, frames: Frames, dtype: torch.dtype | None = None) -> AutoregressiveImagination:
+        """Begin at these frames, with an empty cache. ValueError if their depth is needed and missing."""
+        codes, state, dtype = self._first(frames, dtype)
+        cache = self.network.make_cache(len(codes), codes.device, dtype)
+        depth = self._depth(frames.depth, frames.tokens)[:, None]
+        return AutoregressiveImagination(codes, state, cache, frames.context, depth=depth)
+
+    def show(self, imagination: Imagination, mask: Tensor, frames: Frames) -> None:
+        """Replace the newest frames of the environments in `mask` (B,), their depth too."""
+        assert isinstance(imagination, AutoregressiveImagination)
+        super().show(imagination, mask, frames)
+        depth = self._depth(frames.depth, frames.tokens)[:, None]
+        imagination.depth.copy_(torch.where(mask[:, None, None], depth, imagination.depth))
+
+    @torch.no_grad()
+    def step(self, imagination: Imagination, condition: Condition) -> Imagined:
+        """Predict from the newest frame and the cache, to which its keys and values are added."""
+        assert isinstance(imagination, AutoregressiveImagination)
+        network, codes, cache = self.network, imagination.codes, imagination.cache
+        with compute_in(imagination.dtype, codes.device):
+            prediction, depth = network(
+                codes, imagination.proprioception, condition, cache.advance(), imagination.depth
+            )
+            if self.maskgit is None:
+                drawn = network.codebook.sample(prediction.logits, 0.0, None)
+            else:
+                drawn = self.maskgit.decode(network, FramesSeen(codes, condition, prediction, depth, cache))
+        imagination.depth.copy_(depth)
+        imagined = self._advance(imagination, prediction, drawn)
+        return imagined if network.depth is None else imagined._replace(depth=metres(depth[:, 0]))
+
+    def _depth(self, depth: Tensor | None, tokens: Tensor) -> Tensor:
+        """Metres (…, S) of each of the tokens → normalised; (…, 0) without a depth branch."""
+        if self.network.depth is None:
+            return torch.zeros(*tokens.shape[:-1], 0, device=tokens.device)
+        return normalize_depth(depth, tokens)
+
+
+def _newest(imagination: AutoregressiveImagination) -> Inputs:
+    """Copy the newest frames, which the next step overwrites in place."""
+    return Inputs(imagination.codes.clone(), imagination.proprioception.clone(), imagination.depth.clone())

@@ -1,0 +1,149 @@
+"""The autoregressive network: codes of frame t and a condition give frame t + 1 (eq. 1).
+
+A spatial-temporal transformer: attention inside a frame, causal attention along time, condition, MLP. One
+pass predicts every token of the next frame, the next proprioceptive state and whether success holds there.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor, nn
+
+from lerobot_wmrl.common.precision import compute_in
+from lerobot_wmrl.world_models.autoregressive.conditioning import make_conditioning
+from lerobot_wmrl.world_models.configuration_world_model import AutoregressiveConfig
+from lerobot_wmrl.world_models.dynamics import Condition, Prediction
+from lerobot_wmrl.world_models.kv_cache import KVCache
+from lerobot_wmrl.world_models.layers import (
+    STATE_STEP,
+    ClipMemory,
+    FrameNetwork,
+    FrameSizes,
+    SelfAttention,
+    TemporalMemory,
+    attention,
+    make_mlp,
+)
+
+if TYPE_CHECKING:
+    from lerobot_wmrl.world_models.autoregressive.depth import DepthBranch
+
+LayerHook = Callable[[int, Tensor], Tensor]
+"""Takes a layer's index and output (B, T, S, D), and returns what the next layer is given."""
+
+
+def unchanged(layer: int, x: Tensor) -> Tensor:
+    """Hand every layer's output on as it is."""
+    return x
+
+
+class SpatialTemporalBlock(nn.Module):
+    """Space, time, condition, MLP; each with pre-norm and a skip."""
+
+    def __init__(self, width: int, heads: int, conditioning: str) -> None:
+        super().__init__()
+        self.space = SelfAttention(width, heads)
+        self.time = SelfAttention(width, heads)
+        self.condition = make_conditioning(conditioning, width, heads)
+        self.mlp = make_mlp(width)
+
+    def forward(
+        self, x: Tensor, condition: Condition, mean: Tensor,
+        attend_time: Callable[[Tensor, Tensor, Tensor], Tensor],
+    ) -> Tensor:  # fmt: skip
+        """x (B, T, S, D) → same; `attend_time` maps query, key and value (B, S, h, T, d) to the attended."""
+        space, time, mlp = self.condition.branches(mean)
+        heads = self.space.split_heads(space.enter(self.space.norm(x)))
+        x = x + space.leave(self.space.merge_heads(attention(*heads)))
+        heads = self.time.split_heads(time.enter(self.time.norm(x)).transpose(1, 2))
+        x = x + time.leave(self.time.merge_heads(attend_time(*heads)).transpose(1, 2))
+        x = self.condition(x, condition, mean)
+        norm, expand, activate, contract = self.mlp
+        return x + mlp.leave(contract(activate(expand(mlp.enter(norm(x))))))
+
+
+class SpatialTemporalTransformer(nn.Module):
+    """L blocks and a final norm over frames of S tokens of width D.
+
+    Its layers are those from `first_layer` on in a memory that it shares with another transformer.
+    """
+
+    def __init__(self, layers: int, width: int, heads: int, conditioning: str, first_layer: int = 0) -> None:
+        super().__init__()
+        self.first_layer = first_layer
+        self.blocks = nn.ModuleList(SpatialTemporalBlock(width, heads, conditioning) for _ in range(layers))
+        self.norm = nn.LayerNorm(width)
+
+    def forward(
+        self, x: Tensor, condition: Condition, memory: TemporalMemory, after_layer: LayerHook = unchanged
+    ) -> Tensor:
+        """x (B, T, S, D) → (B, T, S, D); `memory` says what a frame sees along time."""
+        mean = condition.mean()
+        for layer, block in enumerate(self.blocks):
+            attend_time = partial(memory.attend, self.first_layer + layer)
+            x = after_layer(layer, block(x, condition, mean, attend_time))
+        return self.norm(x)
+
+
+class NextFrameNetwork(FrameNetwork):
+    """Embeds frames, runs the transformer, reads the predictions from its tokens.
+
+    A register token a frame carries the proprioceptive state and the mean of the condition, attends to all
+    visual tokens, and is where done and the next state are read from.
+    """
+
+    def __init__(self, config: AutoregressiveConfig, sizes: FrameSizes) -> None:
+        super().__init__(sizes, patch=config.patch, width=config.width, code_width=config.code_width)
+        width, state_size = config.width, sizes.state_size
+        self.window, self.heads, self.head_width = config.window, config.heads, width // config.heads
+        self.state_out = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, state_size))
+        self.transformer = SpatialTemporalTransformer(config.layers, width, config.heads, config.conditioning)
+        self.depth: DepthBranch | None = None  # added after construction, where it is wanted
+
+    def forward(
+        self, codes: Tensor, state: Tensor, condition: Condition, memory: TemporalMemory | None = None,
+        depth: Tensor | None = None,
+    ) -> tuple[Prediction, Tensor]:  # fmt: skip
+        """Predict the frame after each of T frames.
+
+        Args:
+            codes: (B, T, S, C).
+            state: (B, T, P), normalised.
+            condition: tokens (B, T or 1, M, D).
+            memory: what frames see along time; without one, frame t sees t − window + 1 … t of the clip.
+            depth: (B, T, S), normalised, if there is a depth branch.
+
+        Returns:
+            The prediction and the next frames' depth (B, T, S), normalised; (B, T, 0) without a branch.
+        """
+        memory = memory or self.clip_memory(codes.shape[1], codes.device)
+        x, local = self.embed(codes, state, condition.mean())
+        after_layer, next_depth = self.guide(depth, x[:, :, :1], condition, memory)
+        x = self.transformer(x, condition, memory, after_layer)
+        logits, hidden = self.token_logits(x, local, codes), x[:, :, 0].float()
+        with compute_in(torch.float32, x.device):
+            next_state = state + STATE_STEP * self.state_out(hidden)
+            return Prediction(logits, self.done(hidden).squeeze(-1), next_state, hidden), next_depth
+
+    def guide(
+        self, depth: Tensor | None, register: Tensor, condition: Condition, memory: TemporalMemory
+    ) -> tuple[LayerHook, Tensor]:
+        """Return what the depth branch adds after each layer, and its prediction, as in `forward`."""
+        if self.depth is None:
+            return unchanged, register.new_zeros(*register.shape[:2], 0)
+        hook, next_depth = self.depth(depth, register, condition, memory)
+        return hook, next_depth
+
+    def clip_memory(self, length: int, device: torch.device) -> ClipMemory:
+        """Return the memory of one pass over clips of `length` frames."""
+        return ClipMemory(length, self.window, self.head_width, device)
+
+    def make_cache(
+        self, batch: int, device: torch.device, dtype: torch.dtype, grows: bool | None = None
+    ) -> KVCache:
+        """Return an empty KV cache for `batch` environments, with the depth branch's layers behind ours."""
+        layers = len(self.transformer.blocks) * (1 if self.depth is None else 2)
+        shape = (layers, batch, self.tokens_per_frame, self.heads, self.window, self.head_width)
+        return KVCache.empty(shape, device, dtype, grows)

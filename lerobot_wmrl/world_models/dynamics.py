@@ -1,0 +1,192 @@
+"""Dynamics: how frames follow each other (eq. 1). The interface that both engines implement."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from lerobot_wmrl.common.precision import imagination_dtype
+from lerobot_wmrl.data.clips import Clip
+from lerobot_wmrl.data.frames import NO_CONTEXT, Context, Frames
+from lerobot_wmrl.world_models.kv_cache import KVCache
+from lerobot_wmrl.world_models.layers import FrameNetwork
+
+
+class Condition(NamedTuple):
+    """Eq. 1's c: tokens (B, T or 1, M, D) and which of them count, mask (B, 1, 1, 1, M); None: all."""
+
+    tokens: Tensor
+    mask: Tensor | None = None
+
+    def mean(self) -> Tensor:
+        """Mean of the tokens that count. → (B, T or 1, D)"""
+        if self.mask is None:
+            return self.tokens.mean(2)
+        kept = self.mask[:, :, 0, 0, :, None].to(self.tokens.dtype)
+        return (self.tokens * kept).sum(2) / kept.sum(2).clamp_min(1)
+
+
+class Prediction(NamedTuple):
+    """The frame t + 1 that follows each of T frames. V is the sum of the levels of all code factors.
+
+    logits (B, T, S, V), or (B, K, S, V) if only K frames were asked for; done_logit (B, T); proprioception
+    (B, T, P), normalised; hidden (B, T, D).
+    """
+
+    logits: Tensor
+    done_logit: Tensor
+    proprioception: Tensor
+    hidden: Tensor
+
+
+class Imagined(NamedTuple):
+    """One imagined frame of every environment.
+
+    tokens (B, S); done_logit (B,); proprioception (B, P), normalised from the dynamics and in the dataset's
+    units from the model; hidden (B, D); entropy (B,), the mean over code factors of the predictive entropy
+    in nats; depth (B, S), metres of each token, None unless the dynamics predict it.
+    """
+
+    tokens: Tensor
+    done_logit: Tensor
+    proprioception: Tensor
+    hidden: Tensor
+    entropy: Tensor
+    depth: Tensor | None = None
+
+
+class OpenLoopPrediction(NamedTuple):
+    """What follows T actions of B imaginations.
+
+    done_logit (B, T) and proprioception (B, T, P) after each action, units as in `Imagined`; tokens (B, S)
+    of the last frame.
+    """
+
+    done_logit: Tensor
+    proprioception: Tensor
+    tokens: Tensor
+
+
+@dataclass
+class Imagination:
+    """Where B imaginations stand: their newest frames, and the keys and values of those before.
+
+    codes (B, 1, S, C) and proprioception (B, 1, P), normalised, are of the newest frames; the context is that
+    of the frames where the imaginations began; the condition is set if it is the same at every step.
+    Tensors are allocated once and advanced in place, so that a step can be captured in a CUDA graph.
+    """
+
+    codes: Tensor
+    proprioception: Tensor
+    cache: KVCache
+    context: Context = NO_CONTEXT
+    condition: Condition | None = None
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """What the network computes in."""
+        return self.cache.dtype
+
+    @property
+    def num_elements(self) -> int:
+        """Numbers that are remembered of the past."""
+        return self.cache.num_elements
+
+    def restart(self, mask: Tensor) -> None:
+        """Begin anew in the environments in `mask` (B,): their past is masked, not moved."""
+        self.cache.restart(mask)
+
+    def rewind(self, other: "Imagination", frames: int) -> None:
+        """Stand `frames` frames behind another imagination, with nothing remembered."""
+        self.cache.rewind(other.cache, frames)
+
+    def put(self, rows: Tensor, other: "Imagination") -> None:
+        """Continue in the environments `rows` (R,) from where the R imaginations of `other` stand."""
+        self.codes.index_copy_(0, rows, other.codes)
+        self.proprioception.index_copy_(0, rows, other.proprioception)
+        maps = zip(self.context.maps, other.context.maps, strict=True)
+        self.context = Context(tuple(own.index_copy(0, rows, new) for own, new in maps))
+        self.cache.put(rows, other.cache)
+
+
+class Dynamics(nn.Module):
+    """A network that predicts frames, its loss, and imagination with it.
+
+    States are normalised throughout; the model that owns the dynamics knows the dataset's units.
+    """
+
+    network: FrameNetwork
+
+    def loss(self, clip: Clip, condition: Condition, progress: float) -> tuple[Tensor, dict[str, float]]:
+        """Eqs. 2-4.
+
+        Args:
+            clip: what happened.
+            condition: of every row of the clip.
+            progress: share of the training that is over.
+
+        Returns:
+            The loss (), and its parts by name.
+        """
+        raise NotImplementedError
+
+    def predict(self, clip: Clip, condition: Condition, drawn: bool) -> Prediction:
+        """Predict the frame after every row of a clip; logits may be (B, 0, S, V) unless `drawn`."""
+        raise NotImplementedError
+
+    def start(self, frames: Frames, dtype: torch.dtype | None = None) -> Imagination:
+        """Begin B imaginations. The network computes in `dtype`, by default the fastest format."""
+        raise NotImplementedError
+
+    def show(self, imagination: Imagination, mask: Tensor, frames: Frames) -> None:
+        """Replace the newest frames of the environments in `mask` (B,); what was before stays remembered."""
+        codes = self.network.codebook.codes(frames.tokens)[:, None]
+        state = frames.proprioception[:, None]
+        imagination.codes.copy_(torch.where(mask[:, None, None, None], codes, imagination.codes))
+        imagination.proprioception.copy_(torch.where(mask[:, None, None], state, imagination.proprioception))
+
+    def restart(self, imagination: Imagination, mask: Tensor, frames: Frames) -> None:
+        """Begin anew in the environments in `mask` (B,); frames are of all B."""
+        self.show(imagination, mask, frames)
+        imagination.context = imagination.context.replaced(mask, frames.context)
+        imagination.restart(mask)
+
+    def step(self, imagination: Imagination, condition: Condition) -> Imagined:
+        """Imagine the next frame of every environment, with the most likely codes. condition (B, 1, M, D)."""
+        raise NotImplementedError
+
+    def open_loop(
+        self, frames: Frames, actions: Tensor, encode: Callable[[Tensor], Condition]
+    ) -> OpenLoopPrediction:
+        """Predict what follows actions (B, T, A), which `encode` turns into conditions."""
+        imagination = self.start(frames)
+        steps = [self.step(imagination, encode(action[:, None])) for action in actions.unbind(1)]
+        return OpenLoopPrediction(
+            torch.stack([step.done_logit for step in steps], 1),
+            torch.stack([step.proprioception for step in steps], 1),
+            steps[-1].tokens,
+        )
+
+    def _first(self, frames: Frames, dtype: torch.dtype | None) -> tuple[Tensor, Tensor, torch.dtype]:
+        """Codes (B, 1, S, C) and states (B, 1, P) of the frames, and what the network computes in."""
+        dtype = dtype or imagination_dtype(frames.tokens.device, len(frames))
+        # a copy: imagination advances its tensors in place
+        return (
+            self.network.codebook.codes(frames.tokens)[:, None],
+            frames.proprioception[:, None].clone(),
+            dtype,
+        )
+
+    def _advance(self, imagination: Imagination, prediction: Prediction, codes: Tensor) -> Imagined:
+        """Make the predicted frame, of codes (B, 1, S, C), the newest one."""
+        imagination.codes.copy_(codes)
+        imagination.proprioception.copy_(prediction.proprioception)
+        return Imagined(
+            self.network.codebook.tokens(imagination.codes[:, 0]),
+            prediction.done_logit[:, 0],
+            prediction.proprioception[:, 0],
+            prediction.hidden[:, 0],
+            self.network.codebook.entropy(prediction.logits[:, 0]),
+        )
