@@ -1,4 +1,7 @@
-"""Two processes that each have half of the environments learn what one process learns from all of them."""
+"""Two processes that each have half of the environments learn what one process learns from all of them.
+
+Minibatches are whole rollouts here; smaller ones are cut from each process's own, so they differ.
+"""
 
 from pathlib import Path
 
@@ -28,6 +31,8 @@ def test_two_processes_log_what_one_does(name: str, trained_twice: tuple[Path, P
     one, two = (read_metrics(folder / name) for folder in trained_twice)
     assert [line["step"] for line in two] == list(range(ITERATIONS + 1))
     assert two[0]["pause/checkpoint"] == 0
+    assert all(line["updates"] > 0 for line in two[1:])
+    assert all(0 < line.get("groups_with_signal", 0.5) < 1 for line in two[1:])
     for first, second in zip(one, two, strict=True):
         timeless = [
             {key: value for key, value in line.items() if key[-2:] != "_s"} for line in (first, second)
