@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Everything a fresh machine needs: uv, Python 3.12, .venv with the locked packages, this project, a renderer.
+# Everything a fresh machine needs: uv, Python 3.12, .venv with the locked packages (those of the extra `maniskill`
+# too), this project, a renderer, FFmpeg's libraries.
 # Each step is skipped when it is done, so a second call takes a second or two. Nothing is asked.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
@@ -95,7 +96,19 @@ install_project() {
     "$uv" pip install --python "$venv_python" --no-deps --no-build-isolation --editable .
 }
 
+# torchcodec, LeRobot's video decoder, loads the system's FFmpeg, and prints a hundred lines where there is none.
+# LeRobot then decodes with the FFmpeg that PyAV ships, so that the set-up goes on without.
+ensure_ffmpeg() {
+    local ldconfig
+    ldconfig=$(PATH="$PATH:/sbin:/usr/sbin" command -v ldconfig) || return 0
+    if ! "$ldconfig" -p | grep -q 'libavdevice\.so'; then
+        as_root "FFmpeg's libraries, for torchcodec" \
+            sh -c "apt-get update && apt-get install -y --no-install-recommends ffmpeg" || true
+    fi
+}
+
 make_venv
 install_once packages requirements.lock install_locked_packages
 install_once project pyproject.toml install_project
 tools/ensure_renderer.sh
+ensure_ffmpeg
