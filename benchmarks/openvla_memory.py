@@ -22,8 +22,8 @@ from peft import LoraConfig, get_peft_model
 from torch import Tensor, nn
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from lerobot_policy_openvla.action_tokens import BINS
-from lerobot_policy_openvla.adapters import adapter_targets
+from lerobot_policy_openvla.actions import BINS
+from lerobot_policy_openvla.modeling_openvla import adapter_targets
 from lerobot_policy_openvla.network import OpenVLANetwork, make_value_head
 from lerobot_policy_openvla.sizes import RELEASED
 

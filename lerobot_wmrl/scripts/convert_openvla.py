@@ -73,6 +73,7 @@ def importer(source: str, unnorm_key: str | None) -> Callable[[Path], None]:
 
 def exporter(source: str) -> Callable[[Path], None]:
     """Load LeRobot's checkpoint. → what writes OpenVLA's. ValueError if it is of another policy."""
+    from lerobot_policy_openvla.checkpoint import write_openvla
     from lerobot_policy_openvla.modeling_openvla import OpenVLAPolicy
     from lerobot_policy_openvla.openvla_export import write_openvla
     from lerobot_wmrl.common.policies import load_with_adapters, read_policy_config

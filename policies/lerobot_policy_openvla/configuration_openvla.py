@@ -8,6 +8,7 @@ from lerobot.configs.types import FeatureType, NormalizationMode, PolicyFeature
 from lerobot.utils.constants import ACTION
 
 from lerobot_policy_openvla.sizes import Sizes
+from lerobot_wmrl.common.errors import FieldError, require_choice
 from lerobot_wmrl.common.policy_configuration import ClonedConfig
 
 DTYPES = ("auto", "float32", "bfloat16")
@@ -16,23 +17,23 @@ DTYPES = ("auto", "float32", "bfloat16")
 @PreTrainedConfig.register_subclass("openvla")
 @dataclass
 class OpenVLAConfig(ClonedConfig):
-    """One action, as tokens, from one picture and the instruction.
+    """OpenVLA: one action, as tokens, from one image and the instruction.
 
-    A checkpoint of OpenVLA brings its sizes and statistics along (`lerobot-wmrl-convert-openvla`); without
+    A checkpoint of OpenVLA brings its sizes and statistics along (`lerobot-wmrl-convert-openvla`). Without
     one, a model of `sizes` starts from random weights.
 
     Args:
-        sizes: of the vision transformers, the projector and the Llama.
-        camera: the picture it sees, by its full name, `observation.images.third_view`; needed only where
+        sizes: sizes of the vision transformers, the projector and the Llama.
+        camera: full name of the camera it sees, such as `observation.images.third_view`; needed only where
             there are several.
         unnorm_key: the dataset whose statistics turn normalised actions into the robot's; set by the import
             and by fine-tuning, together with the processors.
         norm_stats: 1st and 99th percentile and mask of the actions of every dataset it knows.
-        dtype: of the network: `auto` is bfloat16 for a checkpoint on a GPU that multiplies in it, else
-            float32. Adapters and the value head stay in float32; what is bfloat16 cannot be trained itself.
-        temperature: by which logits are divided in sampling, and in the log-probabilities of samples.
-        sampling: act by drawing tokens, as in reinforcement learning; else by the likeliest, as OpenVLA does.
-        value_sizes: hidden layers of the value head (RL4VLA's, Liu et al. 2025).
+        dtype: number format of the network. `auto` is bfloat16 for a checkpoint on a GPU that multiplies in
+            it, else float32. Adapters and the value head stay in float32; bfloat16 weights cannot be trained.
+        temperature: divides the logits in sampling, and in the log-probabilities of samples.
+        sampling: act by drawn tokens, as in reinforcement learning; else by the likeliest, as OpenVLA does.
+        value_sizes: widths of the value head's hidden layers (those of RL4VLA, Liu et al. 2025).
         gradient_checkpointing: recompute activations instead of keeping them: less memory, a third more time.
     """
 
@@ -57,37 +58,39 @@ class OpenVLAConfig(ClonedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.dtype not in DTYPES:
-            raise ValueError(f"policy.dtype={self.dtype}: choose one of {', '.join(DTYPES)}")
+        require_choice(self, "dtype", DTYPES)
         if self.temperature <= 0:
-            raise ValueError(f"policy.temperature={self.temperature}: must be above 0")
+            raise FieldError("temperature", self.temperature, "must be above 0")
 
     @property
     def action_size(self) -> int:
-        """Action tokens a step. ValueError while nothing says how many, or what they mean."""
+        """Number of action tokens per step. Raises FieldError while their statistics are not known."""
         undecided = self.unnorm_key is None and bool(self.norm_stats)
         if self.action_feature is None or undecided:
             known = ", ".join(sorted(self.norm_stats)) or "none"
-            raise ValueError(
-                "policy.unnorm_key: whose statistics turn tokens into actions? Import the checkpoint with "
-                f"--unnorm_key, one of: {known}; or fine-tune it on a dataset"
+            raise FieldError(
+                "unnorm_key",
+                self.unnorm_key,
+                f"the policy must know whose statistics turn tokens into actions, one of: {known}",
+                "import the checkpoint with that `unnorm_key`, or fine-tune it on a dataset",
             )
         return self.action_feature.shape[0]
 
     def validate_features(self) -> None:
-        """Keep the one camera that is looked at. ValueError if there are several and none is named.
+        """Keep the one camera that the policy sees. Raises FieldError if there are several and none is named.
 
-        Depth maps, pictures of one channel, and the state are left out: OpenVLA does not see them.
+        Depth maps (images of one channel) and the state are left out: OpenVLA does not see them.
         """
         cameras = {key: feature for key, feature in self.image_features.items() if feature.shape[0] == 3}
         names = ", ".join(sorted(cameras)) or "none"
         if self.camera is not None and cameras and self.camera not in cameras:
-            raise ValueError(f"policy.camera={self.camera}: no such camera; choose one of {names}")
+            raise FieldError("camera", self.camera, f"no such camera; choose one of {names}")
         if self.camera is None and len(cameras) > 1:
-            raise ValueError(f"policy.camera: the policy sees one of several cameras, name it: {names}")
+            problem = f"the policy sees one of several cameras, name it: {names}"
+            raise FieldError("camera", None, problem)
         inputs = self.input_features or {}
         if inputs and not cameras:
-            raise ValueError(f"input_features={sorted(inputs)}: needs a camera")
+            raise FieldError("input_features", sorted(inputs), "needs a camera")
         for key in [key for key in inputs if key not in cameras or self.camera not in (None, key)]:
             del inputs[key]
         self._validate_action()
@@ -95,4 +98,4 @@ class OpenVLAConfig(ClonedConfig):
     def _validate_action(self) -> None:
         action: PolicyFeature | None = self.action_feature
         if action is not None and (action.type is not FeatureType.ACTION or len(action.shape) != 1):
-            raise ValueError(f"output_features={self.output_features}: needs `{ACTION}` with one dimension")
+            raise FieldError("output_features", self.output_features, f"needs {ACTION} with one dimension")

@@ -1,4 +1,4 @@
-"""From a camera's picture to what both vision transformers see, bit for bit as Pillow and torchvision do.
+"""Resize and normalise images for both vision transformers, bit for bit as Pillow and torchvision do.
 
 B batch, C channels, H height, W width.
 """
@@ -10,7 +10,7 @@ from torch import Tensor
 
 MEAN = ((0.485, 0.456, 0.406), (0.5, 0.5, 0.5))
 STD = ((0.229, 0.224, 0.225), (0.5, 0.5, 0.5))
-"""Of DINOv2 (ImageNet's) and of SigLIP."""
+"""Means and standard deviations for DINOv2 (ImageNet's) and for SigLIP."""
 
 BICUBIC_A = -0.5
 BICUBIC_SUPPORT = 2.0
@@ -19,11 +19,11 @@ PRECISION_BITS = 32 - 8 - 2
 
 
 def to_pixel_values(images: Tensor, size: int) -> Tensor:
-    """Squash to `size` x `size` pixels and normalise twice (`resize-naive`).
+    """Resize to `size` x `size` pixels regardless of the aspect ratio, and normalise twice (`resize-naive`).
 
     Args:
-        images: (B, 3, H, W), bytes, or numbers in [0, 1], which are rounded to bytes.
-        size: pixels a side.
+        images: (B, 3, H, W), uint8, or floating point in [0, 1], which is rounded to uint8.
+        size: pixels of each side.
 
     Returns:
         float32 (B, 6, size, size): normalised for DINOv2, then for SigLIP.
@@ -36,33 +36,33 @@ def to_pixel_values(images: Tensor, size: int) -> Tensor:
 
 
 def check_images(images: Tensor) -> None:
-    """ValueError unless `images` is a batch of RGB pictures."""
+    """Raise ValueError unless `images` is a batch of RGB images."""
     known = images.dtype == torch.uint8 or images.is_floating_point()
     if images.ndim != 4 or images.shape[1] != 3 or not known:
         raise ValueError(
             f"images of shape {tuple(images.shape)} and type {images.dtype}: the policy needs (B, 3, H, W), "
-            "torch.uint8 or numbers in [0, 1]"
+            "torch.uint8 or floating point in [0, 1]"
         )
 
 
 def check_pixel_values(pixel_values: Tensor, size: int) -> None:
-    """ValueError unless `pixel_values` are normalised pictures (B, 6, size, size)."""
+    """Raise ValueError unless `pixel_values` are normalised images (B, 6, size, size)."""
     shape = tuple(pixel_values.shape)
     if pixel_values.ndim != 4 or shape[1:] != (6, size, size) or not pixel_values.is_floating_point():
         raise ValueError(
             f"pixel_values of shape {shape} and type {pixel_values.dtype}: this model needs normalised "
-            f"pictures (B, 6, {size}, {size}), floating point"
+            f"images (B, 6, {size}, {size}), floating point"
         )
 
 
 def resize(images: Tensor, height: int, width: int) -> Tensor:
-    """Pillow's `resize(…, BICUBIC)` on any device. uint8 (B, C, H, W) → uint8 (B, C, height, width)"""
+    """Resize as Pillow's BICUBIC does, on any device. uint8 (B, C, H, W) → uint8 (B, C, height, width)"""
     images = _resize_last(images, width)
     return _resize_last(images.transpose(2, 3), height).transpose(2, 3)
 
 
 def _resize_last(images: Tensor, size: int) -> Tensor:
-    """One pass, along the last dimension; Pillow leaves out a pass that would change nothing.
+    """Resize along the last dimension. Pillow leaves out a pass that would change nothing.
 
     Sums of integers below 2^53 are exact in float64, in which every device multiplies matrices.
     """
@@ -75,7 +75,7 @@ def _resize_last(images: Tensor, size: int) -> Tensor:
 
 @cache
 def filter_matrix(before: int, after: int) -> Tensor:
-    """How much each old pixel counts for each new one, in units of 2^-22. → float64 (after, before)"""
+    """Return the weight of each old pixel for each new one in units of 2^-22, float64 (after, before)."""
     scale = before / after
     stretch = max(scale, 1.0)
     support = BICUBIC_SUPPORT * stretch
@@ -88,7 +88,7 @@ def filter_matrix(before: int, after: int) -> Tensor:
 
 
 def bicubic(x: Tensor) -> Tensor:
-    """Keys' cubic convolution kernel (1981) with a = −0.5, as Pillow evaluates it."""
+    """Evaluate Keys' cubic convolution kernel (1981) with a = −0.5 as Pillow does."""
     a, x = BICUBIC_A, x.abs()
     near = ((a + 2.0) * x - (a + 3.0)) * x * x + 1
     far = (((x - 5) * x + 8) * x - 4) * a

@@ -1,4 +1,7 @@
-"""OpenVLA as LeRobot trains, evaluates and improves it. B batch, L prompt tokens, A action tokens."""
+"""OpenVLA as a LeRobot policy, for fine-tuning, evaluation and reinforcement learning.
+
+B batch, L prompt tokens, A action tokens.
+"""
 
 from collections.abc import Iterable, Iterator
 from contextlib import nullcontext
@@ -14,15 +17,8 @@ from lerobot.utils.constants import ACTION
 from torch import Tensor, nn
 from torch.distributions import Categorical
 
-from lerobot_policy_openvla.action_tokens import ActionTokenizer
-from lerobot_policy_openvla.adapters import VALUE_HEAD, adapter_targets
-from lerobot_policy_openvla.configuration_openvla import OpenVLAConfig
-from lerobot_policy_openvla.images import check_pixel_values, to_pixel_values
-from lerobot_policy_openvla.loading import check_key, compute_dtype, fill, openvla_config
-from lerobot_policy_openvla.memory import AS_STORED, CONVERTED, require_memory
-from lerobot_policy_openvla.network import OpenVLANetwork, Prefix, make_value_head
-from lerobot_policy_openvla.observations import look
-from lerobot_policy_openvla.openvla_checkpoint import (
+from lerobot_policy_openvla.actions import ActionTokenizer, adopt_statistics
+from lerobot_policy_openvla.checkpoint import (
     TOKENIZER_FILE,
     Files,
     OpenVLACheckpoint,
@@ -32,15 +28,34 @@ from lerobot_policy_openvla.openvla_checkpoint import (
     stored_bytes,
     weight_files,
 )
-from lerobot_policy_openvla.prompts import END_ID, PromptTokenizer, aligned_prompts, train_tokenizer
-from lerobot_policy_openvla.statistics import adopt_statistics
+from lerobot_policy_openvla.configuration_openvla import OpenVLAConfig
+from lerobot_policy_openvla.images import check_pixel_values, to_pixel_values
+from lerobot_policy_openvla.loading import (
+    AS_STORED,
+    CONVERTED,
+    check_key,
+    compute_dtype,
+    fill,
+    openvla_config,
+    require_memory,
+)
+from lerobot_policy_openvla.network import OpenVLANetwork, Prefix, make_value_head
+from lerobot_policy_openvla.prompts import (
+    END_ID,
+    PromptTokenizer,
+    aligned_prompts,
+    select_inputs,
+    train_tokenizer,
+)
+from lerobot_policy_openvla.sizes import Sizes
 from lerobot_wmrl.common.precision import require_exact_updates
 
 Observation = dict[str, Any]
+VALUE_HEAD = "value_head"
 
 
 class Sample(NamedTuple):
-    """What was sampled: token ids int64 (B, A), their log-probs float32 (B, A), values (B,)."""
+    """Sampled actions: token ids int64 (B, A), their log-probs float32 (B, A), values (B,)."""
 
     raw_action: Tensor
     log_prob: Tensor
@@ -48,16 +63,16 @@ class Sample(NamedTuple):
 
 
 class OpenVLAPolicy(PreTrainedPolicy):
-    """Greedy action tokens to act; a categorical over the 256 action tokens, and a value, to improve by RL.
+    """OpenVLA: greedy action tokens to act, a categorical over the 256 action tokens and a value for RL.
 
-    Everything it answers with are token ids: the postprocessor turns them into the robot's actions.
+    Actions are token ids everywhere; the postprocessor turns them into the robot's actions.
 
     Args:
-        config: says how large it is; `output_features` how many tokens an action has.
-        files: what lies beside the weights of a checkpoint; without them, a tokenizer is learnt from the
+        config: sizes, and in `output_features` the number of tokens of an action.
+        files: the files beside the weights of a checkpoint. Without them, a tokenizer is trained on the
             dataset's instructions.
-        dataset_meta: a LeRobotDataset's, whose statistics from now on apply.
-        empty: leave the network without memory, to be filled.
+        dataset_meta: metadata of a LeRobotDataset, whose statistics apply from now on.
+        empty: create the network on the meta device, to be filled.
     """
 
     config_class = OpenVLAConfig
@@ -90,7 +105,7 @@ class OpenVLAPolicy(PreTrainedPolicy):
         cls, source: str | Path, *, unnorm_key: str | None = None, device: str = "cpu", dtype: str = "auto",
         as_stored: bool = False,
     ) -> Self:  # fmt: skip
-        """From OpenVLA's own format.
+        """Load a checkpoint in OpenVLA's own format.
 
         Args:
             source: a folder or a hub id.
@@ -110,9 +125,9 @@ class OpenVLAPolicy(PreTrainedPolicy):
         cls, pretrained_name_or_path: str | Path, *, config: PreTrainedConfig | None = None,
         revision: str | None = None, dataset_meta: Any = None, as_stored: bool = False, **_: Any,
     ) -> Self:  # fmt: skip
-        """From LeRobot's format, in evaluation mode; every weight must be there.
+        """Load a checkpoint in LeRobot's format, in evaluation mode; every weight must be there.
 
-        Other keywords are those of LeRobot's method, accepted as it passes them.
+        Other keywords of LeRobot's method are accepted and ignored.
         """
         folder = resolve_folder(pretrained_name_or_path, revision)
         config = config or PreTrainedConfig.from_pretrained(folder)
@@ -130,10 +145,10 @@ class OpenVLAPolicy(PreTrainedPolicy):
     def _fill(
         self, module: nn.Module, tensors: Iterable[tuple[str, Tensor]], source: str, stored: int | None
     ) -> None:
-        """Weights into the network, converted to what it computes in; the value head's stay as they are.
+        """Load weights, converted to the policy's number format; the value head keeps its own.
 
-        `stored`: bytes that all take as they are stored, if they shall keep that format.
-        """
+        `stored` is the size of all weights in bytes if they must keep the format they are stored in, else
+        None."""
         device = self.config.device or "cpu"
         if stored is None:
             count = sum(parameter.numel() for parameter in module.parameters())
@@ -156,25 +171,32 @@ class OpenVLAPolicy(PreTrainedPolicy):
         return adapter_targets(self.config.sizes)
 
     def get_optim_params(self) -> list[nn.Parameter]:
-        """What fine-tuning trains: everything that is not frozen, but for the value. ValueError if that
-        includes weights in bfloat16."""
+        """Return what fine-tuning trains: everything that is not frozen, except the value head.
+
+        Raises:
+            FieldError: if that includes weights in bfloat16.
+        """
         own = {id(parameter) for parameter in self.value_parameters()}
         trained = [p for p in self.parameters() if p.requires_grad and id(p) not in own]
         require_exact_updates(trained)
         return trained
 
     def value_parameters(self) -> Iterator[nn.Parameter]:
-        """The value head's: the state that it looks at does not learn from it."""
+        """Return the value head's parameters. Its gradient does not reach the state that it reads."""
         return (parameter for parameter in self.value_head.parameters() if parameter.requires_grad)
 
     def reset(self) -> None:
-        """Nothing is kept between steps."""
+        """Do nothing: the policy keeps nothing between steps."""
 
     def forward(self, batch: Observation, reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
-        """Cross-entropy of the action tokens and the end token after them. → (), numbers
+        """Compute the cross-entropy of the action tokens and the end token after them.
 
-        `batch["action"]` (B, A) is normalised; it is clipped to [-1, 1]. `reduction="none"` gives one loss a
-        row, (B,).
+        Args:
+            batch: an observation with `action` (B, A), normalised; it is clipped to [-1, 1].
+            reduction: "mean", or "none" for one loss per row.
+
+        Returns:
+            The loss, () or (B,), and metrics.
         """
         actions = batch[ACTION].reshape(len(batch[ACTION]), -1)
         ids = self.action_tokens.encode(actions)
@@ -189,15 +211,15 @@ class OpenVLAPolicy(PreTrainedPolicy):
     def token_losses(
         self, pixel_values: Tensor, input_ids: Tensor, attention_mask: Tensor, action_ids: Tensor
     ) -> Tensor:
-        """−log p of every label: the action ids (B, A), then the end token. Arguments as `action_logits`'.
+        """Return −log p of every label (B, A + 1): the action ids, then the end token.
 
-        → (B, A + 1). ValueError if an id is no action token.
+        Arguments are those of `action_logits`. Raises ValueError if an id is no action token.
         """
         self.action_tokens.columns(action_ids)
         return self._token_losses(self._prompted(pixel_values, input_ids, attention_mask), action_ids)[0]
 
     def _token_losses(self, prefix: Prefix, ids: Tensor) -> tuple[Tensor, Tensor]:
-        """→ losses (B, A + 1), and the likeliest ids of the whole vocabulary (B, A)"""
+        """Return losses (B, A + 1), and the likeliest ids of the whole vocabulary (B, A)."""
         ids = ids.to(prefix.embeddings.device)
         logits = self.model.logits(self.model.states(prefix, ids))
         labels = F.pad(ids, (0, 1), value=END_ID)
@@ -206,7 +228,7 @@ class OpenVLAPolicy(PreTrainedPolicy):
 
     @torch.no_grad()
     def select_action(self, batch: Observation, **_: Any) -> Tensor:
-        """Token ids, for the postprocessor: the likeliest, or with `sampling` drawn ones. → int64 (B, A)"""
+        """Return token ids (B, A), int64: the likeliest, or with `sampling` drawn ones."""
         self.eval()
         if self.config.sampling:
             return self.sample(batch).raw_action
@@ -214,18 +236,17 @@ class OpenVLAPolicy(PreTrainedPolicy):
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: Observation, **_: Any) -> Tensor:
-        """A chunk of one action. → int64 (B, 1, A)"""
+        """Return a chunk of one action (B, 1, A), int64."""
         return self.select_action(batch)[:, None]
 
     @torch.no_grad()
     def predict_action_ids(
         self, pixel_values: Tensor, input_ids: Tensor, attention_mask: Tensor, num_ids: int
     ) -> Tensor:
-        """The likeliest id of the whole vocabulary, one after the other, as OpenVLA's own code predicts them.
+        """Return the likeliest ids of the whole vocabulary (B, num_ids), as OpenVLA's own code predicts them.
 
-        It always answers `num_ids` ids; the original stops at an end token, and then returns ids of the
-        prompt. Arguments as `action_logits`'. → int64 (B, num_ids)
-        """
+        There are always `num_ids` ids; the original stops at an end token, and then returns ids of the
+        prompt. The other arguments are those of `action_logits`."""
         return self._greedy(self._prompted(pixel_values, input_ids, attention_mask), num_ids)
 
     def _greedy(self, prefix: Prefix, num_ids: int) -> Tensor:
@@ -234,7 +255,8 @@ class OpenVLAPolicy(PreTrainedPolicy):
     def action_logits(
         self, pixel_values: Tensor, input_ids: Tensor, attention_mask: Tensor, action_ids: Tensor
     ) -> Tensor:
-        """Logits of the 256 action tokens by ascending id, at each of the given ids' places (teacher-forced).
+        """Return teacher-forced logits of the 256 action tokens, by ascending id, at each place of
+        `action_ids`.
 
         Args:
             pixel_values: (B, 6, H, W), normalised for DINOv2 and for SigLIP.
@@ -251,7 +273,7 @@ class OpenVLAPolicy(PreTrainedPolicy):
         return self._action_logits(self.model.states(prefix, ids[:, :-1]))
 
     def sample(self, observation: Observation) -> Sample:
-        """Draw action tokens; `evaluate` gives these log-probs again. Picture and prompt are encoded once."""
+        """Draw action tokens; `evaluate` gives the same log-probs. Image and prompt are encoded once."""
         log_probs: list[Tensor] = []
 
         def draw(logits: Tensor) -> Tensor:
@@ -264,29 +286,30 @@ class OpenVLAPolicy(PreTrainedPolicy):
         return Sample(ids, torch.stack(log_probs, dim=1), self._value(state))
 
     def evaluate(self, observation: Observation, raw_action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """→ log-probs (B, A), entropies (B,), values (B,). ValueError if an id is no action token."""
+        """Return log-probs (B, A), entropies (B,), values (B,). Raises ValueError if an id is no action
+        token."""
         columns = self.action_tokens.columns(raw_action)
         states = self.model.states(self._observed(observation), raw_action[:, :-1])
         distribution = self._distribution(self._action_logits(states))
         return distribution.log_prob(columns), distribution.entropy().sum(dim=1), self._value(states[:, 0])
 
     def value(self, observation: Observation) -> Tensor:
-        """V(o). → (B,)"""
+        """Return the values V(o) (B,)."""
         return self._value(self.model.last_state(self._observed(observation)))
 
     def _value(self, state: Tensor) -> Tensor:
-        """Of the state that predicts the first action token, (B, D) → (B,)"""
+        """Return the value of the state that predicts the first action token. (B, D) → (B,)"""
         return self.value_head(state.detach().float()).squeeze(1)
 
     def _observed(self, observation: Observation) -> Prefix:
-        """Pictures and instructions of an observation, encoded."""
-        images, instructions = look(self.config, observation)
+        """Encode the images and instructions of an observation."""
+        images, instructions = select_inputs(self.config, observation)
         pixel_values = to_pixel_values(images.to(self._device), self.config.sizes.image_size)
         ids, mask = self.prompts.batch(instructions)
         return self._encoded(pixel_values, ids, mask)
 
     def _prompted(self, pixel_values: Tensor, input_ids: Tensor, attention_mask: Tensor) -> Prefix:
-        """Pictures and prompts in OpenVLA's own form, encoded. ValueError if they have another."""
+        """Encode images and prompts in OpenVLA's own form. Raises ValueError if they have another."""
         check_pixel_values(pixel_values, self.config.sizes.image_size)
         ids, mask = aligned_prompts(input_ids, attention_mask, self.prompts.space_id)
         return self._encoded(pixel_values, ids, mask)
@@ -309,5 +332,25 @@ class OpenVLAPolicy(PreTrainedPolicy):
         return self.model.logits(states)[..., self._action_columns]
 
     def _distribution(self, logits: Tensor) -> Categorical:
-        """What is sampled from and measured: the 256 action tokens at the temperature. (…, 256)"""
+        """Return the distribution of the 256 action tokens at the temperature, for sampling and log-probs."""
         return Categorical(logits=logits / self.config.temperature, validate_args=False)
+
+
+def adapter_targets(sizes: Sizes) -> dict[str, Any]:
+    """Return PEFT's default targets: every linear layer that contributes, and the whole value head.
+
+    It is OpenVLA's and RL4VLA's choice. The vision transformers' last blocks and the pooling head contribute
+    nothing, so they get no adapters.
+    """
+    depths = {"featurizer": sizes.dino.depth, "fused_featurizer": sizes.siglip.depth}
+    linear = r"(attn\.(qkv|proj)|mlp\.fc\d)"
+    layers = [
+        rf"vision_backbone\.{name}\.blocks\.({_any_below(depth - 1)})\.{linear}"
+        for name, depth in depths.items()
+    ]
+    layers += [r"projector\.fc\d", r"language_model\.model\.layers\.\d+\.(self_attn|mlp)\.\w+_proj"]
+    return {"target_modules": rf"model\.({'|'.join(layers)})", "modules_to_save": [VALUE_HEAD]}
+
+
+def _any_below(count: int) -> str:
+    return "|".join(map(str, range(count)))

@@ -1,4 +1,5 @@
-"""Pre- and postprocessor of OpenVLA: LeRobot's own, on OpenVLA's statistics, and a step that reads tokens."""
+"""Pre- and postprocessor of OpenVLA: LeRobot's own with OpenVLA's statistics, and a step that decodes
+tokens."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -13,16 +14,15 @@ from lerobot.processor import (
 )
 from lerobot.utils.constants import ACTION
 
-from lerobot_policy_openvla.action_tokens import ActionTokenizer
+from lerobot_policy_openvla.actions import ActionTokenizer, choose_key, lerobot_statistics
 from lerobot_policy_openvla.configuration_openvla import OpenVLAConfig
-from lerobot_policy_openvla.statistics import choose_key, lerobot_statistics
 
 Features = dict[PipelineFeatureType, dict[str, PolicyFeature]]
 
 
 @dataclass
 class DecodeActionTokens(ActionProcessorStep):
-    """Token ids (…, A) → normalised actions in [-1, 1]. `vocabulary`: ids of the tokenizer."""
+    """Decodes token ids (…, A) to actions in [-1, 1]. `vocabulary` is the number of all token ids."""
 
     vocabulary: int
 
@@ -42,9 +42,10 @@ def make_openvla_pre_post_processors(
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
     PolicyProcessorPipeline[PolicyAction, PolicyAction],
 ]:
-    """Actions are normalised by the statistics of `config.unnorm_key`, or else by `dataset_stats`.
+    """Make the processors; actions are normalised by the statistics of `config.unnorm_key`, else
+    `dataset_stats`.
 
-    Pictures stay as they are: the policy squashes and normalises them.
+    Images stay as they are: the policy resizes and normalises them.
     """
     key = choose_key(config.norm_stats, config.unnorm_key)
     statistics = {ACTION: lerobot_statistics(config.norm_stats[key]["action"])} if key else dataset_stats

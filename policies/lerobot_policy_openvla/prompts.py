@@ -1,10 +1,14 @@
-"""Instructions as token ids. B batch, L tokens."""
+"""What the policy takes from an observation: the images of one camera, and instructions as token ids.
+
+B batch, L tokens.
+"""
 
 import json
 from collections.abc import Sequence
-from typing import Final
+from typing import Any, Final
 
 import torch
+from lerobot.utils.constants import OBS_IMAGES
 from tokenizers import (
     AddedToken,
     Tokenizer,
@@ -17,8 +21,11 @@ from tokenizers import (
 )
 from torch import Tensor
 
-from lerobot_policy_openvla.action_tokens import BINS
+from lerobot_policy_openvla.actions import BINS
+from lerobot_policy_openvla.configuration_openvla import OpenVLAConfig
+from lerobot_wmrl.common.errors import FieldError
 
+TASK = "task"
 PROMPT: Final = "In: What action should the robot take to {instruction}?\nOut:"
 SPACE: Final = "▁"
 UNKNOWN, BEGIN, END, PAD = "<unk>", "<s>", "</s>", "<PAD>"
@@ -29,8 +36,10 @@ ACTION_CHARACTERS: Final = range(0x4E00, 0x4E00 + BINS)
 
 
 class PromptTokenizer:
-    """Turns instructions into prompts as OpenVLA was trained on them: in lower case, and with a lone space
-    behind them, which training had between the colon and the first action token.
+    """Turns instructions into prompts as OpenVLA was trained on them.
+
+    They are in lower case and end with a lone space, which training had between the colon and the first
+    action token.
 
     Args:
         definition: content of a `tokenizer.json`.
@@ -45,14 +54,14 @@ class PromptTokenizer:
         self.known: dict[str, list[int]] = {}
 
     def encode(self, instruction: str) -> list[int]:
-        """The ids of one prompt, from <s> to the lone space."""
+        """Return the ids of one prompt, from <s> to the lone space."""
         if instruction not in self.known:
             prompt = PROMPT.format(instruction=instruction.lower())
             self.known[instruction] = [*self.tokenizer.encode(prompt).ids, self.space_id]
         return self.known[instruction]
 
     def batch(self, instructions: Sequence[str]) -> tuple[Tensor, Tensor | None]:
-        """Prompts of one length, padded behind <s>. → ids (B, L), mask (B, L) or None if nothing is padded"""
+        """Pad prompts behind <s>. Returns ids (B, L), and the mask (B, L) or None if nothing is padded."""
         rows = [self.encode(instruction) for instruction in instructions]
         longest = max(map(len, rows))
         if all(len(row) == longest for row in rows):
@@ -64,16 +73,16 @@ class PromptTokenizer:
 
 
 def aligned_prompts(input_ids: Tensor, attention_mask: Tensor, space_id: int) -> tuple[Tensor, Tensor | None]:
-    """Prompts padded on the right → padded behind their first token, ending with the lone space.
+    """Turn prompts padded on the right into prompts padded behind their first token.
 
-    OpenVLA adds the space where a prompt does not end with it; so does this.
+    Like OpenVLA, add the lone space where a prompt does not end with it.
 
     Args:
         input_ids: (B, L), every row beginning with <s>.
         attention_mask: (B, L), zero or False where padded.
 
     Returns:
-        ids (B, L') and mask (B, L'), or None for the mask if nothing is padded.
+        Ids (B, L'), and the mask (B, L') or None if nothing is padded.
     """
     mask = attention_mask.bool()
     if mask.shape != input_ids.shape or input_ids.ndim != 2:
@@ -95,18 +104,26 @@ def aligned_prompts(input_ids: Tensor, attention_mask: Tensor, space_id: int) ->
 
 
 def train_tokenizer(instructions: Sequence[str], vocabulary: int) -> Tokenizer:
-    """A small tokenizer in the layout of Llama's, for a model that starts from nothing.
+    """Train a small tokenizer in the layout of Llama's, for a model that starts from random weights.
 
-    Byte-pair encoding (Sennrich et al. 2016) that falls back on bytes, learnt from the prompts of
-    `instructions`: <unk>, <s>, </s>, the bytes, what was learnt, and last the 256 action tokens.
-    ValueError if `vocabulary` ids do not hold that much.
+    It is byte-pair encoding (Sennrich et al. 2016) that falls back on bytes, learnt from prompts. Its ids are
+    <unk>, <s>, </s>, the bytes, what was learnt, and last the 256 action tokens.
+
+    Args:
+        instructions: to learn from.
+        vocabulary: number of ids.
+
+    Raises:
+        FieldError: if the vocabulary is too small.
     """
     learnable = vocabulary - BINS
     fixed = [UNKNOWN, BEGIN, END, *BYTES, SPACE]
     if learnable < len(fixed):
-        raise ValueError(
-            f"vocabulary of {vocabulary} ids: needs at least {len(fixed) + BINS}; raise "
-            "policy.sizes.llama.vocab_size, which is that and extra_ids"
+        raise FieldError(
+            "sizes.llama.vocab_size",
+            f"{vocabulary} + `sizes.llama.extra_ids`",
+            f"the tokenizer needs at least {len(fixed) + BINS} ids",
+            "raise `sizes.llama.vocab_size`",
         )
     learnt = Tokenizer(models.BPE(unk_token=UNKNOWN))
     learnt.normalizer = _normalizer()
@@ -117,7 +134,7 @@ def train_tokenizer(instructions: Sequence[str], vocabulary: int) -> Tokenizer:
 
 
 def _whole_tokenizer(learnt: Tokenizer, learnable: int, fixed: Sequence[str]) -> Tokenizer:
-    """What was learnt, ids that stay unused so that the actions come last, the actions, <PAD> after them."""
+    """Complete a tokenizer: what was learnt, unused ids, the action tokens last, and <PAD> after them."""
     model = json.loads(learnt.to_str())["model"]
     vocab: dict[str, int] = model["vocab"]
     vocab |= {f"<unused{index}>": index for index in range(len(vocab), learnable)}
@@ -140,5 +157,35 @@ def _whole_tokenizer(learnt: Tokenizer, learnable: int, fixed: Sequence[str]) ->
 
 
 def _normalizer() -> normalizers.Normalizer:
-    """A space before the text, and a visible character for every space, as Llama's tokenizer has it."""
+    """Return Llama's normaliser: a space before the text, and a visible character for every space."""
     return normalizers.Sequence([normalizers.Prepend(SPACE), normalizers.Replace(" ", SPACE)])
+
+
+def select_inputs(config: OpenVLAConfig, observation: dict[str, Any]) -> tuple[Tensor, list[str]]:
+    """Return images (B, 3, H, W) and instructions. Raises ValueError if the observation lacks them."""
+    camera = camera_name(config, observation)
+    images = observation[camera]
+    instructions = observation.get(TASK)
+    if isinstance(instructions, str):
+        instructions = [instructions] * len(images)
+    if instructions is None or len(instructions) != len(images):
+        given = "none" if instructions is None else len(instructions)
+        raise ValueError(
+            f"observation.task: needs one instruction per image, {len(images)}; there are {given}"
+        )
+    return images, list(instructions)
+
+
+def camera_name(config: OpenVLAConfig, observation: dict[str, Any]) -> str:
+    """Return the camera the policy was trained on; else the one that is named, or the only one."""
+    shown = sorted(name for name in observation if name.startswith(OBS_IMAGES))
+    wanted = list(config.input_features or ()) or ([config.camera] if config.camera else shown)
+    if len(wanted) != 1 or wanted[0] not in shown:
+        raise FieldError(
+            "camera",
+            config.camera,
+            f"the policy needs {', '.join(wanted) or 'a camera'}, the environment or dataset shows "
+            f"{', '.join(shown) or 'none'}",
+            "use one with the camera that the policy was trained on, or name one of them as `camera`",
+        )
+    return wanted[0]

@@ -1,10 +1,12 @@
-"""How large a model is: stated by a configuration, or read from the names and shapes of its weights."""
+"""The sizes of a model: stated by a configuration, or read from the names and shapes of its weights."""
 
 import logging
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
+
+from lerobot_wmrl.common.errors import FieldError
 
 Shapes = Mapping[str, tuple[int, ...]]
 """Name of a weight → its shape."""
@@ -16,7 +18,7 @@ EXTRA_IDS: Final = 64
 
 @dataclass
 class ViTSizes:
-    """A vision transformer. `registers` and a class token only exist with `class_token`."""
+    """Sizes of a vision transformer. It has registers only with a class token."""
 
     width: int = 64
     depth: int = 4
@@ -27,16 +29,15 @@ class ViTSizes:
 
     def __post_init__(self) -> None:
         if self.depth < 2:
-            raise ValueError(
-                f"depth={self.depth}: features come from the block before the last, so 2 or more"
-            )
+            problem = "must be at least 2, because features come from the block before the last"
+            raise FieldError("depth", self.depth, problem)
         if self.width % self.heads:
-            raise ValueError(f"width={self.width}: must be a multiple of heads={self.heads}")
+            raise FieldError("width", self.width, f"must be a multiple of heads={self.heads}")
 
 
 @dataclass
 class LlamaSizes:
-    """The language model. The action tokens are the last 256 of the tokenizer's `vocab_size − extra_ids`."""
+    """Sizes of the language model. The action tokens are the last 256 of the `vocab_size − extra_ids` ids."""
 
     width: int = 128
     depth: int = 4
@@ -51,14 +52,11 @@ class LlamaSizes:
 
     def __post_init__(self) -> None:
         if self.width % (2 * self.heads):
-            raise ValueError(
-                f"sizes.llama.width={self.width}: must be a multiple of twice heads={self.heads}, since "
-                "positions turn pairs of channels"
-            )
+            problem = f"must be a multiple of twice heads={self.heads}: positions rotate pairs of channels"
+            raise FieldError("sizes.llama.width", self.width, problem)
         if self.heads % self.kv_heads:
-            raise ValueError(
-                f"sizes.llama.heads={self.heads}: must be a multiple of kv_heads={self.kv_heads}"
-            )
+            problem = f"must be a multiple of kv_heads={self.kv_heads}"
+            raise FieldError("sizes.llama.heads", self.heads, problem)
 
     @property
     def tokenizer_size(self) -> int:
@@ -68,7 +66,7 @@ class LlamaSizes:
 
 @dataclass
 class Sizes:
-    """The whole model. By default small enough for two CPU cores."""
+    """Sizes of the whole model. By default small enough for two CPU cores."""
 
     image_size: int = 64
     patch_size: int = 8
@@ -84,7 +82,7 @@ class Sizes:
 
     @property
     def patches(self) -> int:
-        """Image tokens of one picture."""
+        """Number of patches of one image."""
         return (self.image_size // self.patch_size) ** 2
 
 
@@ -95,29 +93,29 @@ RELEASED: Final = Sizes(
     siglip=ViTSizes(width=1152, depth=27, heads=16, mlp_size=4304),
     llama=LlamaSizes(width=4096, depth=32, heads=32, kv_heads=32, mlp_size=11008, vocab_size=32064),
 )
-"""openvla/openvla-7b."""
+"""Sizes of openvla/openvla-7b."""
 
 RELEASED_HEADS: Final = {
     RELEASED.dino.width: RELEASED.dino.heads,
     RELEASED.siglip.width: RELEASED.siglip.heads,
 }
-"""Heads leave no trace in the shapes: what timm has for these widths."""
+"""Width → heads of timm's models, as heads leave no trace in the shapes."""
 
 VIT_FILE: Final = "tiny_vit.json"
-"""Tells the heads of vision transformers that no released model has."""
+"""File that tells the heads of vision transformers of other widths."""
 
 DINO, SIGLIP = "vision_backbone.featurizer.", "vision_backbone.fused_featurizer."
 LLAMA = "language_model."
 
 
 def sizes_from_weights(shapes: Shapes, config: Mapping[str, Any], heads: Mapping[str, int]) -> Sizes:
-    """What a checkpoint is made of.
+    """Read the sizes of a checkpoint.
 
     Args:
-        shapes: of all its weights.
-        config: `config.json`'s content, for the numbers that leave no trace in the shapes; the release's
+        shapes: shapes of all its weights.
+        config: `config.json`'s content, for the sizes that leave no trace in the shapes; the release's
             where its `text_config` is silent (32 heads, norm_eps 1e-6, rope_theta 10000).
-        heads: of the vision transformers by weight prefix, where they are known.
+        heads: heads of the vision transformers by weight prefix, where they are known.
     """
     patch_size = shape_of(shapes, f"{DINO}patch_embed.proj.weight")[-1]
     patches = shape_of(shapes, f"{DINO}pos_embed")[1]
@@ -131,7 +129,7 @@ def sizes_from_weights(shapes: Shapes, config: Mapping[str, Any], heads: Mapping
 
 
 def shape_of(shapes: Shapes, name: str) -> tuple[int, ...]:
-    """ValueError that names the weight if it is missing."""
+    """Return the shape of a weight. Raises ValueError if it is missing."""
     if name not in shapes:
         raise ValueError(f"the weight {name} is missing: this is no whole OpenVLA checkpoint")
     return shapes[name]
@@ -151,7 +149,7 @@ def _vit_sizes(shapes: Shapes, prefix: str, heads: Mapping[str, int]) -> ViTSize
 
 
 def vit_heads(prefix: str, width: int) -> int:
-    """Those of the released models; for other widths heads of 16 channels, said aloud: it may be wrong."""
+    """Return the heads of the released models; for other widths assume 16 channels a head, with a warning."""
     if width in RELEASED_HEADS:
         return RELEASED_HEADS[width]
     logging.warning(
@@ -181,7 +179,7 @@ def _llama_sizes(shapes: Shapes, config: Mapping[str, Any]) -> LlamaSizes:
 
 
 def _depth(shapes: Shapes, prefix: str) -> int:
-    """One more than the highest index behind `prefix`. ValueError if there is none."""
+    """Return one more than the highest index behind `prefix`. Raises ValueError if there is none."""
     indices = [int(name[len(prefix) :].split(".")[0]) for name in shapes if name.startswith(prefix)]
     if not indices:
         raise ValueError(f"weights {prefix}* are missing: this is no whole OpenVLA checkpoint")

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from lerobot_policy_openvla.action_tokens import ActionTokenizer
+from lerobot_policy_openvla.actions import ActionTokenizer
 
 RELEASE = ActionTokenizer(32000)
 

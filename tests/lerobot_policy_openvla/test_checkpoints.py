@@ -10,10 +10,9 @@ import torch
 from huggingface_hub import save_torch_state_dict
 from safetensors.torch import load_file, save_file
 
-from lerobot_policy_openvla import memory
+from lerobot_policy_openvla import loading
+from lerobot_policy_openvla.checkpoint import OpenVLACheckpoint, write_openvla
 from lerobot_policy_openvla.modeling_openvla import OpenVLAPolicy
-from lerobot_policy_openvla.openvla_checkpoint import OpenVLACheckpoint
-from lerobot_policy_openvla.openvla_export import write_openvla
 from tests.lerobot_policy_openvla.small import SMALL_SIZES, observe, small_policy
 
 STATISTICS = {
@@ -177,7 +176,7 @@ def test_an_unknown_key_lists_the_known_ones(checkpoint: Path) -> None:
 def test_without_a_key_nothing_is_acted(checkpoint: Path) -> None:
     policy = OpenVLAPolicy.from_openvla(checkpoint)
     for act in (policy.select_action, policy.sample):
-        with pytest.raises(ValueError, match=r"--unnorm_key, one of: one, two"):
+        with pytest.raises(ValueError, match=r"unnorm_key=None: .* one of: one, two"):
             act(observe())
 
 
@@ -199,9 +198,9 @@ def test_unknown_heads_are_guessed_aloud(checkpoint: Path, caplog: pytest.LogCap
 def test_too_little_memory_is_said_before_anything_is_read(
     checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(memory, "free_memory", lambda device: 20_000)
+    monkeypatch.setattr(loading, "free_memory", lambda device: 20_000)
     with pytest.raises(
-        ValueError, match=r"weights take 0\.\d GB on cpu, 0\.0 GB are free; use --policy\.dtype"
+        ValueError, match=r"weights take 0\.\d GB on cpu, 0\.0 GB are free; set `dtype` to bfloat16"
     ):
         OpenVLAPolicy.from_openvla(checkpoint)
 
@@ -211,10 +210,10 @@ def test_a_conversion_needs_room_for_the_weights_as_they_are_stored(
 ) -> None:
     """Half of what they take in float32, in which this machine would compute."""
     stored = (checkpoint / "model.safetensors").stat().st_size
-    monkeypatch.setattr(memory, "free_memory", lambda device: stored)
+    monkeypatch.setattr(loading, "free_memory", lambda device: stored)
     OpenVLAPolicy.from_openvla(checkpoint, as_stored=True)
     with pytest.raises(ValueError, match="are free"):
         OpenVLAPolicy.from_openvla(checkpoint)
-    monkeypatch.setattr(memory, "free_memory", lambda device: stored - 1)
+    monkeypatch.setattr(loading, "free_memory", lambda device: stored - 1)
     with pytest.raises(ValueError, match="are free; end other programs"):
         OpenVLAPolicy.from_openvla(checkpoint, as_stored=True)

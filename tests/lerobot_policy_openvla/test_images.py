@@ -50,5 +50,5 @@ def test_what_is_no_batch_of_pictures_is_refused(images: torch.Tensor) -> None:
     torch.zeros(1, 6, 64, 64, dtype=torch.uint8),
 ])  # fmt: skip
 def test_pixel_values_of_another_size_or_type_are_refused(pixel_values: torch.Tensor) -> None:
-    with pytest.raises(ValueError, match=r"this model needs normalised pictures \(B, 6, 64, 64\)"):
+    with pytest.raises(ValueError, match=r"this model needs normalised images \(B, 6, 64, 64\)"):
         check_pixel_values(pixel_values, 64)

@@ -190,7 +190,7 @@ def test_impossible_settings_are_named(settings: dict[str, Any], message: str) -
 
 @pytest.mark.parametrize(("observation", "message"), [
     ({"observation.images.wrist": torch.zeros(1, 3, 8, 8), "task": ["x"]}, "third_view, the environment or"),
-    ({CAMERA: torch.zeros(1, 3, 8, 8)}, "needs one instruction a picture, 1; there are none"),
+    ({CAMERA: torch.zeros(1, 3, 8, 8)}, "needs one instruction per image, 1; there are none"),
     ({CAMERA: torch.zeros(1, 3, 8, 8), "task": ["x", "y"]}, "there are 2"),
     ({CAMERA: torch.zeros(1, 8, 8, 3), "task": ["x"]}, r"the policy needs \(B, 3, H, W\)"),
 ])  # fmt: skip
@@ -207,7 +207,7 @@ def test_of_several_cameras_one_must_be_named() -> None:
     config = small_config(input_features=dict(inputs))
     assert OpenVLAPolicy(config).config.input_features == {CAMERA: image}
     inputs["observation.images.wrist"] = image
-    with pytest.raises(ValueError, match=r"policy\.camera: .*third_view, observation\.images\.wrist"):
+    with pytest.raises(ValueError, match=r"camera=None: .*third_view, observation\.images\.wrist"):
         OpenVLAPolicy(small_config(input_features=dict(inputs)))
     config = small_config(input_features=dict(inputs), camera="observation.images.wrist")
     assert list(OpenVLAPolicy(config).config.input_features or {}) == ["observation.images.wrist"]

@@ -10,8 +10,7 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import ACTION
 
-from lerobot_policy_openvla.processor_openvla import make_openvla_pre_post_processors
-from lerobot_policy_openvla.statistics import (
+from lerobot_policy_openvla.actions import (
     action_statistics,
     adopt_statistics,
     choose_key,
@@ -19,6 +18,7 @@ from lerobot_policy_openvla.statistics import (
     dataset_statistics,
     lerobot_statistics,
 )
+from lerobot_policy_openvla.processor_openvla import make_openvla_pre_post_processors
 from tests.lerobot_policy_openvla.small import CAMERA, small_config
 
 

@@ -19,6 +19,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.policies.factory import make_policy
 from safetensors.torch import load_file
 
+from lerobot_policy_openvla.actions import dataset_statistics
 from lerobot_policy_openvla.modeling_openvla import OpenVLAPolicy
 from lerobot_policy_openvla.processor_openvla import make_openvla_pre_post_processors
 from lerobot_policy_openvla.statistics import dataset_statistics

@@ -10,6 +10,7 @@ from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
 from safetensors.torch import load_file
 
+from lerobot_policy_openvla.checkpoint import write_openvla
 from lerobot_policy_openvla.modeling_openvla import OpenVLAPolicy
 from lerobot_policy_openvla.openvla_export import write_openvla
 from lerobot_wmrl.common.policies import load_policy, load_processors, read_policy_config

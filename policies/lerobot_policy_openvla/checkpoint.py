@@ -1,23 +1,31 @@
-"""OpenVLA's own checkpoint format, read: weights in one file or in shards, and what lies beside them."""
+"""OpenVLA's own checkpoint format, read and written: weights in one file or shards, and files beside them."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from huggingface_hub import snapshot_download
+from huggingface_hub import save_torch_state_dict, snapshot_download
 from huggingface_hub.constants import SAFETENSORS_INDEX_FILE, SAFETENSORS_SINGLE_FILE
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from lerobot_policy_openvla.action_tokens import BINS
-from lerobot_policy_openvla.sizes import DINO, SIGLIP, VIT_FILE, Shapes, Sizes, sizes_from_weights
-from lerobot_policy_openvla.statistics import NormStats
+from lerobot_policy_openvla.actions import BINS, NormStats, used_statistics
+from lerobot_policy_openvla.sizes import (
+    DINO,
+    RELEASED_HEADS,
+    SIGLIP,
+    VIT_FILE,
+    Shapes,
+    Sizes,
+    ViTSizes,
+    sizes_from_weights,
+)
 
 CONFIG_FILE: Final = "config.json"
 ORIGINAL_CONFIG_FILE: Final = "openvla_config.json"
-"""What `config.json` is called beside LeRobot's."""
+"""Name of OpenVLA's `config.json` beside LeRobot's."""
 
 STATISTICS_FILE: Final = "dataset_statistics.json"
 TOKENIZER_FILE: Final = "tokenizer.json"
@@ -38,8 +46,10 @@ RENAMED: Final = (".gamma", ".scale_factor")
 UNUSED_SUFFIX: Final = "rotary_emb.inv_freq"
 """A buffer that old versions of transformers stored; it is computed anew."""
 
+MAX_SHARD: Final = "5GB"
+
 Files = dict[str, bytes]
-"""Name → content of what lies beside the weights."""
+"""Name → content of the files beside the weights."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +63,7 @@ class OpenVLACheckpoint:
 
     @classmethod
     def open(cls, source: str | Path) -> "OpenVLACheckpoint":
-        """From a folder or a hub id. ValueError names what is missing."""
+        """Open a folder or a hub id. Raises ValueError that names what is missing."""
         folder = resolve_folder(source)
         if not (folder / CONFIG_FILE).is_file():
             raise ValueError(f"{source}: {CONFIG_FILE} is missing: this is no OpenVLA checkpoint")
@@ -79,8 +89,12 @@ class OpenVLACheckpoint:
 
     @property
     def sizes(self) -> Sizes:
-        """Of all parts, from the weights' shapes and the configuration. ValueError if patches do not cover
-        the pictures that the configuration tells of, as 27 patches of 14 pixels do not cover 384."""
+        """Sizes of all parts, from the weights' shapes and the configuration.
+
+        Raises:
+            ValueError: if patches do not cover the images of the configuration's size, as 27 patches of 14
+                pixels do not cover 384.
+        """
         sizes = sizes_from_weights(self.shapes(), self.config, self._heads())
         told = self.config.get("image_sizes") or [sizes.image_size]
         if set(told) != {sizes.image_size}:
@@ -91,7 +105,7 @@ class OpenVLACheckpoint:
         return sizes
 
     def shapes(self) -> Shapes:
-        """Of every weight, by the name that the network gives it; none is read."""
+        """Return the shape of every weight, by the network's name for it. No weight is read."""
         shapes: dict[str, tuple[int, ...]] = {}
         for path in sorted(set(self.locations.values())):
             with safe_open(path, framework="pt") as file:
@@ -100,11 +114,11 @@ class OpenVLACheckpoint:
         return shapes
 
     def tensors(self) -> Iterator[tuple[str, Tensor]]:
-        """Every weight as it is stored, by the name that the network gives it."""
+        """Yield every weight as it is stored, by the network's name for it."""
         return ((name.replace(*RENAMED), tensor) for name, tensor in read_tensors(self.locations))
 
     def _heads(self) -> dict[str, int]:
-        """Of the vision transformers, where the file that tells them is there."""
+        """Return the heads of the vision transformers, where a file tells them."""
         if VIT_FILE not in self.companions:
             return {}
         overrides = json.loads(self.companions[VIT_FILE])["timm_create_model_overrides"]
@@ -112,7 +126,7 @@ class OpenVLACheckpoint:
 
 
 def resolve_folder(source: str | Path, revision: str | None = None) -> Path:
-    """A folder as it is, a hub id as the folder it is downloaded to. ValueError if there is neither."""
+    """Return a folder, or the folder that a hub id is downloaded to. Raises ValueError if there is none."""
     folder = Path(source)
     if folder.is_dir():
         return folder
@@ -126,13 +140,13 @@ def resolve_folder(source: str | Path, revision: str | None = None) -> Path:
 
 
 def read_companions(folder: Path) -> Files:
-    """Those of `COMPANIONS` that are there, and the original configuration if it is kept there."""
+    """Read the files of `COMPANIONS` that exist, and the original configuration if it exists."""
     names = (*COMPANIONS, ORIGINAL_CONFIG_FILE)
     return {name: (folder / name).read_bytes() for name in names if (folder / name).is_file()}
 
 
 def weight_files(folder: Path) -> dict[str, Path]:
-    """Weight → its file. ValueError names a shard or a weight that is missing, or a file that is torn."""
+    """Return weight → its file. Raises ValueError for a missing shard or weight, or a damaged file."""
     index = folder / SAFETENSORS_INDEX_FILE
     if index.is_file():
         files = {name: folder / file for name, file in json.loads(index.read_text())["weight_map"].items()}
@@ -144,12 +158,12 @@ def weight_files(folder: Path) -> dict[str, Path]:
 
 
 def stored_bytes(locations: dict[str, Path]) -> int:
-    """What the files of weights take, and the weights in memory while they keep their number format."""
+    """Return the bytes of the files of weights, and of the weights in memory in their own number format."""
     return sum(path.stat().st_size for path in set(locations.values()))
 
 
 def read_tensors(locations: dict[str, Path]) -> Iterator[tuple[str, Tensor]]:
-    """Every weight as it is stored, one at a time, file by file."""
+    """Yield every weight as it is stored, one at a time, file by file."""
     for path in sorted(set(locations.values())):
         with safe_open(path, framework="pt") as file:
             for name in [name for name, location in locations.items() if location == path]:
@@ -157,7 +171,7 @@ def read_tensors(locations: dict[str, Path]) -> Iterator[tuple[str, Tensor]]:
 
 
 def _require_names(path: Path, names: list[str]) -> list[str]:
-    """The weights in a file. ValueError if it is missing or torn, or lacks one of `names`."""
+    """Return the names of the weights in a file. Raises ValueError if it is damaged or lacks `names`."""
     if not path.is_file():
         raise ValueError(f"{path}: this file of weights is missing; download the checkpoint again")
     try:
@@ -169,3 +183,71 @@ def _require_names(path: Path, names: list[str]) -> list[str]:
     if missing:
         raise ValueError(f"{path}: lacks {', '.join(missing[:5])}, which {SAFETENSORS_INDEX_FILE} has there")
     return found
+
+
+def write_openvla(
+    folder: Path, weights: Mapping[str, Tensor], sizes: Sizes, companions: Files, norm_stats: NormStats
+) -> None:
+    """Write a checkpoint that OpenVLA's own code loads, sharded like the release where it is large.
+
+    Args:
+        folder: created if it does not exist.
+        weights: by OpenVLA's names.
+        sizes: of the model; needed where no original configuration is among `companions`.
+        companions: written as they are, but for the statistics.
+        norm_stats: added to those that the checkpoint came with, and put in place of those that differ.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    files = dict(companions)
+    config = json.loads(files.pop(ORIGINAL_CONFIG_FILE, b"null")) or original_config(sizes)
+    stored = files.pop(STATISTICS_FILE, None)
+    known = json.loads(stored) if stored else config.get("norm_stats") or {}
+    changed = changed_statistics(norm_stats, known)
+    config["norm_stats"] = {**(config.get("norm_stats") or {}), **changed}
+    if not {sizes.dino.width, sizes.siglip.width} <= RELEASED_HEADS.keys():
+        files.setdefault(VIT_FILE, _json(vit_overrides(sizes)))
+    files |= {CONFIG_FILE: _json(config), STATISTICS_FILE: _json({**known, **changed})}
+    for name, content in files.items():
+        (folder / name).write_bytes(content)
+    save_torch_state_dict(dict(weights), folder, max_shard_size=MAX_SHARD)
+
+
+def changed_statistics(norm_stats: NormStats, known: NormStats) -> NormStats:
+    """Return the entries that `known` lacks, or has with other values, as of a dataset that has grown."""
+    before, now = used_statistics(known), used_statistics(norm_stats)
+    return {key: entry for key, entry in norm_stats.items() if before.get(key) != now[key]}
+
+
+def original_config(sizes: Sizes) -> dict[str, Any]:
+    """Return OpenVLA's `config.json` for a model that never had one."""
+    llama = sizes.llama
+    text = {
+        "model_type": "llama", "pad_token_id": llama.tokenizer_size, "vocab_size": llama.vocab_size,
+        "hidden_size": llama.width, "intermediate_size": llama.mlp_size, "num_hidden_layers": llama.depth,
+        "num_attention_heads": llama.heads, "num_key_value_heads": llama.kv_heads,
+        "rms_norm_eps": llama.norm_eps, "rope_theta": llama.rope_theta,
+        "max_position_embeddings": llama.max_positions,
+    }  # fmt: skip
+    return {
+        "architectures": ["OpenVLAForActionPrediction"], "model_type": "openvla",
+        "arch_specifier": "no-align+fused-gelu-mlp", "llm_backbone_id": "llama2-7b-pure",
+        "vision_backbone_id": "dinosiglip-vit-so-224px", "hf_llm_id": "meta-llama/Llama-2-7b-hf",
+        "timm_model_ids": list(VIT_IDS.values()), "timm_override_act_layers": [None, None],
+        "image_sizes": [sizes.image_size] * 2, "llm_max_length": llama.max_positions,
+        "pad_to_multiple_of": llama.extra_ids, "pad_token_id": llama.tokenizer_size,
+        "text_config": text, **SUPPORTED,
+    }  # fmt: skip
+
+
+def vit_overrides(sizes: Sizes) -> dict[str, Any]:
+    """Return the file that tells what the vision transformers' timm ids do not."""
+
+    def changed(vit: ViTSizes) -> dict[str, int]:
+        return {"embed_dim": vit.width, "depth": vit.depth, "num_heads": vit.heads}
+
+    overrides = {VIT_IDS[DINO]: changed(sizes.dino), VIT_IDS[SIGLIP]: changed(sizes.siglip)}
+    return {"timm_create_model_overrides": overrides}
+
+
+def _json(content: Any) -> bytes:
+    return (json.dumps(content, indent=2) + "\n").encode()
