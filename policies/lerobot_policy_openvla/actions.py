@@ -55,7 +55,7 @@ class ActionTokenizer:
         outside = (columns < 0) | (columns >= BINS)
         if bool(outside.any()):
             raise ValueError(
-                f"token id {ids[outside][0].item()} is no action token: labels must be from {self.first_id} to "
+                f"token id {ids[outside][0].item()} is no action token: labels are from {self.first_id} to "
                 f"{self.vocabulary - 1}"
             )
         return columns

@@ -286,8 +286,7 @@ class OpenVLAPolicy(PreTrainedPolicy):
         return Sample(ids, torch.stack(log_probs, dim=1), self._value(state))
 
     def evaluate(self, observation: Observation, raw_action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return log-probs (B, A), entropies (B,), values (B,). Raises ValueError if an id is no action
-        token."""
+        """Return log-probs (B, A), entropies (B,), values (B,). Raises ValueError if an id is no action."""
         columns = self.action_tokens.columns(raw_action)
         states = self.model.states(self._observed(observation), raw_action[:, :-1])
         distribution = self._distribution(self._action_logits(states))

@@ -121,7 +121,7 @@ def train_tokenizer(instructions: Sequence[str], vocabulary: int) -> Tokenizer:
     if learnable < len(fixed):
         raise FieldError(
             "sizes.llama.vocab_size",
-            f"{vocabulary} + `sizes.llama.extra_ids`",
+            f"{vocabulary} + extra_ids",
             f"the tokenizer needs at least {len(fixed) + BINS} ids",
             "raise `sizes.llama.vocab_size`",
         )

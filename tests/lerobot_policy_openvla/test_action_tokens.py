@@ -24,6 +24,6 @@ def test_decoding_clips_what_labels_must_not_be() -> None:
     low, high = RELEASE.decode(torch.tensor([31999, 31744])).tolist()
     assert RELEASE.decode(outside).tolist() == [high, high, low, low]
     for token in outside.tolist():
-        with pytest.raises(ValueError, match=rf"token id {token} is no action: .* from 31744 to 31999"):
+        with pytest.raises(ValueError, match=rf"token id {token} is no action token: .* from 31744 to 31999"):
             RELEASE.columns(torch.tensor([[31800, token]]))
     assert RELEASE.columns(torch.tensor([31744, 31999])).tolist() == [0, 255]

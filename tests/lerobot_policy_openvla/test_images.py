@@ -41,7 +41,7 @@ def test_the_two_halves_are_one_picture_normalised_twice() -> None:
     torch.zeros(1, 3, 32, 32, dtype=torch.int64),
 ])  # fmt: skip
 def test_what_is_no_batch_of_pictures_is_refused(images: torch.Tensor) -> None:
-    with pytest.raises(ValueError, match=r"needs \(B, 3, H, W\), torch\.uint8 or numbers"):
+    with pytest.raises(ValueError, match=r"needs \(B, 3, H, W\), torch\.uint8 or floating"):
         to_pixel_values(images, 32)
 
 
