@@ -75,7 +75,6 @@ def exporter(source: str) -> Callable[[Path], None]:
     """Load LeRobot's checkpoint. → what writes OpenVLA's. ValueError if it is of another policy."""
     from lerobot_policy_openvla.checkpoint import write_openvla
     from lerobot_policy_openvla.modeling_openvla import OpenVLAPolicy
-    from lerobot_policy_openvla.openvla_export import write_openvla
     from lerobot_wmrl.common.policies import load_with_adapters, read_policy_config
 
     config = read_policy_config(source, [])

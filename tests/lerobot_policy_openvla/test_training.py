@@ -22,7 +22,6 @@ from safetensors.torch import load_file
 from lerobot_policy_openvla.actions import dataset_statistics
 from lerobot_policy_openvla.modeling_openvla import OpenVLAPolicy
 from lerobot_policy_openvla.processor_openvla import make_openvla_pre_post_processors
-from lerobot_policy_openvla.statistics import dataset_statistics
 from lerobot_wmrl.common.policies import (
     check_weights,
     load_policy,

@@ -12,7 +12,6 @@ from safetensors.torch import load_file
 
 from lerobot_policy_openvla.checkpoint import write_openvla
 from lerobot_policy_openvla.modeling_openvla import OpenVLAPolicy
-from lerobot_policy_openvla.openvla_export import write_openvla
 from lerobot_wmrl.common.policies import load_policy, load_processors, read_policy_config
 from lerobot_wmrl.scripts.convert_openvla import main, write_whole
 from tests.hub_server import Hub
