@@ -17,7 +17,7 @@ from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
 from lerobot_wmrl.common.constants import ACTION_LOW, START_SCENE, START_TASK, TASKS
-from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.errors import FieldError, within
 from lerobot_wmrl.data.episodes import (
     EpisodeTable,
     check_dataset,
@@ -221,7 +221,9 @@ def simulate_first_frames(source: StartFrames, config: Any) -> FirstFrames:
         task=tasks[0], split="ood" if source.split == "ood" else "ind", scenes=source.scenes,
         cameras=list(sizes.cameras), image_size=sizes.image_size,
     )  # fmt: skip
-    scenes, simulation = env.selected_scenes(), env.create_simulation()
+    with within("dataset"):
+        scenes = env.selected_scenes()
+    simulation = env.create_simulation()
     frames, instructions, indices = [], [], []
     for seed in range(source.resets):
         simulation.task = task_of(tasks[seed // len(scenes) % len(tasks)])

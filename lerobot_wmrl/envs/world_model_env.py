@@ -132,7 +132,7 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         Raises:
             ValueError: it has another tokenizer, so that it cannot read the tokens of starts and goals.
         """
-        check_same_tokenizer(self.model, model, "the refreshed world model")
+        check_same_tokenizer(self.model, model, "world_model_path", "the refreshed one")
         self.model = model
 
     def _advance(self, imagined: Imagined, uncertainty: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
@@ -238,7 +238,7 @@ def load_world_models(config: WorldModelEnv, device: str | None) -> WorldModels:
     text_model = None
     if config.text_world_model_path:
         text_model = load_model(config.text_world_model_path, "text_world_model", device)
-        check_same_tokenizer(model, text_model, f"text_world_model_path={config.text_world_model_path}")
+        check_same_tokenizer(model, text_model, "text_world_model_path", config.text_world_model_path)
     measure = make_similarity(getattr(config.reward, "similarity", "tokenizer"), model.state_mean.device)
     return WorldModels(model, text_model, measure, load_reward(config.reward, model))
 

@@ -182,7 +182,7 @@ def load_text_model(
     text_model: TextWorldModelRewardModel = load_model(
         cfg.text_model.path, "text_world_model", cfg.device, "text_model.path"
     )
-    check_same_tokenizer(model, text_model, f"--text_model.path={cfg.text_model.path}")
+    check_same_tokenizer(model, text_model, "text_model.path", cfg.text_model.path)
     return text_model
 
 

@@ -108,11 +108,11 @@ def load_model(
         ) from error
 
 
-def check_same_tokenizer(model: Any, text_model: Any, where: str) -> None:
-    """Raise ValueError unless both world models have the same tokenizer; `where` says which the second is."""
-    own, other = model.tokenizer.state_dict(), text_model.tokenizer.state_dict()
-    if own.keys() != other.keys() or not all(torch.equal(own[name], other[name]) for name in own):
-        raise ValueError(
-            f"{where}: trained on another tokenizer than the action world model; train both with the same "
-            "tokenizer_path"
-        )
+def check_same_tokenizer(model: Any, other: Any, field: str, value: object) -> None:
+    """Raise FieldError about `field`, which names the other world model, unless both have one tokenizer."""
+    own, others = model.tokenizer.state_dict(), other.tokenizer.state_dict()
+    if own.keys() != others.keys() or not all(torch.equal(own[name], others[name]) for name in own):
+        raise FieldError(
+            field, value, "was trained with another tokenizer than the action world model",
+            "train both with the same `tokenizer_path`",
+        )  # fmt: skip

@@ -35,8 +35,8 @@ class WmMpcPolicy(PreTrainedPolicy):
         self._text_model = []
         if config.text_world_model_path:
             text_model = load_model(config.text_world_model_path, "text_world_model", device)
-            where = f"text_world_model_path={config.text_world_model_path}"
-            check_same_tokenizer(self._model[0], text_model, where)
+            path = config.text_world_model_path
+            check_same_tokenizer(self._model[0], text_model, "text_world_model_path", path)
             self._text_model.append(text_model)
         self.register_buffer("low", torch.tensor(ACTION_LOW), persistent=False)
         self.register_buffer("high", torch.tensor(ACTION_HIGH), persistent=False)
