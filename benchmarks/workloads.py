@@ -75,7 +75,7 @@ class Imagination:
                 prediction = model.dynamics.network(
                     state.codes, state.proprioception, condition, frames, last, state.context
                 )
-        return model.dynamics.network.codebook.sample(prediction.logits[:, -1], 0.0, None)
+        return model.dynamics.network.codebook.most_likely(prediction.logits[:, -1])
 
     def bytes_a_frame(self) -> float:
         """Weights, shared by the batch, and what one imagination remembers, each read once."""

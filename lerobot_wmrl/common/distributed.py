@@ -1,6 +1,6 @@
 """Several processes that train one model. In one process everything here is the identity."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from datetime import timedelta
 
 import torch
@@ -16,16 +16,6 @@ def rank_and_size() -> tuple[int, int]:
     if dist.is_available() and dist.is_initialized():
         return dist.get_rank(), dist.get_world_size()
     return 0, 1
-
-
-def draw_own_rows(draw: Callable[..., Tensor], shape: Sequence[int], device: torch.device) -> Tensor:
-    """Return `draw(shape, device=…)`: every process draws from a seed of its own."""
-    return draw(tuple(shape), device=device)
-
-
-def masked_mean(values: Tensor, weight: Tensor) -> Tensor:
-    """Σ values · weight / Σ weight, both of one shape → scalar; 0 where nothing counts."""
-    return (values * weight).sum() / weight.detach().sum().float().clamp_min(1)
 
 
 def mean_over_processes(metrics: Mapping[str, float], device: torch.device | str) -> dict[str, float]:

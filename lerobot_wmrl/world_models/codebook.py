@@ -13,12 +13,6 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 
-def gumbel(like: Tensor, generator: torch.Generator | None) -> Tensor:
-    """Draw standard Gumbel noise of the same shape."""
-    uniform = torch.rand(like.shape, device=like.device, generator=generator).clamp_min(1e-9)
-    return -(-uniform.log()).log()
-
-
 class CodeBook(nn.Module):
     """Codes of finite scalar quantisation: a code is the index of a level, its value lies in [−1, 1].
 
@@ -98,10 +92,8 @@ class CodeBook(nn.Module):
         parts = [torch.special.entr(part.softmax(-1)).sum(-1) for part in logits.split(self.level_counts, -1)]
         return torch.stack(parts).mean((0, 2))
 
-    def sample(self, logits: Tensor, temperature: float, generator: torch.Generator | None) -> Tensor:
-        """Draw codes at a temperature by Gumbel-argmax, the most likely ones at 0: (…, V) → (…, C)."""
-        if temperature > 0:
-            logits = logits / temperature + gumbel(logits, generator)
+    def most_likely(self, logits: Tensor) -> Tensor:
+        """Return the most likely code of each factor: logits (…, V) → codes (…, C)."""
         return torch.stack([part.argmax(-1) for part in logits.split(self.level_counts, -1)], -1)
 
 

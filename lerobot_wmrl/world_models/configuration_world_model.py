@@ -16,7 +16,9 @@ class DynamicsConfig(ChoiceRegistry):
     """How frames follow each other: `anchored` or `autoregressive`.
 
     Args:
-        layers, width, heads: of the transformer.
+        layers: of the transformer.
+        width: channels of the transformer.
+        heads: of the transformer's attention.
         patch: side of the square of tokens that forms one transformer token.
         code_width: channels of the convolutions on the token grid.
     """
@@ -60,7 +62,6 @@ class AnchoredConfig(DynamicsConfig):
     Imagination begins anew at its own frame once it is as long as a training clip (`clip_length`).
 
     Args:
-        layers, width, heads, patch, code_width: as in every kind of dynamics.
         dropout: share of what each layer adds to the trajectory that training leaves out, so that episodes
             are not learnt by heart.
     """
@@ -82,7 +83,6 @@ class AutoregressiveConfig(DynamicsConfig):
     """Predicts from the frames before (eq. 1, the paper's way), in imagination from its own.
 
     Args:
-        layers, width, heads, patch, code_width: as in every kind of dynamics.
         window: frames that the model remembers.
         conditioning: how blocks take in the condition: adaln, cross_attention (the paper's) or additive.
         maskgit_steps: passes in which a frame's tokens are decoded, the most confident first (MaskGIT; takes

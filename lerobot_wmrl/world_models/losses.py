@@ -88,7 +88,7 @@ def next_frame_loss(
     done = F.binary_cross_entropy_with_logits(prediction.done_logit, clip.done, reduction="none")
     done_loss = masked_mean(done, clip.done_known & clip.valid)
     loss = token_loss + done_loss + STATE_WEIGHT * state_loss
-    right = (codebook.sample(logits.detach(), 0.0, None) == target.codes).all(-1)
+    right = (codebook.most_likely(logits.detach()) == target.codes).all(-1)
     return loss, {
         "token_loss": token_loss.item(),
         "done_loss": done_loss.item(),

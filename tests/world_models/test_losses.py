@@ -84,7 +84,7 @@ def test_forcing_replaces_later_frames_only_and_only_by_predictions():
     seen = force_predictions(prediction, next_depth, CODEBOOK, real, share=1.0)
     for replaced, first in zip(seen, real, strict=True):
         assert torch.equal(replaced[:, 0], first[:, 0])
-    assert torch.equal(seen.codes[:, 1:], CODEBOOK.sample(prediction.logits[:, :-1], 0.0, None))
+    assert torch.equal(seen.codes[:, 1:], CODEBOOK.most_likely(prediction.logits[:, :-1]))
     assert torch.equal(seen.state[:, 1:], prediction.proprioception[:, :-1])
     assert torch.equal(seen.depth[:, 1:], next_depth[:, :-1])
 

@@ -104,9 +104,9 @@ def test_a_draft_depends_on_what_is_fixed_of_its_own_frame(trained):
     fixed = torch.zeros(64, FRAMES, TOKENS, dtype=torch.bool)
     fixed[..., 0] = True
     logits = decoding.draft_logits(model, seen, DraftMemory.after(seen.memory), target, fixed)
-    right = model.codebook.sample(logits, 0.0, None)[:, :-1, 1:, 1] == target[:, :-1, 1:, 1]
+    right = model.codebook.most_likely(logits)[:, :-1, 1:, 1] == target[:, :-1, 1:, 1]
     assert right.float().mean() > 0.95
-    one_pass = model.codebook.sample(seen.prediction.logits, 0.0, None)[:, :-1, 1:, 1]
+    one_pass = model.codebook.most_likely(seen.prediction.logits)[:, :-1, 1:, 1]
     assert (one_pass == target[:, :-1, 1:, 1]).float().mean() < 0.7
 
 
@@ -152,7 +152,7 @@ def test_tokens_once_fixed_are_kept_and_all_are_filled(passes, monkeypatch):
 def test_one_pass_of_maskgit_takes_the_most_likely_codes_at_once():
     model = network().eval()
     seen = seen_last(model, frames(5)[:, :2])
-    expected = model.codebook.sample(seen.prediction.logits, 0.0, None)
+    expected = model.codebook.most_likely(seen.prediction.logits)
     assert torch.equal(maskgit(1).decode(model, seen), expected)
 
 

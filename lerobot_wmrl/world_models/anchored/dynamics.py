@@ -172,7 +172,7 @@ class AnchoredDynamics(Dynamics):
                 imagination.scene, imagination.rollout, condition.mean(), imagination.advance(), None
             )
             imagination.rollout = rollout.last()
-            drawn = network.codebook.sample(prediction.logits, 0.0, None)
+            drawn = network.codebook.most_likely(prediction.logits)
         return self._advance(imagination, prediction, drawn)
 
     @torch.no_grad()
@@ -187,7 +187,7 @@ class AnchoredDynamics(Dynamics):
         last = torch.full((len(codes), 1), length - 1, device=codes.device)
         with compute_in(dtype, codes.device):
             prediction = network(codes, state, encode(actions), length, last, frames.context)
-        drawn = network.codebook.sample(prediction.logits.float(), 0.0, None)
+        drawn = network.codebook.most_likely(prediction.logits.float())
         return OpenLoopPrediction(
             prediction.done_logit, prediction.proprioception, network.codebook.tokens(drawn[:, 0])
         )

@@ -35,7 +35,7 @@ def force_predictions(
     guess: Prediction, next_depth: Tensor, codebook: CodeBook, real: Inputs, share: float
 ) -> Inputs:
     """Replace a share of the input frames by one-pass predictions of them: scheduled sampling in parallel."""
-    predicted = codebook.sample(guess.logits[:, :-1], 0.0, None)
+    predicted = codebook.most_likely(guess.logits[:, :-1])
     swap = torch.rand(real.codes.shape[:2], device=real.codes.device)[:, 1:] < share
     frames = torch.where(swap[..., None, None], predicted, real.codes[:, 1:])
     states, depths = (

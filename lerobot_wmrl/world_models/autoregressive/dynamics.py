@@ -156,7 +156,7 @@ class AutoregressiveDynamics(Dynamics):
                 codes, imagination.proprioception, condition, cache.advance(), imagination.depth
             )
             if self.maskgit is None:
-                drawn = network.codebook.sample(prediction.logits, 0.0, None)
+                drawn = network.codebook.most_likely(prediction.logits)
             else:
                 drawn = self.maskgit.decode(network, FramesSeen(codes, condition, prediction, depth, cache))
         imagination.depth.copy_(depth)

@@ -90,12 +90,12 @@ class MaskGit(nn.Module):
     def decode(self, network: NextFrameNetwork, seen: FramesSeen) -> Tensor:
         """Return the codes of the frames after those seen, (B, T, S, C)."""
         codebook, logits, memory = network.codebook, seen.prediction.logits, DraftMemory.after(seen.memory)
-        codes = codebook.sample(logits, 0.0, None)
+        codes = codebook.most_likely(logits)
         fixed = torch.zeros_like(codes[..., 0], dtype=torch.bool)
         for count in fixed_counts(codes.shape[2], self.passes)[:-1]:
             fixed = most_confident(-codebook.cross_entropy(logits, codes), fixed, count)
             logits = self.draft_logits(network, seen, memory, codes, fixed)
-            codes = torch.where(fixed[..., None], codes, codebook.sample(logits, 0.0, None))
+            codes = torch.where(fixed[..., None], codes, codebook.most_likely(logits))
         return codes
 
     def loss(

@@ -40,20 +40,16 @@ def test_factorised_cross_entropy_equals_that_of_the_product_distribution():
     torch.testing.assert_close(every[token], -first)
 
 
-def test_sampling_follows_the_distribution_at_the_temperature():
-    codebook, generator = CodeBook((4,)), torch.Generator().manual_seed(0)
-    logits = torch.tensor([0.0, 1.0, 2.0, -1.0])
-    drawn = codebook.sample(logits.expand(40_000, 4), 2.0, generator)[:, 0]
-    shares = torch.bincount(drawn, minlength=4) / 40_000
-    torch.testing.assert_close(shares, (logits / 2).softmax(0), atol=0.01, rtol=0)
-    assert (codebook.sample(logits.expand(9, 4), 0.0, None) == 2).all()
+def test_the_most_likely_code_is_that_of_each_factor():
+    logits = torch.tensor([0.0, 1.0, 2.0, -1.0, 5.0, 3.0, 4.0])
+    assert CodeBook((4, 3)).most_likely(logits.expand(9, 7)).tolist() == [[2, 0]] * 9
 
 
 def test_an_untrained_network_prefers_to_leave_the_frame_as_it_is():
     model = network()
     codes = model.codebook.codes(torch.randint(0, 8 * 5 * 3, (2, 3, 32)))
     prediction, _ = model(codes, torch.zeros(2, 3, 3), Condition(torch.zeros(2, 3, 1, 16)))
-    kept = model.codebook.sample(prediction.logits, 0.0, None) == codes
+    kept = model.codebook.most_likely(prediction.logits) == codes
     assert kept.float().mean() > 0.6
 
 

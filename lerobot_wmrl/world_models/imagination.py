@@ -1,0 +1,123 @@
+"""Imagination with a trained world model, in the dataset's units: begin, step, predict open loop."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from lerobot_wmrl.common.precision import compute_in, imagination_dtype
+from lerobot_wmrl.data.frames import NO_CONTEXT, NO_PAST, Context, Frames, Past
+from lerobot_wmrl.world_models.dynamics import (
+    Condition,
+    Dynamics,
+    Imagination,
+    Imagined,
+    OpenLoopPrediction,
+)
+from lerobot_wmrl.world_models.frame_tokenizer import Decoded, FrameTokenizer
+
+
+class ImaginationMixin:
+    """What a world model does with its parts once they are trained."""
+
+    name: str
+    tokenizer: FrameTokenizer
+    dynamics: Dynamics
+    state_mean: Tensor
+    state_std: Tensor
+
+    @torch.no_grad()
+    def start(
+        self, frames: Frames, instructions: Sequence[str] | None = None, past: Past = NO_PAST,
+        dtype: torch.dtype | None = None,
+    ) -> Imagination:  # fmt: skip
+        """Begin to imagine at B frames.
+
+        Args:
+            frames: where the imaginations begin. ValueError if depth that the model looks at is missing; a
+                missing context raises it in the first step.
+            instructions: one an imagination, of a model that is conditioned on text.
+            past: frames before these, which are remembered as if they had been imagined.
+            dtype: what the network computes in, by default the fastest format; what is returned is float32.
+        """
+        first = replace((*past.frames, frames)[0], context=frames.context)
+        imagination = self.dynamics.start(self._normalized(first), dtype)
+        if instructions is not None:
+            imagination.condition = self.encode_instructions(instructions, len(frames))
+        self._watch(imagination, past, frames)
+        return imagination
+
+    @torch.no_grad()
+    def restart(self, imagination: Imagination, mask: Tensor, frames: Frames, past: Past = NO_PAST) -> None:
+        """Begin anew at frames (as in `start`, of all B) in the environments in `mask` (B,).
+
+        With a past they are begun apart, as many frames ago as they have a past, and take their places when
+        they are as far as the others.
+        """
+        if not past.frames:
+            self.dynamics.restart(imagination, mask, self._normalized(frames))
+            return
+        rows = mask.nonzero().squeeze(1)
+        first = replace(past.frames[0][rows], context=frames.context[rows])
+        apart = self.dynamics.start(self._normalized(first), imagination.dtype)
+        apart.rewind(imagination, len(past.frames))
+        self._watch(apart, past[rows], frames[rows])
+        imagination.put(rows, apart)
+
+    def _watch(self, imagination: Imagination, past: Past, now: Frames) -> None:
+        """Bring an imagination from the first of the past frames to `now`, showing it what happened."""
+        everyone = torch.ones(len(now), dtype=torch.bool, device=now.tokens.device)
+        for action, after in zip(past.actions, (*past.frames, now)[1:], strict=True):
+            self.step(imagination, action)
+            self.dynamics.show(imagination, everyone, self._normalized(after))
+
+    @torch.no_grad()
+    def step(self, imagination: Imagination, action: Tensor | None = None) -> Imagined:
+        """Imagine the next frame of every environment: action (B, A) in the dataset's units."""
+        condition = imagination.condition if action is None else self.encode_actions(action[:, None])
+        if condition is None:
+            raise ValueError("this imagination needs an action each step, or an instruction at the start")
+        imagined = self.dynamics.step(imagination, condition)
+        return imagined._replace(proprioception=self.denormalize_state(imagined.proprioception))
+
+    @torch.no_grad()
+    def imagine(self, frames: Frames, actions: Tensor) -> list[Imagined]:
+        """Imagine the frame after each of the actions (B, T, A)."""
+        imagination = self.start(frames)
+        return [self.step(imagination, action) for action in actions.unbind(1)]
+
+    @torch.no_grad()
+    def open_loop(self, frames: Frames, actions: Tensor) -> OpenLoopPrediction:
+        """Predict what follows actions (B, T, A).
+
+        No frame but the last is drawn where the dynamics can do without, so it is much faster than `imagine`.
+        """
+        prediction = self.dynamics.open_loop(self._normalized(frames), actions, self.encode_actions)
+        return prediction._replace(proprioception=self.denormalize_state(prediction.proprioception))
+
+    @torch.no_grad()
+    def decode(self, tokens: Tensor, context: Context = NO_CONTEXT) -> Decoded:
+        """Tokens (B, S) → images and features of the frames, computed as fast as imagination, as float32."""
+        with compute_in(imagination_dtype(tokens.device), tokens.device):
+            images, features = self.tokenizer.decode_with_features(tokens, context)
+        return Decoded(images.float(), [feature.float() for feature in features])
+
+    def encode_actions(self, actions: Tensor) -> Condition:
+        """Actions (B, T, A) in dataset units → condition."""
+        raise NotImplementedError(f"{self.name} is not conditioned on actions")
+
+    def encode_instructions(self, instructions: Sequence[str], batch: int) -> Condition:
+        """One instruction for each of `batch` episodes → condition."""
+        raise NotImplementedError(f"{self.name} is not conditioned on text")
+
+    def normalize_state(self, state: Tensor) -> Tensor:
+        """Dataset units to zero mean and unit spread. (…, P) → (…, P)"""
+        raise NotImplementedError
+
+    def denormalize_state(self, state: Tensor) -> Tensor:
+        """Back to dataset units. (…, P) → (…, P)"""
+        return state * self.state_std + self.state_mean
+
+    def _normalized(self, frames: Frames) -> Frames:
+        return replace(frames, proprioception=self.normalize_state(frames.proprioception))
