@@ -96,6 +96,7 @@ def origin(study: Study, load: Load) -> str:
         f"[{Path(result).name}]({result})" for result in study.results if result.endswith(".json")
     )
     where = f", {machines}" if machines else ""
+    where += "".join(f". {source['note']}" for source in sources if "note" in source).removesuffix(".")
     return f"*Commit {commits}{where}; {files}; `python -m experiments.run experiments/{study.name}.yaml`*"
 
 
