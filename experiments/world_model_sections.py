@@ -70,8 +70,8 @@ interval's upper end is above 5 %.
 {gate_table({"one scene": found})}
 
 Done at {found["done_threshold"]} for {found["done_frames"]} frames, chosen on 1,120 other rollouts; these
-800 were recorded afterwards on new seeds. 75 minutes of one core. `gate_one_scene.yaml` is one training of that
-size, which has not been run."""
+800 were recorded afterwards on new seeds. 75 minutes of one core. `gate_one_scene.yaml` is one training
+of that size, which has not been run."""
 
 
 def gate_autoregressive(load: Load) -> str:
