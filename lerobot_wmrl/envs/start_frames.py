@@ -8,7 +8,7 @@ K is the number of starts, T the frames of each (all but the last are the past),
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from zipfile import BadZipFile
 
 import numpy as np
@@ -34,10 +34,12 @@ from lerobot_wmrl.maniskill.recordings import scene_splits
 from lerobot_wmrl.maniskill.scenes import scene_for_seed
 from lerobot_wmrl.maniskill.tasks import task_of
 from lerobot_wmrl.rewards.similarity import Features, Similarity
+from lerobot_wmrl.world_models.configuration_world_model import WorldModelConfig
 from lerobot_wmrl.world_models.goal import imagine_goal
 from lerobot_wmrl.world_models.modeling_world_model import (
     ActionWorldModelRewardModel,
     TextWorldModelRewardModel,
+    WorldModelRewardModel,
 )
 
 GOAL_BATCH = 64
@@ -60,13 +62,13 @@ class FirstFrames(NamedTuple):
     actions: np.ndarray
     instructions: list[str]
     tasks: np.ndarray
-    depth: Callable[[Any], Tensor | None]
+    depth: Callable[[WorldModelRewardModel], Tensor | None]
 
     def of_task(self, task: int) -> "FirstFrames":
         """Return the starts of one task, an index into `TASKS`."""
         rows = np.flatnonzero(self.tasks == task)
 
-        def depth(model: Any) -> Tensor | None:
+        def depth(model: WorldModelRewardModel) -> Tensor | None:
             every = self.depth(model)
             return every if every is None else every[torch.from_numpy(rows).to(every.device)]
 
@@ -99,7 +101,7 @@ class Goals(NamedTuple):
     reached: Tensor
 
 
-def read_first_frames(source: StartFrames, config: Any) -> FirstFrames:
+def read_first_frames(source: StartFrames, config: WorldModelConfig) -> FirstFrames:
     """Read the first frames that a world model of this configuration can begin in.
 
     Raises:
@@ -140,8 +142,9 @@ def undecided_after(table: EpisodeTable, frames: int) -> np.ndarray:
     return (table.length > frames) & ~np.array(begun)
 
 
-def read_dataset_frames(source: StartFrames, config: Any) -> FirstFrames:
+def read_dataset_frames(source: StartFrames, config: WorldModelConfig) -> FirstFrames:
     """Read the first frames of a LeRobotDataset's episodes."""
+    assert config.tokenizer is not None, "a trained world model knows its tokenizer"
     table = read_episodes(open_dataset(source.root, source.repo_id))
     check_dataset(config, table.dataset.features)
     episodes = chosen_episodes(table, source)
@@ -152,7 +155,7 @@ def read_dataset_frames(source: StartFrames, config: Any) -> FirstFrames:
         )  # fmt: skip
     rows = table.start[episodes, None] + np.arange(source.past + 1)
 
-    def depth(model: Any) -> Tensor | None:
+    def depth(model: WorldModelRewardModel) -> Tensor | None:
         check_dataset(model.config, table.dataset.features)
         every = depth_at(model, table.dataset, rows.reshape(-1))
         return every if every is None else every.unflatten(0, rows.shape)
@@ -167,7 +170,7 @@ def read_dataset_frames(source: StartFrames, config: Any) -> FirstFrames:
     )
 
 
-def read_saved_frames(path: Path, max_starts: int, config: Any) -> FirstFrames:
+def read_saved_frames(path: Path, max_starts: int, config: WorldModelConfig) -> FirstFrames:
     """Read first frames from a file written by `numpy.savez`.
 
     Args:
@@ -179,6 +182,7 @@ def read_saved_frames(path: Path, max_starts: int, config: Any) -> FirstFrames:
     Raises:
         FieldError: the file lacks one of these, or has it in another shape.
     """
+    assert config.tokenizer is not None, "a trained world model knows its tokenizer"
     found = read_arrays(path)
     side, cameras = config.tokenizer.image_size, config.tokenizer.camera_keys
     wanted = {**dict.fromkeys(cameras, (side, side, 3)), OBS_STATE: (config.state_size,), INSTRUCTION: ()}
@@ -211,12 +215,13 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         ) from error
 
 
-def simulate_first_frames(source: StartFrames, config: Any) -> FirstFrames:
+def simulate_first_frames(source: StartFrames, config: WorldModelConfig) -> FirstFrames:
     """Render the first frames of ManiSkill's resets with seeds 0, 1, …
 
     Consecutive seeds visit the scenes in turn, then the next task.
     """
     tasks, sizes = source.tasks or TASKS[:1], config.tokenizer
+    assert sizes is not None, "a trained world model knows its tokenizer"
     env = WmrlManiSkillEnv(
         task=tasks[0], split="ood" if source.split == "ood" else "ind", scenes=source.scenes,
         cameras=list(sizes.cameras), image_size=sizes.image_size,
@@ -244,7 +249,7 @@ def _without_past(
     return FirstFrames(images[:, None], state[:, None], actions, instructions, tasks, _no_depth)
 
 
-def _no_depth(model: Any) -> None:
+def _no_depth(model: WorldModelRewardModel) -> None:
     """Raise FieldError if the model looks at depth."""
     if model.config.depth:
         raise FieldError(
