@@ -45,7 +45,8 @@ def way_to_goal(env: WorldModelVectorEnv) -> list[Tensor]:
 def set_goal(env: WorldModelVectorEnv, measure: Similarity, tokens: Tensor) -> None:
     """The goal frame of the one start."""
     frames = torch.cat([env.starts.now.tokens, tokens])
-    begin, goal = (measure.features(env.model.decode(frame[None], env.starts.context)) for frame in frames)
+    context = env.starts.now.context
+    begin, goal = (measure.features(env.model.decode(frame[None], context)) for frame in frames)
     similarity = measure(begin, goal, env.model.tokenizer.num_cameras)
     assert env.goals is not None
     env.goals = env.goals._replace(features=goal, measure=measure, similarity=similarity)
