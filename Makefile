@@ -23,6 +23,9 @@ docs: setup  ## docs/results.md from docs/results/*.json, docs/reference from --
 	.venv/bin/python -m experiments.tables
 	.venv/bin/python tools/reference_pages.py
 
+help: setup  ## the stored pages of `--help`, after a change of flags or their explanations
+	.venv/bin/python tools/write_help_pages.py
+
 UV ?= $(or $(wildcard .uv/bin/uv),uv)
 
 lock:  ## requirements.lock: every package pinned and hashed, no address, so any mirror serves it

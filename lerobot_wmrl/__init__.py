@@ -10,6 +10,10 @@ H image height, W image width, A action size, P proprioceptive state size, V cod
 
 from importlib import import_module
 
+from lerobot_wmrl.common.stored_help import answer_help
+
+answer_help()
+
 CONFIGURATIONS = (
     "lerobot_wmrl.world_models.configuration_frame_tokenizer",
     "lerobot_wmrl.world_models.configuration_world_model",

@@ -62,7 +62,9 @@ def settings_of(
         if not field.init:
             continue
         name, hint = f"{prefix}{field.name}", without_none(hints.get(field.name, field.type))
-        value = default_of(field) if isinstance(config, type) else getattr(config, field.name)
+        # LeRobot's configurations put the device that this machine has in place of a default of None
+        own = isinstance(config, type) or field.name == "device"
+        value = default_of(field) if own else getattr(config, field.name)
         said = explanations.get(field.name, "")
         known = known_types(hint)
         if known is not None:

@@ -1,10 +1,16 @@
 """`--help` of every command: what it is for, examples, presets, and every flag with its default."""
 
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 
 from lerobot_dataset_maniskill import record
 from lerobot_wmrl.common.command_line import help_of
 from lerobot_wmrl.common.settings import settings_of
+from lerobot_wmrl.common.stored_help import FOLDER
 from lerobot_wmrl.scripts import convert_openvla, demo, eval_world_model, train, train_world_model
 
 COMMANDS = {
@@ -35,6 +41,24 @@ def test_help_explains_and_shows_no_source_code(command: str, monkeypatch: pytes
     assert text.count("(default:") + text.count("(required)") >= len(settings)
     own = [each for each in settings if each.depth == 0]
     assert not [each.name for each in own if not each.explanation]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_stored_page_is_what_the_command_says(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where it is not, `make help` writes it anew."""
+    monkeypatch.setattr("sys.argv", [command, "--help"])
+    assert (FOLDER / f"{command}.txt").read_text() == f"{help_of(*COMMANDS[command])}\n"
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_takes_no_time(command: str) -> None:
+    """CPU time, which other processes do not change much."""
+    program = Path(sys.executable).with_name(command)
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    result = subprocess.run([program, "--help"], capture_output=True, text=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert result.stdout == (FOLDER / f"{command}.txt").read_text()
+    assert after.ru_utime - before.ru_utime < 1
 
 
 def test_flags_of_a_chosen_type_are_listed(monkeypatch: pytest.MonkeyPatch) -> None:
