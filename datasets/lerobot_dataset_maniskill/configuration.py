@@ -267,8 +267,8 @@ def imagined_content(env: WorldModelEnv) -> dict[str, Any]:
     return {
         "world_model": env.world_model_path,
         "starts": asdict(env.dataset),
-        "cameras": list(model.cameras),
-        "image_size": model.image_size,
+        "cameras": list(model.tokenizer.cameras),
+        "image_size": model.tokenizer.image_size,
         "done_threshold": env.done_threshold,
         "done_frames": env.done_frames,
         "reward": env.reward.type,

@@ -47,8 +47,8 @@ class ImaginedPartRecorder:
 
     def record(self, part: Part, report: Report) -> None:
         """Record a part. Its folder appears under its final name only when it is whole."""
-        model = self.env.model.config
-        with whole_part(self.config, self.folder, part, model.cameras, model.image_size) as dataset:
+        shown = self.env.model.config.tokenizer
+        with whole_part(self.config, self.folder, part, shown.cameras, shown.image_size) as dataset:
             for plan, (instruction, rows) in zip(part.episodes, self._imagine(part.episodes), strict=True):
                 start = StartColumns(instruction, task_of(plan.task).index, plan)
                 for before, action, outcome in rows:
