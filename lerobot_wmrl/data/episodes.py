@@ -301,18 +301,13 @@ def check_depth(features: Mapping[str, Any], camera_keys: Sequence[str], image_s
             )  # fmt: skip
 
 
-def check_dataset(config: Any, features: Mapping[str, Any]) -> None:
-    """Raise ValueError unless a trained model can learn from, start in or replay the dataset's episodes."""
-    sizes = config.tokenizer
-    check_cameras(features, sizes.camera_keys, sizes.image_size)
-    if getattr(config, "depth", False):
-        check_depth(features, sizes.camera_keys, sizes.image_size)
-    widths = {OBS_STATE: getattr(config, "state_size", 0), ACTION: getattr(config, "action_size", 0)}
-    for name, wanted in widths.items():
+def check_widths(features: Mapping[str, Any], wanted: Mapping[str, int]) -> None:
+    """Raise ValueError unless the features have as many components as a model was trained with, 0 for any."""
+    for name, width in wanted.items():
         found = features[name]["shape"][0] if name in features else 0
-        if wanted and found != wanted:
+        if width and found != width:
             raise ValueError(
-                f"{name}: the world model was trained with {wanted} components, the dataset has "
+                f"{name}: the world model was trained with {width} components, the dataset has "
                 f"{found or 'none'}; use a dataset like the one it was trained on"
             )
 

@@ -218,14 +218,6 @@ def cached_depth(dataset: LeRobotDataset, camera_keys: Sequence[str], grid: int)
     return memory_map(cache_dir(dataset) / f"depth-{key}.npy", shape, np.float32, fill)
 
 
-def depth_at(model: Any, dataset: LeRobotDataset, rows: Any) -> Tensor | None:
-    """Return depth (…, S) of rows of the dataset on the model's device, None if it does not look at depth."""
-    if not model.config.depth:
-        return None
-    depth = cached_depth(dataset, model.config.tokenizer.camera_keys, model.tokenizer.grid)[rows]
-    return torch.from_numpy(np.array(depth)).to(model.state_mean.device)
-
-
 def decode_depth(dataset: LeRobotDataset, episode: int, key: str) -> Tensor:
     """Decode the depth of one episode and camera, (T, 1, H, W) metres, from video or from stored images."""
     info = dataset.features[key].get("info") or {}

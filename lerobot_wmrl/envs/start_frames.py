@@ -20,13 +20,12 @@ from lerobot_wmrl.common.constants import ACTION_LOW, START_SCENE, START_TASK, T
 from lerobot_wmrl.common.errors import FieldError, within
 from lerobot_wmrl.data.episodes import (
     EpisodeTable,
-    check_dataset,
     choose_episodes,
     evenly_spread,
     open_dataset,
     read_episodes,
 )
-from lerobot_wmrl.data.frame_cache import cached_frames, depth_at, frames_to_tensor
+from lerobot_wmrl.data.frame_cache import cached_frames, frames_to_tensor
 from lerobot_wmrl.data.frames import Frames, Past
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
@@ -34,6 +33,7 @@ from lerobot_wmrl.maniskill.recordings import scene_splits
 from lerobot_wmrl.maniskill.scenes import scene_for_seed
 from lerobot_wmrl.maniskill.tasks import task_of
 from lerobot_wmrl.rewards.similarity import Features, Similarity
+from lerobot_wmrl.world_models.checkpoint import check_dataset
 from lerobot_wmrl.world_models.configuration_world_model import WorldModelConfig
 from lerobot_wmrl.world_models.goal import imagine_goal
 from lerobot_wmrl.world_models.modeling_world_model import (
@@ -157,7 +157,7 @@ def read_dataset_frames(source: StartFrames, config: WorldModelConfig) -> FirstF
 
     def depth(model: WorldModelRewardModel) -> Tensor | None:
         check_dataset(model.config, table.dataset.features)
-        every = depth_at(model, table.dataset, rows.reshape(-1))
+        every = model.recorded_depth(table.dataset, rows.reshape(-1))
         return every if every is None else every.unflatten(0, rows.shape)
 
     return FirstFrames(

@@ -17,9 +17,10 @@ from torch import Tensor
 from lerobot_wmrl.common.constants import KINDS, PLAY, START_KIND, START_TASK, TASKS
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.statistics import Estimate, Proportion
-from lerobot_wmrl.data.episodes import EpisodeTable, check_dataset, open_dataset, read_episodes
+from lerobot_wmrl.data.episodes import EpisodeTable, open_dataset, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames
 from lerobot_wmrl.evaluation.replay import MAX_ACTIONS, EpisodeReplay, Recording, in_batches
+from lerobot_wmrl.world_models.checkpoint import check_dataset
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 
 MAX_FALSE_POSITIVE_RATE: Final = 0.05

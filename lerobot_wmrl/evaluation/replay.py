@@ -10,7 +10,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lerobot_wmrl.data.episodes import EpisodeTable
-from lerobot_wmrl.data.frame_cache import depth_at, frames_to_tensor
+from lerobot_wmrl.data.frame_cache import frames_to_tensor
 from lerobot_wmrl.data.frames import Context, Frames
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
 from lerobot_wmrl.world_models.modeling_world_model import (
@@ -56,7 +56,7 @@ class Recording:
         tokens, context = self.first_frames(episodes, model.tokenizer)
         rows = self.table.start[episodes]
         state = torch.from_numpy(self.table.state[rows]).to(tokens.device)
-        return Frames(tokens, state, context, depth_at(model, self.table.dataset, rows))
+        return Frames(tokens, state, context, model.recorded_depth(self.table.dataset, rows))
 
     def actions(self, episodes: np.ndarray, steps: int, device: torch.device) -> Tensor:
         """Return the first `steps` actions of E episodes; short episodes repeat their last. (E, steps, A)"""
@@ -175,7 +175,7 @@ def recorded_and_imagined_depth(
     Returns:
         Recorded and imagined depth, each (T − 1, N, g, g); None unless the model looks at depth.
     """
-    recorded = depth_at(model, recording.table.dataset, rows)
+    recorded = model.recorded_depth(recording.table.dataset, rows)
     if recorded is None or imagined is None:
         return None
     grids = (model.tokenizer.num_cameras, model.tokenizer.grid, model.tokenizer.grid)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from lerobot_wmrl.data.clips import Clip
-from lerobot_wmrl.data.frame_cache import depth_at, frames_to_tensor
+from lerobot_wmrl.data.frame_cache import frames_to_tensor
 from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.evaluation.replay import Recording
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
@@ -44,12 +44,12 @@ def reward_along_episode(
     state, action = (torch.from_numpy(column[rows]).to(device) for column in (table.state, table.action))
     known = torch.ones(1, len(tokens), dtype=torch.bool, device=device)
     instruction = [table.instructions[episode]]
-    depth = depth_at(model, table.dataset, np.arange(rows.start, rows.stop)[None])
+    depth = model.recorded_depth(table.dataset, np.arange(rows.start, rows.stop)[None])
     clip = Clip(
         tokens[None], state[None], action[None], known.float(), known, known, instruction, depth, start
     )
     done_logit = model.predict(clip, drawn=False).done_logit[0, :-1]
-    first_depth = depth_at(text_model, table.dataset, slice(rows.start, rows.start + 1))
+    first_depth = text_model.recorded_depth(table.dataset, slice(rows.start, rows.start + 1))
     goal = imagine_goal(text_model, Frames(tokens[:1], state[:1], start, first_depth), instruction)
     measure, cameras = make_similarity(reward.similarity, device), model.tokenizer.num_cameras
     features = measure.features(model.tokenizer.decode_with_features(tokens, context))

@@ -111,13 +111,13 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     """Replay, measure, and write metrics.json, metrics.md and the pictures."""
     from lerobot_wmrl.common.constants import START_SCENE
     from lerobot_wmrl.common.files import write_json, write_text
-    from lerobot_wmrl.data.episodes import check_dataset, choose_episodes, open_dataset, read_episodes
+    from lerobot_wmrl.data.episodes import choose_episodes, open_dataset, read_episodes
     from lerobot_wmrl.data.frame_cache import cached_frames
     from lerobot_wmrl.evaluation.reconstruction import reconstruction_metrics
     from lerobot_wmrl.evaluation.replay import Recording
     from lerobot_wmrl.evaluation.report import evaluate, report_action_model, report_agreement
     from lerobot_wmrl.maniskill.recordings import scene_splits
-    from lerobot_wmrl.world_models.checkpoint import load_model
+    from lerobot_wmrl.world_models.checkpoint import check_dataset, load_model
 
     cfg.check()
     model = load_model(cfg.model.path, "action_world_model", cfg.device, "model.path")

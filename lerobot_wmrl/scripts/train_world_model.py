@@ -161,7 +161,7 @@ def conclusion(cfg: TrainWorldModelConfig, model: Any, table: EpisodeTable) -> s
 
     size = sum(path.stat().st_size for path in resolve_checkpoint(cfg.output_dir).glob("*.safetensors"))
     parameters = sum(parameter.numel() for parameter in model.parameters())
-    made = f"{parameters / 1e6:.1f} million parameters, {size / 1e6:.1f} MB"
+    made = f"{parameters:,} parameters, {size / 1e6:.1f} MB"
     return (
         f"{cfg.output_dir}: a {cfg.model.type} of {made}.\n{quality(cfg, model, table)}\n"
         f"Next:\n  {next_command(cfg)}"

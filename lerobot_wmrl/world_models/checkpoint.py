@@ -1,7 +1,7 @@
 """Loading trained models of this package, with errors that say what is wrong and what to do."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -9,10 +9,14 @@ import torch
 from draccus.utils import ParsingError
 from lerobot.configs.rewards import RewardModelConfig
 from lerobot.rewards.factory import get_reward_model_class
+from lerobot.utils.constants import ACTION, OBS_STATE
 from safetensors import SafetensorError
 
 from lerobot_wmrl.common.checkpoints import resolve_checkpoint
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.data.episodes import check_cameras, check_depth, check_widths
+from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
+from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig, WorldModelConfig
 
 FIELDS: Final = {
     "frame_tokenizer": "tokenizer_path",
@@ -106,6 +110,19 @@ def load_model(
             f"{path}: model.safetensors cannot be read ({error}). It is truncated or of another version: "
             "use an earlier checkpoint or train again"
         ) from error
+
+
+def check_dataset(config: FrameTokenizerConfig | WorldModelConfig, features: Mapping[str, Any]) -> None:
+    """Raise ValueError unless a trained model can learn from, start in or replay a dataset's episodes."""
+    sizes = config.tokenizer
+    assert sizes is not None, "a trained model knows its tokenizer"
+    check_cameras(features, sizes.camera_keys, sizes.image_size)
+    if isinstance(config, WorldModelConfig):
+        if config.depth:
+            check_depth(features, sizes.camera_keys, sizes.image_size)
+        check_widths(features, {OBS_STATE: config.state_size})
+    if isinstance(config, ActionWorldModelConfig):
+        check_widths(features, {ACTION: config.action_size})
 
 
 def check_same_tokenizer(model: Any, other: Any, field: str, value: object) -> None:

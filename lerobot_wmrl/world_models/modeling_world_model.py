@@ -9,8 +9,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import torch
 from lerobot.configs.rewards import RewardModelConfig
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.rewards.pretrained import PreTrainedRewardModel
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
@@ -19,15 +21,14 @@ from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.clips import Clip, clip_from_windows
 from lerobot_wmrl.data.episodes import (
     check_cameras,
-    check_dataset,
     check_depth,
     check_episode_lengths,
     success_column,
 )
-from lerobot_wmrl.data.frame_cache import depth_of_windows
+from lerobot_wmrl.data.frame_cache import cached_depth, depth_of_windows
 from lerobot_wmrl.world_models.anchored.dynamics import AnchoredDynamics
 from lerobot_wmrl.world_models.autoregressive.dynamics import AutoregressiveDynamics
-from lerobot_wmrl.world_models.checkpoint import load_model
+from lerobot_wmrl.world_models.checkpoint import check_dataset, load_model
 from lerobot_wmrl.world_models.configuration_world_model import (
     ActionWorldModelConfig,
     AnchoredConfig,
@@ -202,6 +203,13 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
 
     def _normalized_clip(self, clip: Clip) -> Clip:
         return clip._replace(state=self.normalize_state(clip.state))
+
+    def recorded_depth(self, dataset: LeRobotDataset, rows: Any) -> Tensor | None:
+        """Return the depth (…, S) of rows of a dataset in metres, None unless the model looks at depth."""
+        if not self.config.depth:
+            return None
+        depth = cached_depth(dataset, self.config.tokenizer.camera_keys, self.tokenizer.grid)[rows]
+        return torch.from_numpy(np.array(depth)).to(self.state_mean.device)
 
     @torch.no_grad()
     def clip_from_batch(self, batch: dict[str, Any]) -> Clip:

@@ -40,12 +40,11 @@ from lerobot_wmrl.data.clips import ClipSampler, FrameSampler, InTurn
 from lerobot_wmrl.data.episodes import (
     EpisodeTable,
     TrainingData,
-    check_dataset,
     open_dataset,
     read_episodes,
 )
 from lerobot_wmrl.data.frame_cache import cached_context, cached_depth, cached_frames, cached_tokens
-from lerobot_wmrl.world_models.checkpoint import load_model
+from lerobot_wmrl.world_models.checkpoint import check_dataset, load_model
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import cosine_schedule
 from lerobot_wmrl.world_models.configuration_world_model import TextWorldModelConfig
 
@@ -189,7 +188,7 @@ def train(
     Raises:
         ValueError: the loss or its gradient is not finite; no new checkpoint is written.
     """
-    processes = PartialState()
+    processes, device = PartialState(), model.config.device
     set_seed(settings.seed + processes.process_index)
     preset: Any = model.config.get_optimizer_preset()
     optimizer = preset.build([p for p in model.parameters() if p.requires_grad])
@@ -197,8 +196,6 @@ def train(
     checkpoint = latest_checkpoint(settings.output_dir)
     first = 0 if checkpoint is None else load_training_state(checkpoint, optimizer, scheduler)
     network = DistributedDataParallel(model) if processes.num_processes > 1 else model
-    device: str = model.config.device
-    dtype = training_dtype(settings.precision, device)
 
     def save(folder: Path) -> None:
         model.save_pretrained(folder / PRETRAINED_MODEL_DIR)
@@ -206,9 +203,8 @@ def train(
         save_training_state(folder, step, random_states, optimizer, scheduler)
 
     model.train()
-    began = time.monotonic()
-    progress = tqdm(total=settings.steps, initial=first, desc=f"Training {model.name}", unit="step",
-                    disable=not processes.is_main_process)  # fmt: skip
+    began, dtype = time.monotonic(), training_dtype(settings.precision, device)
+    progress = progress_bar(model.name, first, settings.steps)
     for step in range(first + 1, settings.steps + 1):
         with compute_in(dtype, device):
             loss, metrics = network(sampler(step - 1), (step - 1) / settings.steps)
@@ -224,6 +220,12 @@ def train(
                 write_checkpoint(settings.output_dir, settings.steps, step, save)
         progress.update()
     progress.close()
+
+
+def progress_bar(name: str, first: int, steps: int) -> tqdm:
+    """Show steps done and the time left, in the first process."""
+    quiet = not PartialState().is_main_process
+    return tqdm(total=steps, initial=first, desc=f"Training {name}", unit="step", disable=quiet)
 
 
 def log(output_dir: Path, step: int, metrics: dict[str, float], progress: tqdm, wandb: Any) -> None:

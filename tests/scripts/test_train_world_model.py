@@ -38,7 +38,7 @@ def test_training_goes_on_with_the_weights_and_settings_of_a_checkpoint(
     for name, weights in before.items():
         torch.testing.assert_close(after[name], weights, atol=1e-6, rtol=0)
     settings = json.loads((output_dir / TRAINED / "config.json").read_text())
-    assert (settings["type"], settings["width"], settings["learning_rate"]) == (model, 32, 1e-12)
+    assert (settings["type"], settings["dynamics"]["width"], settings["learning_rate"]) == (model, 32, 1e-12)
 
 
 def test_a_path_without_a_model_is_named(
@@ -76,7 +76,7 @@ def test_a_training_ends_with_what_it_made_how_good_it_is_and_what_comes_next(
     monkeypatch.setattr(sys, "argv", flags(root, tokenizer))
     main()
     said = capsys.readouterr().out
-    assert f"{tokenizer}: a frame_tokenizer of 0.0 million parameters, 0.1 MB." in said
+    assert f"{tokenizer}: a frame_tokenizer of 18,306 parameters, 0.1 MB." in said
     psnr = json.loads((tokenizer / "reconstruction.json").read_text())["psnr"]["third_view"]
     assert f"PSNR on held-out episodes: third_view {psnr:.1f} dB." in said
     following = said.strip().splitlines()[-1].split()
