@@ -147,6 +147,8 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
 
 def conclusion(cfg: EvalWorldModelConfig, episodes: int, report: "Report") -> str:
     """Say in a few lines what was found, where it is, and what comes next."""
+    from lerobot_wmrl.evaluation.gate import MAX_FALSE_POSITIVE_RATE
+
     metrics = report.metrics
     psnr, ceiling = (metrics["headline"][name]["value"] for name in ("psnr", "psnr_ceiling"))
     found = (
@@ -162,11 +164,17 @@ def conclusion(cfg: EvalWorldModelConfig, episodes: int, report: "Report") -> st
             "The gate is passed. Next: train a policy in it, "
             f"lerobot-wmrl-train --env.type=world_model --env.world_model_path={cfg.model.path} …"
         )
-    else:
+    elif (metrics["false_positive_rate"]["share"] or 0) > MAX_FALSE_POSITIVE_RATE:
         verdict = (
             "The gate is not passed: a policy trained in this model may exploit its false positives. Next: "
-            "record more failures near success and train it longer, or judge success more strictly "
-            "(--done_threshold, --done_frames; the table above has the best values)."
+            "record more failures near success and train the model longer, or ask for more before an episode "
+            "counts as a success (--done_threshold, --done_frames; the table above has other values)."
+        )
+    else:
+        verdict = (
+            "The gate is not passed, for want of recall or episodes: successes that the model does not see "
+            "are never rewarded. Next: train it longer, replay more episodes, or lower --done_threshold or "
+            "--done_frames (the table above has other values)."
         )
     return f"{found}\n{verdict}\nmetrics.json, metrics.md and pictures are in {cfg.output_dir}"
 

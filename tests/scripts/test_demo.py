@@ -46,7 +46,7 @@ def outputs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """The finished folder, and what the second of two calls printed: the first was killed in a stage."""
     folder = tmp_path_factory.mktemp("loop")
     first = start_demo(folder)
-    end = time.monotonic() + 300
+    end = time.monotonic() + 600
     while not stage_record(folder / "demo", KILLED_STAGE).get("seconds"):
         assert first.poll() is None, first.communicate()[0][-3000:]
         assert time.monotonic() < end, "the stage did not start in time"
