@@ -8,7 +8,6 @@ import fcntl
 import importlib
 import importlib.metadata
 import json
-import logging
 import multiprocessing
 import os
 import select
@@ -24,6 +23,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import huggingface_hub.constants
 import psutil
 
 from lerobot_wmrl.common.errors import FieldError
@@ -149,12 +149,10 @@ def read_record(output_dir: Path, stage: Stage) -> dict[str, Any]:
 
 
 def preload() -> None:
-    """Import once what every stage needs, without network and without LeRobot's page about FFmpeg.
-
-    The libraries ask whether they may use the network when they are imported, and no stage needs it.
-    """
-    os.environ.setdefault("HF_HUB_OFFLINE", "1")
-    logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
+    """Import once what every stage needs, and keep the stages off the network, which none of them needs."""
+    if "HF_HUB_OFFLINE" not in os.environ:
+        os.environ["HF_HUB_OFFLINE"] = "1"  # for processes that a stage starts
+        huggingface_hub.constants.HF_HUB_OFFLINE = True  # the library read the variable at its import
     for module in PRELOADED:
         importlib.import_module(module)
 

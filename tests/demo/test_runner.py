@@ -1,9 +1,9 @@
 """The runner of the stages, on commands that take a moment: resuming, ending, refusing."""
 
 import json
+import multiprocessing
 import os
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -85,17 +85,19 @@ def test_a_stage_ends_when_the_demo_is_stopped(sign: signal.Signals, tmp_path: P
         "import os, time; from pathlib import Path; time.sleep(0.5); "
         f"Path({str(pid_file)!r}).write_text(str(os.getpid())); time.sleep(60)"
     )
-    runner = (
-        "import signal, sys; from pathlib import Path; from lerobot_wmrl.demo import runner; "
-        "signal.signal(signal.SIGINT, signal.default_int_handler); "  # background jobs ignore it
-        "runner.entry_point = lambda program: lambda: exec(sys.argv[1], {}); "
-        f"runner.run_measured(['python', {stage!r}], Path({str(log)!r}), print)"
-    )
-    process = subprocess.Popen([sys.executable, "-c", runner], stdout=subprocess.DEVNULL)
+    process = multiprocessing.get_context("fork").Process(target=run_and_wait, args=(stage, log))
+    process.start()
     wait_until(lambda: pid_file.exists() and pid_file.read_text() != "")
-    process.send_signal(sign)
-    process.wait(30)
+    os.kill(process.pid or 0, sign)
+    process.join(30)
+    assert process.exitcode is not None
     wait_until(lambda: tree_memory(int(pid_file.read_text())) == 0)
+
+
+def run_and_wait(code: str, log: Path) -> None:
+    """Run a stage as the demo does, in a process that hears Ctrl-C: background jobs ignore it."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    run_measured(["python", code], log, lambda *_: None)
 
 
 def wait_until(condition: Callable[[], bool], seconds: float = 20.0) -> None:
