@@ -23,7 +23,14 @@ from lerobot.utils.utils import flatten_dict, init_logging
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.files import foreign_files, write_json
 from lerobot_wmrl.common.presets import TYPE, format_value, read_settings
-from lerobot_wmrl.common.settings import Setting, help_page, settings_of, type_hints, without_none
+from lerobot_wmrl.common.settings import (
+    Setting,
+    help_page,
+    known_types,
+    settings_of,
+    type_hints,
+    without_none,
+)
 
 CONFIG_FILE = "train_config.json"
 
@@ -118,22 +125,33 @@ def without_help_texts() -> Iterator[None]:
 
 
 def parsing_error(said: str, config_class: type[RunConfig]) -> str:
-    """Return why the command line was refused. `said` is what argparse or draccus printed of it."""
-    if undecoded := re.match(r"error: `(\w+)`: Could not decode the value into any", said):
-        return refusal(undecoded[1], config_class) or said
-    reason = said.rpartition("error: ")[2]
-    unknown = re.findall(r"--[\w.-]+", reason) if reason.startswith("unrecognized arguments") else []
+    """Return in one line why the command line was refused, of which argparse or draccus `said` something."""
+    group, reason = "", said.rpartition("error: ")[2]
+    if undecoded := re.match(r"`(\w+)`: Could not decode the value into any.*?\n\s*\w+: (.*)", reason, re.S):
+        group, reason = undecoded[1], refusal(undecoded[1], config_class) or undecoded[2]
+    if inner := re.match(r"`([\w.]+)`: (.*)", reason, re.S):
+        group, reason = ".".join(filter(None, (group, inner[1]))), inner[2]
     settings = list(settings_of(config_class, chosen_types(sys.argv[1:])))
-    found = [
-        f"there is no flag {flag}: "
-        + (
-            f"did you mean --{near}?"
-            if (near := near_flag(flag[2:], settings, config_class))
-            else "see --help"
+    if "Expected a dict with a 'type' key" in reason:
+        return "; ".join(
+            f"--{flag} is a setting of a type: give --{kind}=…" for flag, kind in untyped(settings)
         )
-        for flag in unknown
-    ]
-    return "; ".join(found) or reason
+    unknown = re.findall(r"--([\w.-]+)", reason) if reason.startswith("unrecognized arguments") else []
+    if invalid := re.match(r"The fields? (.*) (?:is|are) not valid for", reason):
+        unknown = [".".join(filter(None, (group, name))) for name in re.findall(r"`(\w+)`", invalid[1])]
+    near = [near_flag(name, settings, config_class) for name in unknown]
+    hints = [f"did you mean --{name}?" if name else "see --help" for name in near]
+    found = [f"there is no flag --{name}: {hint}" for name, hint in zip(unknown, hints, strict=True)]
+    return "; ".join(found) or " ".join(f"{f'--{group}: ' if group else ''}{reason}".split())
+
+
+def untyped(settings: Sequence[Setting]) -> Iterator[tuple[str, str]]:
+    """Yield the flags that were typed although the type that they belong to was not, each with that flag."""
+    typed, chosen = typed_flags(sys.argv[1:]), chosen_types(sys.argv[1:])
+    for group in (each.name.removesuffix(TYPE) for each in settings if each.name.endswith(TYPE)):
+        flag = next((name for name in typed if name.startswith(f"{group}.")), None)
+        if flag and group not in chosen and f"{group}.path" not in typed:
+            yield flag, f"{group}{TYPE}"
 
 
 def refusal(name: str, config_class: type[RunConfig]) -> str | None:
@@ -142,15 +160,18 @@ def refusal(name: str, config_class: type[RunConfig]) -> str | None:
     Raises:
         FieldError: it says which setting cannot be.
     """
-    kind = without_none(type_hints(config_class)[name])
-    chosen = kind.get_choice_class(parser.get_type_arg(name))
+    chosen = (known_types(without_none(type_hints(config_class)[name])) or {}).get(parser.get_type_arg(name))
+    if chosen is None:
+        return None
     try:
-        with without_help_texts():
+        with without_help_texts(), redirect_stderr(StringIO()):
             draccus.parse(chosen, args=parser.get_cli_overrides(name))
-    except ParsingError as error:
-        if isinstance(cause(error), FieldError):
-            raise cause(error) from None
-        return str(cause(error))
+    except (ParsingError, SystemExit) as error:
+        reason = cause(error)
+        if isinstance(reason, FieldError):
+            raise reason from None
+        if isinstance(error, ParsingError):
+            return str(error if "Couldn't parse" in str(error) else reason)
     return None
 
 

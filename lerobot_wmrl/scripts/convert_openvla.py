@@ -1,4 +1,4 @@
-"""lerobot-wmrl-convert-openvla: OpenVLA's checkpoints to LeRobot's format and back.
+"""lerobot-wmrl-convert-openvla: convert OpenVLA's checkpoints to LeRobot's format and back.
 
     lerobot-wmrl-convert-openvla --direction=import --source=openvla/openvla-7b --unnorm_key=bridge_orig \\
         --target=outputs/openvla
@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_wmrl.common.command_line import RunConfig, run_command
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.files import foreign_files, writing
 
 DIRECTIONS = ("import", "export")
@@ -29,8 +30,9 @@ class ConvertOpenVLAConfig(RunConfig):
         direction: `import`, from OpenVLA's format to LeRobot's, or `export`, the reverse.
         source: a checkpoint's folder, for the export also the output folder of a training, or a hub id.
         target: a new folder.
-        unnorm_key: of the import: the dataset whose statistics turn tokens into actions. Without it, a
-            checkpoint that knows several can be fine-tuned, which brings statistics of its own, not run.
+        unnorm_key: for the import, the dataset whose statistics turn tokens into actions. Without it, a
+            checkpoint that knows several datasets can be fine-tuned (which adds statistics of its own) but
+            not run.
     """
 
     direction: str = ""
@@ -42,21 +44,28 @@ class ConvertOpenVLAConfig(RunConfig):
 def convert(cfg: ConvertOpenVLAConfig) -> None:
     """Check what is asked for, then write the target folder whole or not at all."""
     if cfg.direction not in DIRECTIONS:
-        raise ValueError(f"--direction={cfg.direction}: choose one of {', '.join(DIRECTIONS)}")
+        raise FieldError("direction", cfg.direction, f"choose one of {', '.join(DIRECTIONS)}")
     if not cfg.source:
-        raise ValueError("--source: give the checkpoint to convert")
+        raise FieldError("source", cfg.source, "give the checkpoint to convert")
     if cfg.target is None or cfg.target.is_file() or foreign_files(cfg.target):
-        raise ValueError(f"--target={cfg.target or ''}: choose a new folder")
+        raise FieldError("target", cfg.target, "choose a new folder")
     if cfg.direction == "export" and cfg.unnorm_key is not None:
-        raise ValueError("--unnorm_key: the export keeps all statistics; leave it out")
+        raise FieldError("unnorm_key", cfg.unnorm_key, "the export keeps all statistics; leave it out")
     write = importer(cfg.source, cfg.unnorm_key) if cfg.direction == "import" else exporter(cfg.source)
     with writing("target", cfg.target):
         write_whole(cfg.target, write)
-    print(f"{cfg.target}: written")
+    print(conclusion(cfg.direction, cfg.target))
+
+
+def conclusion(direction: str, target: Path) -> str:
+    """Say what was made and what comes next."""
+    if direction == "import":
+        return f"{target}: a policy of LeRobot. Next: lerobot-eval --policy.path={target} --env.type=…"
+    return f"{target}: a checkpoint that OpenVLA's own code loads"
 
 
 def importer(source: str, unnorm_key: str | None) -> Callable[[Path], None]:
-    """Load OpenVLA's checkpoint. → what writes LeRobot's"""
+    """Load OpenVLA's checkpoint and return a function that writes LeRobot's."""
     from lerobot_policy_openvla.modeling_openvla import OpenVLAPolicy
     from lerobot_policy_openvla.processor_openvla import make_openvla_pre_post_processors
 
@@ -72,14 +81,14 @@ def importer(source: str, unnorm_key: str | None) -> Callable[[Path], None]:
 
 
 def exporter(source: str) -> Callable[[Path], None]:
-    """Load LeRobot's checkpoint. → what writes OpenVLA's. ValueError if it is of another policy."""
+    """Load LeRobot's checkpoint and return a function that writes OpenVLA's. FieldError if it is not one."""
     from lerobot_policy_openvla.checkpoint import write_openvla
     from lerobot_policy_openvla.modeling_openvla import OpenVLAPolicy
     from lerobot_wmrl.common.policies import load_with_adapters, read_policy_config
 
     config = read_policy_config(source, [])
     if config.type != OpenVLAPolicy.name:
-        raise ValueError(f"--source={source}: a policy of type {config.type}, not {OpenVLAPolicy.name}")
+        raise FieldError("source", source, f"a policy of type {config.type}, not {OpenVLAPolicy.name}")
     if config.use_peft:
         policy = load_with_adapters(config, as_stored=True).merge_and_unload()
     else:
@@ -104,7 +113,7 @@ def write_whole(target: Path, write: Callable[[Path], None]) -> None:
 
 
 def main() -> None:
-    """Entry point of the console command."""
+    """Run the console command."""
     run_command(convert, ConvertOpenVLAConfig, list)
 
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from lerobot_wmrl.common.command_line import RunConfig, near_flag, said_in_flags
+from lerobot_wmrl.common.command_line import RunConfig, near_flag, parse_flags, said_in_flags
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.settings import settings_of
 from lerobot_wmrl.scripts.train import TrainConfig
@@ -70,3 +70,36 @@ def test_a_field_is_said_as_its_flag(error: ValueError, typed: list[str], messag
 )
 def test_a_flag_that_does_not_exist_leads_to_one_that_does(name: str, near: str | None) -> None:
     assert near_flag(name, list(settings_of(TrainConfig, {"env": "world_model"})), TrainConfig) == near
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--steps=3"], "there is no flag --steps: did you mean --iterations?"),
+        (
+            ["--env.type=world_model", "--env.reward.form=absolute"],
+            "--env.reward.form is a setting of a type: give --env.reward.type=…",
+        ),
+        (
+            ["--env.type=world_model", "--env.light_jitter=true"],
+            "there is no flag --env.light_jitter: see --help",
+        ),
+        (
+            ["--env.type=world_model", "--env.max_starts=3"],
+            "there is no flag --env.max_starts: did you mean --env.dataset.max_starts?",
+        ),
+        (
+            ["--env.type=world_model", "--env.reward.type=general", "--env.reward.alpha=x"],
+            "--env.reward.alpha: Couldn't parse 'x' into a float",
+        ),
+        (["--iterations=many"], "--iterations: Couldn't parse 'many' into an int"),
+    ],
+)
+def test_what_cannot_be_parsed_is_said_in_one_line(
+    flags: list[str], message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.argv", ["lerobot-wmrl-train", *flags])
+    with pytest.raises(ValueError) as error:  # noqa: PT011  (the whole message is compared)
+        parse_flags(TrainConfig)
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
