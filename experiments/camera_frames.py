@@ -41,9 +41,10 @@ class Frames(NamedTuple):
     episode: np.ndarray
 
     def save(self, path: Path) -> None:
-        """Whole or not at all."""
+        """Write the frames; a crash never leaves half a file."""
         partial = path.with_suffix(".partial.npz")
-        np.savez(partial, **self.images, **{name: getattr(self, name) for name in self._fields[1:]})
+        arrays: dict[str, Any] = {**self.images, **{name: getattr(self, name) for name in self._fields[1:]}}
+        np.savez(partial, **arrays)
         partial.replace(path)
 
     @classmethod

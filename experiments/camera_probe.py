@@ -76,7 +76,7 @@ class CameraEncoder(nn.Module):
 
 
 class Probe(nn.Module):
-    """An encoder a camera, two layers on all of them. [(B, 3, H, W), …] → (B, outputs)"""
+    """One encoder for each camera, two layers on all of them. [(B, 3, H, W), …] → (B, outputs)"""
 
     def __init__(self, image_size: int, cameras: int, outputs: int) -> None:
         super().__init__()
@@ -91,7 +91,7 @@ class Probe(nn.Module):
 
 
 def held_out(episode: np.ndarray) -> np.ndarray:
-    """Episodes for the test, as many of every task. (N,) bool"""
+    """Return which frames are held out for the test, as many of every task. (N,) → (N,) bool"""
     return episode // len(TASKS) % round(1 / TEST_SHARE) == 0
 
 
@@ -129,7 +129,7 @@ def probe(cameras: list[str], frames: Frames, steps: int) -> dict[str, Any]:
 
 
 def summary(error: np.ndarray, right: np.ndarray, gaps: np.ndarray, task: np.ndarray) -> dict[str, Any]:
-    """Mean and median errors (N, 7), the share of right answers to whether there is contact; by task, too."""
+    """Return mean and median of errors (N, 7) and the accuracy of contact, also by task."""
     clear = (gaps < TOUCHING) | (gaps > APART)
     means, medians = (
         {name: round(float(value), 1) for name, value in zip(NAMES, values, strict=False)}

@@ -34,7 +34,7 @@ from lerobot_wmrl.rl.trainer import Schedule, make_algorithm, train
 EPISODES: Final = 100
 STATE: Final = "observation.state"
 FREE: Final[dict[str, Any]] = {"reference_coefficient": 0.0, "max_reference_kl": 1e9}
-"""There is no cloned policy to stay near."""
+"""There is no reference policy to stay near."""
 
 VALUE: Final[dict[str, Any]] = {"value_lr": 3e-3, "value_iterations": 0}
 
@@ -141,7 +141,7 @@ class ControlPolicy(nn.Module):
         return Normal(decided, self.log_std.exp())
 
     def best(self, observation: Observation) -> Tensor:
-        """The action without exploration. → (B, K)"""
+        """Return the action without exploration. → (B, K)"""
         decided = self.actor(observation[STATE])
         return decided.argmax(dim=1, keepdim=True) if self.discrete else decided
 
@@ -162,22 +162,22 @@ class ControlPolicy(nn.Module):
         return self.critic.parameters()
 
     def to_action(self, raw_action: Tensor) -> Tensor:
-        """In the task's units."""
+        """Return actions in the task's units."""
         return raw_action if self.discrete else raw_action * self.scale
 
 
 def network(inputs: int, outputs: int, gain: float) -> nn.Sequential:
-    """Two hidden layers; the last layer's weights are scaled by `gain`."""
-    layers = [nn.Linear(inputs, 64), nn.Tanh(), nn.Linear(64, 64), nn.Tanh(), nn.Linear(64, outputs)]
-    for layer in layers[::2]:
-        nn.init.orthogonal_(layer.weight, gain if layer is layers[-1] else 2**0.5)
+    """Return a network with two hidden layers; the last layer's weights are scaled by `gain`."""
+    first, second, last = nn.Linear(inputs, 64), nn.Linear(64, 64), nn.Linear(64, outputs)
+    for layer in (first, second, last):
+        nn.init.orthogonal_(layer.weight, gain if layer is last else 2**0.5)
         nn.init.zeros_(layer.bias)
-    return nn.Sequential(*layers)
+    return nn.Sequential(first, nn.Tanh(), second, nn.Tanh(), last)
 
 
 @torch.no_grad()
 def score(task: str, policy: ControlPolicy) -> float:
-    """Mean return of evaluation episodes."""
+    """Return the mean return of evaluation episodes."""
     env = ControlEnv(task, EPISODES)
     observation, _ = env.reset(seed=EVALUATION_SEED)
     running, returns = torch.ones(EPISODES, dtype=torch.bool), torch.zeros(EPISODES)

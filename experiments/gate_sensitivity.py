@@ -34,7 +34,7 @@ ERRORS_MM: Final = (0.0, 0.5, 1.0, 2.0, 3.0, 5.0)
 
 
 def put_aside(simulation: Simulation, shift: np.ndarray) -> None:
-    """Let the episode begin with the object displaced by `shift` (2,), in metres."""
+    """Displace the object by `shift` (2,), in metres, at the start of the episode."""
     episode = simulation.episode
     episode.start = replace(episode.start, object_xy=episode.start.object_xy + shift)
     simulation.env.place(episode.scene, episode.start)
@@ -42,14 +42,14 @@ def put_aside(simulation: Simulation, shift: np.ndarray) -> None:
 
 
 def succeeds(simulation: Simulation, actions: np.ndarray) -> bool:
-    """Whether success holds after one of the actions (T, 7)."""
+    """Return whether success holds after one of the actions (T, 7)."""
     return any(simulation.step(action).success for action in actions)
 
 
 def repeated(
     simulation: Simulation, table: EpisodeTable, real: dict[str, np.ndarray], errors_mm: Sequence[float]
 ) -> np.ndarray:
-    """Success of every episode with each error. → (E, errors)"""
+    """Return the success of every episode with each error. → (E, errors)"""
     found = np.zeros((len(table.start), len(errors_mm)), bool)
     for episode in tqdm(range(len(table.start)), desc="Repeating episodes", unit="episode"):
         task, scene, seed = (int(real[name][episode]) for name in ("task", "scene", "seed"))
@@ -64,7 +64,7 @@ def repeated(
 
 
 def measure(found: np.ndarray, success: np.ndarray, errors_mm: Sequence[float]) -> list[dict[str, Any]]:
-    """The gate of each error; success (E,) as recorded."""
+    """Return the gate at each error; success (E,) is the recorded one."""
     return [
         {
             "error_mm": error,
@@ -76,7 +76,7 @@ def measure(found: np.ndarray, success: np.ndarray, errors_mm: Sequence[float]) 
 
 
 def results_table(rows: Sequence[dict[str, Any]]) -> str:
-    """A line an error."""
+    """Return a table with a line for each error."""
     lines = []
     for row in rows:
         rates = (row[name] for name in ("false_positive_rate", "recall"))

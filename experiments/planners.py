@@ -44,7 +44,7 @@ class Measured:
 
 
 def play(simulation: Simulation, motion: Motion, kind: str, seed: int) -> tuple[bool, Way, float]:
-    """One planned episode: its success, the way of TCP and object (T, 2, 3), and CPU seconds of its plan."""
+    """Play one planned episode. → success, positions of TCP and object (T, 2, 3), CPU seconds of its plan"""
     rng = np.random.default_rng(seed)
     scene = SCENES[rng.integers(len(SCENES))]
     simulation.reset(scene, seed)
@@ -61,7 +61,7 @@ def play(simulation: Simulation, motion: Motion, kind: str, seed: int) -> tuple[
 
 
 def measure(planner: str, episodes: int) -> dict[str, dict[str, Measured]]:
-    """By task and kind."""
+    """Play the episodes of every task and kind. → results by task and kind"""
     measured: dict[str, dict[str, Measured]] = {}
     motion = MOTIONS[planner]()
     for name, task in TASKS.items():
@@ -78,7 +78,7 @@ def measure(planner: str, episodes: int) -> dict[str, dict[str, Measured]]:
 
 
 def draw(measured: dict[str, dict[str, Measured]], path: Path) -> None:
-    """Seen from above: a row a task, a column a kind; blue the gripper, orange the object."""
+    """Draw where gripper (blue) and object (orange) were: a row a task, a column a kind, from above."""
     figure = Figure(figsize=(2.2 * len(TASK_KINDS), 2.2 * len(measured)))
     panels = figure.subplots(len(measured), len(TASK_KINDS), sharex=True, sharey=True)
     for row, (task, kinds) in zip(panels, measured.items(), strict=True):

@@ -44,13 +44,13 @@ from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.world_models.checkpoint import load_model
 
 FRAMES = 3
-"""In a row that count together, as in the environment."""
+"""Consecutive done frames that make a success, as in the environment."""
 
 THRESHOLD = 0.5
-"""Of success."""
+"""Done probability from which a frame counts as success."""
 
 FEWEST = 5
-"""Episodes that a mean is drawn of."""
+"""Episodes that a mean needs to be drawn."""
 
 NEVER = 10**6
 """No episode ends while it is judged."""
@@ -58,38 +58,43 @@ NEVER = 10**6
 HANDS: Final = ("random", "frozen", "saturated")
 
 
-class EveryReward:
-    """Stands where the environment's reward stands and remembers what each of the trained ones says."""
+class RewardProbe:
+    """A reward for an environment that pays nothing and keeps what every learned reward pays."""
 
     def __init__(self, rewards: Mapping[str, PreTrainedRewardModel]) -> None:
         self.rewards = rewards
-        self.said: dict[str, list[Tensor]] = {}
+        self.paid: dict[str, list[Tensor]] = {}
 
     @torch.no_grad()
     def compute_reward(self, batch: dict[str, Any]) -> Tensor:
-        """(B,) of zeros: nobody learns from it."""
+        """Ask every learned reward. → (B,) zeros"""
         for name, reward in self.rewards.items():
-            self.said.setdefault(name, []).append(reward.compute_reward(batch))
+            self.paid.setdefault(name, []).append(reward.compute_reward(batch))
         return torch.zeros_like(batch["success"])
 
 
-def judged(env: WorldModelVectorEnv, actions: Tensor, config: GeneralConfig) -> dict[str, np.ndarray]:
-    """What every reward says of the frames after actions (B, T, A) from the first B starts, and both signals
-    of uncertainty. → (B, T) each"""
-    env.reward.said.clear()
+def judged(
+    env: WorldModelVectorEnv, probe: RewardProbe, actions: Tensor, config: GeneralConfig
+) -> dict[str, np.ndarray]:
+    """Imagine actions (B, T, A) from the first B starts.
+
+    Returns:
+        The reward of every frame by every reward, and both signals of uncertainty, each (B, T).
+    """
+    probe.paid.clear()
     env.reset(seed=list(range(env.num_envs)))
     parts = [env.step(action)[-1]["reward_parts"] for action in actions.unbind(1)]
     success = torch.stack([part["done_probability"] for part in parts], 1)
     similarity = torch.stack([part["similarity"] for part in parts], 1)
     level = config.alpha * (success >= THRESHOLD).float() + (1 - config.alpha) * similarity
-    learned = {name: torch.stack(values, 1) for name, values in env.reward.said.items()}
+    learned = {name: torch.stack(values, 1) for name, values in probe.paid.items()}
     uncertainty = {signal: torch.stack([part[signal] for part in parts], 1) for signal in SIGNALS}
     every = {"general": level, "success": success, "similarity": similarity, **learned, **uncertainty}
     return {name: values.cpu().numpy() for name, values in every.items()}
 
 
 def recorded(table: EpisodeTable, episodes: np.ndarray, column: np.ndarray, steps: int) -> np.ndarray:
-    """A column of the dataset by episode, NaN after its end. (rows,) → (E, steps)"""
+    """Return a column of the dataset by episode, NaN after its end. (rows,) → (E, steps)"""
     values = np.full((len(episodes), steps), np.nan)
     for row, episode in enumerate(episodes):
         length = min(int(table.length[episode]), steps)
@@ -98,7 +103,7 @@ def recorded(table: EpisodeTable, episodes: np.ndarray, column: np.ndarray, step
 
 
 def within_episodes(reward: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Spearman's correlation over each episode's frames, NaN where one of both is constant. (E, T) → (E,)"""
+    """Return Spearman's correlation over each episode's frames; NaN where one is constant. (E, T) → (E,)"""
     found = np.full(len(reward), np.nan)
     for row, (own, real) in enumerate(zip(reward, truth, strict=True)):
         known = np.isfinite(real)
@@ -108,8 +113,7 @@ def within_episodes(reward: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def curve(values: np.ndarray) -> dict[str, list[float]]:
-    """Mean over the episodes that last so long, and its 95 % band; ends where fewer than `FEWEST` do.
-    (E, T)"""
+    """Return the mean of (E, T) over episodes with its 95 % band, as long as `FEWEST` episodes last."""
     lasting = np.isfinite(values).sum(0)
     each = [Estimate.mean(column) for column in values[:, lasting >= FEWEST].T]
     return {
@@ -122,7 +126,13 @@ def curve(values: np.ndarray) -> dict[str, list[float]]:
 def measure(
     curves: Mapping[str, np.ndarray], done: np.ndarray, alone: Mapping[str, Mapping[str, np.ndarray]]
 ) -> dict[str, Any]:
-    """Of every reward the numbers above; done (E, T) real success; `alone`: what other hands earn."""
+    """Return the numbers of every reward.
+
+    Args:
+        curves: rewards (E, T) by name, `rule_based` among them.
+        done: success in ManiSkill (E, T).
+        alone: rewards of hands that attempt nothing, by hand and name.
+    """
     truth, success = curves["rule_based"], done.any(1)
     lasted = {name: np.where(np.isfinite(truth), values, np.nan) for name, values in curves.items()}
     uncertainty = {signal: lasted.pop(signal) for signal in SIGNALS}
@@ -145,8 +155,10 @@ def measure(
 
 
 def warnings(uncertainty: Mapping[str, np.ndarray], outcomes: Outcomes) -> dict[str, Any]:
-    """Among the episodes that are called successes: how well a signal's maximum up to that call, which is
-    what the environment's guard would have seen, tells the false ones."""
+    """Return how well the maximum of a signal tells false positives among predicted successes.
+
+    The maximum is taken up to the frame of the prediction, as the environment's guard would see it.
+    """
     first = outcomes.first_predicted_success(THRESHOLD, FRAMES)
     called, end = outcomes.where(first >= 0), first[first >= 0] + FRAMES
     seen = np.arange(called.done.shape[1]) < end[:, None]
@@ -159,7 +171,7 @@ def warnings(uncertainty: Mapping[str, np.ndarray], outcomes: Outcomes) -> dict[
 
 
 def other_hands(shape: tuple[int, int]) -> dict[str, Tensor]:
-    """Actions (B, T, A) of hands that attempt nothing."""
+    """Return actions (B, T, A) of hands that attempt nothing."""
     low, high = torch.tensor(ACTION_LOW), torch.tensor(ACTION_HIGH)
     drawn = torch.rand(*shape, len(low), generator=torch.Generator().manual_seed(0))
     return {
@@ -170,7 +182,7 @@ def other_hands(shape: tuple[int, int]) -> dict[str, Tensor]:
 
 
 def curves_of(given: argparse.Namespace, root: str, rewards: Mapping[str, Any]) -> dict[str, Any]:
-    """All numbers of one dataset of real episodes."""
+    """Return all numbers of one dataset of recorded episodes."""
     table, config = read_episodes(open_dataset(root)), GeneralConfig(device="cpu")
     source = StartFrames(root=root, max_starts=given.max_episodes)
     episodes = chosen_episodes(table, source)
@@ -181,21 +193,24 @@ def curves_of(given: argparse.Namespace, root: str, rewards: Mapping[str, Any]) 
         ),
         len(episodes), "cpu",
     )  # fmt: skip
-    env.reward = EveryReward(rewards)  # type: ignore[assignment]
+    probe = RewardProbe(rewards)
+    env.reward = probe
     steps = int(table.length[episodes].max())
     offset = np.minimum(np.arange(steps), table.length[episodes][:, None] - 1)
     actions = torch.from_numpy(table.action[table.start[episodes][:, None] + offset])
     column = np.asarray(table.dataset.hf_dataset.with_format("numpy")["next.reward"][:]).reshape(-1)
     curves = {
-        "rule_based": recorded(table, episodes, column, steps), **judged(env, actions, config),
+        "rule_based": recorded(table, episodes, column, steps), **judged(env, probe, actions, config),
     }  # fmt: skip
     done = recorded(table, episodes, table.done, steps) == 1
-    hands = {name: judged(env, moves, config) for name, moves in other_hands((len(episodes), steps)).items()}
+    hands = {
+        name: judged(env, probe, moves, config) for name, moves in other_hands((len(episodes), steps)).items()
+    }
     return measure(curves, done, hands)
 
 
 def results_table(found: Mapping[str, Mapping[str, Any]]) -> str:
-    """A line a dataset and reward."""
+    """Return a table with a line for every dataset and reward."""
     lines = []
     for dataset, numbers in found.items():
         for name, row in numbers["rewards"].items():
@@ -208,7 +223,7 @@ def results_table(found: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def draw(found: Mapping[str, Mapping[str, Any]], path: Path) -> None:
-    """A row a dataset, a column a reward: mean curves of successes and failures."""
+    """Draw the mean curves of successes and failures: a row a dataset, a column a reward."""
     names = list(next(iter(found.values()))["rewards"])
     figure = Figure(figsize=(2.2 * len(names), 2.2 * len(found)), layout="constrained")
     grid = figure.subplots(len(found), len(names), squeeze=False, sharex=True)

@@ -26,7 +26,7 @@ SEED = 4_000_000
 
 
 def scenes_with_each_object() -> list[Scene]:
-    """One scene an object, tables and containers in turn."""
+    """Return one scene for each object, tables and containers in turn."""
     chosen = []
     for index, name in enumerate(OBJECTS):
         having = [scene for scene in SCENES if scene.object == name]
@@ -35,7 +35,7 @@ def scenes_with_each_object() -> list[Scene]:
 
 
 def grid(pictures: Sequence[tuple[str, np.ndarray]], columns: int, path: Path) -> None:
-    """Titled pictures, row by row."""
+    """Save titled pictures, row by row."""
     rows = -(-len(pictures) // columns)
     height, width = pictures[0][1].shape[:2]
     figure = Figure(figsize=(1.7 * columns * width / height, 1.95 * rows))
@@ -51,7 +51,7 @@ def grid(pictures: Sequence[tuple[str, np.ndarray]], columns: int, path: Path) -
 
 
 def episode(simulation: Simulation, scene: Scene, kind: str, seed: int) -> np.ndarray:
-    """A planned episode's third view, (T, H, W, 3)."""
+    """Return a planned episode in the third view, (T, H, W, 3)."""
     frame, rng = simulation.reset(scene, seed), np.random.default_rng(seed)
     follower = follow_plan(simulation.task.name, scene, simulation.current_start, kind, rng)
     frames = [frame.images["third_view"]]
@@ -64,7 +64,7 @@ def episode(simulation: Simulation, scene: Scene, kind: str, seed: int) -> np.nd
 
 
 def strip(frames: np.ndarray) -> np.ndarray:
-    """A few evenly spaced frames beside each other."""
+    """Return a few evenly spaced frames beside each other."""
     return in_a_row(frames[evenly_spaced(len(frames), STRIP_FRAMES)])
 
 
