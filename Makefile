@@ -19,7 +19,7 @@ lint: setup
 	.venv/bin/mypy
 	.venv/bin/lint-imports
 
-docs: setup  ## docs/results.md from docs/results/*.json, docs/reference from --help
+docs: setup  ## docs/results.md from docs/results/*.json, docs/reference from the stored pages of --help
 	.venv/bin/python -m experiments.tables
 	.venv/bin/python tools/reference_pages.py
 

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from experiments.cells import points
+from lerobot_wmrl.common.stored_help import FOLDER
 from tests.experiments.typed import ROOT, check
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -80,3 +81,9 @@ def test_the_readme_says_what_the_demo_measured() -> None:
         gate = json.loads((results / f"{stem}.json").read_text())["known"]
         assert round(100 * gate["false_positive_rate"]["share"]) == percent
         assert f"{percent} %" in text
+
+
+@pytest.mark.parametrize("page", sorted(FOLDER.glob("*.txt")), ids=lambda page: page.stem)
+def test_the_reference_is_what_help_says(page: Path) -> None:
+    """Where it is not, `make help docs` writes it anew."""
+    assert page.read_text().rstrip() in (ROOT / "docs" / "reference" / f"{page.stem}.md").read_text()

@@ -1,6 +1,6 @@
-"""Write docs/reference/*.md: what every console command says with `--help`.
+"""Write docs/reference/*.md: what every console command answers to `--help`, alone and with its types.
 
-python tools/reference_pages.py
+make help docs
 """
 
 import os
@@ -12,20 +12,20 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Final
 
+from lerobot_wmrl.common.stored_help import FOLDER
+
 ROOT: Final = Path(__file__).parents[1]
-PAGES: Final = {
-    "lerobot-wmrl-record": (["--help"], ["--env.type=wmrl_maniskill", "--help"]),
+TYPES: Final = {
+    "lerobot-wmrl-record": (["--env.type=wmrl_maniskill"], ["--env.type=world_model"]),
     "lerobot-wmrl-train-world-model": (
-        ["--model.type=frame_tokenizer", "--help"],
-        ["--model.type=action_world_model", "--help"],
-        ["--model.type=text_world_model", "--help"],
+        ["--model.type=frame_tokenizer"],
+        ["--model.type=action_world_model"],
+        ["--model.type=action_world_model", "--model.dynamics.type=autoregressive"],
+        ["--model.type=text_world_model"],
     ),
-    "lerobot-wmrl-train": (
-        ["--env.type=world_model", "--algorithm.type=ppo", "--help"],
-        ["--env.type=world_model", "--algorithm.type=grpo", "--help"],
-    ),
+    "lerobot-wmrl-train": (["--env.type=world_model"], ["--algorithm.type=grpo"]),
 }
-"""Flags of each help that a page shows; `--help` alone for commands that are not named."""
+"""Flags that choose types, whose own flags a page shows beside `--help` alone."""
 
 
 def scripts() -> dict[str, str]:
@@ -49,10 +49,30 @@ def help_of(module: str, flags: list[str]) -> str:
 
 def page(command: str, module: str) -> str:
     """Return one command's page."""
-    parts = [f"# {command}\n\nGenerated from `--help` by `python tools/reference_pages.py`.\n"]
-    for flags in PAGES.get(command, (["--help"],)):
-        parts.append(f"## `{' '.join([command, *flags])}`\n\n```text\n{help_of(module, flags)}\n```\n")
+    stored = (FOLDER / f"{command}.txt").read_text().rstrip()
+    parts = [
+        f"# {command}\n\nWritten from `--help` by `make help docs`.\n",
+        f"## `{command} --help`\n\n```text\n{stored}\n```\n",
+    ]
+    for flags in TYPES.get(command, ()):
+        lines = help_of(module, [*flags, "--help"]).splitlines()
+        own = "\n".join(added(lines, stored.splitlines()))
+        parts.append(f"## With `{' '.join(flags)}`\n\n```text\n{own}\n```\n")
     return "\n".join(parts)
+
+
+def added(lines: list[str], stored: list[str]) -> list[str]:
+    """Return the flags, with their explanations, that are not in the stored page."""
+    known = {line.split()[0] for line in stored if line.startswith("  --")}
+    kept, keep = [], False
+    for line in lines:
+        if line.startswith("  --"):
+            keep = line.split()[0] not in known
+        elif not line.startswith("     "):
+            keep = False
+        if keep:
+            kept.append(line)
+    return kept
 
 
 def main() -> None:
