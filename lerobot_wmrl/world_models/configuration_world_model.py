@@ -16,9 +16,9 @@ class DynamicsConfig(ChoiceRegistry):
     """How frames follow each other: `anchored` or `autoregressive`.
 
     Args:
-        layers: of the transformer.
+        layers: blocks of the transformer.
         width: channels of the transformer.
-        heads: of the transformer's attention.
+        heads: attention heads of a block.
         patch: side of the square of tokens that forms one transformer token.
         code_width: channels of the convolutions on the token grid.
     """

@@ -12,7 +12,7 @@ from lerobot_wmrl.world_models.dynamics import Prediction
 from lerobot_wmrl.world_models.layers import STATE_STEP
 
 STATE_WEIGHT: Final = 4.0
-"""Of the state's loss beside those of tokens and done, which count 1."""
+"""Weight of the state's loss beside those of tokens and done, which count 1."""
 
 MOTION_WEIGHT: Final = 1.0
 """How much more a token counts when it moves. A high weight makes the model believe in motion: it then pushes

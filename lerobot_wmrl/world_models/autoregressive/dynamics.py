@@ -25,7 +25,7 @@ from lerobot_wmrl.world_models.layers import FrameSizes
 from lerobot_wmrl.world_models.losses import corrupt_codes, next_frame_loss, weighted_frames
 
 DEPTH_WEIGHT: Final = 1.0
-"""Of the depth branch's loss."""
+"""Weight of the depth branch's loss."""
 
 
 @dataclass

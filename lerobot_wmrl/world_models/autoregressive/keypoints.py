@@ -20,7 +20,7 @@ KEYPOINTS = 16
 """K, the most active tracks a camera and clip. A gripper and an object cover about as many tokens."""
 
 REACH = 1
-"""Tokens by which a track moves at most from one frame to the next, along each axis."""
+"""How many tokens a track moves at most from one frame to the next, along each axis."""
 
 
 class Tracks(NamedTuple):
@@ -32,7 +32,7 @@ class Tracks(NamedTuple):
 
 
 def surroundings(grid: int, num_cameras: int, device: torch.device) -> Tensor:
-    """Tokens within `REACH` of each one in its camera's grid, itself first. → (S, (2 REACH + 1)²)"""
+    """Return the tokens within `REACH` of each one in its camera's grid, itself first. (S, (2 REACH + 1)²)"""
     offset = torch.arange(-REACH, REACH + 1, device=device)
     shifts = torch.cartesian_prod(offset, offset)
     shifts = shifts[shifts.abs().sum(1).argsort(stable=True)]
@@ -60,7 +60,7 @@ def track_tokens(codes: Tensor, codebook: CodeBook, around: Tensor) -> Tensor:
 
 
 def most_active(places: Tensor, valid: Tensor, num_cameras: int) -> Tracks:
-    """Of tracks (B, T, S) the `KEYPOINTS` of each camera that change place most often.
+    """Choose from tracks (B, T, S) the `KEYPOINTS` of each camera that change place most often.
 
     By camera, since in one on the wrist everything moves. valid (B, T): frames of the episode.
     """
