@@ -18,7 +18,6 @@ ROOT: Final = Path(__file__).parents[1]
 TYPES: Final = {
     "lerobot-wmrl-record": (["--env.type=wmrl_maniskill"], ["--env.type=world_model"]),
     "lerobot-wmrl-train-world-model": (
-        ["--model.type=frame_tokenizer"],
         ["--model.type=action_world_model"],
         ["--model.type=action_world_model", "--model.dynamics.type=autoregressive"],
         ["--model.type=text_world_model"],
