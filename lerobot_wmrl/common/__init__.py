@@ -1,1 +1,1 @@
-"""What every command shares."""
+"""Command line, presets, errors, checkpoints, tracking, statistics: shared by every command."""

@@ -23,7 +23,7 @@ BEST_CHECKPOINT_LINK = "best"
 
 
 def resolve_checkpoint(path: str | Path) -> Path:
-    """A training's output folder, or one of its checkpoints → the `pretrained_model` folder inside."""
+    """Return the `pretrained_model` folder inside a training's output folder or one of its checkpoints."""
     root = Path(path)
     for candidate in (root, root / PRETRAINED_MODEL_DIR, root / LAST_CHECKPOINT / PRETRAINED_MODEL_DIR):
         if (candidate / "config.json").is_file():
@@ -52,8 +52,11 @@ def link_checkpoint(checkpoint: Path, name: str) -> None:
 
 
 def read_weights(checkpoint: Path, folder: str = PRETRAINED_MODEL_DIR) -> dict[str, Any]:
-    """The tensors of a checkpoint's model or of its adapters, or of another of its folders. ValueError if
-    they are truncated."""
+    """Load the tensors of a checkpoint's model or its adapters, or of another of its folders.
+
+    Raises:
+        ValueError: the file is truncated or missing.
+    """
     adapters = checkpoint / folder / ADAPTERS_FILE
     path = adapters if adapters.is_file() else checkpoint / folder / SAFETENSORS_SINGLE_FILE
     try:
@@ -65,7 +68,7 @@ def read_weights(checkpoint: Path, folder: str = PRETRAINED_MODEL_DIR) -> dict[s
 
 
 def latest_checkpoint(output_dir: Path) -> Path | None:
-    """The whole checkpoint of the highest step, or None."""
+    """Return the whole checkpoint of the highest step, None without one."""
     folder = output_dir / CHECKPOINTS_DIR
     steps = [path for path in folder.glob("*") if path.name.isdigit()] if folder.is_dir() else []
     return max(steps, key=lambda path: int(path.name), default=None)

@@ -8,18 +8,18 @@ from torch import Tensor, nn
 from torch import distributed as dist
 
 LONGEST_WAIT = timedelta(hours=6)
-"""Of other processes for the first one, while it encodes a large dataset, or measures a policy."""
+"""Time that the other processes wait while the first one encodes a large dataset or measures a policy."""
 
 
 def rank_and_size() -> tuple[int, int]:
-    """This process's index and the number of processes; (0, 1) outside `torchrun`."""
+    """Return this process's index and the number of processes; (0, 1) outside `torchrun`."""
     if dist.is_available() and dist.is_initialized():
         return dist.get_rank(), dist.get_world_size()
     return 0, 1
 
 
 def mean_over_processes(metrics: Mapping[str, float], device: torch.device | str) -> dict[str, float]:
-    """Every process's metrics, of the same names, averaged. All processes must call it."""
+    """Return the mean of every process's metrics, which have the same names. All processes must call it."""
     _, size = rank_and_size()
     if size == 1:
         return dict(metrics)
@@ -29,7 +29,7 @@ def mean_over_processes(metrics: Mapping[str, float], device: torch.device | str
 
 
 def sum_over_processes(values: Tensor) -> Tensor:
-    """Every process's `values`, of one shape, added up in place. All processes must call it."""
+    """Add up every process's `values`, of one shape, in place. All processes must call it."""
     if rank_and_size()[1] > 1:
         dist.all_reduce(values)
     return values
@@ -51,13 +51,13 @@ def gather_counts(count: int, device: torch.device | str) -> list[int]:
 
 
 def wait_for_all() -> None:
-    """Until every process is here."""
+    """Wait until every process is here."""
     if rank_and_size()[1] > 1:
         dist.barrier()
 
 
 def mean_and_variance(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Of every process's `values` (N,) together, N may differ. → (), () the variance of a sample, of one 0"""
+    """Return mean () and sample variance () of all processes' `values` (N,); their N may differ."""
     count = sum_over_processes(torch.tensor(float(len(values)), device=values.device))
     mean = sum_over_processes(values.sum()) / count
     return mean, sum_over_processes((values - mean).square().sum()) / (count - 1).clamp_min(1)

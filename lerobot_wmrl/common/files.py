@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 NOT_WRITABLE = (EACCES, EDQUOT, EFBIG, ENOSPC, EPERM, EROFS)
-"""What the system says of a disk that is full or must not be written."""
+"""Error numbers of a disk that is full or must not be written."""
 
 
 def write_text(path: Path, text: str) -> None:
@@ -20,14 +20,14 @@ def write_text(path: Path, text: str) -> None:
 
 
 def foreign_files(folder: Path, *own: str) -> bool:
-    """Whether a folder holds anything but the files called `own`, and what a torn `write_text` left."""
+    """Return whether a folder holds more than the files called `own` and what a torn `write_text` left."""
     known = {*own, *(f".{name}.partial" for name in own)}
     return folder.is_dir() and any(path.name not in known for path in folder.iterdir())
 
 
 @contextmanager
 def writing(flag: str, folder: Path) -> Iterator[None]:
-    """ValueError that names `flag` and the remedy if the disk is full or must not be written."""
+    """Raise ValueError with `flag` and the remedy if the disk is full or must not be written."""
     try:
         yield
     except OSError as error:
@@ -40,5 +40,5 @@ def writing(flag: str, folder: Path) -> Iterator[None]:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """`content` as indented JSON, atomically."""
+    """Write `content` as indented JSON, whole or not at all."""
     write_text(path, json.dumps(content, indent=2) + "\n")

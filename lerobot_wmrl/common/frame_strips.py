@@ -8,17 +8,17 @@ GAP = 2
 
 
 def evenly_spaced(length: int, count: int) -> np.ndarray:
-    """At most `count` indices from 0 to `length` - 1, both included. (N,) int64"""
+    """Return at most `count` indices from 0 to `length` - 1, both included. (N,) int64"""
     return np.linspace(0, length - 1, min(count, length)).round().astype(int)
 
 
 def in_a_row(frames: np.ndarray) -> np.ndarray:
-    """(N, H, W, 3) uint8 → (H, N·W + gaps, 3)"""
+    """Place frames side by side. (N, H, W, 3) uint8 → (H, N·W + gaps, 3)"""
     gap = np.full((frames.shape[1], GAP, 3), 255, np.uint8)
     return np.concatenate([part for frame in frames for part in (frame, gap)][:-1], 1)
 
 
 def enlarged(picture: np.ndarray, factor: int) -> Image.Image:
-    """(H, W, 3) uint8, every pixel as a square of `factor` pixels."""
+    """Enlarge a picture (H, W, 3) uint8: every pixel becomes a square of `factor` pixels."""
     image = Image.fromarray(picture)
     return image.resize((factor * image.width, factor * image.height), Image.Resampling.NEAREST)

@@ -1,4 +1,4 @@
-"""What the configurations of this project's policies have in common."""
+"""Bases of this project's policy configurations."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from lerobot.optim import AdamWConfig, LRSchedulerConfig
 
 @dataclass
 class SingleStepConfig(PreTrainedConfig):
-    """One action from one observation."""
+    """Configuration of a policy that takes one action from one observation."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -33,10 +33,12 @@ class SingleStepConfig(PreTrainedConfig):
 
 @dataclass
 class ClonedConfig(SingleStepConfig):
-    """One that lerobot-train fits to demonstrations, by AdamW at a constant rate.
+    """Configuration of a policy that lerobot-train fits to demonstrations, by AdamW at a constant rate.
 
     Args:
-        optimizer_lr, optimizer_weight_decay, optimizer_grad_clip_norm: AdamW's.
+        optimizer_lr: learning rate.
+        optimizer_weight_decay: weight decay.
+        optimizer_grad_clip_norm: largest norm of the gradient.
     """
 
     optimizer_lr: float = 1e-3

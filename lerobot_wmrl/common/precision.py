@@ -13,6 +13,8 @@ from typing import Final, NamedTuple
 import torch
 from torch import Tensor
 
+from lerobot_wmrl.common.errors import FieldError
+
 SMALL_BATCH: Final = 16
 """In so few imaginations at once on the CPU, casts cost more than bfloat16 saves."""
 
@@ -20,7 +22,7 @@ PRECISIONS: Final = ("auto", "float32", "bfloat16")
 
 
 def multiplies_bfloat16(device: torch.device | str) -> bool:
-    """Whether `device` has instructions for it: CUDA from Ampere on; AVX512-BF16 or AMX."""
+    """Return whether `device` has instructions for bfloat16: CUDA from Ampere on; AVX512-BF16 or AMX."""
     kind = torch.device(device).type
     if kind == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
@@ -28,36 +30,36 @@ def multiplies_bfloat16(device: torch.device | str) -> bool:
 
 
 def imagination_dtype(device: torch.device | str, batch: int = SMALL_BATCH) -> torch.dtype:
-    """The fastest format on `device` that is exact enough for `batch` imaginations at once."""
+    """Return the fastest format on `device` that is exact enough for `batch` imaginations at once."""
     small = batch < SMALL_BATCH and torch.device(device).type == "cpu"
     return torch.bfloat16 if multiplies_bfloat16(device) and not small else torch.float32
 
 
 def training_dtype(precision: str, device: torch.device | str) -> torch.dtype:
-    """What `--precision` means on `device`. ValueError if it is none of `PRECISIONS`."""
+    """Return the format that `precision` means on `device`. FieldError if it is none of `PRECISIONS`."""
     if precision not in PRECISIONS:
-        raise ValueError(f"--precision={precision}: choose one of {', '.join(PRECISIONS)}")
+        raise FieldError("precision", precision, f"choose one of {', '.join(PRECISIONS)}")
     if precision == "auto":
         return torch.bfloat16 if multiplies_bfloat16(device) else torch.float32
     return torch.float32 if precision == "float32" else torch.bfloat16
 
 
 def require_exact_updates(trained: Iterable[Tensor]) -> None:
-    """ValueError if weights that are to be trained are in bfloat16: its eight bits round small steps away."""
+    """Raise FieldError if trained weights are in bfloat16, whose eight bits round small steps away."""
     if any(weights.dtype == torch.bfloat16 for weights in trained):
-        raise ValueError(
-            "policy.dtype: weights in bfloat16 cannot be trained, most steps would be rounded away; use "
-            "--policy.dtype=float32, or train adapters, --peft.method_type=LORA"
-        )
+        raise FieldError(
+            "policy.dtype", "bfloat16", "such weights cannot be trained: most steps would be rounded away",
+            "use `policy.dtype=float32`, or train adapters, `peft.method_type=LORA`",
+        )  # fmt: skip
 
 
 def compute_in(dtype: torch.dtype, device: torch.device | str) -> torch.autocast:
-    """A context in which matrix products and convolutions run in `dtype`; float32 changes nothing."""
+    """Return a context in which matrix products and convolutions run in `dtype`; float32 changes nothing."""
     return torch.autocast(torch.device(device).type, dtype=dtype, enabled=dtype != torch.float32)
 
 
 def computing_dtype(device: torch.device | str) -> torch.dtype:
-    """What the surrounding `compute_in` computes in on `device`; float32 outside of one."""
+    """Return the format of the surrounding `compute_in` on `device`; float32 outside of one."""
     kind = torch.device(device).type
     return torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else torch.float32
 

@@ -13,7 +13,7 @@ RESAMPLES = 2000
 
 
 def wilson_interval(successes: int, n: int) -> tuple[float, float]:
-    """Wilson's 95 % score interval of a proportion; (0, 1) for n = 0 (Wilson 1927)."""
+    """Return Wilson's 95 % score interval of a proportion; (0, 1) for n = 0 (Wilson 1927)."""
     if n == 0:
         return 0.0, 1.0
     share, z2 = successes / n, Z_95**2
@@ -24,7 +24,7 @@ def wilson_interval(successes: int, n: int) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Proportion:
-    """k of n."""
+    """k successes of n, with Wilson's interval."""
 
     k: int
     n: int
@@ -44,7 +44,7 @@ class Proportion:
         return f"{100 * self.share:.0f} % ({self.k} of {self.n}; {100 * low:.0f}–{100 * high:.0f} %)"
 
     def as_json(self) -> dict[str, float | int | list[float] | None]:
-        """Share and interval included, so that a reader of the file need not compute them."""
+        """Return the proportion as JSON, with share and interval, which a reader need not compute."""
         return {
             "k": self.k,
             "n": self.n,
@@ -64,13 +64,13 @@ class Estimate:
 
     @classmethod
     def mean(cls, values: np.ndarray) -> "Estimate":
-        """Of one number an episode (E,); NaN where an episode has none."""
+        """Return the mean of one number an episode (E,); NaN where an episode has none."""
         known = np.isfinite(values)
         return cls.ratio(np.where(known, values, 0), known)
 
     @classmethod
     def ratio(cls, numerator: np.ndarray, denominator: np.ndarray) -> "Estimate":
-        """Of the sums of both (E,) over the episodes: a precision, say. NaN if the denominator's is 0."""
+        """Return Σ numerator / Σ denominator over the episodes, (E,) each. NaN if the latter sum is 0."""
         value, low, high = map(float, bootstrap_ratio(numerator, denominator))
         return cls(value, low, high, int((np.asarray(denominator) > 0).sum()))
 
@@ -80,7 +80,7 @@ class Estimate:
         return f"{self.value:.3g} ({self.low:.3g} to {self.high:.3g})"
 
     def as_json(self) -> dict[str, float | int | list[float] | None]:
-        """The value is None where there is no episode."""
+        """Return the estimate as JSON; the value is None where there is no episode."""
         known = not math.isnan(self.value)
         return {
             "value": self.value if known else None,
@@ -92,7 +92,7 @@ class Estimate:
 def bootstrap_ratio(
     numerator: np.ndarray, denominator: np.ndarray, seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Σ numerator / Σ denominator over E episodes, and its percentile bootstrap 95 % interval (Efron 1979).
+    """Return Σ numerator / Σ denominator over E episodes and its bootstrap 95 % interval (Efron 1979).
 
     Whole episodes are drawn, since the frames of one depend on each other. (E, …), (E, …) → value, low, high,
     each (…); NaN where the denominator is 0.
@@ -120,13 +120,13 @@ class PairedChange:
 
     @classmethod
     def between(cls, before: Sequence[bool], after: Sequence[bool]) -> "PairedChange":
-        """From the outcomes of the same episodes in the same order. ValueError if their number differs."""
+        """Compare the outcomes of the same episodes in the same order. ValueError if their number differs."""
         pairs = list(zip(before, after, strict=True))
         return cls(sum(b and not a for a, b in pairs), sum(a and not b for a, b in pairs))
 
     @property
     def p_value(self) -> float:
-        """Of no change at all, two-sided: McNemar's test in its exact form."""
+        """Two-sided p-value of no change at all: McNemar's test in its exact form."""
         changed = self.gained + self.lost
         return float(binomtest(self.gained, changed).pvalue) if changed else 1.0
 
@@ -149,10 +149,10 @@ class MeanChange:
 
     @classmethod
     def over_runs(cls, before: Sequence[Sequence[bool]], after: Sequence[Sequence[bool]]) -> "MeanChange":
-        """From the outcomes of R runs on the same E starts, in the same order.
+        """Compare the outcomes of R runs on the same E starts, in the same order.
 
-        The runs share their starts, so that R·E outcomes are not independent: the bootstrap draws starts
-        (Efron 1979). How much another seed of the training would differ, the interval does not say.
+        The runs share their starts, so R·E outcomes are not independent: the bootstrap draws starts (Efron
+        1979). The interval does not say how much another seed of the training would differ.
         """
         if len({len(run) for run in (*before, *after)}) != 1:
             raise ValueError("the runs were evaluated on different numbers of starts: they cannot be pooled")

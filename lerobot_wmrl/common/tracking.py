@@ -1,4 +1,4 @@
-"""Numbers of a run: JSON lines, which anything can plot; LeRobot's lines in the terminal, and its wandb."""
+"""Metrics of a run: JSON lines, which anything can plot; LeRobot's lines in the terminal, and its wandb."""
 
 import json
 import logging
@@ -21,8 +21,10 @@ def append_metrics(output_dir: Path, step: int, metrics: Mapping[str, float]) ->
 
 
 def read_metrics(output_dir: Path) -> list[dict[str, Any]]:
-    """What was written of each step, in order of steps; of a number written twice, as after a resume, the
-    later value. Torn lines are dropped."""
+    """Return the metrics of each step, in order of steps.
+
+    Of a metric that was written twice, as after a resume, the later value counts. Torn lines are dropped.
+    """
     path = output_dir / METRICS_FILE
     lines: dict[int, dict[str, Any]] = {}
     for text in path.read_text().splitlines() if path.is_file() else []:
@@ -52,7 +54,7 @@ def make_wandb(cfg: Any) -> Any:
 
 
 class Tracker:
-    """What a training says of itself.
+    """Log the metrics of a training.
 
     Args:
         output_dir: where metrics.jsonl goes.
@@ -68,7 +70,7 @@ class Tracker:
         self.log_freq, self.wandb = log_freq, wandb
 
     def log(self, step: int, metrics: Mapping[str, float], mode: str = "train") -> None:
-        """To the file and to wandb, as `train/…` or `eval/…`; of several processes the first does."""
+        """Write metrics to the file and to wandb, as `train/…` or `eval/…`, from the first process."""
         if rank_and_size()[0] > 0:
             return
         append_metrics(self.output_dir, step, metrics)
@@ -76,7 +78,7 @@ class Tracker:
             self.wandb.log_dict(dict(metrics), step, mode)
 
     def log_step(self, step: int, metrics: Mapping[str, float]) -> None:
-        """The same of a step that is finished, and from time to time a line in the terminal."""
+        """Log a finished step, every `log_freq` steps also as a line in the terminal."""
         self.log(step, metrics)
         self.meters.step()
         self.meters.update_metrics({name: metrics[name] for name in self.shown if name in metrics})
@@ -85,6 +87,6 @@ class Tracker:
             self.meters.reset_averages()
 
     def log_policy(self, checkpoint: Path) -> None:
-        """The policy of a checkpoint as wandb's artifact."""
+        """Upload the policy of a checkpoint as wandb's artifact."""
         if self.wandb is not None and rank_and_size()[0] == 0:
             self.wandb.log_policy(checkpoint)

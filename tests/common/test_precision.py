@@ -21,5 +21,5 @@ def test_auto_is_what_the_hardware_multiplies_in() -> None:
 
 
 def test_another_precision_is_named() -> None:
-    with pytest.raises(ValueError, match="--precision=half: choose one of auto, float32, bfloat16"):
+    with pytest.raises(ValueError, match=r"^precision=half: choose one of auto, float32, bfloat16"):
         training_dtype("half", "cpu")
