@@ -1,8 +1,9 @@
-.PHONY: setup demo test lint docs lock
+.PHONY: setup demo test lint docs help lock
 
 # What `lerobot-wmrl-demo` gets besides its preset: make demo DEMO_FLAGS="--seed=1 --output_dir=outputs/demo-1"
 DEMO_FLAGS ?=
-PYTEST_FLAGS ?=
+# Two processes suit two cores: a test starts commands of its own, and each process loads a simulator.
+PYTEST_FLAGS ?= --numprocesses=2 --dist=loadfile
 
 setup:  ## an interpreter, .venv, the locked packages, this project, a renderer: does only what is missing
 	@tools/setup.sh
@@ -11,7 +12,7 @@ demo: setup  ## the whole loop, then outputs/demo/report.html
 	.venv/bin/lerobot-wmrl-demo --preset=demo --output_dir=outputs/demo $(DEMO_FLAGS)
 
 test: setup
-	.venv/bin/python -m pytest $(PYTEST_FLAGS)
+	OMP_NUM_THREADS=1 .venv/bin/python -m pytest $(PYTEST_FLAGS)
 
 lint: setup
 	.venv/bin/ruff check .
