@@ -56,7 +56,7 @@ class RecordConfig(RunConfig):
     """Number of episodes to record."""
 
     seed: int = 0
-    """Seed of the first episode; episode i has seed + i."""
+    """Seed of the first episode; episode i has seed + i. Seeds from 1,000,000 on are for evaluation."""
 
     tasks: list[str] = field(default_factory=list)
     """Tasks, recorded in turn; the environment's own task by default."""
@@ -77,7 +77,7 @@ class RecordConfig(RunConfig):
     MPLib plans in joint space, around the table, the container and, until it must be touched, the object."""
 
     num_workers: int = 2
-    """Number of simulating processes."""
+    """Number of processes that simulate."""
 
     part_episodes: int = 20
     """Episodes per sub-dataset. An interruption costs each worker at most one sub-dataset."""
@@ -89,11 +89,13 @@ class RecordConfig(RunConfig):
     """Folders of all shards: merge them into output_dir, and stop."""
 
     policy: PreTrainedConfig | None = None
-    """LeRobot policy to roll out, given as --policy.path=…."""
+    """LeRobot policy to roll out: --policy.path=FOLDER. A policy without a checkpoint (--policy.type=wm_mpc)
+    cannot be recorded."""
 
     exploration: float = 0.0
-    """Largest standard deviation of the noise on a policy's translations, as a share of the action box. Each
-    episode draws its level up to it; the noise is correlated over about ten steps."""
+    """Noise on the translations of a policy's actions: the largest standard deviation, as a share of the
+    largest action. Each episode draws its own level from 0 to this one. The noise is correlated over about
+    ten steps."""
 
     push_to_hub: bool = False
     """Publish the dataset as repo_id on the Hugging Face hub when it is complete."""

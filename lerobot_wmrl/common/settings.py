@@ -9,7 +9,7 @@ import inspect
 import re
 import textwrap
 from collections.abc import Iterator, Mapping
-from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
+from dataclasses import MISSING, Field, dataclass, fields, is_dataclass, replace
 from enum import Enum
 from functools import cache
 from types import NoneType, UnionType
@@ -75,9 +75,17 @@ def settings_of(
                 yield from settings_of(value if same else known[chosen], types, f"{name}.", depth + 1)
         elif is_dataclass(hint):
             inner = hint if value is MISSING or value is None else value
-            yield from settings_of(inner, types, f"{name}.", depth + 1)
+            yield from introduced(settings_of(inner, types, f"{name}.", depth + 1), said)
         else:
             yield Setting(name, kind_of(hint), value, said, depth)
+
+
+def introduced(settings: Iterator[Setting], said: str) -> Iterator[Setting]:
+    """Yield a group's settings. What is `said` of the group goes before the first one's explanation."""
+    for number, setting in enumerate(settings):
+        own = setting.explanation
+        both = " ".join(filter(None, (said, own[:1].upper() + own[1:])))
+        yield setting if number else replace(setting, explanation=both)
 
 
 def known_types(hint: Any) -> dict[str, type] | None:
@@ -196,9 +204,15 @@ def help_page(config_class: type, introduction: str, command: str, types: Mappin
         lines += flag_lines(setting)
         group, _, last = setting.name.rpartition(".")
         if last == "type" and group in paths:
-            lines += [f"  --{group}.path  str  (default: none)", "      a checkpoint, in place of the type."]
-    lines += ["  --config_path  path  (default: none)", "      a YAML or JSON file of these settings.", ""]
-    return "\n".join([*lines, "Add --<name>.type=… to --help for the flags of that type."])
+            lines += [
+                f"  --{group}.path  str  (default: none)",
+                f"      a checkpoint, in place of --{group}.type.",
+            ]
+    lines += ["  --config_path  path  (default: none)", "      a YAML or JSON file with these settings.", ""]
+    kinds = [f"--{each.name}=…" for each in settings if each.name.endswith(".type")]
+    if kinds:
+        lines += [f"A type has flags of its own. To list them, add it to --help: {', '.join(kinds)}"]
+    return "\n".join(lines).rstrip()
 
 
 def preset_lines(command: str) -> list[str]:
@@ -218,7 +232,10 @@ def preset_lines(command: str) -> list[str]:
 def flag_lines(setting: Setting) -> list[str]:
     """Write one flag: its type and default in a line, its explanation indented below."""
     default = "required" if setting.default is MISSING else f"default: {shown(setting.default)}"
-    choices = f"One of {', '.join(setting.kind.split('|'))}." if "|" in setting.kind else ""
+    listed = "|" in setting.kind and " | " not in setting.kind  # a union of types is not a list of choices
+    of_type = setting.name.rpartition(".")[2] == "type"
+    known = "Registered types:" if of_type else "One of"
+    choices = f"{known} {', '.join(setting.kind.split('|'))}." if listed else ""
     head = f"  --{setting.name}  {'' if choices else f'{setting.kind}  '}({default})"
     said = f"{setting.explanation} {choices}".strip()
     return [

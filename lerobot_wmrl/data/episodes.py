@@ -31,8 +31,8 @@ class DatasetSource:
     """A LeRobotDataset on disk.
 
     Args:
-        root: its folder.
-        repo_id: the name it was published under, if it was.
+        root: folder of the dataset on disk.
+        repo_id: name of the dataset on the hub, if it has one. It is not downloaded.
     """
 
     root: str = ""
@@ -46,8 +46,8 @@ class TrainingData(DatasetSource):
     Args:
         episodes: indices of the episodes to learn from, as in lerobot-train; by default all. Episodes that
             are held out stay held out.
-        more: roots of further datasets to learn from: every second step's batch is of one of them, in turn
-            (half old, half new: Ball et al. 2023).
+        more: folders of further datasets. Every second batch comes from one of them, in turn, so that half of
+            the batches are old and half new (Ball et al. 2023).
     """
 
     episodes: list[int] | None = None

@@ -40,12 +40,14 @@ class DemoConfig(RunConfig):
 
     Args:
         output_dir: folder of everything the demo makes; `report.html` is the page to read.
-        seed: of recording, training and PPO; the evaluation seeds stay the same.
-        stage_preset: the `--preset` that each stage's command gets.
-        sft_episodes: optimal episodes that the SFT policy is cloned from.
-        explore_episodes: noisy episodes of that policy that the world models learn from as well.
-        eval_episodes: held-out episodes of each success rate.
-        rollout_episodes: episodes of each policy in ManiSkill that are replayed in the world model.
+        seed: seed of recording, training and PPO. The evaluation seeds stay the same.
+        stage_preset: `--preset` of each stage's command.
+        sft_episodes: optimal planned episodes that the SFT policy is cloned from.
+        explore_episodes: noisy rollouts of that policy, which the world models learn from beside the planned
+            episodes.
+        eval_episodes: held-out episodes behind each success rate.
+        rollout_episodes: rollouts of each policy in ManiSkill that are replayed in the world model to measure
+            false positives and recall.
     """
 
     output_dir: Path = Path("outputs/demo")

@@ -35,14 +35,14 @@ class WmrlManiSkillEnv(EnvConfig):
     Args:
         task: push, pull, pick_place or move_to_aim.
         split: `ind` (scenes that training may see) or `ood` (scenes held out).
-        scenes: indices of some scenes of the split; all of them by default.
+        scenes: indices of scenes within the split (`lerobot-wmrl-record --list_scenes=true`); all by default.
         cameras: cameras that the policy sees.
         image_size: side of the square images in pixels.
         episode_length: steps after which an episode is truncated; the task's own horizon by default.
         reward: what a step pays for success and for progress.
         assets: YAML file with meshes to use in place of objects (`lemon: {mesh: lemon.obj, scale: 0.001}`).
         robot_mesh_detail: share of the robot's triangles that are drawn; 1 draws all, three times slower.
-        batched: whether episodes share one simulation on CUDA instead of having a process each.
+        batched: let all episodes share one simulation on CUDA. By default each has a process of its own.
         light_jitter: how much the light varies between episodes, as a share (0.2 is plenty).
         camera_jitter: how far the fixed camera is displaced between episodes (m; 0.01 is plenty).
     """

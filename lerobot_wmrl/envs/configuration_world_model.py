@@ -79,14 +79,14 @@ class WorldModelEnv(EnvConfig):
     Args:
         world_model_path: the action world model, a checkpoint or the output folder of its training.
         text_world_model_path: the text world model; not needed by rewards without a goal frame.
-        dataset: start frames and instructions.
+        dataset: where imagined episodes start. Give one of `root`, `frames` and `resets`.
         reward: `general` and its settings; `embedding` or `proxy` with the output folder of its training as
             `reward.pretrained_path`; or one of LeRobot's own, such as `reward_classifier`.
         episode_length: frames after which an episode is truncated.
-        done_threshold: done probability θ from which a frame counts as done (eq. 7).
-        done_frames: consecutive done frames that make a success (k).
-        uncertainty: what becomes of episodes of which the world model is uncertain.
-        device: where the models live; the best device there is by default.
+        done_threshold: predicted success probability θ at which a frame counts as done (eq. 7).
+        done_frames: consecutive done frames k that make a success.
+        uncertainty: what happens to episodes about which the world model is uncertain.
+        device: device of the models; by default the best one of this machine.
     """
 
     task: str | None = "imagination"

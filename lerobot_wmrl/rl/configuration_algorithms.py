@@ -15,16 +15,17 @@ class PolicyGradientConfig(RLAlgorithmConfig):
     """Options that PPO and GRPO share: ascent on a clipped objective, several epochs a rollout.
 
     Args:
-        epochs: passes over the decisions of each rollout.
-        minibatch_size: decisions of one optimiser step, in each process of `torchrun`.
-        micro_batch_size: decisions in memory at once, if a whole minibatch does not fit; the gradient stays
-            the same.
+        epochs: passes over the policy's decisions of each rollout. A decision is one call of the policy: an
+            action, or a chunk of actions.
+        minibatch_size: decisions in one optimizer step, in each process of `torchrun`.
+        micro_batch_size: decisions in one forward and backward pass, if a whole minibatch does not fit into
+            memory. The gradient stays the same; by default the whole minibatch.
         policy_lr: learning rate of the policy (AdamW).
         ratio: probability ratio that is clipped: of the whole `action`, or of each `token` (component) of it.
         reference_coefficient: weight of the KL penalty towards the SFT policy that training starts from.
-        target_kl: KL to the policy that collected the rollout, in nats a decision, beyond which its updates
-            end early.
-        max_reference_kl: KL to the SFT policy, in nats a decision, beyond which training stops.
+        target_kl: KL to the policy that collected the rollout, in nats per decision. Above it, the updates of
+            this iteration end early.
+        max_reference_kl: KL to the SFT policy, in nats per decision. Above it, the training stops.
         initial_std: standard deviation of exploration in normalised actions; by default the policy's own.
     """
 
@@ -60,9 +61,9 @@ class PPOConfig(PolicyGradientConfig):
         gae_lambda: λ of generalised advantage estimation.
         clip: half-width of the interval around 1 in which the ratio may move.
         value_lr: learning rate of the value function (AdamW).
-        value_iterations: first iterations, in which only the value function learns.
-        value_normalisation: learn returns in units of their running standard deviation; for returns that are
-            far from 1 in size.
+        value_iterations: number of iterations at the beginning in which only the value function learns.
+        value_normalisation: divide returns by their running standard deviation, for returns far from 1 in
+            size.
     """
 
     gamma: float = 0.97

@@ -21,10 +21,10 @@ class SelectionConfig:
     """Choice of the best checkpoint, `checkpoints/best`.
 
     Args:
-        freq: iterations between two measurements of success, each of which also saves a checkpoint; 0 is off.
-        n_episodes: episodes of a measurement, always the same and kept apart from training and evaluation.
-            They are played in `real_env` if there is one; otherwise imagined ones alone decide.
-        dataset: dataset whose first frames imagined episodes start from; by default the training's.
+        freq: iterations between two measurements of success. Each one also saves a checkpoint. 0: off.
+        n_episodes: episodes in each measurement. Their starts are always the same, and are used neither for
+            training nor for evaluation. They run in `real_env` if it is set, otherwise in the world model.
+        dataset: dataset whose first frames start the imagined episodes; by default `env.dataset`.
     """
 
     freq: int = 0
@@ -37,13 +37,14 @@ class GateConfig:
     """Check that the world model does not call too many failures successes.
 
     Args:
-        action: `stop` the training, `warn`, or `off`.
-        limit: largest share of false positives: failed episodes that the world model calls successes.
-        dataset: labelled rollouts that the world model was not trained on. It is checked on them before the
+        action: what happens above `limit`: `stop` the training or `warn`. `off`: there is no check.
+        limit: largest false positive rate: the share of failed episodes that the world model predicts as
+            successes.
+        dataset: labelled rollouts that the world model was not trained on. The gate replays them before the
             first update and after each Dyna round.
-        freq: iterations between two checks on new rollouts in `real_env`. Before the first update there is
-            one in any case; 0: only then.
-        n_episodes: rollouts of a check in `real_env`.
+        freq: iterations between two checks on new rollouts in `real_env`. There is always a check before the
+            first update. 0: that one only.
+        n_episodes: rollouts in each check in `real_env`.
     """
 
     action: str = "stop"
@@ -62,8 +63,9 @@ class NewRollouts:
     """Datasets of the policy that were recorded elsewhere.
 
     Args:
-        roots: a LeRobotDataset for each round. The training stops where one is missing and says which policy
-            to record; the same command with one more root continues. Begin with [].
+        roots: folders of LeRobotDatasets, one for each round; begin with []. Where the next one is missing,
+            the training stops and names the policy to record. Add the recording's folder and run the command
+            again to continue.
     """
 
     roots: list[str] | None = None
@@ -71,15 +73,17 @@ class NewRollouts:
 
 @dataclass
 class DynaConfig:
-    """Rounds that train the world model further on what the policy does by then (Sutton 1991).
+    """Rounds that train the world model further on new rollouts of the current policy (Sutton 1991).
 
     Args:
-        rounds: how many, evenly spread over the iterations; 0 is off.
-        n_episodes: episodes of the policy recorded in `real_env` in each round, half of them with noise.
-        dataset: datasets recorded elsewhere instead, on a real robot for example.
-        learnt: dataset that the world model was trained on and must not forget; by default `env.dataset`.
-        steps: training steps of each round, half on old and half on new episodes.
-        batch_size: clips of a training step.
+        rounds: number of rounds, evenly spread over the iterations. 0: off.
+        n_episodes: rollouts of the current policy recorded in `real_env` in each round, half of them with
+            noise on the actions.
+        dataset: datasets recorded elsewhere, for example on a robot, in place of `real_env`.
+        learnt: dataset that the world model was trained on, which is mixed in so that it is not forgotten; by
+            default `env.dataset`.
+        steps: training steps of the world model in each round, half on old and half on new episodes.
+        batch_size: clips in a training step of the world model.
     """
 
     rounds: int = 0

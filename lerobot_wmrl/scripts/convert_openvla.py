@@ -7,7 +7,7 @@
 The import gives a folder for `--policy.path` of lerobot-train, lerobot-eval and lerobot-wmrl-train. The
 export takes what they write, merges adapters into the weights, and gives a folder that OpenVLA's own code
 loads.
-Weights keep their number format; there and back again they are equal bit by bit.
+Weights keep their number format. An import followed by an export gives equal weights bit by bit.
 """
 
 import shutil
@@ -27,11 +27,11 @@ class ConvertOpenVLAConfig(RunConfig):
     """Convert a checkpoint of OpenVLA.
 
     Args:
-        direction: `import`, from OpenVLA's format to LeRobot's, or `export`, the reverse.
-        source: a checkpoint's folder, for the export also the output folder of a training, or a hub id.
-        target: a new folder.
-        unnorm_key: for the import, the dataset whose statistics turn tokens into actions. Without it, a
-            checkpoint that knows several datasets can be fine-tuned (which adds statistics of its own) but
+        direction: `import` converts OpenVLA's format to LeRobot's, `export` LeRobot's to OpenVLA's.
+        source: folder or hub id of a checkpoint. For the export also the output folder of a training.
+        target: folder to write, which must be new.
+        unnorm_key: for the import: name of the dataset whose statistics turn tokens into actions. Without it
+            a checkpoint with the statistics of several datasets can be fine-tuned, which adds its own, but
             not run.
     """
 

@@ -4,8 +4,8 @@
 
 It records a task in ManiSkill, clones an SFT policy from a few episodes, trains the world models, trains the
 policy by PPO inside them, and measures both policies on the same held-out starts in ManiSkill. Every stage is
-one console command, which it prints. Running the same command again continues after the last finished piece
-of work. It ends with the result in a few lines and `report.html`.
+one console command, which it prints. Running the same command again continues an interrupted demo. It ends
+with a summary and `report.html`.
 """
 
 import signal

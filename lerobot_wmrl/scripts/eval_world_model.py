@@ -46,7 +46,7 @@ class Checkpoint:
     """A trained model.
 
     Args:
-        path: the output folder of its training, or one of its checkpoints.
+        path: output folder of its training, or one of its checkpoints.
     """
 
     path: str = ""
@@ -61,23 +61,25 @@ class EvalWorldModelConfig(RunConfig):
     `--preset=tiny` or `--preset=demo` stands for the flags of that size; flags further right override it.
 
     Args:
-        model: `--model.path=…`, an action world model.
-        text_model: `--text_model.path=…`, a text world model, for goal frames and reward curves.
-        dataset: `--dataset.root=…`, the recorded episodes.
-        split: `all`; `train` or `validation` of the dataset that the model was trained on; `ind` or `ood`,
-            scenes that training may see and those held out. A comma joins them: `validation,ind` is what is
-            in both.
-        max_episodes: at most so many episodes, evenly spread.
-        done_threshold: done probability at which an imagined frame counts as done; as in the environment.
-        done_frames: consecutive done frames that make an imagined success; as in the environment.
-        reward: the general reward of the curves (`--reward.alpha=…`); as in the environment.
-        policies: checkpoints of policies, or output folders of trainings, of which every checkpoint counts.
-            Their success in the world model, from the dataset's first frames, is compared with that in
-            `real_env`, in episodes of the same length.
-        policy_episodes: episodes of each policy in each environment.
-        real_env: `--real_env.type=wmrl_maniskill` and its settings.
-        device: where the models run; the best there is by default.
-        output_dir: where metrics.json, metrics.md and the pictures go.
+        model: an action world model.
+        text_model: a text world model, for goal frames and reward curves; may be left out.
+        dataset: the recorded episodes to replay.
+        split: which episodes. `all`; `train` or `validation` (held out), if this is the dataset that the
+            model was trained on; `ind` or `ood`, the recorder's training scenes and its held-out scenes. A
+            comma means both: `validation,ind`.
+        max_episodes: largest number of episodes, chosen evenly over the dataset.
+        done_threshold: predicted success probability at which a frame counts as done. Give the environment
+            the same (`--env.done_threshold`).
+        done_frames: consecutive done frames that make an imagined success. Give the environment the same
+            (`--env.done_frames`).
+        reward: the general reward, whose curves are drawn; as in the environment (`--env.reward.alpha`).
+        policies: checkpoints of policies, or output folders of trainings, of which every checkpoint is taken.
+            Success in the world model, from the dataset's first frames, is compared with success in
+            `real_env`. Episodes have the same length in both.
+        policy_episodes: episodes of each policy in each of the two.
+        real_env: simulator for `policies`, `--real_env.type=wmrl_maniskill` and its settings.
+        device: device of the models; by default the best one of this machine.
+        output_dir: folder of metrics.json, metrics.md and the pictures.
     """
 
     model: Checkpoint = field(default_factory=Checkpoint)

@@ -4,11 +4,14 @@
         --env.text_world_model_path=X --env.dataset.root=D --gate.dataset.root=ROLLOUTS --output_dir=rl
     lerobot-wmrl-train --policy.path=outputs/sft --env.type=wmrl_maniskill --num_envs=2 --output_dir=rl
 
-Before the first update the gate counts how many failures the world model calls successes, in
-`--gate.dataset.root=ROLLOUTS` (with labels) or in fresh rollouts, `--real_env.type=wmrl_maniskill …`.
-`--selection.freq=5` measures success on seeds of its own, in `--real_env` too, and keeps `checkpoints/best`.
-`--dyna.rounds=2` trains the world model further on what the policy does by then.
-`--policy.push_to_hub=true --policy.repo_id=USER/NAME` publishes the best checkpoint, else the last one.
+Before the first update the gate measures the world model's false positive rate: how many failures it predicts
+as successes. It needs labelled rollouts (`--gate.dataset.root=ROLLOUTS`) or a simulator to record some in
+(`--real_env.type=wmrl_maniskill …`). Above `--gate.limit` the training stops.
+`--selection.freq=5` measures success every five iterations, in `--real_env` if it is set, and keeps the best
+checkpoint as `checkpoints/best`.
+`--dyna.rounds=2` trains the world model further, twice, on new rollouts of the current policy.
+`--policy.push_to_hub=true --policy.repo_id=USER/NAME` publishes the best checkpoint, or the last one without
+selection.
 
 Running the same command again continues from the last checkpoint. `--preset=demo` sets the sizes.
 `lerobot-eval --policy.path=outputs/rl/checkpoints/best/pretrained_model …` evaluates the result.
@@ -72,27 +75,29 @@ class TrainConfig(CallbackSettings, RunConfig):
     `--preset=tiny|demo|cpu` stands for the flags of that size; flags further right override it.
 
     Args:
-        policy: `--policy.path=`, a checkpoint of lerobot-train or the folder it was written to.
-        env: `--env.type=world_model|wmrl_maniskill` and its settings.
-        algorithm: `--algorithm.type=ppo|grpo` and its settings.
-        peft: `--peft.method_type=LORA --peft.r=32`, as in lerobot-train: train new adapters and the value
-            function alone. If the policy has adapters already, they are trained without this.
-        output_dir: where checkpoints and metrics go; continues if it holds this run already.
+        policy: the SFT policy to improve, `--policy.path=FOLDER`: a checkpoint, or the output folder of
+            lerobot-train. `cnn`, `act` and `openvla` can be trained.
+        env: `--env.type=world_model` or `wmrl_maniskill`, and its settings.
+        algorithm: `--algorithm.type=ppo` or `grpo`, and its settings.
+        peft: `--peft.method_type=LORA --peft.r=32`, as in lerobot-train, trains new adapters and the value
+            function alone. A policy that has adapters already needs none of these flags.
+        output_dir: folder of checkpoints and metrics. If it holds this run already, the run continues.
         num_envs: environments stepped together, in each process of `torchrun`.
         rollout_steps: steps of each environment in a rollout; by default the longest episode.
-        iterations: rollouts, each followed by an update.
-        save_freq, log_freq: iterations between checkpoints, and between lines in the terminal.
-        seed: of sampling and of the episodes; below the evaluation seeds.
-        resume: continue from the last checkpoint in `output_dir`, which must exist, as in lerobot-train; also
-            with `--config_path=outputs/rl/train_config.json` in place of all other flags. Without this the
-            same command continues too, but may also begin.
-        wandb: `--wandb.enable=true` also sends the metrics there, as lerobot-train does.
-        job_name: name of the run in wandb.
-        real_env: environment outside the world model, `--real_env.type=wmrl_maniskill` and its settings.
-        real_num_envs: simulators at once in `real_env`.
-        selection: how the checkpoint that is kept as `checkpoints/best` is chosen.
-        gate: whether a policy may be trained in the world model (`--gate.action=stop|warn|off`).
-        dyna: rounds that train the world model further on what the policy does by then (`--dyna.rounds`).
+        iterations: number of rollouts, each followed by an update.
+        save_freq: iterations between checkpoints.
+        log_freq: iterations between lines in the terminal.
+        seed: seed of sampling and of the episodes, below 1,000,000. Seeds from there on are for evaluation.
+        resume: require a checkpoint in `output_dir` and continue from it, as in lerobot-train. Works with
+            `--config_path=outputs/rl/train_config.json` in place of all other flags too. Without this flag
+            the same command begins or continues.
+        wandb: `--wandb.enable=true` sends the metrics to Weights & Biases too, as lerobot-train does.
+        job_name: name of the run in Weights & Biases.
+        real_env: simulator for selection, gate and Dyna, `--real_env.type=wmrl_maniskill` and its settings.
+        real_num_envs: simulators that run at once in `real_env`.
+        selection: choice of the checkpoint that is kept as `checkpoints/best`; off by default.
+        gate: check of the world model's false positive rate.
+        dyna: rounds that train the world model further on new rollouts of the current policy; off by default.
     """
 
     path_fields: ClassVar[list[str]] = ["policy"]

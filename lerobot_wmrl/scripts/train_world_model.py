@@ -6,7 +6,8 @@
         --dataset.root=D --output_dir=outputs/action_world_model
 
 Running the same command again continues from the last checkpoint. `--preset=demo` sets the sizes.
-`--model.path=outputs/action_world_model` instead of a type trains a trained model further, on other data say.
+`--model.path=outputs/action_world_model` in place of `--model.type` trains that model further, for example on
+new data.
 """
 
 from dataclasses import dataclass, field, replace
@@ -42,20 +43,22 @@ class TrainWorldModelConfig(RunConfig):
     """Train a tokenizer or world model.
 
     Args:
-        model: `--model.type=frame_tokenizer|action_world_model|text_world_model` and its settings; or
-            `--model.path=`, a trained one to begin with, and those of its settings that are to be others.
-        dataset: the LeRobotDataset to learn from, or some of its episodes; and `more` of them.
-        output_dir: where checkpoints and metrics go; continues if it holds this run already.
-        steps, batch_size: optimizer steps, and frames (tokenizer) or clips (world models) a step.
-            Under `torchrun --nproc_per_node=N` every process has `batch_size` of them.
-        save_freq, log_freq: steps between checkpoints and between lines of metrics.jsonl.
-        seed: of initial weights and batches.
-        precision: `float32`, `bfloat16` (mixed: weights and losses stay in float32), or `auto`: bfloat16 if
-            the device multiplies in it. The checkpoints' train_config.json tells which it was.
-        resume: there must be a checkpoint in `output_dir` to go on from, as in lerobot-train, also with
-            `--config_path=outputs/tokenizer/train_config.json` in place of all other flags.
-        wandb: `--wandb.enable=true` also sends the metrics there, as lerobot-train does.
-        job_name: of the run in wandb, by default that of `output_dir`.
+        model: `--model.type=frame_tokenizer|action_world_model|text_world_model` and its settings. Or
+            `--model.path=FOLDER`, a trained model to train further, and the settings that change.
+        dataset: the LeRobotDataset to learn from.
+        output_dir: folder of checkpoints and metrics. If it holds this run already, the run continues.
+        steps: optimizer steps.
+        batch_size: frames (tokenizer) or clips (world models) in a step. Under `torchrun --nproc_per_node=N`
+            every process has that many.
+        save_freq: steps between checkpoints.
+        log_freq: steps between lines of metrics.jsonl.
+        seed: seed of the initial weights and of the batches.
+        precision: `float32`; `bfloat16`, with weights and losses in float32; or `auto`, which is bfloat16
+            where the device has hardware for it. The checkpoints' train_config.json says which one was used.
+        resume: require a checkpoint in `output_dir` and continue from it, as in lerobot-train. Works with
+            `--config_path=outputs/tokenizer/train_config.json` in place of all other flags too.
+        wandb: `--wandb.enable=true` sends the metrics to Weights & Biases too, as lerobot-train does.
+        job_name: name of the run in Weights & Biases; by default the name of `output_dir`.
     """
 
     path_fields: ClassVar[list[str]] = ["model"]

@@ -31,14 +31,14 @@ class TokenizerConfig:
     """Which frames become tokens, and how.
 
     Args:
-        cameras: camera names whose frames make one time step.
-        image_size: side of the square frames in the dataset, in pixels.
+        cameras: names of the cameras, without `observation.images.`.
+        image_size: side of the dataset's square frames in pixels. The dataset must have this size.
         widths: channels from fine to coarse. With one entry a token is 4x4 pixels; each further entry doubles
-            its side. The last scale does most of the work.
+            its side.
         quantizer: `fsq` (finite scalar quantisation) or `lfq` (MAGVIT-2's lookup-free quantisation).
         levels: codes of each factor of a token; with `lfq` the same power of two for all, such as [512,512]
             for 18 bits.
-        context: give encoder and decoder the episode's first frame, so that tokens need carry only motion.
+        context: show encoder and decoder the episode's first frame too, so that tokens encode what moves.
     """
 
     cameras: list[str] = field(default_factory=lambda: ["third_view"])
@@ -116,8 +116,8 @@ class FrameTokenizerConfig(RewardModelConfig):
 
     Args:
         tokenizer: which frames become tokens, and how.
-        perceptual_weight: of LPIPS in the loss. Needs torchvision's VGG-16 in its cache; 0 does without.
-        learning_rate: peak of the schedule.
+        perceptual_weight: weight of LPIPS in the loss, 0 is off. Needs torchvision's VGG-16 in torch's cache.
+        learning_rate: highest learning rate of the schedule.
     """
 
     tokenizer: TokenizerConfig = field(default_factory=TokenizerConfig)

@@ -59,11 +59,10 @@ class DynamicsConfig(ChoiceRegistry):
 class AnchoredConfig(DynamicsConfig):
     """Predicts from the episode's first frame and the actions since: errors in pictures do not add up.
 
-    Imagination begins anew at its own frame once it is as long as a training clip (`clip_length`).
+    An imagination as long as a training clip (`clip_length`) takes its last frame as a new first frame.
 
     Args:
-        dropout: share of what each layer adds to the trajectory that training leaves out, so that episodes
-            are not learnt by heart.
+        dropout: dropout rate on the residual branches of the trajectory, against overfitting.
     """
 
     dropout: float = 0.0
@@ -80,20 +79,20 @@ class AnchoredConfig(DynamicsConfig):
 @DynamicsConfig.register_subclass("autoregressive")
 @dataclass
 class AutoregressiveConfig(DynamicsConfig):
-    """Predicts from the frames before (eq. 1, the paper's way), in imagination from its own.
+    """Predicts from the frames before (eq. 1, as the paper does). In imagination these are its own.
 
     Args:
         window: frames that the model remembers.
         conditioning: how blocks take in the condition: adaln, cross_attention (the paper's) or additive.
         maskgit_steps: passes in which a frame's tokens are decoded, the most confident first (MaskGIT; takes
             a second pass in training too). 0: all tokens in the pass that predicts the frame.
-        depth: see and predict each camera's depth beside its tokens (RoboScape's depth branch). The dataset
-            must have `observation.images.<camera>_depth`.
+        depth: take in and predict each camera's depth beside its tokens (RoboScape's depth branch). The
+            dataset must have `observation.images.<camera>_depth`.
         self_forcing: share of input frames replaced by the model's own predictions in training.
-        self_rollout: share of clips that in the last quarter of training show what the model itself makes of
-            their first frame and actions, instead of the real frames; what it has to predict stays real.
-        keypoint_weight: of RoboScape's keypoint consistency: the tokens that move most should look, wherever
-            they get to, as at the clip's start. 0: off.
+        self_rollout: share of clips whose input frames, in the last quarter of training, are the model's own
+            imagination from the first frame and the actions. The targets stay the recorded frames.
+        keypoint_weight: weight of RoboScape's keypoint consistency: the tokens that move most keep the
+            appearance that they have at the clip's start. 0: off.
     """
 
     window: int = 48
@@ -125,11 +124,11 @@ class WorldModelConfig(RewardModelConfig):
         tokenizer_path: frame tokenizer checkpoint to start from; a trained world model carries its own copy.
         tokenizer: that tokenizer's settings, filled in from its checkpoint.
         state_size: width of `observation.state`, 0 to do without proprioception; filled in from the dataset.
-        dynamics: how frames follow each other, `dynamics.type=anchored` or `autoregressive`.
-        clip_length: frames of a training clip. Success is learnt only that far from an episode's start, so
-            give it the number of frames that episodes are imagined for.
+        dynamics: network that predicts frames, `dynamics.type=anchored` or `autoregressive`.
+        clip_length: frames in a training clip. Success is learnt only up to this many frames after a start,
+            so set it to the length of the episodes that will be imagined.
         from_start: share of training clips that begin with their episode; the others begin anywhere in it.
-        learning_rate: peak of the schedule.
+        learning_rate: highest learning rate of the schedule.
     """
 
     tokenizer_path: str | None = None
@@ -193,7 +192,7 @@ class ActionWorldModelConfig(WorldModelConfig):
 @RewardModelConfig.register_subclass("text_world_model")
 @dataclass
 class TextWorldModelConfig(WorldModelConfig):
-    """Imagines the golden trajectory of an instruction (eq. 1 with c = i). Learns from optimal successes.
+    """Imagines a successful trajectory of an instruction (eq. 1 with c = i). Learns from optimal successes.
 
     Args:
         text_encoder: id or folder of a pretrained T5 (T5, flan-T5, ByT5, mT5, umT5) that reads the

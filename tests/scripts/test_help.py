@@ -58,6 +58,12 @@ def test_help_imports_neither_torch_nor_lerobot(command: str) -> None:
     assert result.stdout == (FOLDER / f"{command}.txt").read_text() + "set()\n"
 
 
+def test_a_groups_explanation_stands_before_its_first_flag() -> None:
+    page = (FOLDER / "lerobot-wmrl-train.txt").read_text()
+    _, _, after = page.partition("--gate.dataset.root")
+    assert "labelled rollouts" in after.partition("  --")[0]
+
+
 def test_flags_of_a_chosen_type_are_listed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.argv", ["lerobot-wmrl-train", "--env.type=wmrl_maniskill", "--help"])
     text = help_of(train.train_policy, train.TrainConfig)
