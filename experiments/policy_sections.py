@@ -21,16 +21,17 @@ def demo(load: Load) -> str:
     head = ["seed", "known: SFT", "after PPO", "unseen: SFT", "after PPO", "false positives", "recall"]
     control = load("cloning_control")["cloned_from"]["180"]
     return f"""It does: {points(known["mean_change"])} in known scenes, {points(unseen["mean_change"])} in
-unseen ones. But the gain is over a policy of eight demonstrations. The world model has learnt from 180 good
-episodes of the planner too, and the same network cloned from those reaches
+unseen ones. But the SFT policy is cloned from only eight demonstrations, while the world model learns from
+180 good episodes of the planner too. The same network cloned from those 180 reaches
 {100 * control["ind"]["share"]:.0f} and {100 * control["ood"]["share"]:.0f} % ([next
-section](#cloning_control)): on this task, with a planner at hand, cloning is the better use of the same data.
+section](#cloning_control)): on this task, cloning is the better use of the same data.
 
 {table(head, rows)}
 
-100 starts a rate, the same for all runs; three seeds. The SFT policy is cloned from eight planned episodes.
-*False positives*: failures of the SFT policy that the world model calls successes; *recall*: its successes
-that it recognises. The preset's iterations and its penalty were chosen on starts of the same seeds."""
+Each rate is over 100 starts, the same for all runs; three seeds. The SFT policy is cloned from eight planned
+episodes. *False positives*: failures of the SFT policy that the world model predicts as successes. *Recall*:
+successes of the SFT policy that it predicts as successes. The preset's iterations and KL penalty were chosen
+on starts of the same seeds."""
 
 
 def cloning_control(load: Load) -> str:
@@ -52,13 +53,13 @@ def cloning_control(load: Load) -> str:
         ],
         ["planning in a world model (`wm_mpc`)", share(plan["ind"]), share(plan["ood"])],
     ]
-    return f"""Better than the policy that PPO makes of eight demonstrations. So neither the cameras nor the
-network limit the demo's PPO.
+    return f"""Cloned from 180 episodes, it is better than the policy that PPO improves from eight. So neither
+the cameras nor the network limit PPO in the demo.
 
 {table(["policy", "known scenes", "unseen scenes"], rows)}
 
-100 starts a rate (planning: {plan["ind"]["n"]} and {plan["ood"]["n"]}, in another world model), one seed of
-cloning. All rows of cloning and PPO have the demo's two views and its recordings."""
+Each rate is over 100 starts (planning: {plan["ind"]["n"]} and {plan["ood"]["n"]}, in another world model);
+one seed of cloning. Cloning and PPO use the demo's two cameras and its recordings."""
 
 
 def rl_comparison(load: Load) -> str:
@@ -83,22 +84,22 @@ def rl_comparison(load: Load) -> str:
     last, rival = found["mean_change"]["imagined 60"], found["mean_change"]["simulated 20"]
     cloned = found["cloned"]
     return f"""It does, by {points(last["ind"])} in known scenes and {points(last["ood"])} in unseen ones. A
-step in ManiSkill teaches more ({points(rival["ind"])} after 51,200 steps) and costs more than twice the time.
+step in ManiSkill gains more ({points(rival["ind"])} after 51,200 steps) and takes more than twice as long.
 
 {table(["PPO in", "scenes", "steps", "minutes", "three seeds", "change on the same starts"], rows)}
 
 SFT policy: {share(cloned["ind"])} in known, {share(cloned["ood"])} in unseen scenes; {found["episodes"]}
-starts a rate; intervals draw starts anew, not seeds. Time on one core, without collecting data and learning
-the world model (about an hour on two cores). Penalty and number of starts were chosen on 200 of these
-starts. PPO in ManiSkill was stopped while it still rose, with learning rates that were tuned in imagination.
+starts behind each rate; intervals resample starts, not seeds. Time on one core, without collecting data and
+training the world model (about an hour on two cores). KL penalty and number of starts were chosen on 200 of
+these starts. PPO in ManiSkill was stopped while success still rose, with learning rates tuned in imagination.
 
 ![Success in ManiSkill against steps and minutes](results/rl_comparison.png)"""
 
 
 def imagined_ppo(load: Load) -> str:
     names = {
-        "unseen": "one that the world model has not seen act",
-        "B": "one whose attempts it learnt from",
+        "unseen": "SFT policy whose rollouts the world model was not trained on",
+        "B": "SFT policy whose rollouts it was trained on",
     }
     return improvement(load("imagined_ppo")["imagined"], names)
 
@@ -106,27 +107,27 @@ def imagined_ppo(load: Load) -> str:
 def openvla_small(load: Load) -> str:
     found = load("openvla_small")["imagined"]
     drawn, greedy = (found[domain]["policies"]["openvla"] for domain in ("drawn", "ind"))
-    return f"""When it acts as PPO trains it, by drawn tokens: {100 * drawn["cloned"]["share"]:.0f} →
-{100 * drawn["trained"]["share"]:.0f} %. With the likeliest tokens, OpenVLA's own way to act, the gain is
+    return f"""When tokens are sampled, as in PPO: {100 * drawn["cloned"]["share"]:.0f} →
+{100 * drawn["trained"]["share"]:.0f} %. With greedy tokens, OpenVLA's default, the gain is
 within chance ({100 * greedy["cloned"]["share"]:.0f} → {100 * greedy["trained"]["share"]:.0f} %), and in
 unseen scenes there is none.
 
 {improvement_table(found, {"openvla": "small OpenVLA, 1.0 M parameters"})}
 
-200 starts a rate, one seed, 153,600 imagined steps."""
+Each rate is over 200 starts; one seed, 153,600 imagined steps."""
 
 
 def improvement(found: Mapping[str, Any], names: Mapping[str, str]) -> str:
-    """Return what PPO in imagination made of policies that are good already."""
+    """Return what PPO in imagination gained for policies that were good already."""
     changes = " and ".join(
         f"{points(row['mean_change'])} in {DOMAINS[domain]} scenes" for domain, row in found.items()
     )
     starts = next(iter(found.values()))["mean_change"]["starts"]
-    return f"""A little: {changes}, under a penalty five times as strong as today's default.
+    return f"""A little: {changes}, with a KL penalty five times today's default.
 
 {improvement_table(found, names)}
 
-{starts} starts a rate, one seed; two of the four policies that the study was set up with."""
+Each rate is over {starts} starts; one seed. The other two of the study's four policies are not shown."""
 
 
 def improvement_table(found: Mapping[str, Any], names: Mapping[str, str]) -> str:
@@ -140,8 +141,8 @@ def improvement_table(found: Mapping[str, Any], names: Mapping[str, str]) -> str
 
 def planning(load: Load) -> str:
     found = load("planning")
-    return f"""Not on this task: `wm_mpc`, which imagines action sequences and carries out the best one,
-beats every policy that was trained in this world model.
+    return f"""Not on this task: `wm_mpc`, which imagines action sequences and executes the best one, beats
+every policy that was trained in this world model.
 
 {table(["scenes", "success of `wm_mpc`"], [[DOMAINS[d], counted(found[d])] for d in ("ind", "ood")])}
 
@@ -160,8 +161,8 @@ def synthetic_data(load: Load) -> str:
         for kind, title in names.items()
     ]  # fmt: skip
     return f"""It does, and more than from ManiSkill's successes. An imagined success is stricter here (done
-at 0.95 for two frames); whether that explains the difference has not been tested.
+probability of 0.95 in two consecutive frames); whether that explains the difference has not been tested.
 
 {table(["cloned from", "known scenes", "unseen scenes", "known scenes, on the same starts"], rows)}
 
-{found["episodes"]} starts a rate, one seed."""
+Each rate is over {found["episodes"]} starts; one seed."""

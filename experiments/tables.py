@@ -47,18 +47,18 @@ SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
 
 INTRODUCTION: Final = """# Results
 
-Every question that was measured, its answer, one table, and what limits it. The page is generated from
+Each section is a question, its answer, one table and its limits. The page is generated from
 [`docs/results/`](results) by `python -m experiments.tables`; each JSON there is made by one file of
 [`experiments/`](../experiments).
 
 - Success is success in ManiSkill unless a column says otherwise. *Known* scenes are those that policies and
   world model were trained in; *unseen* ones are held out from all training. Starts are held out in both.
-- Behind a share stands Wilson's 95 % interval, behind a mean over episodes a bootstrap 95 % interval over
-  episodes, behind a change one that draws starts anew. None of them covers other seeds of training.
-- All numbers come from CPUs and from earlier commits than the present one. The commit stands under each
-  table, *before* it where only the commit that added the numbers is known. Today's files repeat the set-up;
-  they have not all been run again.
-- Numbers that did not come out as hoped stay here.
+- Intervals in parentheses are 95 %: Wilson's for a share, bootstrap over episodes for a mean, bootstrap over
+  starts for a change. None of them covers other seeds of training.
+- All numbers come from CPUs and from earlier commits than the present one. The commit is under each
+  table; *before* means that only the commit that added the numbers is known. Today's studies repeat the
+  set-up, but not all have been run again.
+- Null results stay here.
 """
 
 

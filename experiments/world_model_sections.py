@@ -16,13 +16,14 @@ def policies(load: Load) -> str:
     low, high = found["pearson"]["fisher_95"]
     return f"""It ranks them: over these {len(rows)} checkpoints Pearson's r is
 {found["pearson"]["value"]:.2f} ({low:.2f}–{high:.2f}, as if they were independent) and rates differ by
-{100 * gap / len(rows):.1f} points on average. That is nearer than chance lets even a perfect model come with
-80 episodes in either place (5.3 points), and the threshold was chosen on rollouts of one of the policies;
-over the demo's six policies the difference is 12 points, imagination being lower.
+{100 * gap / len(rows):.1f} points on average. That is less than even a perfect model would have by chance
+with 80 episodes in each (5.3 points), so it was lucky, and the threshold was chosen on rollouts of one of the
+policies. Over the demo's six policies the difference is 12 points, imagined success being lower.
 
 {table(["checkpoint", "in the world model", "in ManiSkill"], rows)}
 
-80 episodes a rate, other starts in either place. Half of the policies were trained in this world model.
+Each rate is over 80 episodes, with different starts in the two. Half of the policies were
+trained in this world model.
 
 ![Success of twelve policies in the world model and in ManiSkill](results/policies.png)"""
 
@@ -52,31 +53,31 @@ def gate_table(columns: Mapping[str, Mapping[str, Any]]) -> str:
 def gate(load: Load) -> str:
     found = load("world_model_gate_anchored")
     columns = {"known scenes": found["known"], "unseen scenes": found["unseen"]}
-    return f"""Not yet by our own gate: pictures and actions are well beyond the goals, but too many failures
-are called successes.
+    return f"""Not yet by our own gate: frames and the response to actions exceed the goals, but the world
+model predicts too many failures as successes.
 
 {gate_table(columns)}
 
 Anchored dynamics, {found["steps"]:,} steps on 3,300 episodes (96,204 frames), one seed; done at 0.5 for 3
-frames. Asked about rollouts of a policy that was not learnt from, half of them noisy, and unperturbed ones
-in sixteen scenes that are held out from all training (the model has seen three)."""
+frames. Measured on rollouts of a policy that the model was not trained on: in known scenes half of them with
+noise, in unseen scenes without. The sixteen unseen scenes are held out from all training; three are known."""
 
 
 def gate_one_scene(load: Load) -> str:
     found = load("world_model_gate_one_scene")["known"]
-    return f"""Yes, as a share: {counted(found["false_positive_rate"])} failures are called successes. The
-interval's upper end is above 5 %.
+    return f"""Yes, by the point estimate: {counted(found["false_positive_rate"])} of the failures are false
+positives. The upper end of the interval is above 5 %.
 
 {gate_table({"one scene": found})}
 
 Done at {found["done_threshold"]} for {found["done_frames"]} frames, chosen on 1,120 other rollouts; these
-800 were recorded afterwards on new seeds. 75 minutes of one core. `gate_one_scene.yaml` is one training
-of that size, which has not been run."""
+800 were recorded afterwards on new seeds. 75 minutes of one core. This model was trained in three steps;
+`gate_one_scene.yaml` is a single training of that size, which has not been run."""
 
 
 def gate_autoregressive(load: Load) -> str:
     found = load("world_model_gate")["known"]
-    return f"""Far from passed, in less training than anchored dynamics had.
+    return f"""It is far from passed, with less training than the anchored dynamics had.
 
 {gate_table({"nine scenes": found})}
 
@@ -86,11 +87,11 @@ Autoregressive dynamics, 2,200 steps on 2,040 episodes, side view and wrist, one
 def gate_sensitivity(load: Load) -> str:
     found = load("gate_sensitivity")["errors"]
     rows = [[row["error_mm"], counted(row["false_positive_rate"]), counted(row["recall"])] for row in found]
-    return f"""To half a millimetre. The simulator repeats the rollouts with their own actions and the object
-put a little off: a perfect model of physics that reads the object to 2 mm, as one can at 64 pixels, would
-call a tenth of the failures successes.
+    return f"""To half a millimetre. The simulator repeats the rollouts with their own actions and a slightly
+displaced object. A perfect model of physics that locates the object to 2 mm, as is possible at 64 pixels,
+would predict a tenth of the failures as successes.
 
-{table(["normal error of the object's place along x and y (mm)", "false positives", "recall"], rows)}
+{table(["position error of the object in x and y, std (mm)", "false positives", "recall"], rows)}
 
 480 rollouts."""
 
@@ -109,7 +110,7 @@ of training; delta-PSNR at step 15 is {estimate(head["delta_psnr_15"])} dB.
 
 {table(["", *columns], rows)}
 
-153 held-out episodes of planners, which are easier than a policy's; anchored dynamics, one seed."""
+153 held-out episodes of planners, which are easier than a policy's rollouts; anchored dynamics, one seed."""
 
 
 def training_rows(variants: Mapping[str, Mapping[str, Any]]) -> str:
@@ -131,8 +132,8 @@ def training_rows(variants: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def ablation(load: Load) -> str:
-    return f"""No: neither wins, nor do both together; all intervals overlap, and depth costs twice the
-arithmetic. Both are off by default.
+    return f"""No: neither of them nor both together gain anything measurable. All intervals overlap, and
+depth costs twice the arithmetic. Both are off by default.
 
 {training_rows(load("world_model_ablation")["variants"])}
 
@@ -152,13 +153,13 @@ AdaLN in seed 1; *maskgit* and *self rollout* have cross-attention. All are far 
 
 
 def learning_curve(load: Load) -> str:
-    return f"""All three, training first: half of the steps costs 3.5 dB of delta-PSNR. Pictures are learnt
-early and from few episodes; telling a failure when one sees it takes data, steps and size.
+    return f"""All three, longer training most: half of the steps loses 3.5 dB of delta-PSNR. Frames are
+predicted well early and from few episodes; predicting success takes more data, steps and parameters.
 
 {training_rows(load("learning_curve")["variants"])}
 
-60 held-out episodes, 480 rollouts for the gate, one seed: small differences mean little. Minutes are upper
-bounds, as the machine had other work.
+60 held-out episodes, 480 rollouts for the gate, one seed, so small differences mean little. Minutes are
+upper bounds, because the machine had other work.
 
 ![Learning curve](results/learning_curve.png)"""
 
@@ -184,20 +185,20 @@ def reward_curves(load: Load) -> str:
             f"{row['spearman']['value']:.2f}, {unseen[name]['spearman']['value']:.2f}",
             f"{row['earned_by_successes']:.2f}", ", ".join(earned),
         ])  # fmt: skip
-    doubt = found["known"]["uncertainty"]
+    unsure = found["known"]["uncertainty"]
     head = ["reward", "AUC: known, unseen", "Spearman with the rule-based reward", "a success earns a frame",
             "random, frozen, saturated actions earn"]  # fmt: skip
-    return f"""Done alone tells success from failure best and says nothing before it; with similarity to the
-goal frame the general reward follows progress best. The embedding reward does nearly as well, but needs
-recorded rewards.
+    return f"""Done alone separates success from failure best, but gives no signal before it. With similarity
+to the goal frame the general reward follows progress best. The embedding reward does nearly as well, but
+needs recorded rewards.
 
 {table(head, rows)}
 
 {found["known"]["successes"]} successes and {found["known"]["failures"]} failures in known scenes,
 {found["unseen"]["successes"]} and {found["unseen"]["failures"]} in unseen ones, of a policy that the world
-model has not seen. Uncertainty warns: of {doubt["predicted_successes"]} episodes that are called successes
-{doubt["false"]} are failures, and the greatest token entropy is higher in a false one than in a true one in
-{100 * doubt["auc"]["token_entropy"]:.0f} % of all pairs. Its effect on PPO has not been measured.
+model was not trained on. Uncertainty indicates false positives: of {unsure["predicted_successes"]} predicted
+successes {unsure["false"]} are failures, and the largest token entropy is higher in a false than in a true
+one in {100 * unsure["auc"]["token_entropy"]:.0f} % of all pairs. Its effect on PPO has not been measured.
 
 ![Mean reward along successes and failures](results/reward_curves.png)"""
 
@@ -210,7 +211,7 @@ def planners(load: Load) -> str:
         for planner, tasks in both.items()
         for task, row in tasks.items()
     ]
-    return f"""Every optimal episode succeeds, of every task, with both planners; near misses fail on purpose.
+    return f"""With both planners every optimal episode of every task succeeds. Near misses fail on purpose.
 
 {table(["planner", "task", *(kind.replace("_", " ") for kind in kinds)], rows)}
 
@@ -228,8 +229,8 @@ size,             *(" ".join(f"{mean[f'{thing}_{axis}']:.1f}" for axis in "xyz")
 "tcp")),             f"{row['opening_percent']:.1f}", f"{100 * row['contact_accuracy']:.1f}",
         ])  # fmt: skip
     head = ["cameras", "size", "object x y z (mm)", "TCP x y z (mm)", "opening (%)", "touching, right (%)"]
-    return f"""Places to 2–6 mm; contact less surely, since a gap of 2 mm is half a pixel. Three views of 128
-pixels read best, so the recipes `cpu`, `gpu` and `paper` record these.
+    return f"""Positions to 2–6 mm. Contact less reliably, because a gap of 2 mm is half a pixel. Three views
+of 128 pixels read best, so the recipes `cpu`, `gpu` and `paper` record these.
 
 {table(head, rows)}
 
@@ -252,7 +253,7 @@ def control(load: Load) -> str:
 
 {table(["training", "solved from", "score of three seeds", "steps"], rows)}
 
-100 episodes a score, without exploration."""
+Each score is over 100 episodes, without exploration."""
 
 
 def speed(load: Load) -> str:
