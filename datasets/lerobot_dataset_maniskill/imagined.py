@@ -19,7 +19,7 @@ from lerobot_wmrl.common.policies import check_fit, load_policy, load_processors
 from lerobot_wmrl.envs.evaluation_adapter import images_to_numpy
 from lerobot_wmrl.maniskill.episode import Frame
 from lerobot_wmrl.maniskill.tasks import task_of
-from lerobot_wmrl.rl.protocol import make_pipeline
+from lerobot_wmrl.rl.policy_adapters import make_pipeline
 
 Row = tuple[Frame, np.ndarray, Outcome]
 

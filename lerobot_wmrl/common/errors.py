@@ -35,6 +35,13 @@ def require_at_least(settings: object, least: float, *fields: str) -> None:
             raise FieldError(field, getattr(settings, field), f"must be at least {least}")
 
 
+def require_positive(settings: object, *fields: str) -> None:
+    """Raise FieldError for the first of the `fields` of `settings` that is not above 0."""
+    for field in fields:
+        if getattr(settings, field) <= 0:
+            raise FieldError(field, getattr(settings, field), "must be above 0")
+
+
 def require_share(settings: object, *fields: str) -> None:
     """Raise FieldError for the first of the `fields` of `settings` that is not within 0 and 1."""
     for field in fields:

@@ -1,11 +1,11 @@
-"""Configurations of the algorithms, `--algorithm.type=ppo|grpo`."""
+"""Configuration of PPO, `algorithm.type` ppo, and the options that it shares with GRPO."""
 
 from dataclasses import dataclass
 from typing import Any, Final, Self
 
 from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 
-from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice, require_share
+from lerobot_wmrl.common.errors import require_at_least, require_choice, require_positive, require_share
 
 RATIOS: Final = ("action", "token")
 
@@ -77,38 +77,3 @@ class PPOConfig(PolicyGradientConfig):
         super().__post_init__()
         require_positive(self, "gamma", "gae_lambda", "clip", "value_lr")
         require_share(self, "gamma", "gae_lambda", "clip")
-
-
-@RLAlgorithmConfig.register_subclass("grpo")
-@dataclass
-class GRPOConfig(PolicyGradientConfig):
-    """Group relative policy optimisation (Shao et al. 2024): episodes that start alike are compared with each
-    other, so no value function is needed. Asymmetric clip and group filter as in DAPO (Yu et al. 2025).
-
-    Args:
-        group_size: environments that start from the same state; divides --num_envs.
-        clip_low: how far the ratio may move below 1.
-        clip_high: how far the ratio may move above 1.
-        least_group_std: smallest standard deviation of a group's returns at which the group is trained on.
-            With a reward of about 1 for success, groups below it have all succeeded or all failed.
-        reference_coefficient: weight of the KL penalty towards the SFT policy; GRPO needs none.
-    """
-
-    group_size: int = 8
-    clip_low: float = 0.2
-    clip_high: float = 0.28
-    least_group_std: float = 0.05
-    reference_coefficient: float = 0.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_positive(self, "clip_low", "clip_high", "least_group_std")
-        require_share(self, "clip_low", "clip_high")
-        require_at_least(self, 2, "group_size")
-
-
-def require_positive(settings: object, *fields: str) -> None:
-    """Raise FieldError for the first of the `fields` that is not above 0."""
-    for field in fields:
-        if getattr(settings, field) <= 0:
-            raise FieldError(field, getattr(settings, field), "must be above 0")

@@ -17,9 +17,9 @@ from lerobot_wmrl.common.presets import Flags, format_flags
 from lerobot_wmrl.common.processes import run_subcommand
 from lerobot_wmrl.data.episodes import DatasetSource, open_dataset
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
+from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.callbacks import REAL_STEPS, Record, RolloutRecorder, record_folder
 from lerobot_wmrl.rl.configuration_callbacks import DYNA_SEEDS, DynaConfig
-from lerobot_wmrl.rl.policy_gradient import TrainingStopped
 from lerobot_wmrl.world_models.checkpoint import load_model
 
 NOISE_LEVELS: Final = {"calm": 0.0, "noisy": 0.4}

@@ -19,9 +19,9 @@ from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.evaluation.gate import Gate, Outcomes, gate_at, labelled_recording, predict_outcomes
 from lerobot_wmrl.evaluation.pictures import save_strip, side_by_side
 from lerobot_wmrl.evaluation.replay import Recording, replay_episodes
+from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.callbacks import REAL_STEPS, Record, RolloutRecorder
 from lerobot_wmrl.rl.configuration_callbacks import GateConfig
-from lerobot_wmrl.rl.policy_gradient import TrainingStopped
 
 SEEDS = 1_000_000
 """Number of seeds from GATE_SEED on."""

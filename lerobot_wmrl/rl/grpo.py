@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from lerobot_wmrl.common.distributed import mean_over_processes
-from lerobot_wmrl.rl.configuration_algorithms import GRPOConfig
+from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 from lerobot_wmrl.rl.policy_gradient import Batch, PolicyGradient
 from lerobot_wmrl.rl.rollout import RolloutBuffer
 

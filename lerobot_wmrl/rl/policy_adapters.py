@@ -5,16 +5,19 @@ B environments, n steps of a decision, K action components, D width of ACT's dec
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.processor import DeviceProcessorStep
 from lerobot.utils.constants import OBS_IMAGES
 from torch import Tensor, nn
 from torch.distributions import Normal
 
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.policies import unwrapped
-from lerobot_wmrl.rl.protocol import Observation, StochasticPolicy
+from lerobot_wmrl.rl.protocol import Observation, Pipeline, StochasticPolicy
 
 INITIAL_STD = 0.1
 """In normalised actions. ACT's L1 loss learns no spread, so exploration needs a value to start from."""
@@ -118,3 +121,22 @@ def as_stochastic(policy: Any) -> Any:
             f"take one that has them, for example cnn, or one of {', '.join(ADAPTERS)}",
         )  # fmt: skip
     return ADAPTERS[policy.config.type](policy)
+
+
+def make_pipeline(config: PreTrainedConfig, preprocessor: Any, postprocessor: Any) -> Pipeline:
+    """Wrap a policy's processors. Observations that the policy does not know are left out, and actions stay
+    on the policy's device, although LeRobot's postprocessors fetch them to the CPU."""
+    known = {*(config.input_features or {}), "task"}
+    steps = [
+        replace(step, device=config.device) if isinstance(step, DeviceProcessorStep) else step
+        for step in postprocessor.steps
+    ]
+    on_device = replace(postprocessor, steps=steps)
+
+    def prepare(observation: Observation) -> Observation:
+        return preprocessor({name: value for name, value in observation.items() if name in known})
+
+    def to_action(raw_action: Tensor) -> Tensor:
+        return on_device(raw_action)
+
+    return Pipeline(prepare, to_action)

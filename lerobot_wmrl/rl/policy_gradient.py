@@ -4,7 +4,6 @@ T time, B environments or decisions, K action components, J ratios of a decision
 one cuts minibatches from its own rollout, and gradients and metrics are averaged over all of them.
 """
 
-import copy
 import math
 from abc import abstractmethod
 from collections.abc import Iterator
@@ -12,10 +11,8 @@ from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
-from lerobot.rl.algorithms.base import RLAlgorithm
 from lerobot.rl.algorithms.configs import TrainingStats
 from torch import Tensor, nn
-from torch.optim import AdamW, Optimizer
 
 from lerobot_wmrl.common.distributed import (
     average_gradients,
@@ -24,26 +21,18 @@ from lerobot_wmrl.common.distributed import (
     mean_and_variance,
     mean_over_processes,
 )
-from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.policies import load_trained_weights
-from lerobot_wmrl.common.precision import require_exact_updates
+from lerobot_wmrl.rl.algorithm import NORM, RATIO_ERROR, Algorithm, training_stats
 from lerobot_wmrl.rl.configuration_algorithms import PolicyGradientConfig
-from lerobot_wmrl.rl.policy_adapters import as_stochastic
 from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer
 
 GRAD_CLIP_NORM = 1.0
 """Largest gradient norm, of the policy's parameters and of the value's separately."""
 
-REFERENCE, EXECUTED, RATIO_ERROR = "reference_log_prob", "executed", "ratio_error"
-LOSS, NORM = "_loss", "_grad_norm"
+REFERENCE, EXECUTED = "reference_log_prob", "executed"
 
 Batch = dict[str, Any]
 """B decisions: `observation`, `raw_action`, `log_prob` and the buffer's columns."""
-
-
-class TrainingStopped(ValueError):
-    """Training cannot go on; the last checkpoint is good."""
 
 
 def log_ratios(log_prob_change: Tensor, kind: str) -> Tensor:
@@ -125,7 +114,7 @@ class Minibatches:
         return len(rows), read_batch(self.rollout, rows if len(rows) else rows.new_zeros(1), self.pipeline)
 
 
-class PolicyGradient(RLAlgorithm):
+class PolicyGradient(Algorithm):
     """Ascent on a clipped objective, with a KL penalty towards the SFT policy (the reference).
 
     `policy` samples: the policy that was given, or that policy in its adapter. `iteration` counts the
@@ -134,34 +123,10 @@ class PolicyGradient(RLAlgorithm):
 
     config: PolicyGradientConfig
 
-    def __init__(self, policy: Any, config: PolicyGradientConfig) -> None:
-        self.given, self.policy = policy, as_stochastic(policy)
-        self.config, self.iteration = config, 0
-        if config.initial_std is not None:
-            if not hasattr(self.policy, "set_std"):
-                raise FieldError(
-                    "algorithm.initial_std", config.initial_std,
-                    "this policy has no standard deviation", "leave it out",
-                )  # fmt: skip
-            self.policy.set_std(config.initial_std)
-        self.policy.eval()
-        self.reference = frozen_copy(self.policy)
-        self.value_parameters = list(self.policy.value_parameters())
-        owned = {id(parameter) for parameter in self.value_parameters}
-        self.policy_parameters = [
-            p for p in self.policy.parameters() if p.requires_grad and id(p) not in owned
-        ]
-        require_exact_updates(self.policy_parameters)
-        self.optimizer = self.make_optimizers_and_scheduler()[self.name]
-
     @property
     def group_size(self) -> int:
         """Neighbouring environments that start from the same state."""
         return 1
-
-    @abstractmethod
-    def parameter_groups(self) -> dict[str, tuple[list[nn.Parameter], float]]:
-        """Return parameters and learning rates by name."""
 
     def trained_groups(self) -> list[str]:
         """Return the names of the parameter groups that this iteration trains."""
@@ -182,13 +147,32 @@ class PolicyGradient(RLAlgorithm):
         metrics["reference_kl"] = self.add_reference(rollout, pipeline)
         return Minibatches(rollout, chosen, pipeline, self.config), metrics
 
+    @torch.no_grad()
+    def add_reference(self, rollout: RolloutBuffer, pipeline: Pipeline) -> float:
+        """Add the reference's log-probabilities of what was done, and which steps of chunks were executed.
+        Return the mean KL of the policy to the reference."""
+        reference = torch.zeros_like(rollout.log_prob)
+        executed = rollout.executed()
+        if executed is not None:
+            rollout.columns[EXECUTED] = executed
+        size = self.config.micro_batch_size or self.config.minibatch_size
+        for rows in rollout.decided.flatten().nonzero()[:, 0].cpu().split(size):
+            batch = read_batch(rollout, rows, pipeline)
+            log_prob = self.reference.evaluate(batch["observation"], batch["raw_action"])[0]
+            reference.flatten(0, 1)[rows.to(reference.device)] = log_prob
+        rollout.columns[REFERENCE] = reference
+        counted = 1.0 if executed is None else executed
+        flat = [(each * counted).flatten(0, 1).flatten(1) for each in (rollout.log_prob, reference)]
+        return mean_and_variance(kl_estimate(*flat)[rollout.decided.flatten()])[0].item()
+
     def update(self, batch_iterator: Iterator[Minibatch]) -> TrainingStats:
         """Take one optimiser step on each minibatch, until the policy has moved by `target_kl`."""
         records: list[dict[str, float]] = []
         first = self.optimization_step
         for minibatch in batch_iterator:
             record = self.accumulate_gradient(minibatch)
-            self._check(record)
+            self.check_finite(record)
+            self.check_reference_kl(record)
             records.append(record)
             if record["kl"] > self.config.target_kl:
                 break
@@ -232,24 +216,6 @@ class PolicyGradient(RLAlgorithm):
         penalty = self.config.reference_coefficient * reference_penalty(now, reference)
         return record["policy_loss"] + penalty, record, value
 
-    @torch.no_grad()
-    def add_reference(self, rollout: RolloutBuffer, pipeline: Pipeline) -> float:
-        """Add the reference's log-probabilities of what was done, and which steps of chunks were executed.
-        Return the mean KL of the policy to the reference."""
-        reference = torch.zeros_like(rollout.log_prob)
-        executed = rollout.executed()
-        if executed is not None:
-            rollout.columns[EXECUTED] = executed
-        size = self.config.micro_batch_size or self.config.minibatch_size
-        for rows in rollout.decided.flatten().nonzero()[:, 0].cpu().split(size):
-            batch = read_batch(rollout, rows, pipeline)
-            log_prob = self.reference.evaluate(batch["observation"], batch["raw_action"])[0]
-            reference.flatten(0, 1)[rows.to(reference.device)] = log_prob
-        rollout.columns[REFERENCE] = reference
-        counted = 1.0 if executed is None else executed
-        flat = [(each * counted).flatten(0, 1).flatten(1) for each in (rollout.log_prob, reference)]
-        return mean_and_variance(kl_estimate(*flat)[rollout.decided.flatten()])[0].item()
-
     def optimizer_step(self) -> dict[str, float]:
         """Clip the gradients of each group, step, and return their norms.
 
@@ -265,72 +231,7 @@ class PolicyGradient(RLAlgorithm):
             average_gradients(parameters)
             clipped[name + NORM] = nn.utils.clip_grad_norm_(parameters, GRAD_CLIP_NORM)
         norms = {name: norm.item() for name, norm in clipped.items()}
-        self._check_finite(norms)
+        self.check_finite(norms)
         self.optimizer.step()
         self.optimization_step += 1
         return norms
-
-    def _check_finite(self, record: dict[str, float]) -> None:
-        broken = [name for name, value in record.items() if not math.isfinite(value)]
-        if broken:
-            raise TrainingStopped(
-                f"iteration {self.iteration + 1}: {', '.join(broken)} is not finite; the last checkpoint is "
-                "kept: lower `algorithm.policy_lr` or `algorithm.value_lr`"
-            )
-
-    def _check(self, record: dict[str, float]) -> None:
-        """Raise TrainingStopped before a step that would spoil the policy."""
-        self._check_finite(record)
-        if record["reference_kl"] > self.config.max_reference_kl:
-            raise TrainingStopped(
-                f"iteration {self.iteration + 1}: the policy is {record['reference_kl']:.1f} nats from the "
-                f"SFT policy, above `algorithm.max_reference_kl` ({self.config.max_reference_kl}); raise "
-                "`algorithm.reference_coefficient` or lower `algorithm.policy_lr`"
-            )
-
-    def make_optimizers_and_scheduler(self) -> dict[str, Optimizer]:
-        """Return AdamW with a constant rate for each parameter group."""
-        groups = [{"params": params, "lr": rate} for params, rate in self.parameter_groups().values()]
-        return {self.name: AdamW(groups, weight_decay=0.0)}
-
-    def get_optimizers(self) -> dict[str, Optimizer]:
-        """Return the optimiser by the algorithm's name."""
-        return {self.name: self.optimizer}
-
-    def load_weights(self, weights: dict[str, Any], device: str | torch.device = "cpu") -> None:
-        """Load the policy's weights from a checkpoint's."""
-        load_trained_weights(self.given, weights)
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """Return what the policy's checkpoint lacks: the adapter's tensors, and what an algorithm adds."""
-        added = {} if self.policy is self.given else self.policy.own_tensors()
-        return {f"adapter.{name}": value for name, value in added.items()}
-
-    @torch.no_grad()
-    def load_state_dict(self, state_dict: dict[str, Tensor], device: str | torch.device = "cpu") -> None:
-        """Copy the tensors of `state_dict` into this algorithm's own."""
-        own = self.state_dict()
-        if state_dict.keys() != own.keys():
-            raise ValueError(
-                f"algorithm.type={self.name}: its tensors are {sorted(own)}, got {sorted(state_dict)}"
-            )
-        for name, value in own.items():
-            value.copy_(state_dict[name])
-
-
-def frozen_copy(policy: Any) -> Any:
-    """Return a copy that is not trained. It shares the parameters that the policy does not train either, such
-    as a large network under LoRA's adapters."""
-    frozen = {id(each): each for each in policy.parameters() if not each.requires_grad}
-    return copy.deepcopy(policy, frozen).requires_grad_(False)
-
-
-def training_stats(records: list[dict[str, float]], updates: int) -> TrainingStats:
-    """Return means over minibatches, and the first one's ratio error, which must be 0 up to rounding."""
-    names = dict.fromkeys(name for record in records for name in record)
-    seen = {name: [record[name] for record in records if name in record] for name in names}
-    mean = {name: sum(values) / len(values) for name, values in seen.items()}
-    losses = {name: mean.pop(name) for name in names if name.endswith(LOSS)}
-    norms = {name.removesuffix(NORM): mean.pop(name) for name in names if name.endswith(NORM)}
-    first = {"first_ratio_error": records[0][RATIO_ERROR]} if records else {}
-    return TrainingStats(losses, norms, extra={**mean, **first, "updates": float(updates)})

@@ -6,11 +6,9 @@ after n steps or when a new episode begins.
 """
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
-from lerobot.configs import PreTrainedConfig
-from lerobot.processor import DeviceProcessorStep
 from torch import Tensor, nn
 
 Observation = dict[str, Any]
@@ -61,22 +59,3 @@ class Pipeline:
 
     prepare: Callable[[Observation], Observation]
     to_action: Callable[[Tensor], Tensor]
-
-
-def make_pipeline(config: PreTrainedConfig, preprocessor: Any, postprocessor: Any) -> Pipeline:
-    """Wrap a policy's processors. Observations that the policy does not know are left out, and actions stay
-    on the policy's device, although LeRobot's postprocessors fetch them to the CPU."""
-    known = {*(config.input_features or {}), "task"}
-    steps = [
-        replace(step, device=config.device) if isinstance(step, DeviceProcessorStep) else step
-        for step in postprocessor.steps
-    ]
-    on_device = replace(postprocessor, steps=steps)
-
-    def prepare(observation: Observation) -> Observation:
-        return preprocessor({name: value for name, value in observation.items() if name in known})
-
-    def to_action(raw_action: Tensor) -> Tensor:
-        return on_device(raw_action)
-
-    return Pipeline(prepare, to_action)

@@ -9,8 +9,8 @@ from lerobot_wmrl.common.distributed import rank_and_size
 from lerobot_wmrl.common.lerobot_compat import checkpoint_dir
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.evaluation.agreement import Evaluated
+from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.callbacks import REAL_STEPS, Record
-from lerobot_wmrl.rl.policy_gradient import TrainingStopped
 
 REAL, IMAGINED = "real", "imagined"
 

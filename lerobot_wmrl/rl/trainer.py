@@ -23,7 +23,8 @@ from lerobot_wmrl.common.lerobot_compat import (
 )
 from lerobot_wmrl.common.tracking import Tracker
 from lerobot_wmrl.rl.callbacks import Callback, Callbacks
-from lerobot_wmrl.rl.configuration_algorithms import GRPOConfig, PolicyGradientConfig
+from lerobot_wmrl.rl.configuration_algorithms import PolicyGradientConfig
+from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 from lerobot_wmrl.rl.grpo import GRPO
 from lerobot_wmrl.rl.policy_gradient import PolicyGradient
 from lerobot_wmrl.rl.ppo import PPO

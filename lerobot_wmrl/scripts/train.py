@@ -40,8 +40,9 @@ from lerobot_wmrl.common.errors import FieldError, require_at_least
 from lerobot_wmrl.common.precision import keep_freed_memory
 from lerobot_wmrl.common.presets import expand_preset, format_flags
 from lerobot_wmrl.common.tracking import make_wandb
-from lerobot_wmrl.rl.configuration_algorithms import GRPOConfig, PolicyGradientConfig, PPOConfig
+from lerobot_wmrl.rl.configuration_algorithms import PolicyGradientConfig, PPOConfig
 from lerobot_wmrl.rl.configuration_callbacks import CallbackSettings
+from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 
 PUBLISHING = ("push_to_hub", "repo_id", "private", "license", "tags")
 """Settings of the policy that only matter when it is published."""
@@ -235,7 +236,7 @@ def train_in(
     """Check that policy and environment fit, then train."""
     from lerobot_wmrl.common.policies import adopt_features, check_fit, with_new_adapters
     from lerobot_wmrl.rl.make_callbacks import Trained, make_callbacks
-    from lerobot_wmrl.rl.protocol import make_pipeline
+    from lerobot_wmrl.rl.policy_adapters import make_pipeline
     from lerobot_wmrl.rl.rollout import RolloutBuffer
     from lerobot_wmrl.rl.trainer import Schedule, make_algorithm, train
 

@@ -30,7 +30,7 @@ from lerobot_wmrl.common.policies import (
     unwrapped,
 )
 from lerobot_wmrl.common.tracking import read_metrics
-from lerobot_wmrl.rl.policy_gradient import frozen_copy
+from lerobot_wmrl.rl.algorithm import frozen_copy
 from lerobot_wmrl.scripts.convert_openvla import ConvertOpenVLAConfig, convert
 from lerobot_wmrl.scripts.train import main
 from tests.lerobot_policy_openvla.small import observe, small_policy

@@ -95,7 +95,7 @@ def test_act_is_saved_as_act_and_what_was_added_with_the_algorithm(
     algorithm = improve(small_act(images=False), pipeline, tmp_path / "whole", 2)
     last = tmp_path / "whole" / "checkpoints" / "last"
     loaded = ACTPolicy.from_pretrained(last / "pretrained_model")
-    changed = algorithm.given.predict_action_chunk(OBSERVATION)
+    changed = algorithm.lerobot_policy.predict_action_chunk(OBSERVATION)
     assert torch.equal(loaded.predict_action_chunk(OBSERVATION), changed)
     assert not torch.equal(changed, small_act(images=False).predict_action_chunk(OBSERVATION))
     added = load_file(last / "algorithm" / "model.safetensors")

@@ -19,10 +19,10 @@ from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.evaluation.agreement import evaluate_within
 from lerobot_wmrl.rl import gate
+from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.callbacks import Callback, Record
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.configuration_callbacks import DYNA_SEEDS
-from lerobot_wmrl.rl.policy_gradient import TrainingStopped
 from lerobot_wmrl.rl.ppo import PPO
 from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer

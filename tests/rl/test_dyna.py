@@ -13,10 +13,10 @@ from safetensors.torch import load_file
 from lerobot_wmrl.data.episodes import DatasetSource
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
+from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.callbacks import Callbacks
 from lerobot_wmrl.rl.configuration_callbacks import DynaConfig, NewRollouts
 from lerobot_wmrl.rl.dyna import DynaRounds, round_iterations
-from lerobot_wmrl.rl.policy_gradient import TrainingStopped
 
 WEIGHTS = "checkpoints/last/pretrained_model/model.safetensors"
 

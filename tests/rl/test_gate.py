@@ -13,10 +13,10 @@ from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.evaluation.gate import success_gate
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
+from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.callbacks import RolloutRecorder, env_flags
 from lerobot_wmrl.rl.configuration_callbacks import GateConfig
 from lerobot_wmrl.rl.gate import SuccessGate
-from lerobot_wmrl.rl.policy_gradient import TrainingStopped
 
 BELIEVES_ALL, BELIEVES_NONE = 0.0001, 0.9999
 """Done thresholds."""

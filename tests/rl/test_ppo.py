@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
+from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.policy_gradient import (
     Minibatch,
     Minibatches,
-    TrainingStopped,
     clipped_objective,
     kl_estimate,
     read_batch,

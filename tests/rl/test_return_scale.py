@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from lerobot_wmrl.rl.ppo import ReturnScale
+from lerobot_wmrl.rl.return_scale import ReturnScale
 
 
 def test_before_the_first_returns_nothing_changes() -> None:

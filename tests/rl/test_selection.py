@@ -7,8 +7,8 @@ import pytest
 
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.evaluation.agreement import Evaluated
+from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.callbacks import Record
-from lerobot_wmrl.rl.policy_gradient import TrainingStopped
 from lerobot_wmrl.rl.selection import Measure, Selection, best_iteration, diverged
 
 N = 64

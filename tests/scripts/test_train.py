@@ -15,7 +15,7 @@ from lerobot.envs.configs import EnvConfig
 from safetensors.torch import load_file
 
 from lerobot_wmrl.common.tracking import read_metrics
-from lerobot_wmrl.rl.configuration_algorithms import GRPOConfig
+from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 from lerobot_wmrl.scripts.train import TrainConfig, check_config, main, rollout_length
 from tests.hub_server import Hub
 from tests.rl.checkpoints import save_untrained_policy

@@ -1,0 +1,70 @@
+"""Storage of a rollout's observations. T time, B environments."""
+
+import torch
+from lerobot.utils.constants import OBS_IMAGES
+from torch import Tensor
+
+from lerobot_wmrl.rl.protocol import Observation
+
+TASK = "task"
+
+
+class ObservationBuffer:
+    """Observations of T × B steps. Images are kept as bytes and instructions as indices.
+
+    The policy acts on what is read back, so it is trained on exactly what it has seen.
+    """
+
+    def __init__(self, steps: int, num_envs: int) -> None:
+        self.steps, self.num_envs = steps, num_envs
+        self.tensors: dict[str, Tensor] = {}  # (T, B, …) by name
+        self.instructions: dict[str, int] = {}
+
+    def write(self, step: int, observation: Observation) -> None:
+        """Keep the observations (B, …) of `step`."""
+        encoded = {
+            name: to_bytes(value) if name.startswith(OBS_IMAGES) else value
+            for name, value in observation.items()
+            if isinstance(value, Tensor)
+        }
+        if texts := observation.get(TASK):
+            indices = [self.instructions.setdefault(text, len(self.instructions)) for text in texts]
+            encoded[TASK] = torch.tensor(indices)  # on the CPU, where the texts are
+        for name, value in encoded.items():
+            if name not in self.tensors:
+                self.tensors[name] = value.new_empty((self.steps, self.num_envs, *value.shape[1:]))
+            self.tensors[name][step] = value
+
+    def read_step(self, step: int) -> Observation:
+        """Return the observations (B, …) of `step`."""
+        return self._decoded({name: value[step] for name, value in self.tensors.items()})
+
+    def read(self, rows: Tensor) -> Observation:
+        """Return the observations of flat rows t · B + b. `rows` (N,) is on the CPU, so that reading the
+        instructions waits for no other device."""
+        moved = {device: rows.to(device) for device in {value.device for value in self.tensors.values()}}
+        return self._decoded(
+            {name: value.flatten(0, 1)[moved[value.device]] for name, value in self.tensors.items()}
+        )
+
+    def _decoded(self, encoded: dict[str, Tensor]) -> Observation:
+        texts = list(self.instructions)
+        return {
+            name: value.float() / 255 if name.startswith(OBS_IMAGES)
+            else [texts[index] for index in value.tolist()] if name == TASK
+            else value
+            for name, value in encoded.items()
+        }  # fmt: skip
+
+
+def to_bytes(image: Tensor) -> Tensor:
+    """Convert an image from [0, 1] to uint8."""
+    return (image * 255).round().byte()
+
+
+def as_read_back(observation: Observation) -> Observation:
+    """Return the observation as an ObservationBuffer would give it back."""
+    return {
+        name: to_bytes(value).float() / 255 if name.startswith(OBS_IMAGES) else value
+        for name, value in observation.items()
+    }
