@@ -58,6 +58,11 @@ class Algorithm(RLAlgorithm):
         require_exact_updates(self.policy_parameters)
         self.optimizer = self.make_optimizers_and_scheduler()[self.name]
 
+    @property
+    def group_size(self) -> int:
+        """Neighbouring environments that start from the same state."""
+        return 1
+
     @abstractmethod
     def parameter_groups(self) -> dict[str, tuple[list[nn.Parameter], float]]:
         """Return parameters and learning rates by name."""

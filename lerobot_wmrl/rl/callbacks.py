@@ -6,8 +6,7 @@ was killed and resumed reads the record instead of running the callback again.
 
 import json
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -15,7 +14,6 @@ from typing import Any, Protocol
 import draccus
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
-from lerobot.utils.random_utils import get_rng_state, set_rng_state
 from lerobot.utils.utils import flatten_dict
 
 from lerobot_wmrl.common.distributed import rank_and_size, wait_for_all
@@ -25,6 +23,7 @@ from lerobot_wmrl.common.presets import Flags, format_flags
 from lerobot_wmrl.common.processes import run_subcommand
 from lerobot_wmrl.common.tracking import Tracker
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.rl.seeds import preserved_randomness
 
 RECORD_FILE = "record.json"
 REAL_STEPS = "real_steps"
@@ -149,16 +148,6 @@ def numbers(name: str, record: Record) -> dict[str, float]:
         for key, value in flatten_dict(record).items()
         if isinstance(value, int | float) and not isinstance(value, bool) and key != REAL_STEPS
     }
-
-
-@contextmanager
-def preserved_randomness() -> Iterator[None]:
-    """Put Python's, numpy's and torch's generators back to their states before the block."""
-    state = get_rng_state()
-    try:
-        yield
-    finally:
-        set_rng_state(state)
 
 
 @dataclass(frozen=True)

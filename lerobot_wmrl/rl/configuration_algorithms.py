@@ -1,13 +1,11 @@
 """Configuration of PPO, `algorithm.type` ppo, and the options that it shares with GRPO."""
 
 from dataclasses import dataclass
-from typing import Any, Final, Self
+from typing import Any, Self
 
 from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 
 from lerobot_wmrl.common.errors import require_at_least, require_choice, require_positive, require_share
-
-RATIOS: Final = ("action", "token")
 
 
 @dataclass
@@ -41,7 +39,7 @@ class PolicyGradientConfig(RLAlgorithmConfig):
 
     def __post_init__(self) -> None:
         require_positive(self, "epochs", "minibatch_size", "policy_lr", "target_kl")
-        require_choice(self, "ratio", RATIOS)
+        require_choice(self, "ratio", ("action", "token"))
         if self.micro_batch_size is not None:
             require_at_least(self, 1, "micro_batch_size")
 

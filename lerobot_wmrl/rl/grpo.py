@@ -26,8 +26,9 @@ def group_advantages(returns: Tensor, least_std: float) -> tuple[Tensor, Tensor]
 
 
 class GRPO(PolicyGradient):
-    """Every decision has its episode's advantage: the return compared with the group's episodes, which start
-    from the same state. Only the first episode of each environment counts; later ones start elsewhere."""
+    """Clipped objective on advantages within groups. Every decision of an episode has the same advantage: the
+    episode's return compared with those of its group, which started from the same state. Only the first
+    episode of each environment counts, because later ones start elsewhere."""
 
     config_class = GRPOConfig
     name = "grpo"
@@ -44,7 +45,7 @@ class GRPO(PolicyGradient):
 
     @torch.no_grad()
     def add_targets(self, rollout: RolloutBuffer) -> tuple[Tensor, dict[str, float]]:
-        """Add advantages within groups. Decisions of groups with a signal are trained on."""
+        """Add advantages within groups. Only decisions of groups with a signal are trained on."""
         returns = (rollout.reward * rollout.first_episode).sum(dim=0)  # (B,)
         advantages, signal = group_advantages(
             returns.view(-1, self.config.group_size), self.config.least_group_std

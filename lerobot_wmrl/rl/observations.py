@@ -10,9 +10,10 @@ TASK = "task"
 
 
 class ObservationBuffer:
-    """Observations of T × B steps. Images are kept as bytes and instructions as indices.
+    """Observations of T × B steps. Images are stored as bytes and instructions as indices.
 
-    The policy acts on what is read back, so it is trained on exactly what it has seen.
+    During the rollout the policy also acts on observations read from here, so that updates see exactly what
+    it has seen, rounding to bytes included.
     """
 
     def __init__(self, steps: int, num_envs: int) -> None:
@@ -21,7 +22,7 @@ class ObservationBuffer:
         self.instructions: dict[str, int] = {}
 
     def write(self, step: int, observation: Observation) -> None:
-        """Keep the observations (B, …) of `step`."""
+        """Store the observations (B, …) of `step`."""
         encoded = {
             name: to_bytes(value) if name.startswith(OBS_IMAGES) else value
             for name, value in observation.items()
@@ -40,11 +41,11 @@ class ObservationBuffer:
         return self._decoded({name: value[step] for name, value in self.tensors.items()})
 
     def read(self, rows: Tensor) -> Observation:
-        """Return the observations of flat rows t · B + b. `rows` (N,) is on the CPU, so that reading the
-        instructions waits for no other device."""
-        moved = {device: rows.to(device) for device in {value.device for value in self.tensors.values()}}
+        """Return the observations of flat rows t · B + b. `rows` (N,) is on the CPU, as the instructions are:
+        no device has to be waited for."""
+        rows_on = {device: rows.to(device) for device in {value.device for value in self.tensors.values()}}
         return self._decoded(
-            {name: value.flatten(0, 1)[moved[value.device]] for name, value in self.tensors.items()}
+            {name: value.flatten(0, 1)[rows_on[value.device]] for name, value in self.tensors.items()}
         )
 
     def _decoded(self, encoded: dict[str, Tensor]) -> Observation:
@@ -63,7 +64,7 @@ def to_bytes(image: Tensor) -> Tensor:
 
 
 def as_read_back(observation: Observation) -> Observation:
-    """Return the observation as an ObservationBuffer would give it back."""
+    """Return the observation with images rounded to bytes, as an ObservationBuffer would return it."""
     return {
         name: to_bytes(value).float() / 255 if name.startswith(OBS_IMAGES) else value
         for name, value in observation.items()

@@ -67,26 +67,26 @@ def reference_penalty(log_prob: Tensor, reference: Tensor) -> Tensor:
 
 
 def read_batch(rollout: RolloutBuffer, rows: Tensor, pipeline: Pipeline) -> Batch:
-    """Return the steps of flat rows t · B + b (N,), which are on the CPU."""
-    moved = rows.to(rollout.device)
+    """Return the decisions of flat rows t · B + b (N,), which are on the CPU."""
+    on_device = rows.to(rollout.device)
     stored = {"raw_action": rollout.raw_action, "log_prob": rollout.log_prob, **rollout.columns}
-    taken = {name: values.flatten(0, 1)[moved] for name, values in stored.items()}
+    taken = {name: values.flatten(0, 1)[on_device] for name, values in stored.items()}
     return {"observation": pipeline.prepare(rollout.observations.read(rows)), **taken}
 
 
 class Minibatch(NamedTuple):
-    """One optimiser step's decisions: their mean number over the processes, and the passes through the policy
-    that they are cut into, each with the number of decisions that count."""
+    """Decisions of one optimiser step: their number, averaged over the processes, and the micro-batches that
+    they are cut into, each with the number of its decisions that count (`Minibatches._read`)."""
 
     size: float
-    passes: Iterator[tuple[int, Batch]]
+    micro_batches: Iterator[tuple[int, Batch]]
 
 
 class Minibatches:
-    """Every chosen step of a rollout once an epoch, in random order.
+    """Every chosen decision of a rollout once an epoch, in random order.
 
-    All processes get equally many minibatches and passes, also where they have chosen different numbers of
-    steps, so that gradients can be averaged and large models be sharded.
+    All processes get the same number of minibatches and micro-batches, even if they have chosen different
+    numbers of decisions, because they average gradients and may share a large model.
     """
 
     def __init__(
@@ -105,28 +105,24 @@ class Minibatches:
             order = self.rows[torch.randperm(len(self.rows))]
             for first in range(0, max(self.counts), size):
                 shares = [min(max(count - first, 0), size) for count in self.counts]
-                passes = math.ceil(max(shares) / (self.config.micro_batch_size or size))
-                cut = order[first : first + size].tensor_split(passes)
+                micro_batches = math.ceil(max(shares) / (self.config.micro_batch_size or size))
+                cut = order[first : first + size].tensor_split(micro_batches)
                 yield Minibatch(sum(shares) / len(shares), (self._read(rows) for rows in cut))
 
     def _read(self, rows: Tensor) -> tuple[int, Batch]:
-        """Return the rows' number and batch; for none a row that does not count, to pass the policy too."""
+        """Return the number of rows and their batch. A process without rows left still runs the policy, on
+        one row that does not count."""
         return len(rows), read_batch(self.rollout, rows if len(rows) else rows.new_zeros(1), self.pipeline)
 
 
 class PolicyGradient(Algorithm):
-    """Ascent on a clipped objective, with a KL penalty towards the SFT policy (the reference).
+    """Ascent on a clipped objective, with a KL penalty towards the SFT policy, the frozen `reference`.
 
-    `policy` samples: the policy that was given, or that policy in its adapter. `iteration` counts the
-    rollouts that were trained on. A training iteration is `prepare`, then `update`.
+    A training iteration is `rollout.collect`, `prepare`, then `update`. Subclasses say what the advantages
+    are (`add_targets`) and what else is in the loss (`losses`).
     """
 
     config: PolicyGradientConfig
-
-    @property
-    def group_size(self) -> int:
-        """Neighbouring environments that start from the same state."""
-        return 1
 
     def trained_groups(self) -> list[str]:
         """Return the names of the parameter groups that this iteration trains."""
@@ -134,11 +130,12 @@ class PolicyGradient(Algorithm):
 
     @abstractmethod
     def add_targets(self, rollout: RolloutBuffer) -> tuple[Tensor, dict[str, float]]:
-        """Fill the columns that `losses` needs; return the decisions to train on (T, B) bool, and metrics."""
+        """Add the advantages, and other columns that `losses` needs, to the rollout. Return the decisions to
+        train on, (T, B) bool, and metrics."""
 
     @abstractmethod
     def losses(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return each decision's loss (B,), and what is logged of it, (B,) by name."""
+        """Return the loss of each decision (B,), and its metrics, (B,) by name."""
 
     def prepare(self, rollout: RolloutBuffer, pipeline: Pipeline) -> tuple[Minibatches, dict[str, float]]:
         """Compute advantages and the reference's log-probabilities; return minibatches for `update`, and
@@ -149,9 +146,9 @@ class PolicyGradient(Algorithm):
 
     @torch.no_grad()
     def add_reference(self, rollout: RolloutBuffer, pipeline: Pipeline) -> float:
-        """Add the reference's log-probabilities of what was done, and which steps of chunks were executed.
+        """Add the reference's log-probabilities of the actions, and which actions of chunks were executed.
         Return the mean KL of the policy to the reference."""
-        reference = torch.zeros_like(rollout.log_prob)
+        reference = torch.zeros_like(rollout.log_prob)  # (T, B, K) or (T, B, n, K)
         executed = rollout.executed()
         if executed is not None:
             rollout.columns[EXECUTED] = executed
@@ -162,11 +159,13 @@ class PolicyGradient(Algorithm):
             reference.flatten(0, 1)[rows.to(reference.device)] = log_prob
         rollout.columns[REFERENCE] = reference
         counted = 1.0 if executed is None else executed
-        flat = [(each * counted).flatten(0, 1).flatten(1) for each in (rollout.log_prob, reference)]
+        flat = [
+            (each * counted).flatten(0, 1).flatten(1) for each in (rollout.log_prob, reference)
+        ]  # (T · B, K)
         return mean_and_variance(kl_estimate(*flat)[rollout.decided.flatten()])[0].item()
 
     def update(self, batch_iterator: Iterator[Minibatch]) -> TrainingStats:
-        """Take one optimiser step on each minibatch, until the policy has moved by `target_kl`."""
+        """Take one optimiser step on each minibatch, until the KL to the rollout's policy is `target_kl`."""
         records: list[dict[str, float]] = []
         first = self.optimization_step
         for minibatch in batch_iterator:
@@ -181,26 +180,26 @@ class PolicyGradient(Algorithm):
         return training_stats(records, self.optimization_step - first)
 
     def accumulate_gradient(self, minibatch: Minibatch) -> dict[str, float]:
-        """Add up the gradient of a minibatch's mean loss, pass by pass, and return its metrics."""
+        """Accumulate the gradient of a minibatch's mean loss over micro-batches, and return its metrics."""
         self.optimizer.zero_grad()
         parts: list[dict[str, Tensor]] = []
-        for count, batch in minibatch.passes:
+        for count, batch in minibatch.micro_batches:
             loss, record = self.losses(batch)  # (B,), (B,) by name
             loss[:count].sum().div(minibatch.size).backward()
             parts.append({name: value.detach()[:count] for name, value in record.items()})
         joined = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-        furthest = F.pad(joined.pop(RATIO_ERROR), (0, 1)).max()  # 0 where no decision counts
+        largest_error = F.pad(joined.pop(RATIO_ERROR), (0, 1)).max()  # 0 where no decision counts
         means = torch.stack([value.sum() for value in joined.values()]).div(minibatch.size)
         metrics = mean_over_processes(dict(zip(joined, means.tolist(), strict=True)), means.device)
-        return {**metrics, RATIO_ERROR: largest_over_processes(furthest).item()}
+        return {**metrics, RATIO_ERROR: largest_over_processes(largest_error).item()}
 
     def policy_losses(
         self, batch: Batch, low: float, high: float
     ) -> tuple[Tensor, dict[str, Tensor], Tensor]:
-        """Return the loss of each decision, clipped at 1 − low and 1 + high, what is logged of it, and the
-        value. All (B,)"""
+        """Return the policy's loss of each decision, its ratio clipped at 1 − low and 1 + high; metrics by
+        name; and the value. All (B,)"""
         log_prob, entropy, value = self.policy.evaluate(batch["observation"], batch["raw_action"])
-        executed = batch.get(EXECUTED, 1.0)  # (B, n, 1): the other steps of a chunk count nothing
+        executed = batch.get(EXECUTED, 1.0)  # (B, n, 1): actions that were not executed count for nothing
         now, old, reference = (
             (each * executed).flatten(1) for each in (log_prob, batch["log_prob"], batch[REFERENCE])
         )  # (B, K), or (B, n · K)
@@ -224,12 +223,12 @@ class PolicyGradient(Algorithm):
         """
         trained, clipped = self.trained_groups(), {}
         for name, (parameters, _) in self.parameter_groups().items():
-            if name not in trained:
+            if name in trained:
+                average_gradients(parameters)
+                clipped[name + NORM] = nn.utils.clip_grad_norm_(parameters, GRAD_CLIP_NORM)
+            else:  # AdamW leaves parameters without a gradient alone
                 for parameter in parameters:
                     parameter.grad = None
-                continue
-            average_gradients(parameters)
-            clipped[name + NORM] = nn.utils.clip_grad_norm_(parameters, GRAD_CLIP_NORM)
         norms = {name: norm.item() for name, norm in clipped.items()}
         self.check_finite(norms)
         self.optimizer.step()

@@ -22,23 +22,23 @@ def generalised_advantages(
     Args:
         reward, value: r_t and V(o_t). All tensors are (T, B).
         next_value: V(o_{t+1}), at an episode's last step that of its final observation.
-        terminated: the future is worth 0.
-        truncated: the episode was cut, so V(o_{t+1}) counts. Neither lets the next episode's A_{t+1} through.
+        terminated: the episode ended, so V(o_{t+1}) counts as 0.
+        truncated: the episode was cut, but V(o_{t+1}) counts. After both, A_{t+1} is another episode's.
         gamma, gae_lambda: γ and λ.
-        decided: where the policy made a decision; elsewhere an action chunk of an earlier step is executed.
-            A chunk of n steps has δ = Σ_{i<n} γ^i r_{t+i} + γ^n V(o_{t+n}) − V(o_t). Its advantage is A_t of
-            the step of the decision; the other rows have no meaning.
+        decided: where the policy made a decision; elsewhere it executes an earlier step's action chunk. A
+            chunk of n steps has δ = Σ_{i<n} γ^i r_{t+i} + γ^n V(o_{t+n}) − V(o_t). Its advantage is in the
+            row of the decision; the other rows have no meaning.
     """
-    alive = (~terminated).to(value.dtype)
-    connected = (~(terminated | truncated)).to(value.dtype)
+    alive = (~terminated).to(value.dtype)  # (T, B)
+    same_episode = (~(terminated | truncated)).to(value.dtype)  # (T, B)
     advantages = torch.empty_like(value)
     running = torch.zeros_like(value[0])  # (B,)
     for step in reversed(range(len(value))):
-        onward = next_value[step] * alive[step] + gae_lambda * connected[step] * running
+        future = next_value[step] * alive[step] + gae_lambda * same_episode[step] * running
         if decided is not None and step + 1 < len(value):
             continued = ~(decided[step + 1] | terminated[step] | truncated[step])
-            onward = torch.where(continued, advantages[step + 1] + value[step + 1], onward)
-        running = reward[step] + gamma * onward - value[step]
+            future = torch.where(continued, advantages[step + 1] + value[step + 1], future)
+        running = reward[step] + gamma * future - value[step]
         advantages[step] = running
     return advantages
 
@@ -55,8 +55,9 @@ def value_loss(value: Tensor, target: Tensor) -> Tensor:
 
 
 class PPO(PolicyGradient):
-    """Advantages from a value function, which is trained beside the policy, alone in the first
-    `value_iterations`. With `value_normalisation` the policy's value is in units of `return_scale`."""
+    """Clipped objective on generalised advantages. The value function is trained beside the policy, and alone
+    in the first `value_iterations`. With `value_normalisation` it predicts returns scaled by `return_scale`.
+    """
 
     config_class = PPOConfig
     name = "ppo"
@@ -84,24 +85,25 @@ class PPO(PolicyGradient):
 
     @torch.no_grad()
     def add_targets(self, rollout: RolloutBuffer) -> tuple[Tensor, dict[str, float]]:
-        """Add advantages and the value's targets. All decisions are trained on."""
+        """Add normalised advantages and the value's targets. All decisions are trained on."""
         config, decided, scale = self.config, rollout.decided, self.return_scale
         value, next_value = scale.restore(rollout.value), scale.restore(rollout.next_value)  # (T, B)
         advantages = generalised_advantages(
             rollout.reward, value, next_value, rollout.terminated, rollout.truncated,
             config.gamma, config.gae_lambda, decided,
         )  # fmt: skip
-        target = advantages + value
+        target = advantages + value  # (T, B), the λ-returns
         if config.value_normalisation:
             scale.update(target[decided])
         rollout.columns = {
             "advantage": normalised(advantages, decided),
             "target": scale.normalise(target),
         }
-        missed, spread = mean_and_variance(advantages[decided])[1], mean_and_variance(target[decided])[1]
+        unexplained = mean_and_variance(advantages[decided])[1]
+        total = mean_and_variance(target[decided])[1]
         return decided, {
             "value": mean_and_variance(value[decided])[0].item(),
-            "explained_variance": 1 - (missed / spread.clamp_min(1e-12)).item(),
+            "explained_variance": 1 - (unexplained / total.clamp_min(1e-12)).item(),
         }
 
     def losses(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
@@ -111,6 +113,6 @@ class PPO(PolicyGradient):
         return (record["value_loss"] if self.value_only else loss + record["value_loss"]), record
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return the scale of the returns too."""
+        """Return the base's tensors and the running moments of the returns."""
         scale = {f"returns.{name}": value for name, value in self.return_scale.tensors.items()}
         return {**super().state_dict(), **scale}

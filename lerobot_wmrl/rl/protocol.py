@@ -1,8 +1,8 @@
-"""Interfaces between a policy and reinforcement learning. B environments, K action components.
+"""Interface between a policy and reinforcement learning. B environments, K action components.
 
 A policy may decide on n steps at once (an action chunk). Its raw actions and log-probabilities are then
-(B, n, K) instead of (B, K). The n actions are executed one after the other, and the policy is asked again
-after n steps or when a new episode begins.
+(B, n, K) instead of (B, K). The n actions are executed one after the other. The policy decides again after n
+steps or when a new episode begins.
 """
 
 from collections.abc import Callable, Iterable

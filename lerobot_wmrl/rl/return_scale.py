@@ -6,7 +6,7 @@ from torch import Tensor
 from lerobot_wmrl.common.distributed import mean_and_variance
 
 SCALE_DECAY = 0.9
-"""Share of an iteration's return moments that the next one keeps: returns grow as policies improve."""
+"""Weight of earlier iterations in the running moments. Low, because returns grow as the policy improves."""
 
 LEAST_STD = 1e-4
 
@@ -22,10 +22,10 @@ class ReturnScale:
         self.tensors = {name: torch.zeros((), dtype=torch.float64, device=device) for name in names}
 
     def update(self, returns: Tensor) -> None:
-        """Take in the returns (N,) of one iteration, of all processes."""
+        """Update the moments with the returns (N,) of one iteration, of all processes."""
         mean, variance = mean_and_variance(returns.double())
-        seen = {"mean": mean, "square": variance + mean.square(), "weight": torch.ones_like(mean)}
-        for name, value in seen.items():
+        moments = {"mean": mean, "square": variance + mean.square(), "weight": torch.ones_like(mean)}
+        for name, value in moments.items():
             self.tensors[name].lerp_(value, 1 - SCALE_DECAY)
 
     def _mean_and_std(self) -> tuple[Tensor, Tensor]:

@@ -3,29 +3,22 @@
 T time, B environments, K action components, n steps of one decision (an action chunk).
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 import gymnasium as gym
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.distributed import mean_over_processes, rank_and_size
 from lerobot_wmrl.rl.observations import ObservationBuffer, as_read_back
 from lerobot_wmrl.rl.protocol import ActionSample, Observation, Pipeline, StochasticPolicy
-
-NOISE_SEED = 2**31
-"""Added to a rollout's seed, so that the policy's noise differs from the numbers the environment draws."""
+from lerobot_wmrl.rl.seeds import seeded_noise, start_seeds
 
 
 class RolloutBuffer:
     """The steps of one rollout, preallocated.
 
-    All fields are (T, B); `raw_action` and `log_prob` are (T, B, K), or (T, B, n, K) for a policy that
-    decides on n steps at once. Then they are written at the step of the decision, the only one of the n
-    steps that is trained on.
+    All fields are (T, B); `raw_action` and `log_prob` are (T, B, K), or (T, B, n, K) for action chunks. A
+    chunk is stored in the row of its first step. Only such rows, where the policy decided, are trained on.
     """
 
     def __init__(self, steps: int, num_envs: int, device: torch.device | str) -> None:
@@ -38,13 +31,13 @@ class RolloutBuffer:
         self.final_value = torch.full((steps, num_envs), torch.nan, device=device)
         self.terminated, self.truncated = empty(torch.bool), empty(torch.bool)
         self.success, self.age = empty(torch.bool), empty(torch.long)
-        """`age`: steps since the decision that is executed; 0 where a decision was made."""
+        """`age`: steps since the policy decided on the action; 0 where it decides."""
         self.raw_action = self.log_prob = torch.empty(0)
         self.columns: dict[str, Tensor] = {}
-        """What an algorithm adds for its loss, such as advantages: (T, B, …) by name."""
+        """Inputs of the loss that an algorithm adds, such as advantages: (T, B, …) by name."""
 
     def write_decision(self, step: int, rows: Tensor, sample: ActionSample) -> None:
-        """Keep what was drawn at `step` in the environments `rows`."""
+        """Store the decisions that were sampled at `step` for the environments `rows` (N,)."""
         if not self.raw_action.numel():
             if sample.log_prob.dtype != torch.float32:
                 raise ValueError(
@@ -59,14 +52,14 @@ class RolloutBuffer:
         self.value[step, rows] = sample.value
 
     def write(self, step: int, age: Tensor, reward: Tensor, terminated: Tensor, truncated: Tensor) -> None:
-        """Keep the outcome of `step`, which executed decisions of `age` steps before. All (B,)"""
+        """Store the outcome of `step`, whose actions were decided `age` steps before. All (B,)"""
         self.value[step].masked_fill_(age > 0, 0.0)
         self.age[step], self.reward[step] = age, reward
         self.success[step], self.final_value[step] = False, torch.nan
         self.terminated[step], self.truncated[step] = terminated, truncated
 
     def write_end(self, step: int, success: Tensor, final_value: Tensor) -> None:
-        """Keep whether ended episodes succeeded, and the values of their final observations. (B,), (B,)"""
+        """Store success and value of the final observation where an episode ended at `step`. (B,), (B,)"""
         self.success[step] = success & self.finished[step]
         self.final_value[step] = final_value
 
@@ -96,12 +89,12 @@ class RolloutBuffer:
 
     @property
     def first_episode(self) -> Tensor:
-        """Steps of each environment's first episode, which started from its seed. (T, B) bool"""
+        """Steps of each environment's first episode, the one that its seed determines. (T, B) bool"""
         ended = self.finished.long()
         return ended.cumsum(0) == ended
 
     def executed(self) -> Tensor | None:
-        """Return which of a decision's n steps were executed. (T, B, n, 1) bool; None for n = 1"""
+        """Return which actions of each chunk were executed. (T, B, n, 1) bool; None without chunks"""
         if self.raw_action.ndim < 4:
             return None
         length = torch.ones_like(self.age)  # (T, B)
@@ -110,8 +103,8 @@ class RolloutBuffer:
         return torch.arange(self.raw_action.shape[2], device=self.device)[:, None] < length[..., None, None]
 
     def statistics(self) -> dict[str, float]:
-        """Return success and length of first episodes, and the mean reward. Later episodes would bias them:
-        only the short ones of them end within the rollout."""
+        """Return success rate and length of first episodes, and the mean reward of all steps. Later episodes
+        would bias the two: only short ones end within the rollout."""
         first = self.finished & self.first_episode
         steps = torch.arange(1, self.steps + 1, device=self.device)[:, None]
         episodes = first.sum().clamp_min(1)
@@ -123,63 +116,46 @@ class RolloutBuffer:
 
 
 class Actor:
-    """Asks the policy for a decision where one is due, and otherwise executes the last one.
+    """Executes action chunks: asks the policy where a decision is due, elsewhere takes a chunk's next action.
 
-    The ages of decisions are counted on the host too, so that the device is read only when an episode ends.
+    A copy of `age` on the host says where a decision is due, so that the device is read only when an episode
+    ends. Without chunks n = 1.
     """
 
     def __init__(self, policy: StochasticPolicy, pipeline: Pipeline, buffer: RolloutBuffer) -> None:
         self.policy, self.pipeline, self.buffer = policy, pipeline, buffer
         self.all_rows = torch.arange(buffer.num_envs, device=buffer.device)
         self.age = torch.zeros_like(self.all_rows)
-        self.known_age = [0] * buffer.num_envs
-        self.plan = torch.empty(0, 1, 0)
-        """The decisions that are executed, (B, n, K)."""
+        self.host_age = [0] * buffer.num_envs
+        self.chunk = torch.empty(0, 1, 0)
+        """The action chunks that are executed, (B, n, K)."""
 
     def act(self, step: int) -> Tensor:
         """Return the raw action of every environment at `step`. (B, K)"""
-        due, count = [row for row, age in enumerate(self.known_age) if not age], self.buffer.num_envs
+        due, count = [row for row, age in enumerate(self.host_age) if not age], self.buffer.num_envs
         if len(due) == count:
             self._decide(step, self.all_rows, self.buffer.observations.read_step(step))
         elif due:
             rows = torch.tensor(due)
             observed = self.buffer.observations.read(step * count + rows)
             self._decide(step, rows.to(self.all_rows.device), observed)
-        return self.plan[self.all_rows, self.age]
+        return self.chunk[self.all_rows, self.age]
 
     def advance(self, finished: Tensor, any_finished: bool) -> None:
         """Count one step. A decision is due after n steps and where an episode has ended. (B,)"""
-        length = self.plan.shape[1]
+        length = self.chunk.shape[1]
         self.age = torch.where(finished, 0, (self.age + 1) % length)
         if length > 1:
-            following = [(age + 1) % length for age in self.known_age]
-            self.known_age = self.age.tolist() if any_finished else following
+            following = [(age + 1) % length for age in self.host_age]
+            self.host_age = self.age.tolist() if any_finished else following
 
     def _decide(self, step: int, rows: Tensor, observed: Observation) -> None:
         sample = self.policy.sample(self.pipeline.prepare(observed))
         self.buffer.write_decision(step, rows, sample)
         raw = sample.raw_action if sample.raw_action.ndim == 3 else sample.raw_action[:, None]  # (B, n, K)
-        if not self.plan.numel():
-            self.plan = raw.new_zeros((self.buffer.num_envs, *raw.shape[1:]))
-        self.plan[rows] = raw
-
-
-@contextmanager
-def seeded_noise(seed: int, device: torch.device | str) -> Iterator[None]:
-    """Seed the generators for the policy's noise, and put them back afterwards."""
-    on_cuda = torch.device(device).type == "cuda"
-    with torch.random.fork_rng([torch.cuda.current_device()] if on_cuda else []):
-        torch.manual_seed(seed + NOISE_SEED)
-        yield
-
-
-def start_seeds(first: int, num_envs: int, group_size: int) -> int | list[int]:
-    """Return the seeds to reset with: `first` for consecutive ones, or a drawn one for each group."""
-    if group_size == 1:
-        return first
-    generator = torch.Generator().manual_seed(first)
-    drawn = torch.randint(EVALUATION_SEED, (num_envs // group_size,), generator=generator)
-    return drawn.repeat_interleave(group_size).tolist()
+        if not self.chunk.numel():
+            self.chunk = raw.new_zeros((self.buffer.num_envs, *raw.shape[1:]))
+        self.chunk[rows] = raw
 
 
 @torch.no_grad()
@@ -187,14 +163,14 @@ def collect(
     env: gym.vector.VectorEnv, policy: StochasticPolicy, pipeline: Pipeline, buffer: RolloutBuffer, seed: int,
     group_size: int = 1,
 ) -> dict[str, float]:  # fmt: skip
-    """Fill `buffer` with T steps of fresh episodes, and return metrics, means over all processes.
+    """Fill `buffer` with T steps of new episodes, and return metrics, averaged over all processes.
 
     Args:
         env: B environments with `final_obs` in `info` (autoreset in the same step).
         policy: draws the actions.
         pipeline: the policy's processors.
-        buffer: is overwritten.
-        seed: first of this process's B seeds, of episodes and of noise.
+        buffer: receives the rollout; what it holds is overwritten.
+        seed: first of this process's B environment seeds, and seed of the policy's noise.
         group_size: neighbouring environments that start from the same state.
     """
     observation, _ = env.reset(seed=start_seeds(seed, buffer.num_envs, group_size))
@@ -213,7 +189,7 @@ def collect(
             if "final_obs" in info:
                 final = pipeline.prepare(as_read_back(info["final_obs"]))
                 buffer.write_end(step, info["final_info"]["is_success"], policy.value(final))
-        last = policy.value(pipeline.prepare(as_read_back(observation)))
-    buffer.fill_next_value(last)
+        last_value = policy.value(pipeline.prepare(as_read_back(observation)))
+    buffer.fill_next_value(last_value)
     parts = {name: torch.stack(values).mean().item() for name, values in logged.items()}
     return mean_over_processes({**buffer.statistics(), **parts}, buffer.device)

@@ -12,7 +12,6 @@ from lerobot.utils.logging_utils import MetricsTracker
 from tqdm import tqdm
 
 from lerobot_wmrl.common.checkpoints import latest_checkpoint, read_weights, write_checkpoint
-from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.distributed import rank_and_size, wait_for_all
 from lerobot_wmrl.common.lerobot_compat import (
     checkpoint_dir,
@@ -30,6 +29,7 @@ from lerobot_wmrl.rl.policy_gradient import PolicyGradient
 from lerobot_wmrl.rl.ppo import PPO
 from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
+from lerobot_wmrl.rl.seeds import first_seed
 
 SHOWN = (
     "success_rate", "reward", "policy_loss", "value_loss", "explained_variance", "kl", "reference_kl",
@@ -131,11 +131,6 @@ def iterate(
         "update_s": time.perf_counter() - rollout_end,
         "env_steps": algorithm.iteration * rollout.steps * num_envs,
     }
-
-
-def first_seed(seed: int, iteration: int, num_envs: int) -> int:
-    """Return the first of an iteration's `num_envs` environment seeds, all of them below EVALUATION_SEED."""
-    return (seed + iteration * num_envs) % (EVALUATION_SEED - num_envs)
 
 
 def make_tracker(

@@ -26,8 +26,9 @@ from lerobot_wmrl.rl.configuration_callbacks import DYNA_SEEDS
 from lerobot_wmrl.rl.ppo import PPO
 from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer
+from lerobot_wmrl.rl.seeds import first_seed
 from lerobot_wmrl.rl.selection import Selection
-from lerobot_wmrl.rl.trainer import Schedule, first_seed, train
+from lerobot_wmrl.rl.trainer import Schedule, train
 from tests.rl.conftest import ACTION_SCALE
 from tests.rl.point_env import PointEnv
 

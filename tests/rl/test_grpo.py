@@ -12,7 +12,8 @@ from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 from lerobot_wmrl.rl.grpo import GRPO
 from lerobot_wmrl.rl.protocol import Pipeline
-from lerobot_wmrl.rl.rollout import RolloutBuffer, collect, start_seeds
+from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
+from lerobot_wmrl.rl.seeds import start_seeds
 from tests.rl.learning import assert_it_learns, update
 from tests.rl.point_env import PointEnv
 

@@ -14,7 +14,8 @@ from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.ppo import PPO
 from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer
-from lerobot_wmrl.rl.trainer import Schedule, first_seed, train
+from lerobot_wmrl.rl.seeds import first_seed
+from lerobot_wmrl.rl.trainer import Schedule, train
 from tests.rl.point_env import PointEnv
 
 MakePolicy = Callable[..., CnnPolicy]
