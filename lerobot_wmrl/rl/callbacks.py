@@ -1,4 +1,4 @@
-"""Callbacks between iterations, such as measuring success. They leave the training's random numbers alone.
+"""Callbacks between iterations, such as measuring success. They do not change the training's random numbers.
 
 A callback returns a record, which is kept in `<output_dir>/<name>/<iteration>/record.json`. A training that
 was killed and resumed reads the record instead of running the callback again.
@@ -30,10 +30,10 @@ REAL_STEPS = "real_steps"
 """Key of a record: control steps that the callback has taken outside the world model."""
 
 Record = dict[str, Any]
-"""JSON. Its numbers are logged as `<name>/<key>`."""
+"""JSON that a callback returns. Its numbers are logged as `<name>/<key>`."""
 
 DERIVED = ("features", "features_map", "cameras")
-"""Settings of an environment that follow from others, or are given apart."""
+"""Settings of an environment that are derived from others, or that the caller passes itself."""
 
 
 class Callback(Protocol):
@@ -49,8 +49,8 @@ class Callback(Protocol):
 
         Args:
             iteration: finished iterations.
-            checkpoint: the policy's, of this iteration.
-            folder: where to leave files. It may hold those of the same call, which was killed.
+            checkpoint: the policy's checkpoint of this iteration.
+            folder: where to write files. If an earlier run of this call was killed, its files are there.
         """
 
     def apply(self, records: Mapping[int, Record]) -> None:
@@ -62,7 +62,7 @@ class Callback(Protocol):
 
 
 class Callbacks:
-    """Runs callbacks in order and keeps their records. Of several processes the first one runs them, and all
+    """Runs callbacks in order and keeps their records. With several processes the first one runs them, and all
     read the records."""
 
     def __init__(self, callbacks: Sequence[Callback], output_dir: Path, total: int, tracker: Tracker) -> None:
@@ -88,7 +88,7 @@ class Callbacks:
                 self.records[name][int(folder.name)] = json.loads((folder / RECORD_FILE).read_text())
 
     def _apply(self, callback: Callback) -> None:
-        """Apply without drawing from the training's generators: loading a model draws random weights."""
+        """Apply, and restore the training's generators: loading a model draws random initial weights."""
         with preserved_randomness():
             callback.apply(self.records[callback.name])
 
@@ -97,7 +97,7 @@ class Callbacks:
         return any(self._pending(callback, iteration) for callback in self.callbacks)
 
     def run(self, iteration: int, checkpoint: Path) -> None:
-        """Run the callbacks that are due, and put the training's generators back afterwards."""
+        """Run the callbacks that are due, and restore the training's generators afterwards."""
         for callback in self.callbacks:
             if self._pending(callback, iteration):
                 folder = record_folder(self.output_dir, callback.name, iteration, self.total)
@@ -119,14 +119,14 @@ class Callbacks:
 
     def _log(self, name: str, iteration: int) -> None:
         record = self.records[name][iteration]
-        self.tracker.log(iteration, {**numbers(name, record), **self.real_steps()}, "eval")
+        self.tracker.log(iteration, {**record_metrics(name, record), **self.real_steps()}, "eval")
 
     def _pending(self, callback: Callback, iteration: int) -> bool:
         return callback.due(iteration) and iteration not in self.records[callback.name]
 
 
 def record_folder(output_dir: Path, name: str, iteration: int, total: int) -> Path:
-    """Return the folder of a callback's record, which is called like the iteration's checkpoint."""
+    """Return the folder of a callback's record. Its name is that of the iteration's checkpoint."""
     return output_dir / name / checkpoint_name(iteration, total)
 
 
@@ -141,8 +141,9 @@ def read_record(output_dir: Path, name: str, iteration: int, total: int) -> Reco
     return record
 
 
-def numbers(name: str, record: Record) -> dict[str, float]:
-    """Return what can be plotted, `<name>/<key>` with slashes for nesting; steps are logged as totals."""
+def record_metrics(name: str, record: Record) -> dict[str, float]:
+    """Return the numbers of a record as `<name>/<key>`, with slashes for nesting. `real_steps` is left out,
+    because it is logged as a total."""
     return {
         f"{name}/{key}": value
         for key, value in flatten_dict(record).items()
@@ -157,7 +158,7 @@ class RolloutRecorder:
     Args:
         env: the environment.
         num_workers: simulators at once.
-        cameras: what is recorded.
+        cameras: names of the recorded cameras.
         depth: whether depth is recorded too.
     """
 

@@ -15,7 +15,7 @@ class GRPOConfig(PolicyGradientConfig):
     other, so no value function is needed. Asymmetric clip and group filter as in DAPO (Yu et al. 2025).
 
     Args:
-        group_size: environments that start from the same state; divides --num_envs.
+        group_size: environments that start from the same state; must divide `num_envs`.
         clip_low: how far the ratio may move below 1.
         clip_high: how far the ratio may move above 1.
         least_group_std: smallest standard deviation of a group's returns at which the group is trained on.

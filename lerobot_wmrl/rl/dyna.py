@@ -1,8 +1,8 @@
 """Dyna rounds (Sutton 1991): train the world model further on what the policy does by then.
 
-A round records the policy in ManiSkill, with and without noise, or takes a dataset recorded elsewhere, and
-trains the world model on that and on its first dataset. Both are commands of the package, so that a round
-that was killed continues where it was.
+A round records the policy in ManiSkill, with and without noise, or takes a dataset recorded elsewhere. It
+then trains the world model on that and on its first dataset. Recording and training run as commands of this
+package, so a round that was killed continues where it was.
 """
 
 from collections.abc import Mapping
@@ -23,17 +23,18 @@ from lerobot_wmrl.rl.configuration_callbacks import DYNA_SEEDS, DynaConfig
 from lerobot_wmrl.world_models.checkpoint import load_model
 
 NOISE_LEVELS: Final = {"calm": 0.0, "noisy": 0.4}
-"""Exploration of the recorded policy, by the name of the recording. A world model that has only seen a policy
-with noise calls its failures without noise successes."""
+"""Exploration noise of the recorded policy, by the name of the recording. A world model that was trained on
+noisy episodes alone calls failures of the noise-free policy successes."""
 
 LEARNING_RATE: Final = 3e-4
-"""Peak learning rate of a round, below that of a training from nothing."""
+"""Peak learning rate of a round, below that of a training from scratch."""
 
 WORLD_MODEL = "action_world_model"
 
 
 def round_iterations(rounds: int, iterations: int) -> list[int]:
-    """Return the iterations after which there is a round: evenly spread, none at either end."""
+    """Return the iterations after which there is a round: evenly spread, none before the first or after the
+    last iteration."""
     return [round(iterations * number / (rounds + 1)) for number in range(1, rounds + 1)]
 
 
@@ -44,9 +45,9 @@ class DynaRounds:
     Args:
         config: how much to record and to train.
         env: the world model as the environment of the training.
-        recorder: records the policy; None where `config.dataset.roots` are taken.
+        recorder: records the policy; None if datasets are recorded elsewhere (`config.dataset.roots`).
         learnt: the dataset that the world model was trained on.
-        output_dir: of the training.
+        output_dir: the training's output folder.
         total: iterations of the training.
     """
 
@@ -76,7 +77,7 @@ class DynaRounds:
         }
 
     def apply(self, records: Mapping[int, Record]) -> None:
-        """Imagine with the newest world model from now on."""
+        """Give the environment the world model of the latest round."""
         model = load_model(self._world_model(max(records)), WORLD_MODEL, self.env.device.type)
         self.env.adopt(model)
 
@@ -96,9 +97,9 @@ class DynaRounds:
     def _record(
         self, recorder: RolloutRecorder, noise: str, number: int, checkpoint: Path, folder: Path
     ) -> Path:
-        place, every = list(NOISE_LEVELS).index(noise), self.config.n_episodes
-        first = EVALUATION_SEED - DYNA_SEEDS + number * every + place * (every // 2)
-        recorder.record(checkpoint, (every + place) // 2, first, folder / noise, NOISE_LEVELS[noise])
+        half, n_episodes = list(NOISE_LEVELS).index(noise), self.config.n_episodes  # first or second half
+        seed = EVALUATION_SEED - DYNA_SEEDS + number * n_episodes + half * (n_episodes // 2)
+        recorder.record(checkpoint, (n_episodes + half) // 2, seed, folder / noise, NOISE_LEVELS[noise])
         return folder / noise
 
     def _earlier(self, iteration: int) -> list[str]:
@@ -111,11 +112,11 @@ class DynaRounds:
 
     def _train(self, iteration: int, more: list[str], output_dir: Path) -> None:
         """Train on the datasets in `more` in every second step, and on the first dataset in the others."""
-        number, before = self.iterations.index(iteration), self.env.config.world_model_path
+        number, initial = self.iterations.index(iteration), self.env.config.world_model_path
         if number:
-            before = str(self._world_model(self.iterations[number - 1]))
+            initial = str(self._world_model(self.iterations[number - 1]))
         flags: Flags = {
-            "model.path": before, "model.device": self.env.device.type, "dataset.root": self.learnt.root,
+            "model.path": initial, "model.device": self.env.device.type, "dataset.root": self.learnt.root,
             "dataset.more": str(more), "model.learning_rate": LEARNING_RATE,
             "steps": self.config.steps, "batch_size": self.config.batch_size,
             "save_freq": max(1, self.config.steps // 4), "seed": number, "output_dir": str(output_dir),

@@ -1,4 +1,4 @@
-"""The gate: whether the world model calls too many failures successes for a policy to be trained in it.
+"""The gate: a check that the world model does not call too many failures successes.
 
 It replays recorded episodes open loop (`evaluation.gate`) and judges them at the environment's own done
 threshold and number of frames, before the first update and again while the policy changes.
@@ -27,7 +27,7 @@ SEEDS = 1_000_000
 """Number of seeds from GATE_SEED on."""
 
 LABELLED, FRESH = "labelled", "fresh"
-"""Sources of rollouts: a dataset that was there before, or this policy just now."""
+"""Sources of rollouts: `gate.dataset`, or new ones of the current policy."""
 
 REMEDIES = (
     "A policy trained here learns what only looks like success. Record more near misses and train the world "
@@ -41,10 +41,10 @@ class SuccessGate:
     """Counts the world model's false positives at intervals.
 
     Args:
-        config: when to check, and what follows.
+        config: when to check, the limit, and what to do above it.
         env: the world model as the environment of the training.
         recorder: records fresh rollouts; None without a simulator.
-        refreshed: iterations after which the world model is another one.
+        refreshed: iterations after which a Dyna round replaces the world model.
         total: iterations of the training.
     """
 
@@ -64,20 +64,20 @@ class SuccessGate:
 
     def run(self, iteration: int, checkpoint: Path, folder: Path) -> Record:
         """Return a verdict for each source of rollouts, and a warning if one is bad or there is none."""
-        sources: dict[str, Recording] = {}
+        recordings: dict[str, Recording] = {}
         if self.config.dataset.root and self._new_model(iteration):
-            sources[LABELLED] = labelled_recording(self.env.model, self.config.dataset.root)
+            recordings[LABELLED] = labelled_recording(self.env.model, self.config.dataset.root)
         if self.recorder is not None:
-            sources[FRESH] = self._fresh(self.recorder, iteration, checkpoint, folder / "rollouts")
+            recordings[FRESH] = self._fresh(self.recorder, iteration, checkpoint, folder / "rollouts")
         verdicts = {}
-        for place, source in sources.items():
-            outcomes = predict_outcomes(self.env.model, source)
-            verdicts[place] = gate_at(outcomes, self.env.config.done_threshold, self.env.config.done_frames)
-            save_strips(self.env, source, outcomes, folder, place)
+        for source, recording in recordings.items():
+            outcomes = predict_outcomes(self.env.model, recording)
+            verdicts[source] = gate_at(outcomes, self.env.config.done_threshold, self.env.config.done_frames)
+            save_strips(self.env, recording, outcomes, folder, source)
         shutil.rmtree(folder / "rollouts.cache", ignore_errors=True)
-        steps = int(sources[FRESH].table.length.sum()) if FRESH in sources else 0
+        steps = int(recordings[FRESH].table.length.sum()) if FRESH in recordings else 0
         return {
-            **{place: verdict.as_json() for place, verdict in verdicts.items()},
+            **{source: verdict.as_json() for source, verdict in verdicts.items()},
             "failed": any(self._above(verdict) for verdict in verdicts.values()),
             "warning": self._warning(iteration, verdicts),
             REAL_STEPS: steps,
@@ -106,29 +106,29 @@ class SuccessGate:
 
     def _warning(self, iteration: int, verdicts: Mapping[str, Gate]) -> str | None:
         """Return what is wrong with the verdicts, if anything is."""
-        failed = {place: verdict for place, verdict in verdicts.items() if self._above(verdict)}
+        failed = {source: verdict for source, verdict in verdicts.items() if self._above(verdict)}
         if failed:
-            told = " and ".join(f"{v.false_positives} of {place} rollouts" for place, v in failed.items())
+            counts = " and ".join(f"{v.false_positives} of {source} rollouts" for source, v in failed.items())
             return (
-                f"Gate, iteration {iteration}: the world model calls failures successes, {told}, above "
+                f"Gate, iteration {iteration}: the world model calls failures successes, {counts}, above "
                 f"`gate.limit` ({self.config.limit}). {REMEDIES}"
             )
         if not verdicts:
             return (
-                "Gate: nothing says how many failures this world model calls successes, so what it imagines "
-                "may be wrong; give labelled rollouts (`gate.dataset.root`) or a simulator "
+                "Gate: nobody has checked how many failures this world model calls successes, so success in "
+                "imagination may be wrong; give labelled rollouts (`gate.dataset.root`) or a simulator "
                 "(`real_env.type`, wmrl_maniskill)"
             )
         if not any(verdict.false_positives.n for verdict in verdicts.values()):
-            return f"Gate, iteration {iteration}: no rollout failed, so they say nothing of the world model"
+            return f"Gate, iteration {iteration}: no rollout failed, so false positives were not counted"
         return None
 
 
 def save_strips(
-    env: WorldModelVectorEnv, source: Recording, outcomes: Outcomes, folder: Path, place: str
+    env: WorldModelVectorEnv, recording: Recording, outcomes: Outcomes, folder: Path, source: str
 ) -> None:
-    """Draw two short episodes as recorded, above, and as imagined, below: a success and a failure, which is a
-    false positive if there is one."""
+    """Draw the shortest success and the shortest failure, a false positive if there is one, as frames: the
+    recorded episode above, the imagined one below."""
     folder.mkdir(parents=True, exist_ok=True)
     predicted = outcomes.first_predicted_success(env.config.done_threshold, env.config.done_frames) >= 0
     false_positives = predicted & ~outcomes.success
@@ -136,6 +136,6 @@ def save_strips(
     for name, rows in {"success": outcomes.success, "failure": failures}.items():
         if rows.any():
             episodes = outcomes.episodes[rows]
-            shortest = episodes[np.argmin(source.table.length[episodes])]
-            run: Any = next(replay_episodes(env.model, source, np.array([shortest])))
-            save_strip(side_by_side(env.model, source, run), folder / f"{place}_{name}.png")
+            shortest = episodes[np.argmin(recording.table.length[episodes])]
+            replay: Any = next(replay_episodes(env.model, recording, np.array([shortest])))
+            save_strip(side_by_side(env.model, recording, replay), folder / f"{source}_{name}.png")

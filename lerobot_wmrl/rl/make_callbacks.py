@@ -1,4 +1,4 @@
-"""Callbacks made from a training's configuration."""
+"""Construction of a training's callbacks from its configuration."""
 
 import logging
 from functools import partial
@@ -19,7 +19,7 @@ from lerobot_wmrl.rl.selection import IMAGINED, REAL, Measure, Selection
 
 
 class Trained(NamedTuple):
-    """A policy with its processors, and the environment that it is trained in, made from `config`."""
+    """A policy with its processors, and the environment that it is trained in with its configuration."""
 
     policy: Any
     processors: tuple[Any, Any]
@@ -58,8 +58,8 @@ def make_recorder(settings: CallbackSettings, env: WorldModelVectorEnv) -> Rollo
 
 
 def make_measures(settings: CallbackSettings, trained: Trained) -> dict[str, Measure]:
-    """Return how success is measured: in `real_env` and in imagination, or, for a training that is not in a
-    world model, in its own environment."""
+    """Return functions that measure success: `real` in `real_env`, and `imagined` in the world model. For a
+    training outside a world model, `real` is in `real_env` or else in the training's environment."""
     policy, processors, env, config = trained
     episodes, dataset = settings.selection.n_episodes, settings.selection.dataset
     measures: dict[str, Measure] = {}
@@ -69,16 +69,16 @@ def make_measures(settings: CallbackSettings, trained: Trained) -> dict[str, Mea
             settings.real_num_envs,
         )  # fmt: skip
 
-    def within() -> Any:
-        place = env
+    def measure_in_training_env() -> Any:
+        measured_env = env
         if dataset.root and isinstance(env, WorldModelVectorEnv):
-            place = make_success_env(env, StartFrames(dataset.root, dataset.repo_id))
-        return evaluate_within(place, config, policy, processors, episodes, SELECTION_SEED)
+            measured_env = make_success_env(env, StartFrames(dataset.root, dataset.repo_id))
+        return evaluate_within(measured_env, config, policy, processors, episodes, SELECTION_SEED)
 
     if isinstance(env, WorldModelVectorEnv):
-        measures[IMAGINED] = within
+        measures[IMAGINED] = measure_in_training_env
     elif REAL not in measures:
-        measures[REAL] = within
+        measures[REAL] = measure_in_training_env
     if REAL not in measures:
         logging.warning(
             "selection: without `real_env` the best checkpoint is the one that succeeds most often in "

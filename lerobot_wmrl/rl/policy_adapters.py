@@ -1,4 +1,4 @@
-"""Adapters that make policies of LeRobot stochastic, without a change to their code.
+"""Adapters that make LeRobot's policies stochastic without a change to their code, and their processors.
 
 B environments, n steps of a decision, K action components, D width of ACT's decoder.
 """
@@ -20,7 +20,7 @@ from lerobot_wmrl.common.policies import unwrapped
 from lerobot_wmrl.rl.protocol import Observation, Pipeline, StochasticPolicy
 
 INITIAL_STD = 0.1
-"""In normalised actions. ACT's L1 loss learns no spread, so exploration needs a value to start from."""
+"""Standard deviation that exploration starts from, in normalised actions: ACT's L1 loss learns none."""
 
 VALUE_WIDTH = 256
 
@@ -102,7 +102,7 @@ class ActAdapter(nn.Module):
 
 
 ADAPTERS = {"act": ActAdapter}
-"""Adapters by the type of the policy. The `own_tensors` of one are saved with the algorithm."""
+"""Adapters by policy type. Their `own_tensors` are saved with the algorithm, not with the policy."""
 
 
 def as_stochastic(policy: Any) -> Any:
@@ -124,8 +124,8 @@ def as_stochastic(policy: Any) -> Any:
 
 
 def make_pipeline(config: PreTrainedConfig, preprocessor: Any, postprocessor: Any) -> Pipeline:
-    """Wrap a policy's processors. Observations that the policy does not know are left out, and actions stay
-    on the policy's device, although LeRobot's postprocessors fetch them to the CPU."""
+    """Wrap a policy's processors. Observations that the policy has no input for are left out. Actions stay on
+    the policy's device, where LeRobot's postprocessors would move them to the CPU."""
     known = {*(config.input_features or {}), "task"}
     steps = [
         replace(step, device=config.device) if isinstance(step, DeviceProcessorStep) else step

@@ -37,7 +37,7 @@ def seeded_noise(seed: int, device: torch.device | str) -> Iterator[None]:
 
 @contextmanager
 def preserved_randomness() -> Iterator[None]:
-    """Put Python's, numpy's and torch's generators back to their states before the block."""
+    """Restore the states of Python's, numpy's and torch's generators after the block."""
     state = get_rng_state()
     try:
         yield

@@ -22,11 +22,11 @@ class Selection:
     """Measures success at intervals and points `checkpoints/best` at the best checkpoint so far.
 
     Args:
-        freq: iterations between two measurements. The first is before any update, the last after all.
+        freq: iterations between two measurements; one is before the first update and one after the last.
         total: iterations of the training.
-        measures: how success is measured, `real` (outside the world model) and `imagined`. The real one
-            decides where there is one.
-        output_dir: of the training.
+        measures: functions that measure success, `real` (outside the world model) and `imagined`. `real`
+            decides if it is given.
+        output_dir: the training's output folder.
     """
 
     name = "selection"
@@ -40,18 +40,18 @@ class Selection:
         return iteration % self.freq == 0 or iteration == self.total
 
     def run(self, iteration: int, checkpoint: Path, folder: Path) -> Record:
-        """Return the proportion of successes by `real` and `imagined`."""
+        """Return the proportion of successes, `real` and `imagined`."""
         found = {place: measure() for place, measure in self.measures.items()}
         shares = {
             place: Proportion(sum(each.successes), len(each.successes)) for place, each in found.items()
         }
-        told = ", ".join(f"{place} success {share}" for place, share in shares.items())
-        logging.info("Iteration %d: %s", iteration, told)
+        summary = ", ".join(f"{place} success {share}" for place, share in shares.items())
+        logging.info("Iteration %d: %s", iteration, summary)
         steps = found[REAL].steps if REAL in found else 0
         return {**{place: share.as_json() for place, share in shares.items()}, REAL_STEPS: steps}
 
     def apply(self, records: Mapping[int, Record]) -> None:
-        """Link the best checkpoint, the earlier of equals.
+        """Point `checkpoints/best` at the best checkpoint, or the earliest of equally good ones.
 
         Raises:
             TrainingStopped: real success has fallen while imagined success has not.
@@ -81,12 +81,13 @@ def success(record: Record, place: str) -> Proportion:
 
 
 def best_iteration(records: Mapping[int, Record], place: str) -> int:
-    """Return the iteration with most successes, of equals the earlier, which is nearer to the SFT policy."""
+    """Return the iteration with most successes; of equal ones the earliest, nearest to the SFT policy."""
     return max(sorted(records), key=lambda iteration: success(records[iteration], place).share)
 
 
 def diverged(best: Record, latest: Record) -> bool:
-    """Return whether real success has fallen, with separate intervals, while imagined success has not."""
+    """Return whether real success has fallen, so far that the confidence intervals do not overlap, while
+    imagined success has not."""
     if any(place not in record for place in (REAL, IMAGINED) for record in (best, latest)):
         return False
     fallen = success(latest, REAL).interval[1] < success(best, REAL).interval[0]

@@ -35,7 +35,7 @@ SHOWN = (
     "success_rate", "reward", "policy_loss", "value_loss", "explained_variance", "kl", "reference_kl",
     "clip_fraction", "entropy", "rollout_s", "update_s",
 )  # fmt: skip
-"""Metrics of a line in the terminal; metrics.jsonl has all."""
+"""Metrics that a line in the terminal shows; metrics.jsonl has all."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Schedule:
     Args:
         iterations: rollouts, each followed by an update.
         save_freq: iterations between checkpoints.
-        seed: of the first episodes.
+        seed: first seed of the first iteration's episodes.
         log_freq: iterations between lines in the terminal.
     """
 
@@ -68,8 +68,8 @@ def train(
 ) -> None:  # fmt: skip
     """Train until the end of the schedule, from the latest checkpoint in `output_dir` if there is one.
 
-    Every iteration starts fresh episodes, so it can be repeated after a kill. Callbacks run where they are
-    due, before the first iteration or after one, and find a checkpoint there.
+    Every iteration starts new episodes, so one that was killed can be repeated. Callbacks that are due run
+    before the first iteration and after each one, always with a checkpoint of that moment.
 
     Args:
         env: vectorised environment on the device.
@@ -79,32 +79,32 @@ def train(
         schedule: how long to train.
         output_dir: where checkpoints, metrics and records go.
         save_pretrained: writes a checkpoint's `pretrained_model`.
-        callbacks: what runs between iterations.
+        callbacks: run between iterations, in this order.
         wandb: LeRobot's WandBLogger.
     """
     checkpoint, total = resume(algorithm, output_dir), schedule.iterations
     tracker = make_tracker(output_dir, rollout, schedule, algorithm.iteration, wandb)
-    pauses = Callbacks(callbacks, output_dir, total, tracker)
+    runner = Callbacks(callbacks, output_dir, total, tracker)
     with tqdm(
         total=total, initial=algorithm.iteration, desc=algorithm.name.upper(), unit="iteration",
         disable=rank_and_size()[0] > 0,
     ) as progress:  # fmt: skip
-        pauses.resume(algorithm.iteration)
-        wait_for_all()  # else a slow process would find what the first one has written since
-        if pauses.due(algorithm.iteration):
-            pauses.run(algorithm.iteration, checkpoint or save(algorithm, output_dir, total, save_pretrained))
+        runner.resume(algorithm.iteration)
+        wait_for_all()  # else a slow process would read records that the first one writes below
+        if runner.due(algorithm.iteration):
+            runner.run(algorithm.iteration, checkpoint or save(algorithm, output_dir, total, save_pretrained))
         while algorithm.iteration < total:
             metrics = iterate(env, algorithm, pipeline, rollout, schedule.seed)
             step = algorithm.iteration
-            tracker.log_step(step, {**metrics, **pauses.real_steps()})
+            tracker.log_step(step, {**metrics, **runner.real_steps()})
             progress.set_postfix(
                 success=f"{metrics['success_rate']:.2f}", kl=f"{metrics['reference_kl']:.2f}"
             )
             progress.update()
-            if should_save_checkpoint(step, schedule.save_freq, total) or pauses.due(step):
+            if should_save_checkpoint(step, schedule.save_freq, total) or runner.due(step):
                 checkpoint = save(algorithm, output_dir, total, save_pretrained)
                 tracker.log_policy(checkpoint)
-                pauses.run(step, checkpoint)
+                runner.run(step, checkpoint)
 
 
 def iterate(
@@ -136,7 +136,8 @@ def iterate(
 def make_tracker(
     output_dir: Path, rollout: RolloutBuffer, schedule: Schedule, iteration: int, wandb: Any
 ) -> Tracker:
-    """Return a tracker that counts steps as samples, rollouts as episodes, and the schedule as an epoch."""
+    """Return a tracker in LeRobot's units: an environment step is a sample, an environment's rollout an
+    episode, and the whole schedule an epoch."""
     num_envs, total = rollout.num_envs * rank_and_size()[1], schedule.iterations
     samples = rollout.steps * num_envs
     meters = MetricsTracker(samples, samples * total, num_envs * total, {}, initial_step=iteration)

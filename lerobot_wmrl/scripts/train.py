@@ -51,7 +51,7 @@ MAY_DIFFER = (
     "resume", "job_name", "log_freq", "wandb", "gate.action", "dyna.dataset",
     *(f"policy.{name}" for name in PUBLISHING),
 )  # fmt: skip
-"""Settings that may be others when a run is continued."""
+"""Settings that may change when a run is resumed."""
 
 
 CARD: Final = """---
@@ -62,7 +62,7 @@ CARD: Final = """---
 
 A `{type}` policy of LeRobot, trained further by reinforcement learning with lerobot-wmrl-train:
 
-{told}
+{description}
 
 `train_config.json` has the settings of the training. Evaluate the policy with `lerobot-eval
 --policy.path={name} --env.type=…`.
@@ -122,12 +122,12 @@ class TrainConfig(CallbackSettings, RunConfig):
     job_name: str | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """As LeRobot's WandBLogger asks for it."""
+        """Return the configuration as the dictionary that LeRobot's WandBLogger asks for."""
         return draccus.encode(self)
 
 
 def check_config(cfg: TrainConfig) -> PolicyGradientConfig:
-    """Return the algorithm's configuration. FieldError names the first setting that cannot be."""
+    """Check the settings and return the algorithm's. FieldError names the first that is impossible."""
     if not isinstance(cfg.algorithm, PolicyGradientConfig):
         raise FieldError("algorithm.type", cfg.algorithm.type, "this command trains with ppo or grpo")
     if cfg.env is None or not hasattr(cfg.env, "create_tensor_env"):
@@ -148,7 +148,7 @@ def check_config(cfg: TrainConfig) -> PolicyGradientConfig:
 
 
 def rollout_length(cfg: TrainConfig, longest: int) -> int:
-    """Return the steps of a rollout. FieldError if episodes could not end within it."""
+    """Return the number of steps of a rollout. FieldError if the longest episodes do not fit in it."""
     steps = cfg.rollout_steps or longest
     if steps < longest:
         raise FieldError(
@@ -162,8 +162,8 @@ def rollout_length(cfg: TrainConfig, longest: int) -> int:
 def load_config(cfg: TrainConfig) -> PreTrainedConfig:
     """Read the policy's configuration into `cfg` and return it.
 
-    Whether and where it is published is not taken from the checkpoint, which would overwrite the SFT policy
-    on the hub, but from the command line or a resumed run's configuration.
+    Whether and where the policy is published comes from the command line or a resumed run's configuration.
+    The checkpoint's own settings are ignored, because they would overwrite the SFT policy on the hub.
     """
     from lerobot_wmrl.common.policies import read_policy_config
 
@@ -211,7 +211,7 @@ def train_policy(cfg: TrainConfig) -> None:
 
 
 def finished(cfg: TrainConfig) -> bool:
-    """Return whether there is nothing left to train. FieldError if there is nothing to resume."""
+    """Return whether the run has reached its last iteration. FieldError if there is nothing to resume."""
     from lerobot_wmrl.common.checkpoints import latest_checkpoint, require_resumable
     from lerobot_wmrl.rl.callbacks import has_record
     from lerobot_wmrl.rl.selection import Selection
@@ -315,8 +315,8 @@ def publish(cfg: TrainConfig, lines: list[str]) -> None:
         license=config.license or "apache-2.0", library_name="lerobot", pipeline_tag="robotics",
         tags=sorted({*(config.tags or []), "robotics", "lerobot", config.type}), model_name=name,
     )  # fmt: skip
-    told = "\n".join(f"- {line}" for line in lines[:-1])
-    card = CARD.format(metadata=data.to_yaml(), name=name, type=config.type, told=told)
+    description = "\n".join(f"- {line}" for line in lines[:-1])
+    card = CARD.format(metadata=data.to_yaml(), name=name, type=config.type, description=description)
     with TemporaryDirectory() as temporary:
         folder = Path(temporary) / "policy"
         shutil.copytree(chosen_checkpoint(cfg) / PRETRAINED_MODEL_DIR, folder)
