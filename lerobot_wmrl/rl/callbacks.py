@@ -62,8 +62,8 @@ class Callback(Protocol):
 
 
 class Callbacks:
-    """Runs callbacks in order and keeps their records. With several processes the first one runs them, and all
-    read the records."""
+    """Runs callbacks in order and keeps their records. With several processes the first one runs them, and
+    all read the records."""
 
     def __init__(self, callbacks: Sequence[Callback], output_dir: Path, total: int, tracker: Tracker) -> None:
         self.callbacks, self.output_dir, self.total, self.tracker = callbacks, output_dir, total, tracker
