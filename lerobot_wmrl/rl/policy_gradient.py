@@ -159,10 +159,9 @@ class PolicyGradient(Algorithm):
             reference.flatten(0, 1)[rows.to(reference.device)] = log_prob
         rollout.columns[REFERENCE] = reference
         counted = 1.0 if executed is None else executed
-        flat = [
-            (each * counted).flatten(0, 1).flatten(1) for each in (rollout.log_prob, reference)
-        ]  # (T · B, K)
-        return mean_and_variance(kl_estimate(*flat)[rollout.decided.flatten()])[0].item()
+        flat = [(each * counted).flatten(0, 1).flatten(1) for each in (rollout.log_prob, reference)]
+        kl = kl_estimate(*flat)  # (T · B, K) each → (T · B,)
+        return mean_and_variance(kl[rollout.decided.flatten()])[0].item()
 
     def update(self, batch_iterator: Iterator[Minibatch]) -> TrainingStats:
         """Take one optimiser step on each minibatch, until the KL to the rollout's policy is `target_kl`."""
@@ -183,10 +182,10 @@ class PolicyGradient(Algorithm):
         """Accumulate the gradient of a minibatch's mean loss over micro-batches, and return its metrics."""
         self.optimizer.zero_grad()
         parts: list[dict[str, Tensor]] = []
-        for count, batch in minibatch.micro_batches:
-            loss, record = self.losses(batch)  # (B,), (B,) by name
-            loss[:count].sum().div(minibatch.size).backward()
-            parts.append({name: value.detach()[:count] for name, value in record.items()})
+        for counted, batch in minibatch.micro_batches:
+            loss, record = self.losses(batch)  # (B,), (B,) by name; rows from `counted` on do not count
+            loss[:counted].sum().div(minibatch.size).backward()
+            parts.append({name: value.detach()[:counted] for name, value in record.items()})
         joined = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
         largest_error = F.pad(joined.pop(RATIO_ERROR), (0, 1)).max()  # 0 where no decision counts
         means = torch.stack([value.sum() for value in joined.values()]).div(minibatch.size)
