@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 
-from lerobot_wmrl.common.errors import require_at_least, require_positive, require_share
+from lerobot_wmrl.common.errors import FieldError, require_at_least, require_positive, require_share
 from lerobot_wmrl.rl.configuration_algorithms import PolicyGradientConfig
 
 
@@ -34,3 +34,12 @@ class GRPOConfig(PolicyGradientConfig):
         require_positive(self, "clip_low", "clip_high", "least_group_std")
         require_share(self, "clip_low", "clip_high")
         require_at_least(self, 2, "group_size")
+
+    def check_num_envs(self, num_envs: int) -> None:
+        """Raise FieldError unless the environments can be divided into groups."""
+        if num_envs % self.group_size:
+            raise FieldError(
+                "num_envs", num_envs,
+                f"must be a multiple of `algorithm.group_size={self.group_size}`, the environments that "
+                "start from the same state",
+            )  # fmt: skip

@@ -133,12 +133,8 @@ def check_config(cfg: TrainConfig) -> PolicyGradientConfig:
     if cfg.env is None or not hasattr(cfg.env, "create_tensor_env"):
         raise FieldError("env.type", cfg.env and cfg.env.type, "choose world_model or wmrl_maniskill")
     require_at_least(cfg, 1, "num_envs", "iterations", "save_freq", "log_freq")
-    if isinstance(cfg.algorithm, GRPOConfig) and cfg.num_envs % cfg.algorithm.group_size:
-        raise FieldError(
-            "num_envs", cfg.num_envs,
-            f"must be a multiple of `algorithm.group_size={cfg.algorithm.group_size}`, the environments that "
-            "start from the same state",
-        )  # fmt: skip
+    if isinstance(cfg.algorithm, GRPOConfig):
+        cfg.algorithm.check_num_envs(cfg.num_envs)
     if not 0 <= cfg.seed < EVALUATION_SEED:
         raise FieldError(
             "seed", cfg.seed, f"must be from 0 to {EVALUATION_SEED - 1}; those above are for evaluation"
