@@ -93,7 +93,7 @@ def test_what_nobody_has_asked_about_has_not_passed(
     assert "passed" not in str(record)
     with caplog.at_level(logging.WARNING):
         gate.apply({0: record})
-    assert "nothing says how many failures" in caplog.text
+    assert "nobody has checked how many failures" in caplog.text
 
 
 def test_it_asks_in_every_new_world_model_and_again_where_it_can_roll_out(make_gate: Any, env: Any) -> None:
