@@ -105,7 +105,7 @@ class CallbackSettings:
     dyna: DynaConfig = field(default_factory=DynaConfig)
 
     def check_callbacks(self, env: EnvConfig, iterations: int) -> None:
-        """Raise FieldError for a setting that cannot be in a training in `env`."""
+        """Raise FieldError for the first setting that does not fit a training in `env`."""
         require_at_least(self, 1, "real_num_envs")
         self._check_selection_and_gate()
         if isinstance(env, WorldModelEnv) and self.gate.action == "stop":
