@@ -17,6 +17,7 @@ answer_help()
 CONFIGURATIONS = (
     "lerobot_wmrl.world_models.configuration_frame_tokenizer",
     "lerobot_wmrl.world_models.configuration_world_model",
+    "lerobot_wmrl.world_models.autoregressive.configuration",
     "lerobot_wmrl.rewards.configuration_rewards",
     "lerobot_wmrl.envs.configuration_world_model",
     "lerobot_wmrl.envs.configuration_wmrl_maniskill",

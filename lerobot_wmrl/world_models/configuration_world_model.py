@@ -28,6 +28,7 @@ class DynamicsConfig(ChoiceRegistry):
     heads: int = 4
     patch: int = 2
     code_width: int = 48
+    depth = False  # not a field: the anchored dynamics never look at depth
 
     def __post_init__(self) -> None:
         for name in ("layers", "width", "heads", "patch", "code_width"):
@@ -76,46 +77,6 @@ class AnchoredConfig(DynamicsConfig):
         return clip_length
 
 
-@DynamicsConfig.register_subclass("autoregressive")
-@dataclass
-class AutoregressiveConfig(DynamicsConfig):
-    """Predicts from the frames before (eq. 1, as the paper does). In imagination these are its own.
-
-    Args:
-        window: frames that the model remembers.
-        conditioning: how blocks take in the condition: adaln, cross_attention (the paper's) or additive.
-        maskgit_steps: passes in which a frame's tokens are decoded, the most confident first (MaskGIT; takes
-            a second pass in training too). 0: all tokens in the pass that predicts the frame.
-        depth: take in and predict each camera's depth beside its tokens (RoboScape's depth branch). The
-            dataset must have `observation.images.<camera>_depth`.
-        self_forcing: share of input frames replaced by the model's own predictions in training.
-        self_rollout: share of clips whose input frames, in the last quarter of training, are the model's own
-            imagination from the first frame and the actions. The targets stay the recorded frames.
-        keypoint_weight: weight of RoboScape's keypoint consistency: the tokens that move most keep the
-            appearance that they have at the clip's start. 0: off.
-    """
-
-    window: int = 48
-    conditioning: str = "adaln"
-    maskgit_steps: int = 0
-    depth: bool = False
-    self_forcing: float = 0.5
-    self_rollout: float = 0.0
-    keypoint_weight: float = 0.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._require_at_least("window", 1)
-        self._require_at_least("maskgit_steps", 0)
-        self._require_at_least("keypoint_weight", 0)
-        for name in ("self_forcing", "self_rollout"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise FieldError(f"dynamics.{name}", getattr(self, name), "must be between 0 and 1")
-
-    def memory(self, clip_length: int) -> int:
-        return self.window
-
-
 @dataclass
 class WorldModelConfig(RewardModelConfig):
     """What both world models share.
@@ -159,7 +120,7 @@ class WorldModelConfig(RewardModelConfig):
     @property
     def depth(self) -> bool:
         """Whether the dynamics look at depth."""
-        return isinstance(self.dynamics, AutoregressiveConfig) and self.dynamics.depth
+        return self.dynamics.depth
 
     @property
     def context_channels(self) -> int:

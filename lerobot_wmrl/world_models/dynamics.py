@@ -11,34 +11,7 @@ from lerobot_wmrl.common.precision import imagination_dtype
 from lerobot_wmrl.data.clips import Clip
 from lerobot_wmrl.data.frames import NO_CONTEXT, Context, Frames
 from lerobot_wmrl.world_models.kv_cache import KVCache
-from lerobot_wmrl.world_models.layers import FrameNetwork
-
-
-class Condition(NamedTuple):
-    """Eq. 1's c: tokens (B, T or 1, M, D) and which of them count, mask (B, 1, 1, 1, M); None: all."""
-
-    tokens: Tensor
-    mask: Tensor | None = None
-
-    def mean(self) -> Tensor:
-        """Mean of the tokens that count. → (B, T or 1, D)"""
-        if self.mask is None:
-            return self.tokens.mean(2)
-        kept = self.mask[:, :, 0, 0, :, None].to(self.tokens.dtype)
-        return (self.tokens * kept).sum(2) / kept.sum(2).clamp_min(1)
-
-
-class Prediction(NamedTuple):
-    """The frame t + 1 that follows each of T frames. V is the sum of the levels of all code factors.
-
-    logits (B, T, S, V), or (B, K, S, V) if only K frames were asked for; done_logit (B, T); proprioception
-    (B, T, P), normalised; hidden (B, T, D).
-    """
-
-    logits: Tensor
-    done_logit: Tensor
-    proprioception: Tensor
-    hidden: Tensor
+from lerobot_wmrl.world_models.layers import Condition, FrameNetwork, Prediction
 
 
 class Imagined(NamedTuple):

@@ -8,8 +8,7 @@ from torch.nn import functional as F
 
 from lerobot_wmrl.data.clips import Clip, known_transitions
 from lerobot_wmrl.world_models.codebook import CodeBook
-from lerobot_wmrl.world_models.dynamics import Prediction
-from lerobot_wmrl.world_models.layers import STATE_STEP
+from lerobot_wmrl.world_models.layers import STATE_STEP, Prediction
 
 STATE_WEIGHT: Final = 4.0
 """Weight of the state's loss beside those of tokens and done, which count 1."""

@@ -20,7 +20,7 @@ from transformers import (
 from transformers.tokenization_utils_base import VERY_LARGE_INTEGER
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.world_models.dynamics import Condition
+from lerobot_wmrl.world_models.layers import Condition
 
 MAX_TOKENS: Final = 512
 """What T5 was trained with (Raffel et al. 2020); the limit where a tokenizer states none of its own."""

@@ -9,8 +9,9 @@ from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.envs.start_frames import read_first_frames
 from lerobot_wmrl.maniskill.scenes import SCENES
 from lerobot_wmrl.maniskill.tasks import task_of
+from lerobot_wmrl.world_models.autoregressive.configuration import AutoregressiveConfig
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
-from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig, AutoregressiveConfig
+from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig
 
 
 def test_they_are_what_the_simulator_shows(recwarn):

@@ -2,11 +2,10 @@ import torch
 from torch.nn import functional as F
 from vector_quantize_pytorch import FSQ
 
+from lerobot_wmrl.world_models.autoregressive.configuration import AutoregressiveConfig
 from lerobot_wmrl.world_models.autoregressive.network import NextFrameNetwork
 from lerobot_wmrl.world_models.codebook import CodeBook
-from lerobot_wmrl.world_models.configuration_world_model import AutoregressiveConfig
-from lerobot_wmrl.world_models.dynamics import Condition
-from lerobot_wmrl.world_models.layers import FrameSizes
+from lerobot_wmrl.world_models.layers import Condition, FrameSizes
 
 LEVELS = (8, 5, 3)
 

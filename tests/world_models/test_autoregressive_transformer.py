@@ -5,11 +5,9 @@ import torch
 from torch import Tensor
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.world_models.autoregressive.conditioning import CONDITIONINGS
-from lerobot_wmrl.world_models.autoregressive.network import SpatialTemporalTransformer
-from lerobot_wmrl.world_models.dynamics import Condition
+from lerobot_wmrl.world_models.autoregressive.network import CONDITIONINGS, SpatialTemporalTransformer
 from lerobot_wmrl.world_models.kv_cache import KVCache
-from lerobot_wmrl.world_models.layers import ClipMemory
+from lerobot_wmrl.world_models.layers import ClipMemory, Condition
 
 WINDOW, TOKENS, WIDTH = 5, 6, 16
 

@@ -11,9 +11,9 @@ from lerobot_wmrl.data.clips import Clip
 from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.world_models import losses
 from lerobot_wmrl.world_models.autoregressive.depth import FAR, metres, normalize_depth
-from lerobot_wmrl.world_models.autoregressive.drift import Inputs
+from lerobot_wmrl.world_models.autoregressive.dynamics import Inputs
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig
-from lerobot_wmrl.world_models.dynamics import Condition
+from lerobot_wmrl.world_models.layers import Condition
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 from tests.trained import nested, small_tokenizer
 

@@ -3,9 +3,9 @@ import torch
 
 from lerobot_wmrl.data.clips import Clip, known_transitions
 from lerobot_wmrl.world_models import losses
-from lerobot_wmrl.world_models.autoregressive.drift import Inputs, force_predictions
+from lerobot_wmrl.world_models.autoregressive.dynamics import Inputs, force_predictions
 from lerobot_wmrl.world_models.codebook import CodeBook
-from lerobot_wmrl.world_models.dynamics import Prediction
+from lerobot_wmrl.world_models.layers import Prediction
 from lerobot_wmrl.world_models.losses import corrupt_codes, next_frame_loss, weighted_frames
 
 CODEBOOK = CodeBook((4, 3))

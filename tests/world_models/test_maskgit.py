@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from lerobot_wmrl.world_models.autoregressive.configuration import AutoregressiveConfig
 from lerobot_wmrl.world_models.autoregressive.maskgit import (
     DraftMemory,
     FramesSeen,
@@ -14,9 +15,7 @@ from lerobot_wmrl.world_models.autoregressive.maskgit import (
     most_confident,
 )
 from lerobot_wmrl.world_models.autoregressive.network import NextFrameNetwork
-from lerobot_wmrl.world_models.configuration_world_model import AutoregressiveConfig
-from lerobot_wmrl.world_models.dynamics import Condition
-from lerobot_wmrl.world_models.layers import FrameSizes
+from lerobot_wmrl.world_models.layers import Condition, FrameSizes
 
 LEVELS, TOKENS, WIDTH, FRAMES = (5, 3), 4, 32, 4
 

@@ -9,12 +9,11 @@ from torch.nn import functional as F
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.world_models import losses
+from lerobot_wmrl.world_models.autoregressive.configuration import AutoregressiveConfig
 from lerobot_wmrl.world_models.autoregressive.network import NextFrameNetwork
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.codebook import BinaryCodeBook, CodeBook
-from lerobot_wmrl.world_models.configuration_world_model import AutoregressiveConfig
-from lerobot_wmrl.world_models.dynamics import Condition
-from lerobot_wmrl.world_models.layers import FrameSizes
+from lerobot_wmrl.world_models.layers import Condition, FrameSizes
 from lerobot_wmrl.world_models.losses import (
     corrupt_codes,
 )

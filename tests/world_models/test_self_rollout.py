@@ -12,7 +12,7 @@ from lerobot_wmrl.data.clips import Clip, ClipSampler, known_transitions
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.world_models import losses
-from lerobot_wmrl.world_models.autoregressive.drift import SELF_ROLLOUT_FROM, Inputs
+from lerobot_wmrl.world_models.autoregressive.dynamics import SELF_ROLLOUT_FROM, Inputs
 from lerobot_wmrl.world_models.losses import next_frame_loss, weighted_frames
 from lerobot_wmrl.world_models.modeling_world_model import WorldModelRewardModel
 from tests.trained import action_config, text_config

@@ -1,7 +1,6 @@
 """Anchored dynamics: the loss, imagination, and open-loop prediction in one pass."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import Final
 
 import torch
@@ -10,19 +9,13 @@ from torch import Tensor
 from lerobot_wmrl.common.precision import compute_in
 from lerobot_wmrl.data.clips import Clip, known_transitions, take_rows
 from lerobot_wmrl.data.frames import Frames
-from lerobot_wmrl.world_models.anchored.network import AnchoredNetwork, Scene, StateRollout
+from lerobot_wmrl.world_models.anchored.imagination import AnchoredImagination
+from lerobot_wmrl.world_models.anchored.network import AnchoredNetwork
 from lerobot_wmrl.world_models.codebook import CodeBook
 from lerobot_wmrl.world_models.configuration_world_model import AnchoredConfig
-from lerobot_wmrl.world_models.dynamics import (
-    Condition,
-    Dynamics,
-    Imagination,
-    Imagined,
-    OpenLoopPrediction,
-    Prediction,
-)
-from lerobot_wmrl.world_models.kv_cache import CachedMemory, KVCache
-from lerobot_wmrl.world_models.layers import FrameSizes
+from lerobot_wmrl.world_models.dynamics import Dynamics, Imagination, Imagined, OpenLoopPrediction
+from lerobot_wmrl.world_models.kv_cache import KVCache
+from lerobot_wmrl.world_models.layers import Condition, FrameSizes, Prediction
 from lerobot_wmrl.world_models.losses import TargetFrames, corrupt_codes, next_frame_loss, weighted_frames
 
 DRAWN_FRAMES: Final = 4
@@ -43,82 +36,6 @@ def frames_after(rows: Tensor, codes: Tensor, valid: Tensor, codebook: CodeBook)
     """
     known, target = (take_rows(x, rows) for x in (known_transitions(valid), codes[:, 1:]))
     return weighted_frames(codebook, target, codes[:, :1], known)
-
-
-@dataclass
-class AnchoredImagination(Imagination):
-    """Imaginations that each began at a frame of their own: its scene, and the state rollout since.
-
-    Whoever has imagined as many frames as the cache holds begins anew at the frame that was imagined last.
-    `frame` is the cache's position, known to the host. `phases` are the frames, modulo the cache's window, at
-    which some environment may have begun: at any other frame the device need not be asked who is due.
-    """
-
-    scene: Scene | None = None
-    rollout: StateRollout | None = None
-    frame: int = 0
-    phases: set[int] = field(default_factory=lambda: {0})
-
-    @property
-    def num_elements(self) -> int:
-        held = [*(self.scene or ()), *(self.rollout or ())]
-        return self.cache.num_elements + sum(tensor.numel() for tensor in held)
-
-    def restart(self, mask: Tensor) -> None:
-        self.phases.add(self._phase)
-        super().restart(mask)
-
-    def rewind(self, other: Imagination, frames: int) -> None:
-        assert isinstance(other, AnchoredImagination)
-        super().rewind(other, frames)
-        self.frame = other.frame - frames
-        self.phases = {self._phase}
-
-    def put(self, rows: Tensor, other: Imagination) -> None:
-        assert isinstance(other, AnchoredImagination)
-        assert other.scene is not None
-        assert other.rollout is not None
-        self.begin(rows, other.scene, other.rollout)
-        super().put(rows, other)
-        self.phases |= other.phases
-
-    def due(self) -> Tensor:
-        """Environments that have to begin now: rows (R,).
-
-        Waits for the device to say which, if there may be any.
-        """
-        if self._phase not in self.phases:
-            return self.cache.started.new_empty(0)
-        age = self.cache.position - self.cache.started
-        rows = (age % self.cache.window == 0).nonzero().squeeze(1)
-        if not len(rows):
-            self.phases.remove(self._phase)
-        return rows
-
-    def begin(self, rows: Tensor, scene: Scene, rollout: StateRollout) -> None:
-        """Begin in the environments `rows` (R,) with scenes and state rollouts of R rows."""
-        cache = self.cache
-        cache.started.copy_(cache.started.index_copy(0, rows, cache.position.expand(len(rows))))
-        if self.scene is None or self.rollout is None:
-            self.scene, self.rollout = scene, rollout
-        else:
-            self.scene = put_rows(self.scene, rows, scene)
-            self.rollout = put_rows(self.rollout, rows, rollout)
-
-    def advance(self) -> CachedMemory:
-        """Begin a frame in the cache."""
-        self.frame += 1
-        return self.cache.advance()
-
-    @property
-    def _phase(self) -> int:
-        return self.frame % self.cache.window
-
-
-def put_rows[T: tuple[Tensor, ...]](old: T, rows: Tensor, new: T) -> T:
-    """Return `old` with `new` in the rows `rows` (R,) of every tensor."""
-    replaced = (a.index_copy(0, rows, b.to(a.dtype)) for a, b in zip(old, new, strict=True))
-    return type(old)(*replaced)
 
 
 class AnchoredDynamics(Dynamics):

@@ -19,13 +19,14 @@ from lerobot_wmrl.common.precision import compute_in
 from lerobot_wmrl.data.clips import take_rows
 from lerobot_wmrl.data.frames import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.configuration_world_model import AnchoredConfig
-from lerobot_wmrl.world_models.dynamics import Condition, Prediction
 from lerobot_wmrl.world_models.layers import (
     STATE_STEP,
     ClipMemory,
+    Condition,
     CrossAttention,
     FrameNetwork,
     FrameSizes,
+    Prediction,
     SelfAttention,
     TemporalMemory,
     attention,

@@ -14,10 +14,9 @@ import torch
 from torch import Tensor, nn
 
 from lerobot_wmrl.data.clips import known_transitions
+from lerobot_wmrl.world_models.autoregressive.configuration import AutoregressiveConfig
 from lerobot_wmrl.world_models.autoregressive.network import LayerHook, SpatialTemporalTransformer
-from lerobot_wmrl.world_models.configuration_world_model import AutoregressiveConfig
-from lerobot_wmrl.world_models.dynamics import Condition
-from lerobot_wmrl.world_models.layers import FrameEmbedding, FrameHead, FrameSizes, TemporalMemory
+from lerobot_wmrl.world_models.layers import Condition, FrameEmbedding, FrameHead, FrameSizes, TemporalMemory
 from lerobot_wmrl.world_models.losses import masked_mean
 
 FAR: Final = 2.5

@@ -13,11 +13,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from lerobot_wmrl.world_models.autoregressive.configuration import AutoregressiveConfig
 from lerobot_wmrl.world_models.autoregressive.network import NextFrameNetwork
-from lerobot_wmrl.world_models.configuration_world_model import AutoregressiveConfig
-from lerobot_wmrl.world_models.dynamics import Condition, Prediction
 from lerobot_wmrl.world_models.kv_cache import KVCache
-from lerobot_wmrl.world_models.layers import ClipMemory, Rotation
+from lerobot_wmrl.world_models.layers import ClipMemory, Condition, Prediction, Rotation
 from lerobot_wmrl.world_models.losses import masked_mean
 
 

@@ -1,0 +1,46 @@
+"""Configuration of the autoregressive dynamics, `dynamics.type=autoregressive`."""
+
+from dataclasses import dataclass
+
+from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.world_models.configuration_world_model import DynamicsConfig
+
+
+@DynamicsConfig.register_subclass("autoregressive")
+@dataclass
+class AutoregressiveConfig(DynamicsConfig):
+    """Predicts from the frames before (eq. 1, as the paper does). In imagination these are its own.
+
+    Args:
+        window: frames that the model remembers.
+        conditioning: how blocks take in the condition: adaln, cross_attention (the paper's) or additive.
+        maskgit_steps: passes in which a frame's tokens are decoded, the most confident first (MaskGIT; takes
+            a second pass in training too). 0: all tokens in the pass that predicts the frame.
+        depth: take in and predict each camera's depth beside its tokens (RoboScape's depth branch). The
+            dataset must have `observation.images.<camera>_depth`.
+        self_forcing: share of input frames replaced by the model's own predictions in training.
+        self_rollout: share of clips whose input frames, in the last quarter of training, are the model's own
+            imagination from the first frame and the actions. The targets stay the recorded frames.
+        keypoint_weight: weight of RoboScape's keypoint consistency: the tokens that move most keep the
+            appearance that they have at the clip's start. 0: off.
+    """
+
+    window: int = 48
+    conditioning: str = "adaln"
+    maskgit_steps: int = 0
+    depth: bool = False
+    self_forcing: float = 0.5
+    self_rollout: float = 0.0
+    keypoint_weight: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._require_at_least("window", 1)
+        self._require_at_least("maskgit_steps", 0)
+        self._require_at_least("keypoint_weight", 0)
+        for name in ("self_forcing", "self_rollout"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise FieldError(f"dynamics.{name}", getattr(self, name), "must be between 0 and 1")
+
+    def memory(self, clip_length: int) -> int:
+        return self.window
