@@ -125,6 +125,26 @@ def check_dataset(config: FrameTokenizerConfig | WorldModelConfig, features: Map
         check_widths(features, {ACTION: config.action_size})
 
 
+def check_tokenizer_source(config: WorldModelConfig) -> None:
+    """Raise FieldError unless the model gets its tokenizer from exactly one place."""
+    if config.tokenizer_path and config.pretrained_path:
+        raise FieldError(
+            "tokenizer_path", config.tokenizer_path,
+            f"the world model at {config.pretrained_path} carries the tokenizer whose codes it has learnt",
+            "leave one of the two out",
+        )  # fmt: skip
+    if config.tokenizer_path and config.tokenizer is not None:
+        raise FieldError(
+            "tokenizer", config.tokenizer, "is that of the checkpoint at `tokenizer_path`",
+            "leave its settings out",
+        )  # fmt: skip
+    if not config.tokenizer_path and config.tokenizer is None:
+        raise FieldError(
+            "tokenizer_path", config.tokenizer_path, "is missing",
+            "give the output folder of a training with type=frame_tokenizer",
+        )  # fmt: skip
+
+
 def check_same_tokenizer(model: Any, other: Any, field: str, value: object) -> None:
     """Raise FieldError about `field`, which names the other world model, unless both have one tokenizer."""
     own, others = model.tokenizer.state_dict(), other.tokenizer.state_dict()

@@ -2,30 +2,37 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
+import numpy as np
 import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
 
 from lerobot_wmrl.common.precision import compute_in, imagination_dtype
+from lerobot_wmrl.data.frame_cache import cached_depth
 from lerobot_wmrl.data.frames import NO_CONTEXT, NO_PAST, Context, Frames, Past
-from lerobot_wmrl.world_models.dynamics import (
-    Condition,
-    Dynamics,
-    Imagination,
-    Imagined,
-    OpenLoopPrediction,
-)
+from lerobot_wmrl.world_models.dynamics import Dynamics, Imagination, Imagined, OpenLoopPrediction
 from lerobot_wmrl.world_models.frame_tokenizer import Decoded, FrameTokenizer
+from lerobot_wmrl.world_models.layers import Condition
 
 
 class ImaginationMixin:
     """What a world model does with its parts once they are trained."""
 
     name: str
+    config: Any
     tokenizer: FrameTokenizer
     dynamics: Dynamics
     state_mean: Tensor
     state_std: Tensor
+
+    def recorded_depth(self, dataset: LeRobotDataset, rows: Any) -> Tensor | None:
+        """Return the depth (…, S) in metres at rows of a dataset; None if the model does not look at depth."""
+        if not self.config.depth:
+            return None
+        depth = cached_depth(dataset, self.config.tokenizer.camera_keys, self.tokenizer.grid)[rows]
+        return torch.from_numpy(np.array(depth)).to(self.state_mean.device)
 
     @torch.no_grad()
     def start(

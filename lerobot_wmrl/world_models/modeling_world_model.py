@@ -9,10 +9,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
 import torch
 from lerobot.configs.rewards import RewardModelConfig
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.rewards.pretrained import PreTrainedRewardModel
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
@@ -25,27 +23,23 @@ from lerobot_wmrl.data.episodes import (
     check_episode_lengths,
     success_column,
 )
-from lerobot_wmrl.data.frame_cache import cached_depth, depth_of_windows
+from lerobot_wmrl.data.frame_cache import depth_of_windows
 from lerobot_wmrl.world_models.anchored.dynamics import AnchoredDynamics
+from lerobot_wmrl.world_models.autoregressive.configuration import AutoregressiveConfig
 from lerobot_wmrl.world_models.autoregressive.dynamics import AutoregressiveDynamics
-from lerobot_wmrl.world_models.checkpoint import check_dataset, load_model
+from lerobot_wmrl.world_models.checkpoint import check_dataset, check_tokenizer_source, load_model
 from lerobot_wmrl.world_models.configuration_world_model import (
     ActionWorldModelConfig,
     AnchoredConfig,
-    AutoregressiveConfig,
     TextWorldModelConfig,
     WorldModelConfig,
 )
-from lerobot_wmrl.world_models.dynamics import (
-    Condition,
-    Dynamics,
-    Prediction,
-)
+from lerobot_wmrl.world_models.dynamics import Dynamics
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
 from lerobot_wmrl.world_models.goal import imagine_goal, similarity_to_goal
 from lerobot_wmrl.world_models.hub_card import HubCard
 from lerobot_wmrl.world_models.imagination import ImaginationMixin
-from lerobot_wmrl.world_models.layers import FrameSizes
+from lerobot_wmrl.world_models.layers import Condition, FrameSizes, Prediction
 from lerobot_wmrl.world_models.modeling_frame_tokenizer import stack_cameras
 from lerobot_wmrl.world_models.text import CHECKPOINT_FOLDER, FrozenT5, check_one_each, make_text_encoder
 
@@ -81,26 +75,6 @@ def make_dynamics(config: WorldModelConfig, grid: int) -> Dynamics:
         return AnchoredDynamics(chosen, sizes)
     assert isinstance(chosen, AutoregressiveConfig)
     return AutoregressiveDynamics(chosen, sizes)
-
-
-def check_tokenizer_source(config: WorldModelConfig) -> None:
-    """Raise FieldError unless the model gets its tokenizer from exactly one place."""
-    if config.tokenizer_path and config.pretrained_path:
-        raise FieldError(
-            "tokenizer_path", config.tokenizer_path,
-            f"the world model at {config.pretrained_path} carries the tokenizer whose codes it has learnt",
-            "leave one of the two out",
-        )  # fmt: skip
-    if config.tokenizer_path and config.tokenizer is not None:
-        raise FieldError(
-            "tokenizer", config.tokenizer, "is that of the checkpoint at `tokenizer_path`",
-            "leave its settings out",
-        )  # fmt: skip
-    if not config.tokenizer_path and config.tokenizer is None:
-        raise FieldError(
-            "tokenizer_path", config.tokenizer_path, "is missing",
-            "give the output folder of a training with type=frame_tokenizer",
-        )  # fmt: skip
 
 
 class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
@@ -203,13 +177,6 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
 
     def _normalized_clip(self, clip: Clip) -> Clip:
         return clip._replace(state=self.normalize_state(clip.state))
-
-    def recorded_depth(self, dataset: LeRobotDataset, rows: Any) -> Tensor | None:
-        """Return the depth (…, S) of rows of a dataset in metres, None unless the model looks at depth."""
-        if not self.config.depth:
-            return None
-        depth = cached_depth(dataset, self.config.tokenizer.camera_keys, self.tokenizer.grid)[rows]
-        return torch.from_numpy(np.array(depth)).to(self.state_mean.device)
 
     @torch.no_grad()
     def clip_from_batch(self, batch: dict[str, Any]) -> Clip:
