@@ -28,7 +28,7 @@ class ImaginationMixin:
     state_std: Tensor
 
     def recorded_depth(self, dataset: LeRobotDataset, rows: Any) -> Tensor | None:
-        """Return the depth (…, S) in metres at rows of a dataset; None if the model does not look at depth."""
+        """Return the depth (…, S) in metres of rows of a dataset, None for a model without depth."""
         if not self.config.depth:
             return None
         depth = cached_depth(dataset, self.config.tokenizer.camera_keys, self.tokenizer.grid)[rows]

@@ -170,12 +170,9 @@ def make_joint_sampler(
 
 
 def train(
-    model: PreTrainedRewardModel,
-    sampler: Callable[[int], Any],
-    settings: TrainingSettings,
-    save_config: Callable[[Path], None],
-    wandb: Any = None,
-) -> None:
+    model: PreTrainedRewardModel, sampler: Callable[[int], Any], settings: TrainingSettings,
+    save_config: Callable[[Path], None], wandb: Any = None,
+) -> None:  # fmt: skip
     """Train from the last checkpoint in `output_dir` to `steps`.
 
     Args:
