@@ -1,4 +1,4 @@
-"""Clips, from which world models learn: drawn from a recording, or made of lerobot-train's windows.
+"""Clips that world models learn from: drawn from a dataset, or made of lerobot-train's windows.
 
 Training batches are pure functions of (seed, step): a resumed training repeats and skips no sample. Processes
 that train together have seeds of their own.
@@ -19,7 +19,7 @@ from lerobot_wmrl.data.frames import NO_CONTEXT, Context, Frames
 
 
 class Clip(NamedTuple):
-    """T consecutive frames of B episodes: what is seen, what is done, and what that leads to.
+    """T consecutive frames of B episodes, with actions and success.
 
     Args:
         tokens: (B, T, S).
@@ -27,7 +27,7 @@ class Clip(NamedTuple):
         action: (B, T, A), in dataset units.
         done: (B, T), 1 where success holds at frame t + 1.
         valid: (B, T), False where the episode is padded.
-        done_known: (B, T), whether `done` says what happened.
+        done_known: (B, T), False where `done` is unknown.
         instructions: B of them.
         depth: (B, T, S) metres of each token, for models that look at depth.
         context: of the B episodes' first frames, for models that look at it.
@@ -77,7 +77,7 @@ class ClipSampler:
         device: where the clips go.
         depth: (rows, S) metres of each token, for models that look at depth.
         context: (E, N, C, g, g) of the episodes' first frames, for models that look at it.
-        done_known: whether the table's done says what happened.
+        done_known: False if done must not be learnt from this table.
     """
 
     table: EpisodeTable
@@ -107,8 +107,8 @@ class ClipSampler:
         rows = self.table.start[episodes][:, None] + np.minimum(
             rows, self.table.length[episodes][:, None] - 1
         )
-        whole = self.context is not None
-        known = valid & self.done_known & (whole | (offsets == 0))[:, None]
+        shows_start = self.context is not None
+        known = valid & self.done_known & (shows_start | (offsets == 0))[:, None]
         context = NO_CONTEXT if self.context is None else Context((self._tensor(self.context[episodes]),))
         return Clip(
             self._tensor(self.tokens[rows]).long(),
@@ -182,9 +182,9 @@ def clip_from_windows(
     """Make clips of windows as lerobot-train gives them.
 
     A window ends at its row of the dataset. LeRobot fills a window that would begin before its episode with
-    copies of the first row. They are moved behind the window's end, where they count for nothing: else the
-    model would learn that actions at the start of an episode do nothing. Only the last row's `next.done` is
-    in the batch, and as in `ClipSampler` only windows that hold their episode's start have it as a label.
+    copies of the first row. These move to the window's end and become invalid: otherwise the model would
+    learn that actions at the start of an episode have no effect. The batch has `next.done` of the last row
+    alone. As in `ClipSampler`, it is a label only in windows that contain their episode's start.
 
     Args:
         tokens: (B, T, S), of the windows' frames.
@@ -223,6 +223,6 @@ def clip_from_windows(
 
 
 def unpadded_rows(padded: Tensor) -> Tensor:
-    """Return where in windows, of which the first rows are padding, to take a clip's rows. (B, T) → (B, T)"""
+    """Return the row of the window for each row of the clip, past the padding in front. (B, T) → (B, T)"""
     length = padded.shape[1]
     return (torch.arange(length, device=padded.device) + padded.sum(1, keepdim=True)).clamp(max=length - 1)

@@ -1,4 +1,4 @@
-"""Episodes of a LeRobotDataset: where they are, their numbers without pictures, whether they fit a model."""
+"""Episodes of a LeRobotDataset: all columns but the pictures, and checks of a dataset against a model."""
 
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,13 +14,13 @@ from numpy.typing import ArrayLike
 from lerobot_wmrl.common.errors import FieldError
 
 VIDEO_BACKEND: Final = "pyav"
-"""Ships its own FFmpeg; torchcodec needs the system's, and frames are decoded only once anyway."""
+"""pyav ships its own FFmpeg, torchcodec needs the system's. Speed matters little: frames are decoded once."""
 
 VALIDATION_EVERY: Final = 20
 """Every twentieth episode is held out from the training of tokenizers and world models."""
 
 SUCCESS_COLUMNS: Final = ("next.success", DONE)
-"""Where success is looked for. Beside the first, LeRobot's `next.done` may be the mere end of an episode."""
+"""Columns that can hold success, best first: `next.done` may mark the mere end of an episode."""
 
 OWN_COLUMNS: Final = ("index", "episode_index", "frame_index", "task_index")
 """LeRobot's integer columns, which say nothing about an episode."""
@@ -61,10 +61,10 @@ def success_column(columns: Container[str]) -> str | None:
 
 @dataclass
 class EpisodeTable:
-    """The numbers of a dataset: N rows of frames and E episodes.
+    """Columns of a dataset without its pictures: N rows (frames) in E episodes.
 
     Args:
-        dataset: where they come from.
+        dataset: the dataset that was read.
         state: (N, P), P = 0 where the dataset has none.
         action: (N, A).
         done: (N,), whether success holds at the frame; False everywhere where the dataset does not say.
@@ -225,7 +225,7 @@ def choose_episodes(
             one of `further`.
         at_most: how many.
         further: further splits by name, each a mask (E,).
-        wanted: a mask (E,) that leaves the others out.
+        wanted: a mask (E,) of the episodes to choose from; by default all.
 
     Returns:
         Indices of the episodes. (K,)

@@ -31,14 +31,14 @@ ENCODE_BATCH = 128
 
 
 class FrameEncoder(Protocol):
-    """What these caches need of a frame tokenizer."""
+    """Interface of a frame tokenizer, as the caches use it."""
 
     @property
     def tokens_per_frame(self) -> int:
         """S, tokens of all cameras."""
 
     def parameters(self) -> Iterator[torch.nn.Parameter]:
-        """Its weights, of which the caches are valid."""
+        """Return its weights, which the caches' names depend on."""
 
     def context(self, images: Tensor) -> Context:
         """Return the context of first frames (B, N, 3, H, W) in [0, 1]."""
@@ -117,7 +117,7 @@ def cached_context(
 def encoded_path(
     name: str, dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer: FrameEncoder
 ) -> Path:
-    """Return the path of the cache `name` of what exactly this tokenizer makes of these cameras."""
+    """Return the path of the cache `name`, which is valid for these weights, cameras and files alone."""
     weights = hashlib.sha256(b"".join(p.detach().cpu().numpy().tobytes() for p in tokenizer.parameters()))
     key = digest([weights.hexdigest(), *camera_keys, *file_stamps(dataset)])
     return cache_dir(dataset) / f"{name}-{key}.npy"
@@ -164,7 +164,7 @@ def decode_video(dataset: LeRobotDataset, episode: int, key: str) -> Tensor:
 def memory_map(
     path: Path, shape: tuple[int, ...], dtype: type, fill: Callable[[np.ndarray], None]
 ) -> np.ndarray:
-    """Return the array at `path`, or a new one that `fill` writes; it appears only once it is whole."""
+    """Return the array at `path`, written by `fill` if missing; the file appears only once it is whole."""
     if not path.is_file():
         path.parent.mkdir(parents=True, exist_ok=True)
         for torn in path.parent.glob("*.partial"):
@@ -182,7 +182,7 @@ def memory_map(
 
 
 def file_stamps(dataset: LeRobotDataset) -> list[object]:
-    """Return size and time of the dataset's files: another recording in the same folder is another cache."""
+    """Return names, sizes and times of the dataset's files: a new recording needs caches of its own."""
     files = sorted(path for pattern in ("*.mp4", "*.parquet") for path in Path(dataset.root).rglob(pattern))
     return [item for path in files for item in (path.name, path.stat().st_size, path.stat().st_mtime_ns)]
 
@@ -237,7 +237,7 @@ def decode_depth(dataset: LeRobotDataset, episode: int, key: str) -> Tensor:
 
 
 def depth_of_windows(batch: Mapping[str, Any], camera_keys: Sequence[str], grid: int) -> Tensor:
-    """Bring depth maps (B, T, 1, H, W) of lerobot-train's batch, in millimetres, to metres a token (B, T, S).
+    """Average depth maps (B, T, 1, H, W) in millimetres, as lerobot-train gives, to metres a token (B, T, S).
 
     Raises:
         FieldError: the depth of a camera is missing.

@@ -1,4 +1,4 @@
-"""What is known of single frames, as the tokenizer and the world models see them."""
+"""Frames at which imaginations begin, the past before them, and the context of their episodes."""
 
 from dataclasses import dataclass
 from typing import Any, Final
@@ -9,11 +9,11 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Context:
-    """What the tokenizer keeps of B first frames, maps (B, N, C, h, w); no map without its option `context`.
+    """Features of the first frames of B episodes, maps (B, N, C, h, w); none without the option `context`.
 
     The first map holds their features at the coarsest scale. The others are what each fusion of the tokenizer
     adds to its features, which is the same for every frame of an episode: the encoder's, then the decoder's
-    from coarse to fine. Callers that only ask the dynamics can leave these out.
+    from coarse to fine. Callers that use the dynamics alone can leave these out.
     """
 
     maps: tuple[Tensor, ...] = ()
@@ -40,7 +40,7 @@ class Context:
         )
 
     def projections(self) -> list[Tensor]:
-        """What the fusions of the tokenizer add, [(B·N, C, h, w), …], cameras as rows of the batch."""
+        """Return what the tokenizer's fusions add, [(B·N, C, h, w), …], cameras as rows of the batch."""
         return [each.flatten(0, 1) for each in self.maps[1:]]
 
 
@@ -77,7 +77,7 @@ class Past:
     """The H frames before those with which B imaginations begin, oldest first, and the action after each.
 
     Args:
-        frames: H of them, without context: an episode has one, which the frames after the past carry.
+        frames: H of them, without context. It is the same for a whole episode, and the frames after have it.
         actions: H of (B, A), in the dataset's units.
     """
 

@@ -1,4 +1,4 @@
-"""Convolutional parts of the frame tokenizer, most of their work at the coarse grid.
+"""Convolutional encoder and decoder of the frame tokenizer; most of their work is at the coarsest scale.
 
 As an option encoder and decoder are given features of the episode's first frame. Tokens then need not carry
 the static detail of a scene, only what moves in it (iVideoGPT, Wu et al. 2024, and Delta-IRIS, Micheli et al.

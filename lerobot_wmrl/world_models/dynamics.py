@@ -1,4 +1,4 @@
-"""Dynamics: how frames follow each other (eq. 1). The interface that both engines implement."""
+"""Interface of the dynamics (eq. 1), which both kinds implement, and the state of imaginations."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,8 +17,8 @@ from lerobot_wmrl.world_models.layers import Condition, FrameNetwork, Prediction
 class Imagined(NamedTuple):
     """One imagined frame of every environment.
 
-    tokens (B, S); done_logit (B,); proprioception (B, P), normalised from the dynamics and in the dataset's
-    units from the model; hidden (B, D); entropy (B,), the mean over code factors of the predictive entropy
+    tokens (B, S); done_logit (B,); proprioception (B, P), which the dynamics return normalised and the model
+    in the dataset's units; hidden (B, D); entropy (B,), the mean over code factors of the predictive entropy
     in nats; depth (B, S), metres of each token, None unless the dynamics predict it.
     """
 
@@ -31,7 +31,7 @@ class Imagined(NamedTuple):
 
 
 class OpenLoopPrediction(NamedTuple):
-    """What follows T actions of B imaginations.
+    """Outcome of T actions in each of B imaginations.
 
     done_logit (B, T) and proprioception (B, T, P) after each action, units as in `Imagined`; tokens (B, S)
     of the last frame.
@@ -44,7 +44,7 @@ class OpenLoopPrediction(NamedTuple):
 
 @dataclass
 class Imagination:
-    """Where B imaginations stand: their newest frames, and the keys and values of those before.
+    """State of B imaginations: their newest frames, and the keys and values of the frames before.
 
     codes (B, 1, S, C) and proprioception (B, 1, P), normalised, are of the newest frames; the context is that
     of the frames where the imaginations began; the condition is set if it is the same at every step.
@@ -59,12 +59,12 @@ class Imagination:
 
     @property
     def dtype(self) -> torch.dtype:
-        """What the network computes in."""
+        """Number format in which the network computes."""
         return self.cache.dtype
 
     @property
     def num_elements(self) -> int:
-        """Numbers that are remembered of the past."""
+        """Numbers kept of past frames."""
         return self.cache.num_elements
 
     def restart(self, mask: Tensor) -> None:
@@ -72,11 +72,11 @@ class Imagination:
         self.cache.restart(mask)
 
     def rewind(self, other: "Imagination", frames: int) -> None:
-        """Stand `frames` frames behind another imagination, with nothing remembered."""
+        """Move to `frames` frames before the position of another imagination, with an empty past."""
         self.cache.rewind(other.cache, frames)
 
     def put(self, rows: Tensor, other: "Imagination") -> None:
-        """Continue in the environments `rows` (R,) from where the R imaginations of `other` stand."""
+        """Replace the imaginations of the environments `rows` (R,) by the R imaginations of `other`."""
         self.codes.index_copy_(0, rows, other.codes)
         self.proprioception.index_copy_(0, rows, other.proprioception)
         maps = zip(self.context.maps, other.context.maps, strict=True)
@@ -93,11 +93,11 @@ class Dynamics(nn.Module):
     network: FrameNetwork
 
     def loss(self, clip: Clip, condition: Condition, progress: float) -> tuple[Tensor, dict[str, float]]:
-        """Eqs. 2-4.
+        """Compute the loss of eqs. 2-4.
 
         Args:
-            clip: what happened.
-            condition: of every row of the clip.
+            clip: recorded frames, with normalised states.
+            condition: that of every row of the clip.
             progress: share of the training that is over.
 
         Returns:
@@ -106,7 +106,7 @@ class Dynamics(nn.Module):
         raise NotImplementedError
 
     def predict(self, clip: Clip, condition: Condition, drawn: bool) -> Prediction:
-        """Predict the frame after every row of a clip; logits may be (B, 0, S, V) unless `drawn`."""
+        """Predict the frame after every row of a clip. Without `drawn`, logits may be empty, (B, 0, S, V)."""
         raise NotImplementedError
 
     def start(self, frames: Frames, dtype: torch.dtype | None = None) -> Imagination:
@@ -114,7 +114,7 @@ class Dynamics(nn.Module):
         raise NotImplementedError
 
     def show(self, imagination: Imagination, mask: Tensor, frames: Frames) -> None:
-        """Replace the newest frames of the environments in `mask` (B,); what was before stays remembered."""
+        """Replace the newest frames of the environments in `mask` (B,); their past is kept."""
         codes = self.network.codebook.codes(frames.tokens)[:, None]
         state = frames.proprioception[:, None]
         imagination.codes.copy_(torch.where(mask[:, None, None, None], codes, imagination.codes))
@@ -143,7 +143,7 @@ class Dynamics(nn.Module):
         )
 
     def _first(self, frames: Frames, dtype: torch.dtype | None) -> tuple[Tensor, Tensor, torch.dtype]:
-        """Codes (B, 1, S, C) and states (B, 1, P) of the frames, and what the network computes in."""
+        """Return codes (B, 1, S, C) and states (B, 1, P) of the frames, and the number format."""
         dtype = dtype or imagination_dtype(frames.tokens.device, len(frames))
         # a copy: imagination advances its tensors in place
         return (

@@ -29,7 +29,7 @@ def imagine_goal(
     model: "TextWorldModelRewardModel", frames: Frames, instructions: Sequence[str],
     threshold: float = GOAL_THRESHOLD,
 ) -> Goal:  # fmt: skip
-    """Eq. 6: the first imagined frame whose done probability reaches θ, else the one of the largest.
+    """Imagine the goal frame (eq. 6): the first whose done probability reaches θ, else the likeliest.
 
     Args:
         model: imagines `goal_horizon` frames at most.

@@ -1,4 +1,4 @@
-"""Imagination with a trained world model, in the dataset's units: begin, step, predict open loop."""
+"""Imagination with a trained world model, in the dataset's units: start, step, open-loop prediction."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -18,7 +18,7 @@ from lerobot_wmrl.world_models.layers import Condition
 
 
 class ImaginationMixin:
-    """What a world model does with its parts once they are trained."""
+    """Imagination for models with a tokenizer, dynamics and statistics of the states."""
 
     name: str
     config: Any
@@ -52,15 +52,15 @@ class ImaginationMixin:
         imagination = self.dynamics.start(self._normalized(first), dtype)
         if instructions is not None:
             imagination.condition = self.encode_instructions(instructions, len(frames))
-        self._watch(imagination, past, frames)
+        self._follow_past(imagination, past, frames)
         return imagination
 
     @torch.no_grad()
     def restart(self, imagination: Imagination, mask: Tensor, frames: Frames, past: Past = NO_PAST) -> None:
         """Begin anew at frames (as in `start`, of all B) in the environments in `mask` (B,).
 
-        With a past they are begun apart, as many frames ago as they have a past, and take their places when
-        they are as far as the others.
+        With a past, they start in an imagination of their own, as many frames back as the past is long. It
+        follows the past up to now, and then replaces theirs.
         """
         if not past.frames:
             self.dynamics.restart(imagination, mask, self._normalized(frames))
@@ -69,11 +69,11 @@ class ImaginationMixin:
         first = replace(past.frames[0][rows], context=frames.context[rows])
         apart = self.dynamics.start(self._normalized(first), imagination.dtype)
         apart.rewind(imagination, len(past.frames))
-        self._watch(apart, past[rows], frames[rows])
+        self._follow_past(apart, past[rows], frames[rows])
         imagination.put(rows, apart)
 
-    def _watch(self, imagination: Imagination, past: Past, now: Frames) -> None:
-        """Bring an imagination from the first of the past frames to `now`, showing it what happened."""
+    def _follow_past(self, imagination: Imagination, past: Past, now: Frames) -> None:
+        """Take the past's actions in an imagination, and replace each imagined frame by the recorded one."""
         everyone = torch.ones(len(now), dtype=torch.bool, device=now.tokens.device)
         for action, after in zip(past.actions, (*past.frames, now)[1:], strict=True):
             self.step(imagination, action)
@@ -105,7 +105,7 @@ class ImaginationMixin:
 
     @torch.no_grad()
     def decode(self, tokens: Tensor, context: Context = NO_CONTEXT) -> Decoded:
-        """Tokens (B, S) → images and features of the frames, computed as fast as imagination, as float32."""
+        """Tokens (B, S) → images and features in float32, computed in imagination's number format."""
         with compute_in(imagination_dtype(tokens.device), tokens.device):
             images, features = self.tokenizer.decode_with_features(tokens, context)
         return Decoded(images.float(), [feature.float() for feature in features])
@@ -119,11 +119,11 @@ class ImaginationMixin:
         raise NotImplementedError(f"{self.name} is not conditioned on text")
 
     def normalize_state(self, state: Tensor) -> Tensor:
-        """Dataset units to zero mean and unit spread. (…, P) → (…, P)"""
+        """Scale states from dataset units to zero mean and unit variance. (…, P) → (…, P)"""
         raise NotImplementedError
 
     def denormalize_state(self, state: Tensor) -> Tensor:
-        """Back to dataset units. (…, P) → (…, P)"""
+        """Scale normalised states back to dataset units. (…, P) → (…, P)"""
         return state * self.state_std + self.state_mean
 
     def _normalized(self, frames: Frames) -> Frames:

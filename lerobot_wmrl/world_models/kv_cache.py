@@ -31,8 +31,8 @@ class KVCache:
     ) -> "KVCache":
         """Return a ring of shape (L, B, S, h, window, d).
 
-        If it grows, attention skips slots that are still empty; if not, all steps are alike, which a CUDA
-        graph needs. By default it grows on the CPU.
+        If it grows, attention skips slots that are still empty; if not, all steps have the same shapes, which
+        a CUDA graph needs. By default it grows on the CPU.
         """
         grows = device.type == "cpu" if grows is None else grows
         keys, values = (torch.zeros(shape, device=device, dtype=dtype) for _ in range(2))
@@ -41,7 +41,7 @@ class KVCache:
 
     @property
     def dtype(self) -> torch.dtype:
-        """What the network computes in."""
+        """Number format in which the network computes."""
         return self.keys.dtype
 
     @property
@@ -67,9 +67,9 @@ class KVCache:
         self.started.copy_(torch.where(mask, self.position, self.started))
 
     def rewind(self, other: "KVCache", frames: int) -> None:
-        """Go `frames` frames behind the other cache, so that slots and rotations are those of its frames.
+        """Move to `frames` frames before the other cache's position, with its slots and rotations.
 
-        ValueError if it has not had so many.
+        ValueError unless it has had so many, and the window is longer.
         """
         if not frames < min(self.window, int(other.position) + 1):
             raise ValueError(
@@ -81,7 +81,7 @@ class KVCache:
         self.visible = other.visible
 
     def put(self, rows: Tensor, other: "KVCache") -> None:
-        """Remember in `rows` (R,) what the other cache does, of R environments at the same frame."""
+        """Copy another cache of R environments, at the same frame, into the rows `rows` (R,)."""
         for ring, theirs in ((self.keys, other.keys), (self.values, other.values)):
             ring.index_copy_(1, rows, theirs)
         self.started.index_copy_(0, rows, other.started)
@@ -91,7 +91,7 @@ class KVCache:
         return self.keys[layer, ..., : self.visible, :], self.values[layer, ..., : self.visible, :]
 
     def mask(self) -> Tensor:
-        """Which visible slots hold frames of the current episode. → (B, 1, 1, 1, visible)"""
+        """Mark the visible slots that hold frames of the current imagination. → (B, 1, 1, 1, visible)"""
         newest = self.position - 1
         slots = torch.arange(self.visible, device=self.started.device)
         held = newest - (newest - slots) % self.window

@@ -1,4 +1,4 @@
-"""What both networks are made of: attention, rotary positions, frames in and frames out."""
+"""Parts of both kinds of dynamics: condition and prediction, attention, embedding and reading of frames."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -51,7 +51,10 @@ class Rotation(NamedTuple):
 
 
 class Condition(NamedTuple):
-    """Eq. 1's c: tokens (B, T or 1, M, D) and which of them count, mask (B, 1, 1, 1, M); None: all."""
+    """The condition c of eq. 1.
+
+    tokens (B, T or 1, M, D); mask (B, 1, 1, 1, M), True for the tokens that count, None if all do.
+    """
 
     tokens: Tensor
     mask: Tensor | None = None
@@ -65,10 +68,10 @@ class Condition(NamedTuple):
 
 
 class Prediction(NamedTuple):
-    """The frame t + 1 that follows each of T frames. V is the sum of the levels of all code factors.
+    """Predictions of frame t + 1 for each of T frames.
 
-    logits (B, T, S, V), or (B, K, S, V) if only K frames were asked for; done_logit (B, T); proprioception
-    (B, T, P), normalised; hidden (B, T, D).
+    logits (B, T, S, V), V the sum of the levels of all factors, or (B, K, S, V) if only K frames were asked
+    for; done_logit (B, T); proprioception (B, T, P), normalised; hidden (B, T, D).
     """
 
     logits: Tensor
@@ -81,7 +84,7 @@ class TemporalMemory(Protocol):
     """Attention along time, layer by layer: within a clip in training, to a KV cache in imagination."""
 
     def attend(self, layer: int, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
-        """Attend to what frames may see. (B, S, h, T, d) each → (B, S, h, T, d)"""
+        """Attend to the frames that each frame may see. (B, S, h, T, d) each → (B, S, h, T, d)"""
 
 
 class ClipMemory:
@@ -95,7 +98,7 @@ class ClipMemory:
         self.keys_values: dict[int, tuple[Tensor, Tensor]] = {}
 
     def attend(self, layer: int, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
-        """Attend, and remember the layer's keys and values (B, S, h, T, d)."""
+        """Attend, and keep the layer's keys and values (B, S, h, T, d), which MaskGIT reads."""
         query, key = self.rotation(query), self.rotation(key)
         self.keys_values[layer] = key, value
         return attention(query, key, value, self.mask)
@@ -174,7 +177,7 @@ class FrameEmbedding(nn.Module):
 
 
 class FrameHead(nn.Module):
-    """Transformer tokens back to the code grid: logits of each factor, biased towards staying the same."""
+    """Transformer tokens to logits on the code grid, and gates that bias each factor to its present code."""
 
     def __init__(self, factors: int, logits: int, patch: int, code_width: int, width: int) -> None:
         super().__init__()
@@ -195,7 +198,7 @@ class FrameHead(nn.Module):
 
 @dataclass(frozen=True)
 class FrameSizes:
-    """What a network has to know of the frames it predicts.
+    """Sizes of the frames that a network predicts.
 
     Args:
         levels: codes of each factor of a token.
@@ -204,7 +207,7 @@ class FrameSizes:
         num_cameras: grids a frame, N.
         state_size: components of the proprioceptive state, P; 0 without.
         clip_length: frames of a training clip.
-        context_channels: of the coarsest features of the tokenizer's context; 0 without.
+        context_channels: channels of the coarsest features of the tokenizer's context; 0 without.
     """
 
     levels: Sequence[int]

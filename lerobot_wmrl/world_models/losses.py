@@ -14,15 +14,15 @@ STATE_WEIGHT: Final = 4.0
 """Weight of the state's loss beside those of tokens and done, which count 1."""
 
 MOTION_WEIGHT: Final = 1.0
-"""How much more a token counts when it moves. A high weight makes the model believe in motion: it then pushes
-objects that the hand misses."""
+"""Extra weight of a token that moves. If it is high, the model imagines motion that does not happen, such as
+objects that move although the hand misses them."""
 
 MOTION_LEVELS: Final = 3
-"""A token moves when its code changes by so many steps, FSQ's levels or LFQ's signs; less is mostly the
-codes' own flicker."""
+"""Steps (levels of FSQ, signs of LFQ) by which a token's codes must change to count as motion. Smaller
+changes are mostly noise of the tokenizer."""
 
 STATE_PRECISION: Final = 0.1
-"""Where the state's loss turns from squared to absolute, in `STATE_STEP`s: about a millimetre of the TCP."""
+"""Error at which the state's loss turns from squared to absolute, in `STATE_STEP`s: about a millimetre."""
 
 TOKEN_NOISE = 0.02
 """Share of input code factors moved by one step in training: a level of FSQ, a sign of LFQ."""
@@ -43,7 +43,7 @@ def corrupt_codes(codes: Tensor, codebook: CodeBook) -> Tensor:
 
 
 class TargetFrames(NamedTuple):
-    """K frames a clip that are to be predicted.
+    """Targets of the token loss: K frames of every clip.
 
     codes (B, K, S, C); weight (B, K, S) of each token, 0 for padding; moved (B, K, S), tokens of valid frames
     that move.
@@ -55,10 +55,15 @@ class TargetFrames(NamedTuple):
 
 
 def weighted_frames(codebook: CodeBook, target: Tensor, reference: Tensor, known: Tensor) -> TargetFrames:
-    """Weigh frames with codes `target` (B, K, S, C), of which those `known` (B, K) count.
+    """Give the tokens of target frames their weights in the loss.
 
-    Tokens that are not as in `reference` (B, K or 1, S, C) count more: most of a frame is still, and what
-    moves decides.
+    Most of a frame is still, and what moves decides. So tokens that have moved count more.
+
+    Args:
+        codebook: measures how far codes are apart.
+        target: codes of the frames, (B, K, S, C).
+        reference: codes from which motion is measured, (B, K or 1, S, C).
+        known: (B, K), False for frames that do not count.
     """
     moved = known[..., None] & (codebook.distance(target, reference) >= MOTION_LEVELS)
     return TargetFrames(target, (1 + MOTION_WEIGHT * moved) * known[..., None].float(), moved)
@@ -72,8 +77,8 @@ def next_frame_loss(
     Computed in float32, whatever the network computes in.
 
     Args:
-        prediction: about the rows of the clip; its first logits are of the target frames.
-        codebook: of the tokens.
+        prediction: for every row of the clip. Its first K logits are of the target frames, in their order.
+        codebook: code book of the tokens.
         target: the frames whose tokens are learnt.
         clip: with normalised states.
 
@@ -98,7 +103,7 @@ def next_frame_loss(
 
 
 def next_state_loss(predicted: Tensor, clip: Clip) -> Tensor:
-    """Smooth L1 of predicted states (B, T, P) against the next rows' ones, in `STATE_STEP`s. → ()"""
+    """Smooth L1 of predicted states (B, T, P) against those of the next rows, in `STATE_STEP`s. → ()"""
     error = (predicted[:, :-1] - clip.state[:, 1:]) / STATE_STEP
     losses = F.smooth_l1_loss(error, torch.zeros_like(error), reduction="none", beta=STATE_PRECISION)
     return masked_mean(losses, known_transitions(clip.valid)[..., None].expand_as(losses))

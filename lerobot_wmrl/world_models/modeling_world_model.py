@@ -1,7 +1,7 @@
 """The two world models (eq. 1) as LeRobot reward models: one architecture, two conditions.
 
-A checkpoint holds tokenizer, dynamics and statistics. Trained from token clips, or from a LeRobotDataset's
-batches; `ImaginationMixin` has what they do once they are trained.
+They are trained on clips of tokens, or on lerobot-train's batches; `ImaginationMixin` adds imagination. A
+checkpoint holds tokenizer, dynamics and statistics.
 """
 
 import logging
@@ -47,18 +47,19 @@ CONDITION_TOKENS: Final = 4
 """Tokens that an action is embedded into."""
 
 MIN_SPREAD: Final = 1e-3
-"""Components that vary less than this are constants, and left alone by normalisation."""
+"""Standard deviation below which a component is a constant, and not scaled."""
 
 STATE_SPREAD: Final = 0.02
-"""In the dataset's units: what varies less (a closed gripper's opening, the rotation of a hand that is held
-upright) is scaled as if it varied so much, lest its noise weigh as much as centimetres."""
+"""Least standard deviation by which the state is scaled, in the dataset's units. The opening of a closed
+gripper or the rotation of a hand held upright hardly varies: scaled by less, its noise would weigh as much as
+centimetres."""
 
 STATE_LIMIT: Final = 5.0
-"""In standard deviations."""
+"""Standard deviations to which the normalised state is clamped."""
 
-NEVER: Final = -5.0
-"""Logit of done with which a model begins whose dataset does not say what success is: else it would stay at
-chance, and every second imagination would succeed."""
+UNLABELLED_DONE: Final = -5.0
+"""Initial logit of done where the dataset does not say what success is. Nothing trains done then, and at a
+probability of one half imaginations would end in success."""
 
 
 def make_dynamics(config: WorldModelConfig, grid: int) -> Dynamics:
@@ -104,7 +105,7 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
         self.dynamics = make_dynamics(config, self.tokenizer.grid)
         if dataset_meta is not None and success_column(dataset_meta.features) is None:
             last: Any = self.dynamics.network.done[-1]
-            nn.init.constant_(last.bias, NEVER)
+            nn.init.constant_(last.bias, UNLABELLED_DONE)
         self._register_statistics("state", OBS_STATE, config.state_size, dataset_stats, STATE_SPREAD)
 
     def train(self, mode: bool = True) -> "WorldModelRewardModel":
@@ -121,7 +122,7 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
         return source
 
     def _adopt_features(self, features: dict[str, Any]) -> None:
-        """Take the widths from the dataset; a trained model must find its own there."""
+        """Take the sizes of features from the dataset, or check them against those of a trained model."""
         if self.config.pretrained_path:
             check_dataset(self.config, features)
         sizes = self.config.tokenizer
@@ -134,7 +135,7 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
             self.config.state_size = features[OBS_STATE]["shape"][0] if OBS_STATE in features else 0
 
     def _register_statistics(self, name: str, key: str, size: int, stats: Any, least: float = 0.0) -> None:
-        """Keep mean and standard deviation of the feature `key`, the latter at least `least`."""
+        """Register mean and standard deviation of the feature `key`, the latter at least `least`."""
         mean, std = torch.zeros(size), torch.ones(size)
         if stats is not None and size:
             mean = torch.as_tensor(stats[key]["mean"], dtype=torch.float32)
@@ -153,7 +154,7 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
         return ((state - self.state_mean) / self.state_std).clamp(-STATE_LIMIT, STATE_LIMIT)
 
     def condition(self, clip: Clip) -> Condition:
-        """Eq. 1's c, of every row of a clip."""
+        """Return the condition (eq. 1's c) of every row of a clip."""
         raise NotImplementedError
 
     def forward(self, batch: Clip | dict[str, Any], progress: float = 1.0) -> tuple[Tensor, dict[str, float]]:
@@ -164,7 +165,7 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
         return self.loss(batch if isinstance(batch, Clip) else self.clip_from_batch(batch), progress)
 
     def loss(self, clip: Clip, progress: float = 1.0) -> tuple[Tensor, dict[str, float]]:
-        """Eqs. 2-4 on a clip of tokens."""
+        """Compute the loss of eqs. 2-4 on a clip of tokens."""
         return self.dynamics.loss(self._normalized_clip(clip), self.condition(clip), progress)
 
     @torch.no_grad()
@@ -180,7 +181,10 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
 
     @torch.no_grad()
     def clip_from_batch(self, batch: dict[str, Any]) -> Clip:
-        """Tokenise a batch of LeRobot's windows, beside their first frames: they lack their episodes'."""
+        """Tokenise a batch of LeRobot's windows.
+
+        Each window's first frame gives the context, because the batch lacks the episode's first frame.
+        """
         sizes = self.config.tokenizer
         images = stack_cameras(batch, sizes.camera_keys, sizes.image_size)
         shape = images.shape[:2]
@@ -195,7 +199,7 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
 
 
 class ActionWorldModelRewardModel(WorldModelRewardModel):
-    """The world model that answers a policy."""
+    """The world model that imagines what follows a policy's actions."""
 
     config_class = ActionWorldModelConfig
     name = "action_world_model"
@@ -232,7 +236,7 @@ class ActionWorldModelRewardModel(WorldModelRewardModel):
 
     @torch.no_grad()
     def compute_reward(self, batch: dict[str, Any]) -> Tensor:
-        """Probability that success holds after the window's last action. → (B,)"""
+        """Return the probability that success holds after the window's last action. → (B,)"""
         clip = self.clip_from_batch(batch)
         last = clip.valid.sum(1, keepdim=True) - 1
         return self.predict(clip, drawn=False).done_logit.gather(1, last).squeeze(1).sigmoid()
@@ -283,7 +287,7 @@ class TextWorldModelRewardModel(WorldModelRewardModel):
 
     @torch.no_grad()
     def compute_reward(self, batch: dict[str, Any]) -> Tensor:
-        """Similarity of the window's last frame to the goal imagined from its first one. → (B,)"""
+        """Return the similarity of the window's last frame to the goal imagined from its first one. → (B,)"""
         clip = self.clip_from_batch(batch)
         goal = imagine_goal(self, clip.first(), clip.instructions)
         return similarity_to_goal(self.tokenizer, clip.tokens[:, -1], goal.decoded.features, clip.context)

@@ -33,7 +33,7 @@ class PerceptualLoss:
 
 
 def backbone_path(net: str) -> Path:
-    """Where torchvision keeps it: in `$TORCH_HOME/hub/checkpoints`, by default under `~/.cache/torch`."""
+    """Return the backbone's file in `$TORCH_HOME/hub/checkpoints`, by default in `~/.cache/torch`."""
     return Path(torch.hub.get_dir()) / "checkpoints" / PurePosixPath(BACKBONES[net].url).name
 
 
@@ -55,5 +55,5 @@ def require_backbone(net: str, field: str, value: object, otherwise: str) -> Non
 
 @cache
 def lpips_network(net: str, device: torch.device) -> torch.nn.Module:
-    """LPIPS on `vgg` or `alex`, fixed. Its backbone must be cached."""
+    """Return LPIPS on `vgg` or `alex`, frozen. Its backbone must be in torch's cache."""
     return LPIPS(net=net, verbose=False).requires_grad_(False).to(device)

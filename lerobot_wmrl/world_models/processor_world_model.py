@@ -1,4 +1,4 @@
-"""Processors of the world models: batches pass through, moved to the device, with success as what done means.
+"""Processors of the world models: they move batches to the device, and put success in the place of done.
 
 Statistics live in the models' buffers, because LeRobot does not reload reward processors on resume.
 """
@@ -25,7 +25,7 @@ from lerobot_wmrl.data.episodes import success_column
 
 
 def labelled_transition(batch: dict[str, Any]) -> EnvTransition:
-    """LeRobot's, which has no place for `next.success`: it takes that of `next.done` where there is one."""
+    """Make LeRobot's transition, in which `next.success`, if there is one, takes the place of `next.done`."""
     column = success_column(batch)
     return batch_to_transition(batch if column is None else {**batch, DONE: batch[column]})
 
@@ -33,7 +33,7 @@ def labelled_transition(batch: dict[str, Any]) -> EnvTransition:
 def make_pass_through_processors(
     config: RewardModelConfig, dataset_stats: dict[str, dict[str, Any]] | None = None
 ) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
-    """Pre- and postprocessor of any model of this package."""
+    """Return the pre- and postprocessor of any model of this package."""
     preprocessor: PolicyProcessorPipeline = PolicyProcessorPipeline(
         steps=[AddBatchDimensionProcessorStep(), DeviceProcessorStep(device=config.device or "cpu")],
         name=POLICY_PREPROCESSOR_DEFAULT_NAME,

@@ -15,14 +15,15 @@ from lerobot_wmrl.common.precision import compute_in
 from lerobot_wmrl.world_models.codebook import BinaryCodeBook
 
 ENTROPY_WEIGHT: Final = 0.1
-"""Of LFQ's entropy term, as in MAGVIT-2: of a token's code (low: decided) minus of all codes (high: used)."""
+"""Weight of LFQ's entropy term, as in MAGVIT-2: the entropy of a single token's code, which should be low,
+minus that of the codes of all tokens, which should be high."""
 
 COMMITMENT_WEIGHT: Final = 0.25
-"""Of the squared distance between a vector and its signs."""
+"""Weight of the squared distance between a vector and its signs."""
 
 
 class Quantized(NamedTuple):
-    """What F grids of vectors become.
+    """Quantised values and tokens of F grids of vectors.
 
     Args:
         values: (F, K, g, g), through which gradients pass as if nothing was rounded.

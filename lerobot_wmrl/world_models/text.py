@@ -23,25 +23,26 @@ from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.world_models.layers import Condition
 
 MAX_TOKENS: Final = 512
-"""What T5 was trained with (Raffel et al. 2020); the limit where a tokenizer states none of its own."""
+"""Limit where a tokenizer states none of its own: the length T5 was trained with (Raffel et al. 2020)."""
 
 QUOTED_CHARACTERS = 40
-"""How much of an instruction an error repeats."""
+"""Characters of an instruction that an error repeats."""
 
 T5_TYPES: Final = ("t5", "mt5", "umt5")
 """`model_type`s of the family. ByT5 and flan-T5 are of type t5."""
 
 VOCABULARY_PADDING = 128
-"""Encoders' vocabularies are rounded up to multiples of it. Tokenizers that differ by more are others; of a
-folder without one, transformers makes an empty one up."""
+"""Tokens by which the vocabularies of encoder and tokenizer may differ, as encoders round up to multiples of
+this. A larger difference means a tokenizer of another model, or the empty one that transformers makes up for
+a folder without any."""
 
 CACHED_INSTRUCTIONS = 4096
 
 CHECKPOINT_FOLDER: Final = "text_encoder"
-"""Where a checkpoint carries it, as diffusers' pipelines do."""
+"""Folder of a checkpoint that holds the frozen T5, named as in diffusers' pipelines."""
 
 UNREADABLE: Final = (OSError, ValueError, ImportError, SafetensorError)
-"""What transformers raises of models that are not there, broken, or need another package."""
+"""Errors of transformers about models that are missing, broken, or need another package."""
 
 
 def tokenize(tokenizer: Any, instructions: Sequence[str]) -> Any:
@@ -88,8 +89,8 @@ def first_line(error: BaseException) -> str:
 class FrozenT5:
     """A pretrained T5 encoder (Raffel et al. 2020) and its tokenizer: T5, flan-T5, ByT5, mT5 or umT5.
 
-    The embedding of each instruction is computed once. It is no `nn.Module`, so that no optimiser,
-    `state_dict`, training mode or gradient synchronisation of the world model meets it.
+    The embedding of each instruction is computed once. It is not an `nn.Module`: the world model's
+    optimiser, `state_dict`, training mode and gradient synchronisation leave it alone.
     """
 
     def __init__(self, model: Any, tokenizer: Any) -> None:
@@ -144,13 +145,13 @@ class FrozenT5:
 
     @torch.no_grad()
     def _embed(self, instruction: str, device: torch.device) -> Tensor:
-        """Return the last hidden states (M, width) of one instruction's tokens, float32."""
+        """Return the last hidden states (M, width) of one instruction's tokens in float32."""
         batch = tokenize(self.tokenizer, [instruction]).to(device)
         return self.model.to(device)(**batch).last_hidden_state[0].float()
 
 
 class TextEncoder(nn.Module):
-    """Base of both. The episodes of a batch share few instructions, so each is encoded once."""
+    """Base class of text encoders. A batch has few different instructions, so each is encoded once."""
 
     tokenizer: Any
 

@@ -49,11 +49,11 @@ from lerobot_wmrl.world_models.configuration_frame_tokenizer import cosine_sched
 from lerobot_wmrl.world_models.configuration_world_model import TextWorldModelConfig
 
 HELD_OUT_BATCHES = 8
-"""Batches on which a trained world model is measured: a few seconds."""
+"""Held-out batches on which a trained world model is measured, which takes a few seconds."""
 
 
 class TrainingSettings(Protocol):
-    """What the loop needs of a command's configuration."""
+    """Settings of a command that the training loop reads."""
 
     output_dir: Path
     steps: int
@@ -98,7 +98,7 @@ def make_sampler(
         chosen: indices of episodes to learn from, all by default; held-out episodes are left out.
         batch_size: frames (tokenizer) or clips (world models) a batch.
         seed: of the draws.
-        done_known: whether the table's done says what happened.
+        done_known: False if done must not be learnt from this table.
 
     Raises:
         FieldError: there is no episode to learn from.
@@ -133,7 +133,7 @@ def make_sampler(
 def make_clip_sampler(
     model: Any, table: EpisodeTable, episodes: np.ndarray, batch_size: int, seed: int, done_known: bool = True
 ) -> ClipSampler:
-    """Make a sampler of clips from these episodes, with what the world model looks at."""
+    """Make a sampler of clips from these episodes, with depth and context if the model looks at them."""
     config, tokenizer, dataset = model.config, model.tokenizer, table.dataset
     cameras = config.tokenizer.camera_keys
     return ClipSampler(

@@ -39,7 +39,7 @@ def frames_after(rows: Tensor, codes: Tensor, valid: Tensor, codebook: CodeBook)
 
 
 class AnchoredDynamics(Dynamics):
-    """Every frame from the episode's first one and the actions since: no picture is ever fed back."""
+    """Predict every frame from the episode's first one and the actions since, never from imagined ones."""
 
     network: AnchoredNetwork
 
@@ -48,7 +48,7 @@ class AnchoredDynamics(Dynamics):
         self.network = AnchoredNetwork(config, sizes)
 
     def loss(self, clip: Clip, condition: Condition, progress: float) -> tuple[Tensor, dict[str, float]]:
-        """Eqs. 2-4: the tokens of `DRAWN_FRAMES` frames of a clip, done and state of all of them."""
+        """Eqs. 2-4, with the tokens of `DRAWN_FRAMES` frames a clip, and done and state of all frames."""
         network, codebook = self.network, self.network.codebook
         codes = codebook.codes(clip.tokens)  # (B, T, S, C)
         rows = draw_rows(clip.valid, DRAWN_FRAMES)  # (B, K)
@@ -59,10 +59,10 @@ class AnchoredDynamics(Dynamics):
 
     @torch.no_grad()
     def predict(self, clip: Clip, condition: Condition, drawn: bool) -> Prediction:
-        """Predict from the first frame and all actions until then."""
+        """Predict each frame from the first one and the actions before it."""
         codes = self.network.codebook.codes(clip.tokens[:, :1])
-        none = torch.empty(len(codes), 0, dtype=torch.long, device=codes.device)
-        rows, length = None if drawn else none, clip.tokens.shape[1]
+        no_rows = torch.empty(len(codes), 0, dtype=torch.long, device=codes.device)
+        rows, length = None if drawn else no_rows, clip.tokens.shape[1]
         prediction: Prediction = self.network(codes, clip.state[:, :1], condition, length, rows, clip.context)
         return prediction
 
@@ -96,7 +96,7 @@ class AnchoredDynamics(Dynamics):
     def open_loop(
         self, frames: Frames, actions: Tensor, encode: Callable[[Tensor], Condition]
     ) -> OpenLoopPrediction:
-        """Predict in one pass that draws the last frame alone, unless imagination begins anew on the way."""
+        """Predict in one pass that draws the last frame alone; step by step beyond the length of a clip."""
         network, length = self.network, actions.shape[1]
         if length > network.window:
             return super().open_loop(frames, actions, encode)

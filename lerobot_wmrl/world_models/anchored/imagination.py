@@ -13,9 +13,10 @@ from lerobot_wmrl.world_models.kv_cache import CachedMemory
 class AnchoredImagination(Imagination):
     """Imaginations that each began at a frame of their own: its scene, and the state rollout since.
 
-    Whoever has imagined as many frames as the cache holds begins anew at the frame that was imagined last.
-    `frame` is the cache's position, known to the host. `phases` are the frames, modulo the cache's window, at
-    which some environment may have begun: at any other frame the device need not be asked who is due.
+    An environment that has imagined as many frames as the cache holds begins anew at its last frame.
+
+    `frame` is the cache's position, known to the host. `phases` are the values of `frame`, modulo the cache's
+    window, at which some environment may have to begin. At all others the host need not wait for the device.
     """
 
     scene: Scene | None = None
@@ -47,9 +48,9 @@ class AnchoredImagination(Imagination):
         self.phases |= other.phases
 
     def due(self) -> Tensor:
-        """Environments that have to begin now: rows (R,).
+        """Return the environments that have to begin now, rows (R,).
 
-        Waits for the device to say which, if there may be any.
+        The host waits for the device only if there may be any.
         """
         if self._phase not in self.phases:
             return self.cache.started.new_empty(0)

@@ -62,14 +62,14 @@ class StateRollout(NamedTuple):
     hidden: Tensor
 
     def last(self) -> "StateRollout":
-        """Where the rollout goes on, T = 1."""
+        """Return the last step, T = 1, from which the rollout goes on."""
         return StateRollout(*(tensor[:, -1:] for tensor in self))
 
 
 class ContextEmbedding(nn.Module):
     """The tokenizer's features of an episode's first frame, as transformer tokens.
 
-    They are continuous: they say where things lie twice as exactly as the first frame's codes.
+    They are continuous, and locate objects twice as precisely as the first frame's codes.
     """
 
     def __init__(self, channels: int, patch: int, width: int) -> None:
@@ -84,7 +84,7 @@ class ContextEmbedding(nn.Module):
 
 
 class SceneSummary(nn.Module):
-    """A scene's M tokens as one vector. Each token has weights of its own, as it matters where things are."""
+    """A scene's M tokens as one vector. Each token has weights of its own, so that positions are kept."""
 
     def __init__(self, tokens: int, width: int) -> None:
         super().__init__()
@@ -99,24 +99,24 @@ class SceneSummary(nn.Module):
 
 
 class StateRolloutNetwork(nn.Module):
-    """A recurrent network whose outputs are summed to the robot's state. Computes in float32.
+    """A recurrent network that predicts changes of the robot's state and sums them up. Computes in float32.
 
-    Contact bends the robot's way, and a sum of predicted changes never makes up for that. So each step is
-    given the state that the rollout itself has reached, and the scene's summary. Training goes through all
-    steps, so training and imagination do not differ.
+    Contact deflects the robot, and changes that are predicted from actions alone never make up for it. So
+    each step is given the state that the rollout itself has reached, and the scene's summary. Training
+    unrolls all steps, as imagination does.
     """
 
     def __init__(self, state_size: int, width: int) -> None:
         super().__init__()
         self.start = nn.Linear(state_size, width)
-        self.given = nn.Linear(2 * width, width)
-        self.moved = nn.Linear(2 * state_size, width)
+        self.condition_in = nn.Linear(2 * width, width)
+        self.state_in = nn.Linear(2 * state_size, width)
         self.mix = nn.Linear(width, width)
         self.cell = nn.GRUCell(width, width)
-        self.pull = nn.Linear(width, state_size)
-        self.carry = nn.Linear(state_size, state_size, bias=False)
-        nn.init.zeros_(self.carry.weight)
-        self.push = nn.Linear(width, state_size)
+        self.condition_change = nn.Linear(width, state_size)
+        self.momentum = nn.Linear(state_size, state_size, bias=False)
+        nn.init.zeros_(self.momentum.weight)
+        self.hidden_change = nn.Linear(width, state_size)
 
     def begin(self, state: Tensor) -> StateRollout:
         """Begin in a clip's first state (B, 1, P)."""
@@ -127,18 +127,20 @@ class StateRolloutNetwork(nn.Module):
         """Go T steps further under the conditions' means (B, T, D), in a scene of this summary (B, 1, D)."""
         with compute_in(torch.float32, condition.device):
             condition = condition.float()
-            given = self.given(torch.cat([condition, summary.float().expand_as(condition)], -1))
+            given = self.condition_in(torch.cat([condition, summary.float().expand_as(condition)], -1))
             steps, now = [], StateRollout(*(tensor[:, 0] for tensor in begin))
-            for known, pull in zip(given.unbind(1), self.pull(condition).unbind(1), strict=True):
-                now = self._step(now, known, pull)
+            for known, change in zip(
+                given.unbind(1), self.condition_change(condition).unbind(1), strict=True
+            ):
+                now = self._step(now, known, change)
                 steps.append(now)
             return StateRollout(*(torch.stack(tensors, 1) for tensors in zip(*steps, strict=True)))
 
-    def _step(self, now: StateRollout, given: Tensor, pull: Tensor) -> StateRollout:
+    def _step(self, now: StateRollout, given: Tensor, given_change: Tensor) -> StateRollout:
         """Go one action further; no tensor has a time dimension."""
-        seen = F.silu(given + self.moved(torch.cat([now.state, now.change], -1)))
+        seen = F.silu(given + self.state_in(torch.cat([now.state, now.change], -1)))
         hidden = self.cell(F.silu(self.mix(seen)), now.hidden)
-        change = pull + self.carry(now.change) + self.push(hidden)
+        change = given_change + self.momentum(now.change) + self.hidden_change(hidden)
         return StateRollout(now.state + STATE_STEP * change, change, hidden)
 
 
@@ -160,7 +162,7 @@ class SpatialBlock(nn.Module):
 
 
 class Dropout(nn.Module):
-    """Dropout (Srivastava et al. 2014) whose noise is uniform float32 in every number format."""
+    """Dropout (Srivastava et al. 2014) with float32 noise, so that every number format drops the same."""
 
     def __init__(self, share: float) -> None:
         super().__init__()
@@ -260,7 +262,18 @@ class AnchoredNetwork(FrameNetwork):
     def follow(
         self, scene: Scene, begin: StateRollout, mean: Tensor, memory: TemporalMemory, rows: Tensor | None
     ) -> tuple[Prediction, StateRollout]:
-        """Follow the trajectory from where a rollout stands, under the conditions' means (B, T, D)."""
+        """Roll the states on from `begin` under the conditions' means (B, T, D), and predict the frames.
+
+        Args:
+            scene: of the first frames.
+            begin: state rollout of T = 1 from which this one goes on.
+            mean: (B, T, D).
+            memory: what a frame sees along time.
+            rows: (B, K), those whose next frame is drawn; by default all.
+
+        Returns:
+            The prediction, and the state rollout of these T steps.
+        """
         rollout = self.state_rollout(begin, scene.summary, mean)
         x = self.register + mean + self.motion(rollout.hidden) + self.state_in(rollout.state)  # (B, T, D)
         x = x[:, None]  # (B, 1, T, D): space before time

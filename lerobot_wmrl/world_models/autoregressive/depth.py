@@ -2,7 +2,7 @@
 
 A transformer of its own, of the same layout, sees depth, the robot's state and the condition; layer by layer
 its hidden states, projected, are added to those of the tokens (additive fusion). The projections begin at
-zero, so the model begins as the one without depth. The tokens' branch never reaches this one.
+zero, so the model begins as the one without depth. Nothing flows from the tokens' branch to this one.
 """
 
 import math
@@ -45,7 +45,7 @@ def require_depth(depth: Tensor | None, shape: Sequence[int]) -> Tensor:
 
 
 def add_layer(added: Sequence[Tensor], layer: int, x: Tensor) -> Tensor:
-    """Return x (B, T, S', D) and what is added to it after this layer."""
+    """Return the sum of x (B, T, S', D) and what the depth branch adds after this layer."""
     return x + added[layer]
 
 
@@ -79,7 +79,7 @@ class DepthBranch(nn.Module):
             memory: shared with the tokens' branch.
 
         Returns:
-            What happens to the tokens' branch after each of its layers, and the depth (B, T, S).
+            The hook to call after each layer of the tokens' branch, and the depth (B, T, S).
         """
         grids = (self.num_cameras, self.grid, self.grid)
         frames, depth = register.shape[:2], require_depth(depth, (*register.shape[:2], math.prod(grids)))

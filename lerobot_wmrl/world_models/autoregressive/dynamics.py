@@ -1,4 +1,4 @@
-"""Autoregressive dynamics: the loss, the inputs that training shows against drift, and imagination."""
+"""Autoregressive dynamics: the inputs of a training step, the loss, and imagination."""
 
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
@@ -23,11 +23,11 @@ DEPTH_WEIGHT: Final = 1.0
 """Weight of the depth branch's loss."""
 
 SELF_ROLLOUT_FROM: Final = 0.75
-"""Progress of the training after which clips are replaced by rollouts: earlier ones soon leave the data."""
+"""Progress of the training after which rollouts replace clips. Earlier ones soon leave the data."""
 
 
 class Inputs(NamedTuple):
-    """What the network sees of clips: codes (B, T, S, C), state (B, T, P) and depth (B, T, S or 0).
+    """Inputs of the network for whole clips: codes (B, T, S, C), state (B, T, P) and depth (B, T, S or 0).
 
     State and depth are normalised.
     """
@@ -38,9 +38,9 @@ class Inputs(NamedTuple):
 
 
 def forced_share(target: float, progress: float) -> float:
-    """Share of input frames to replace after `progress` (0 to 1) of the training.
+    """Return the share of input frames to replace after `progress` (0 to 1) of the training.
 
-    None in the first quarter, when predictions are noise, then rising to `target` at half time.
+    It is 0 in the first quarter, when predictions are noise, and has risen to `target` at half time.
     """
     return target * min(1.0, max(0.0, 4 * progress - 1))
 
@@ -86,7 +86,7 @@ class AutoregressiveImagination(Imagination):
 
 
 class AutoregressiveDynamics(Dynamics):
-    """Each frame from those before it, which in imagination are the dynamics' own."""
+    """Predict each frame from those before it, in imagination from imagined ones."""
 
     network: NextFrameNetwork
 
@@ -155,7 +155,7 @@ class AutoregressiveDynamics(Dynamics):
     def roll_out(
         self, first: Frames, condition: Condition, steps: int, dtype: torch.dtype | None = None
     ) -> Inputs:
-        """Imagine frames 0 … `steps`, from frame 0 on, as the network sees them: T = 1 + `steps`.
+        """Imagine `steps` frames after the first one. → what the network sees of all, T = 1 + `steps`.
 
         condition (B, `steps` or more, M, D) or (B, 1, M, D), float32. Draws no random number.
         """
@@ -169,7 +169,7 @@ class AutoregressiveDynamics(Dynamics):
 
     @torch.no_grad()
     def predict(self, clip: Clip, condition: Condition, drawn: bool) -> Prediction:
-        """Predict from the real frames until then; the logits cost next to nothing."""
+        """Predict each frame from the real ones before it; logits cost little and are always there."""
         codes, depth = self.network.codebook.codes(clip.tokens), self._depth(clip.depth, clip.tokens)
         prediction: Prediction = self.network(codes, clip.state, condition, depth=depth)[0]
         return prediction

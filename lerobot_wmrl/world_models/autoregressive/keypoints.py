@@ -1,8 +1,8 @@
-"""Keypoint consistency (RoboScape, section 2.3): what moves looks, wherever it gets to, as at the start.
+"""Keypoint consistency (RoboScape, section 2.3): a moving point keeps its look along its track.
 
 RoboScape tracks dense points with SpatialTracker, keeps the K most active ones, and draws the visual tokens
-predicted along their tracks to those of the first frame. Here tokens are the points and block matching of
-their codes is the tracker: nothing is looked at but the pictures.
+predicted along their tracks to those of the first frame. Here tokens are the points, and block matching
+of their codes is the tracker.
 """
 
 import math
@@ -24,8 +24,11 @@ REACH = 1
 
 
 class Tracks(NamedTuple):
-    """places (B, T, K), the token of each keypoint in each frame; moving (B, T, K), whether it is known there
-    and moves at all in the clip."""
+    """Tracks of K keypoints through clips.
+
+    places (B, T, K), the token where each keypoint is in each frame; moving (B, T, K), True where the frame
+    is valid and the keypoint moves at all in the clip.
+    """
 
     places: Tensor
     moving: Tensor
@@ -43,10 +46,10 @@ def surroundings(grid: int, num_cameras: int, device: torch.device) -> Tensor:
 
 
 def track_tokens(codes: Tensor, codebook: CodeBook, around: Tensor) -> Tensor:
-    """Where each token of the first frame is later: codes (B, T, S, C), `around` (S, N) → (B, T, S).
+    """Track every token of the first frame: codes (B, T, S, C), `around` (S, N) → its place (B, T, S).
 
-    Block matching: frame by frame to the code nearest to the first one among those around, if it is nearer
-    by `MOTION_LEVELS`.
+    Block matching: from frame to frame a track moves to the token around it whose codes are nearest to those
+    at its start, if they are nearer by `MOTION_LEVELS` than where it is.
     """
     clip = torch.arange(len(codes), device=codes.device)[:, None, None]
     own = codes[:, 0, :, None]
@@ -62,7 +65,7 @@ def track_tokens(codes: Tensor, codebook: CodeBook, around: Tensor) -> Tensor:
 def most_active(places: Tensor, valid: Tensor, num_cameras: int) -> Tracks:
     """Choose from tracks (B, T, S) the `KEYPOINTS` of each camera that change place most often.
 
-    By camera, since in one on the wrist everything moves. valid (B, T): frames of the episode.
+    Each camera has its own: one on the wrist sees everything move. valid (B, T): frames of the episode.
     """
     moves = (places[:, 1:] != places[:, :-1]) & known_transitions(valid)[..., None]
     activity = moves.sum(1).unflatten(-1, (num_cameras, -1))

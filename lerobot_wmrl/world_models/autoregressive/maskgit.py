@@ -21,10 +21,10 @@ from lerobot_wmrl.world_models.losses import masked_mean
 
 
 class FramesSeen(NamedTuple):
-    """A pass of the network over frames.
+    """The first pass over frames, which the others refine.
 
-    The codes (B, T, S, C) it saw, under which condition, what it predicts of the next frames and of their
-    depth, and the memory it wrote.
+    Its inputs are codes (B, T, S, C) and the condition; its outputs the prediction of the next frames, their
+    depth, and the memory that it has filled.
     """
 
     codes: Tensor
@@ -36,7 +36,7 @@ class FramesSeen(NamedTuple):
 
 @dataclass
 class DraftMemory:
-    """Frames that no other frame sees: a draft sees what the frame before it saw, and itself.
+    """Memory of drafts: each sees what the frame before it saw, and itself; no frame sees a draft.
 
     past: keys and values (B, S, h, K, d) by layer; mask broadcastable to (B, S, h, T, K).
     """
@@ -47,7 +47,7 @@ class DraftMemory:
 
     @classmethod
     def after(cls, memory: ClipMemory | KVCache) -> "DraftMemory":
-        """For a draft of the frame after each frame of a clip, or after the newest one of a cache."""
+        """Return the memory for drafts after each frame of a clip, or after the newest one of a cache."""
         if isinstance(memory, ClipMemory):
             rotation = Rotation.at(memory.positions + 1, memory.head_width)
             return cls(memory.keys_values, memory.mask, rotation)
@@ -102,10 +102,10 @@ class MaskGit(nn.Module):
     ) -> tuple[Tensor, dict[str, float]]:
         """Cross-entropy of masked tokens; a frame's masked share is cos(π/2 · u), u uniform (eq. 1 there).
 
-        The last frame's next one is unknown: its draft is made up, nobody sees it and it does not count.
+        The frame after the last one is unknown: the last one stands in for it, and does not count.
 
         Args:
-            network: whose pass it was.
+            network: the one that made the first pass.
             seen: frames (B, T, …).
             target: codes (B, T − 1, S, C) of the frames after all but the last.
             weight: of their tokens, (B, T − 1, S).

@@ -42,13 +42,13 @@ def unchanged(layer: int, x: Tensor) -> Tensor:
 
 
 class Branch:
-    """A branch of a block as it is."""
+    """A branch of a block (space, time or MLP) that the condition does not modulate."""
 
-    def enter(self, normed: Tensor) -> Tensor:
+    def modulate(self, normed: Tensor) -> Tensor:
         """Return what the branch sees: (B, T, S, D) after its norm → same."""
         return normed
 
-    def leave(self, update: Tensor) -> Tensor:
+    def gated(self, update: Tensor) -> Tensor:
         """Return what the branch adds to the tokens: (B, T, S, D) → same."""
         return update
 
@@ -59,15 +59,19 @@ class ModulatedBranch(Branch):
     def __init__(self, scale: Tensor, shift: Tensor, gate: Tensor) -> None:
         self.scale, self.shift, self.gate = scale, shift, gate
 
-    def enter(self, normed: Tensor) -> Tensor:
+    def modulate(self, normed: Tensor) -> Tensor:
         return normed * (1 + self.scale) + self.shift
 
-    def leave(self, update: Tensor) -> Tensor:
+    def gated(self, update: Tensor) -> Tensor:
         return update * (1 + self.gate)
 
 
 class Conditioning(nn.Module):
-    """Base: leaves branches and tokens as they are. The mean (B, T or 1, D) is the condition's."""
+    """How a block takes in the condition (eq. 1's c). This base ignores it.
+
+    Subclasses modulate the block's three branches (space, time, MLP), change the tokens between time and MLP,
+    or both. `mean` (B, T or 1, D) is that of the condition's tokens.
+    """
 
     def branches(self, mean: Tensor) -> tuple[Branch, Branch, Branch]:
         """Return the branches of space, time and MLP."""
@@ -151,19 +155,19 @@ class SpatialTemporalBlock(nn.Module):
     ) -> Tensor:  # fmt: skip
         """x (B, T, S, D) → same; `attend_time` maps query, key and value (B, S, h, T, d) to the attended."""
         space, time, mlp = self.condition.branches(mean)
-        heads = self.space.split_heads(space.enter(self.space.norm(x)))
-        x = x + space.leave(self.space.merge_heads(attention(*heads)))
-        heads = self.time.split_heads(time.enter(self.time.norm(x)).transpose(1, 2))
-        x = x + time.leave(self.time.merge_heads(attend_time(*heads)).transpose(1, 2))
+        heads = self.space.split_heads(space.modulate(self.space.norm(x)))
+        x = x + space.gated(self.space.merge_heads(attention(*heads)))
+        heads = self.time.split_heads(time.modulate(self.time.norm(x)).transpose(1, 2))
+        x = x + time.gated(self.time.merge_heads(attend_time(*heads)).transpose(1, 2))
         x = self.condition(x, condition, mean)
         norm, expand, activate, contract = self.mlp
-        return x + mlp.leave(contract(activate(expand(mlp.enter(norm(x))))))
+        return x + mlp.gated(contract(activate(expand(mlp.modulate(norm(x))))))
 
 
 class SpatialTemporalTransformer(nn.Module):
     """L blocks and a final norm over frames of S tokens of width D.
 
-    Its layers are those from `first_layer` on in a memory that it shares with another transformer.
+    Two transformers may share a memory, where the layers of this one are numbered from `first_layer` on.
     """
 
     def __init__(self, layers: int, width: int, heads: int, conditioning: str, first_layer: int = 0) -> None:
@@ -226,7 +230,7 @@ class NextFrameNetwork(FrameNetwork):
     def guide(
         self, depth: Tensor | None, register: Tensor, condition: Condition, memory: TemporalMemory
     ) -> tuple[LayerHook, Tensor]:
-        """Return what the depth branch adds after each layer, and its prediction, as in `forward`."""
+        """Run the depth branch: return what it adds after each layer, and the next depth, as in `forward`."""
         if self.depth is None:
             return unchanged, register.new_zeros(*register.shape[:2], 0)
         hook, next_depth = self.depth(depth, register, condition, memory)
@@ -239,7 +243,7 @@ class NextFrameNetwork(FrameNetwork):
     def make_cache(
         self, batch: int, device: torch.device, dtype: torch.dtype, grows: bool | None = None
     ) -> KVCache:
-        """Return an empty KV cache for `batch` environments, with the depth branch's layers behind ours."""
+        """Return an empty KV cache for `batch` environments; the depth branch's layers follow the tokens'."""
         layers = len(self.transformer.blocks) * (1 if self.depth is None else 2)
         shape = (layers, batch, self.tokens_per_frame, self.heads, self.window, self.head_width)
         return KVCache.empty(shape, device, dtype, grows)
