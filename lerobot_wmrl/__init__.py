@@ -15,6 +15,7 @@ from lerobot_wmrl.common.stored_help import answer_help
 answer_help()
 
 CONFIGURATIONS = (
+    "lerobot.rewards",  # LeRobot's own reward models, which an environment may take
     "lerobot_wmrl.world_models.configuration_frame_tokenizer",
     "lerobot_wmrl.world_models.configuration_world_model",
     "lerobot_wmrl.world_models.autoregressive.configuration",

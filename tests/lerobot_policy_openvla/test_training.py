@@ -200,7 +200,7 @@ def test_new_adapters_on_adapters_are_refused(
 ) -> None:
     with pytest.raises(SystemExit):
         improve(monkeypatch, tuned, tmp_path / "new", "--peft.r=2")
-    assert "--peft: the policy has adapters already" in capsys.readouterr().err
+    assert "--peft: the policy has adapters, which are trained further" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
 
 
