@@ -47,7 +47,7 @@ def check(command: str) -> None:
 
     Checkpoints need not be there: nothing looks into its world model here.
     """
-    program, *flags = words_of(command)
+    program, *flags = (word for word in words_of(command) if word != "--help")
     unseen = {"__post_init__": lambda self: None}
     with patch.multiple(WorldModelEnv, **unseen), patch.multiple(EmbeddingConfig, **unseen):
         if program == "torchrun":
