@@ -8,21 +8,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from lerobot_wmrl.demo.report.figures import tidy
+
 COLOURS: Final = ("#2b6cb0", "#dd6b20", "#2f855a", "#805ad5")
 PLACES: Final = {"imagined": "PPO in imagination", "simulated": "PPO in ManiSkill"}
 DOMAINS: Final = {"ind": "known scenes", "ood": "unseen scenes", "drawn": "known scenes, tokens drawn"}
 CURVES: Final = (("data", "episodes"), ("time", "minutes"), ("size", "parameters"))
 """How the names of a learning curve's trainings begin, and what they are drawn over."""
-
-
-def tidy(figure: Figure) -> Figure:
-    """Take away frames, put legends in."""
-    for axes in figure.axes:
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(axis="y", alpha=0.25)
-        if axes.get_legend_handles_labels()[0]:
-            axes.legend(frameon=False, fontsize=9)
-    return figure
 
 
 def spread(rate: Mapping[str, Any]) -> list[list[float]]:

@@ -60,6 +60,7 @@ def curves(named: Mapping[str, Curve], title: str, xlabel: str = "step") -> str:
 
 
 def tidy(figure: Figure) -> Figure:
+    """Remove frames, add horizontal grid lines, and show a legend where lines are labelled."""
     for axes in figure.axes:
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(axis="y", alpha=0.25)
