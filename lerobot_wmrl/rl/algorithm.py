@@ -11,7 +11,7 @@ from lerobot.rl.algorithms.configs import TrainingStats
 from torch import Tensor, nn
 from torch.optim import AdamW, Optimizer
 
-from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.errors import FieldError, within
 from lerobot_wmrl.common.policies import load_trained_weights
 from lerobot_wmrl.common.precision import require_exact_updates
 from lerobot_wmrl.rl.configuration_algorithms import PolicyGradientConfig
@@ -45,9 +45,10 @@ class Algorithm(RLAlgorithm):
             if not hasattr(self.policy, "set_std"):
                 raise FieldError(
                     "algorithm.initial_std", config.initial_std,
-                    "this policy has no standard deviation", "leave it out",
+                    "this policy has no standard deviation", "set it to null",
                 )  # fmt: skip
-            self.policy.set_std(config.initial_std)
+            with within("algorithm"):
+                self.policy.set_std(config.initial_std)
         self.policy.eval()
         self.reference = frozen_copy(self.policy)
         self.value_parameters = list(self.policy.value_parameters())
@@ -73,11 +74,11 @@ class Algorithm(RLAlgorithm):
         return {self.name: AdamW(groups, weight_decay=0.0)}
 
     def get_optimizers(self) -> dict[str, Optimizer]:
-        """Return the optimiser by the algorithm's name."""
+        """Return the optimiser in use, with its moments; `make_optimizers_and_scheduler` makes a new one."""
         return {self.name: self.optimizer}
 
     def load_weights(self, weights: dict[str, Any], device: str | torch.device = "cpu") -> None:
-        """Load the policy's weights from a checkpoint."""
+        """Load a checkpoint's weights into `lerobot_policy`. Reference and adapter stay as they are."""
         load_trained_weights(self.lerobot_policy, weights)
 
     def state_dict(self) -> dict[str, Tensor]:

@@ -38,10 +38,13 @@ class PolicyGradientConfig(RLAlgorithmConfig):
     initial_std: float | None = None
 
     def __post_init__(self) -> None:
-        require_positive(self, "epochs", "minibatch_size", "policy_lr", "target_kl")
+        require_positive(self, "epochs", "minibatch_size", "policy_lr", "target_kl", "max_reference_kl")
+        require_at_least(self, 0, "reference_coefficient")
         require_choice(self, "ratio", ("action", "token"))
         if self.micro_batch_size is not None:
             require_at_least(self, 1, "micro_batch_size")
+        if self.initial_std is not None:
+            require_positive(self, "initial_std")
 
     @classmethod
     def from_policy_config(cls, policy_cfg: Any) -> Self:
@@ -60,8 +63,8 @@ class PPOConfig(PolicyGradientConfig):
         clip: half-width of the interval around 1 in which the ratio may move.
         value_lr: learning rate of the value function (AdamW).
         value_iterations: number of iterations at the beginning in which only the value function learns.
-        value_normalisation: divide returns by their running standard deviation, for returns far from 1 in
-            size.
+        value_normalisation: normalise the value's targets by the returns' running mean and standard
+            deviation, for returns far from 1 in size.
     """
 
     gamma: float = 0.97

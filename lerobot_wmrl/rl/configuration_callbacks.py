@@ -42,8 +42,8 @@ class GateConfig:
             successes.
         dataset: labelled rollouts that the world model was not trained on. The gate replays them before the
             first update and after each Dyna round.
-        freq: iterations between two checks on new rollouts in `real_env`. There is always a check before the
-            first update. 0: that one only.
+        freq: iterations between two checks on new rollouts in `real_env`; 0: no such checks. There is always
+            one before the first update.
         n_episodes: rollouts in each check in `real_env`.
     """
 

@@ -40,7 +40,7 @@ class GRPO(PolicyGradient):
         return self.config.group_size
 
     def parameter_groups(self) -> dict[str, tuple[list[nn.Parameter], float]]:
-        """Return the policy alone."""
+        """Return the policy alone: a value function that it has is not trained."""
         return {"policy": (self.policy_parameters, self.config.policy_lr)}
 
     @torch.no_grad()

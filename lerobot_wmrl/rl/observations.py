@@ -1,5 +1,7 @@
 """Storage of a rollout's observations. T time, B environments."""
 
+from collections.abc import Sequence
+
 import torch
 from lerobot.utils.constants import OBS_IMAGES
 from torch import Tensor
@@ -43,19 +45,25 @@ class ObservationBuffer:
     def read(self, rows: Tensor) -> Observation:
         """Return the observations of flat rows t · B + b. `rows` (N,) is on the CPU, as the instructions are:
         no device has to be waited for."""
-        rows_on = {device: rows.to(device) for device in {value.device for value in self.tensors.values()}}
-        return self._decoded(
-            {name: value.flatten(0, 1)[rows_on[value.device]] for name, value in self.tensors.items()}
-        )
+        return self._decoded(self.read_stored(rows))
 
-    def _decoded(self, encoded: dict[str, Tensor]) -> Observation:
-        texts = list(self.instructions)
-        return {
-            name: value.float() / 255 if name.startswith(OBS_IMAGES)
-            else [texts[index] for index in value.tolist()] if name == TASK
-            else value
-            for name, value in encoded.items()
-        }  # fmt: skip
+    def read_stored(self, rows: Tensor) -> dict[str, Tensor]:
+        """Return the observations of `rows`, as in `read`, as they are stored."""
+        rows_on = {device: rows.to(device) for device in {value.device for value in self.tensors.values()}}
+        return {name: value.flatten(0, 1)[rows_on[value.device]] for name, value in self.tensors.items()}
+
+    def _decoded(self, stored: dict[str, Tensor]) -> Observation:
+        return decoded(stored, list(self.instructions))
+
+
+def decoded(stored: dict[str, Tensor], instructions: Sequence[str]) -> Observation:
+    """Return stored observations as the policy sees them: images in [0, 1], instructions as texts."""
+    return {
+        name: value.float() / 255 if name.startswith(OBS_IMAGES)
+        else [instructions[index] for index in value.tolist()] if name == TASK
+        else value
+        for name, value in stored.items()
+    }  # fmt: skip
 
 
 def to_bytes(image: Tensor) -> Tensor:

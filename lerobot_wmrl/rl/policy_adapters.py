@@ -11,13 +11,16 @@ from typing import Any, NamedTuple
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.processor import DeviceProcessorStep
-from lerobot.utils.constants import OBS_IMAGES
+from lerobot.utils.constants import ACTION, OBS_IMAGES
 from torch import Tensor, nn
 from torch.distributions import Normal
 
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.policies import unwrapped
 from lerobot_wmrl.rl.protocol import Observation, Pipeline, StochasticPolicy
+
+ACTION_IS_PAD = f"{ACTION}_is_pad"
+"""Marks the actions of a chunk beyond the end of the episode, in LeRobot's batches. (B, n) bool"""
 
 INITIAL_STD = 0.1
 """Standard deviation that exploration starts from, in normalised actions: ACT's L1 loss learns none."""
@@ -78,8 +81,6 @@ class ActAdapter(nn.Module):
     @torch.no_grad()
     def set_std(self, std: float) -> None:
         """Start exploration from `std` in every component."""
-        if std <= 0:
-            raise FieldError("initial_std", std, "must be above 0")
         self.log_std.fill_(math.log(std))
 
     def own_tensors(self) -> dict[str, Tensor]:
@@ -111,8 +112,7 @@ def as_stochastic(policy: Any) -> Any:
     Raises:
         FieldError: there is no adapter for this type of policy.
     """
-    suitable: bool = isinstance(unwrapped(policy), StochasticPolicy)
-    if suitable:
+    if isinstance(unwrapped(policy), StochasticPolicy):
         return policy
     if policy.config.type not in ADAPTERS:
         raise FieldError(
@@ -126,7 +126,7 @@ def as_stochastic(policy: Any) -> Any:
 def make_pipeline(config: PreTrainedConfig, preprocessor: Any, postprocessor: Any) -> Pipeline:
     """Wrap a policy's processors. Observations that the policy has no input for are left out. Actions stay on
     the policy's device, where LeRobot's postprocessors would move them to the CPU."""
-    known = {*(config.input_features or {}), "task"}
+    known = {*(config.input_features or {}), "task", ACTION, ACTION_IS_PAD}
     steps = [
         replace(step, device=config.device) if isinstance(step, DeviceProcessorStep) else step
         for step in postprocessor.steps

@@ -5,18 +5,22 @@ one cuts minibatches from its own rollout, and gradients and metrics are average
 """
 
 import math
+import time
 from abc import abstractmethod
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
+import gymnasium as gym
 import torch
 import torch.nn.functional as F
 from lerobot.rl.algorithms.configs import TrainingStats
 from torch import Tensor, nn
+from tqdm import tqdm
 
 from lerobot_wmrl.common.distributed import (
     average_gradients,
     gather_counts,
+    hidden_progress,
     largest_over_processes,
     mean_and_variance,
     mean_over_processes,
@@ -24,7 +28,7 @@ from lerobot_wmrl.common.distributed import (
 from lerobot_wmrl.rl.algorithm import NORM, RATIO_ERROR, Algorithm, training_stats
 from lerobot_wmrl.rl.configuration_algorithms import PolicyGradientConfig
 from lerobot_wmrl.rl.protocol import Pipeline
-from lerobot_wmrl.rl.rollout import RolloutBuffer
+from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
 
 GRAD_CLIP_NORM = 1.0
 """Largest gradient norm, of the policy's parameters and of the value's separately."""
@@ -56,13 +60,20 @@ def outside_clip(log_ratio: Tensor, low: float, high: float) -> Tensor:
 
 
 def kl_estimate(log_prob: Tensor, other: Tensor) -> Tensor:
-    """Estimate KL(sampling ‖ other) by r − 1 − log r, r = other / sampling (Schulman 2020). (B, K) → (B,)"""
+    """Estimate KL(p ‖ q) on samples of p by r − 1 − log r, r = q / p (Schulman 2020). (B, K), (B, K) → (B,)
+
+    `log_prob` is log p of each component, `other` is log q.
+    """
     log_ratio = (other - log_prob).sum(dim=1)
     return log_ratio.exp() - 1 - log_ratio
 
 
 def reference_penalty(log_prob: Tensor, reference: Tensor) -> Tensor:
-    """Return ½ (log π − log π_ref)², whose gradient on π's samples is that of KL(π ‖ π_ref). (B, K) → (B,)"""
+    """Return ½ Σ (log π − log π_ref)² over the components. (B, K), (B, K) → (B,)
+
+    Its mean gradient on π's samples is that of KL(π ‖ π_ref) for independent components; per token it ignores
+    what a token does to later ones.
+    """
     return 0.5 * (log_prob - reference).square().sum(dim=1)
 
 
@@ -75,8 +86,13 @@ def read_batch(rollout: RolloutBuffer, rows: Tensor, pipeline: Pipeline) -> Batc
 
 
 class Minibatch(NamedTuple):
-    """Decisions of one optimiser step: their number, averaged over the processes, and the micro-batches that
-    they are cut into, each with the number of its decisions that count (`Minibatches._read`)."""
+    """Decisions of one optimiser step.
+
+    Args:
+        size: their number, averaged over the processes.
+        micro_batches: the parts that they are cut into, each with the number of its decisions that count: the
+            first ones (`Minibatches._read`).
+    """
 
     size: float
     micro_batches: Iterator[tuple[int, Batch]]
@@ -104,10 +120,10 @@ class Minibatches:
         for _ in range(self.config.epochs if max(self.counts) else 0):
             order = self.rows[torch.randperm(len(self.rows))]
             for first in range(0, max(self.counts), size):
-                shares = [min(max(count - first, 0), size) for count in self.counts]
-                micro_batches = math.ceil(max(shares) / (self.config.micro_batch_size or size))
+                sizes = [min(max(count - first, 0), size) for count in self.counts]
+                micro_batches = math.ceil(max(sizes) / (self.config.micro_batch_size or size))
                 cut = order[first : first + size].tensor_split(micro_batches)
-                yield Minibatch(sum(shares) / len(shares), (self._read(rows) for rows in cut))
+                yield Minibatch(sum(sizes) / len(sizes), (self._read(rows) for rows in cut))
 
     def _read(self, rows: Tensor) -> tuple[int, Batch]:
         """Return the number of rows and their batch. A process without rows left still runs the policy, on
@@ -118,7 +134,7 @@ class Minibatches:
 class PolicyGradient(Algorithm):
     """Ascent on a clipped objective, with a KL penalty towards the SFT policy, the frozen `reference`.
 
-    A training iteration is `rollout.collect`, `prepare`, then `update`. Subclasses say what the advantages
+    An iteration is `rollout.collect`, `prepare`, then `update`. Subclasses say what the advantages
     are (`add_targets`) and what else is in the loss (`losses`).
     """
 
@@ -137,11 +153,30 @@ class PolicyGradient(Algorithm):
     def losses(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss of each decision (B,), and its metrics, (B,) by name."""
 
+    def iterate(
+        self, env: gym.vector.VectorEnv, pipeline: Pipeline, rollout: RolloutBuffer, seed: int, last: bool
+    ) -> dict[str, float]:
+        """Collect one rollout with the seeds from `seed` on, update the policy on it, and return metrics."""
+        started = time.perf_counter()
+        collected = collect(env, self.policy, pipeline, rollout, seed, self.group_size)
+        rollout_end = time.perf_counter()
+        minibatches, targets = self.prepare(rollout, pipeline)
+        progress = tqdm(minibatches, "update", leave=False, unit="minibatch", disable=hidden_progress())
+        stats = self.update(iter(progress))
+        progress.close()
+        return {
+            **collected,
+            **targets,
+            **stats.to_log_dict(),
+            "rollout_s": rollout_end - started,
+            "update_s": time.perf_counter() - rollout_end,
+        }
+
     def prepare(self, rollout: RolloutBuffer, pipeline: Pipeline) -> tuple[Minibatches, dict[str, float]]:
         """Compute advantages and the reference's log-probabilities; return minibatches for `update`, and
         metrics."""
         chosen, metrics = self.add_targets(rollout)
-        metrics["reference_kl"] = self.add_reference(rollout, pipeline)
+        metrics["rollout_reference_kl"] = self.add_reference(rollout, pipeline)
         return Minibatches(rollout, chosen, pipeline, self.config), metrics
 
     @torch.no_grad()
@@ -164,7 +199,8 @@ class PolicyGradient(Algorithm):
         return mean_and_variance(kl[rollout.decided.flatten()])[0].item()
 
     def update(self, batch_iterator: Iterator[Minibatch]) -> TrainingStats:
-        """Take one optimiser step on each minibatch, until the KL to the rollout's policy is `target_kl`."""
+        """Take one optimiser step on each minibatch, until the KL to the rollout's policy exceeds
+        `target_kl`."""
         records: list[dict[str, float]] = []
         first = self.optimization_step
         for minibatch in batch_iterator:
@@ -195,10 +231,15 @@ class PolicyGradient(Algorithm):
     def policy_losses(
         self, batch: Batch, low: float, high: float
     ) -> tuple[Tensor, dict[str, Tensor], Tensor]:
-        """Return the policy's loss of each decision, its ratio clipped at 1 − low and 1 + high; metrics by
-        name; and the value. All (B,)"""
+        """Return the policy's loss of each decision, with the ratio clipped to [1 − low, 1 + high]; its
+        metrics by name; and the value. All (B,)
+
+        The actions are samples of the policy before the update. There `reference_kl` and the penalty's
+        gradient are unbiased; after it they are approximate.
+        """
         log_prob, entropy, value = self.policy.evaluate(batch["observation"], batch["raw_action"])
-        executed = batch.get(EXECUTED, 1.0)  # (B, n, 1): actions that were not executed count for nothing
+        # (B, n, 1). Not executed: ratio 1 and no gradient, but counted in the mean over ratios.
+        executed = batch.get(EXECUTED, 1.0)
         now, old, reference = (
             (each * executed).flatten(1) for each in (log_prob, batch["log_prob"], batch[REFERENCE])
         )  # (B, K), or (B, n · K)

@@ -23,9 +23,10 @@ def generalised_advantages(
         reward, value: r_t and V(o_t). All tensors are (T, B).
         next_value: V(o_{t+1}), at an episode's last step that of its final observation.
         terminated: the episode ended, so V(o_{t+1}) counts as 0.
-        truncated: the episode was cut, but V(o_{t+1}) counts. After both, A_{t+1} is another episode's.
+        truncated: the episode was cut, and V(o_{t+1}) counts. After either, row t + 1 belongs to another
+            episode, so A_{t+1} is not added.
         gamma, gae_lambda: γ and λ.
-        decided: where the policy made a decision; elsewhere it executes an earlier step's action chunk. A
+        decided: where the policy made a decision; elsewhere the action chunk of an earlier one goes on. A
             chunk of n steps has δ = Σ_{i<n} γ^i r_{t+i} + γ^n V(o_{t+n}) − V(o_t). Its advantage is in the
             row of the decision; the other rows have no meaning.
     """
@@ -36,6 +37,7 @@ def generalised_advantages(
     for step in reversed(range(len(value))):
         future = next_value[step] * alive[step] + gae_lambda * same_episode[step] * running
         if decided is not None and step + 1 < len(value):
+            # where the chunk goes on, this sum is the return of its remaining steps
             continued = ~(decided[step + 1] | terminated[step] | truncated[step])
             future = torch.where(continued, advantages[step + 1] + value[step + 1], future)
         running = reward[step] + gamma * future - value[step]
@@ -56,8 +58,8 @@ def value_loss(value: Tensor, target: Tensor) -> Tensor:
 
 class PPO(PolicyGradient):
     """Clipped objective on generalised advantages. The value function is trained beside the policy, and alone
-    in the first `value_iterations`. With `value_normalisation` it predicts returns scaled by `return_scale`.
-    """
+    in the first `value_iterations`. With `value_normalisation` it predicts returns that `return_scale` has
+    normalised."""
 
     config_class = PPOConfig
     name = "ppo"
@@ -68,14 +70,14 @@ class PPO(PolicyGradient):
         self.return_scale = ReturnScale(self.value_parameters[0].device)
 
     def parameter_groups(self) -> dict[str, tuple[list[nn.Parameter], float]]:
-        """Return the policy and the value function, each with its learning rate."""
+        """Return two groups: the value function has a learning rate and a gradient norm of its own."""
         return {
             "policy": (self.policy_parameters, self.config.policy_lr),
             "value": (self.value_parameters, self.config.value_lr),
         }
 
     def trained_groups(self) -> list[str]:
-        """Return both names, or the value's alone in the first iterations."""
+        """Leave the policy out in the first `value_iterations`."""
         return ["value"] if self.value_only else super().trained_groups()
 
     @property
@@ -113,6 +115,6 @@ class PPO(PolicyGradient):
         return (record["value_loss"] if self.value_only else loss + record["value_loss"]), record
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return the base's tensors and the running moments of the returns."""
+        """Add the moments of the returns, in whose units the value function predicts."""
         scale = {f"returns.{name}": value for name, value in self.return_scale.tensors.items()}
         return {**super().state_dict(), **scale}

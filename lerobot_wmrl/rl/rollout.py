@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from lerobot_wmrl.common.distributed import mean_over_processes, rank_and_size
+from lerobot_wmrl.common.distributed import hidden_progress, mean_over_processes
 from lerobot_wmrl.rl.observations import ObservationBuffer, as_read_back
 from lerobot_wmrl.rl.protocol import ActionSample, Observation, Pipeline, StochasticPolicy
 from lerobot_wmrl.rl.seeds import seeded_noise, start_seeds
@@ -19,6 +19,7 @@ class RolloutBuffer:
 
     All fields are (T, B); `raw_action` and `log_prob` are (T, B, K), or (T, B, n, K) for action chunks. A
     chunk is stored in the row of its first step. Only such rows, where the policy decided, are trained on.
+    `age` counts the steps since the policy decided on the action; it is 0 where it decides.
     """
 
     def __init__(self, steps: int, num_envs: int, device: torch.device | str) -> None:
@@ -31,7 +32,6 @@ class RolloutBuffer:
         self.final_value = torch.full((steps, num_envs), torch.nan, device=device)
         self.terminated, self.truncated = empty(torch.bool), empty(torch.bool)
         self.success, self.age = empty(torch.bool), empty(torch.long)
-        """`age`: steps since the policy decided on the action; 0 where it decides."""
         self.raw_action = self.log_prob = torch.empty(0)
         self.columns: dict[str, Tensor] = {}
         """Inputs of the loss that an algorithm adds, such as advantages: (T, B, …) by name."""
@@ -53,7 +53,7 @@ class RolloutBuffer:
 
     def write(self, step: int, age: Tensor, reward: Tensor, terminated: Tensor, truncated: Tensor) -> None:
         """Store the outcome of `step`, whose actions were decided `age` steps before. All (B,)"""
-        self.value[step].masked_fill_(age > 0, 0.0)
+        self.value[step].masked_fill_(age > 0, 0.0)  # an earlier rollout may have decided there
         self.age[step], self.reward[step] = age, reward
         self.success[step], self.final_value[step] = False, torch.nan
         self.terminated[step], self.truncated[step] = terminated, truncated
@@ -97,14 +97,14 @@ class RolloutBuffer:
         """Return which actions of each chunk were executed. (T, B, n, 1) bool; None without chunks"""
         if self.raw_action.ndim < 4:
             return None
-        length = torch.ones_like(self.age)  # (T, B)
+        length = torch.ones_like(self.age)  # (T, B), steps until the next decision or the rollout's end
         for step in reversed(range(self.steps - 1)):
             length[step] += torch.where(self.decided[step + 1], 0, length[step + 1])
         return torch.arange(self.raw_action.shape[2], device=self.device)[:, None] < length[..., None, None]
 
     def statistics(self) -> dict[str, float]:
-        """Return success rate and length of first episodes, and the mean reward of all steps. Later episodes
-        would bias the two: only short ones end within the rollout."""
+        """Return the mean reward of all steps, and success rate and length of first episodes. Later episodes
+        would bias success rate and length: only short ones end within the rollout."""
         first = self.finished & self.first_episode
         steps = torch.arange(1, self.steps + 1, device=self.device)[:, None]
         episodes = first.sum().clamp_min(1)
@@ -142,7 +142,8 @@ class Actor:
         return self.chunk[self.all_rows, self.age]
 
     def advance(self, finished: Tensor, any_finished: bool) -> None:
-        """Count one step. A decision is due after n steps and where an episode has ended. (B,)"""
+        """Count one step. A decision is due after n steps and where an episode has `finished`, (B,) bool.
+        `any_finished` says whether one has, without reading the device."""
         length = self.chunk.shape[1]
         self.age = torch.where(finished, 0, (self.age + 1) % length)
         if length > 1:
@@ -175,9 +176,8 @@ def collect(
     """
     observation, _ = env.reset(seed=start_seeds(seed, buffer.num_envs, group_size))
     actor, logged = Actor(policy, pipeline, buffer), dict[str, list[Tensor]]()
-    quiet = True if rank_and_size()[0] else None  # None: shown only in a terminal
     with seeded_noise(seed, buffer.device):
-        for step in tqdm(range(buffer.steps), "rollout", leave=False, unit="step", disable=quiet):
+        for step in tqdm(range(buffer.steps), "rollout", leave=False, unit="step", disable=hidden_progress()):
             buffer.observations.write(step, observation)
             raw_action, age = actor.act(step), actor.age  # (B, K), (B,)
             action = pipeline.to_action(raw_action).to(buffer.device)

@@ -1,12 +1,12 @@
 """The training loop: collect, update, log, save, and run callbacks. It resumes bit for bit on a CPU."""
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 from lerobot.utils.constants import ALGORITHM_DIR, PRETRAINED_MODEL_DIR
 from lerobot.utils.logging_utils import MetricsTracker
 from tqdm import tqdm
@@ -22,13 +22,14 @@ from lerobot_wmrl.common.lerobot_compat import (
 )
 from lerobot_wmrl.common.tracking import Tracker
 from lerobot_wmrl.rl.callbacks import Callback, Callbacks
-from lerobot_wmrl.rl.configuration_algorithms import PolicyGradientConfig
+from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
+from lerobot_wmrl.rl.distillation import Distillation
 from lerobot_wmrl.rl.grpo import GRPO
 from lerobot_wmrl.rl.policy_gradient import PolicyGradient
 from lerobot_wmrl.rl.ppo import PPO
 from lerobot_wmrl.rl.protocol import Pipeline
-from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
+from lerobot_wmrl.rl.rollout import RolloutBuffer
 from lerobot_wmrl.rl.seeds import first_seed
 
 SHOWN = (
@@ -36,6 +37,8 @@ SHOWN = (
     "clip_fraction", "entropy", "rollout_s", "update_s",
 )  # fmt: skip
 """Metrics that a line in the terminal shows; metrics.jsonl has all."""
+
+IN_PROGRESS_BAR = ("success_rate", "reference_kl")
 
 
 @dataclass(frozen=True)
@@ -55,14 +58,19 @@ class Schedule:
     log_freq: int = 1
 
 
-def make_algorithm(policy: Any, config: PolicyGradientConfig) -> PolicyGradient:
-    """Return the algorithm that `config` describes, to train `policy`."""
+Algorithm = PolicyGradient | Distillation
+
+
+def make_algorithm(policy: Any, config: RLAlgorithmConfig, output_dir: Path) -> Algorithm:
+    """Return the algorithm that `config` describes, to train `policy` in `output_dir`."""
+    if isinstance(config, DistillationConfig):
+        return Distillation(policy, config, output_dir)
     algorithm: type[PolicyGradient] = GRPO if isinstance(config, GRPOConfig) else PPO
     return algorithm(policy, config)
 
 
 def train(
-    env: gym.vector.VectorEnv, algorithm: PolicyGradient, pipeline: Pipeline, rollout: RolloutBuffer,
+    env: gym.vector.VectorEnv, algorithm: Algorithm, pipeline: Pipeline, rollout: RolloutBuffer,
     schedule: Schedule, output_dir: Path, save_pretrained: Callable[[Path], None],
     callbacks: Sequence[Callback] = (), wandb: Any = None,
 ) -> None:  # fmt: skip
@@ -94,11 +102,11 @@ def train(
         if runner.due(algorithm.iteration):
             runner.run(algorithm.iteration, checkpoint or save(algorithm, output_dir, total, save_pretrained))
         while algorithm.iteration < total:
-            metrics = iterate(env, algorithm, pipeline, rollout, schedule.seed)
+            metrics = iterate(env, algorithm, pipeline, rollout, schedule)
             step = algorithm.iteration
             tracker.log_step(step, {**metrics, **runner.real_steps()})
             progress.set_postfix(
-                success=f"{metrics['success_rate']:.2f}", kl=f"{metrics['reference_kl']:.2f}"
+                {name: f"{metrics[name]:.2f}" for name in IN_PROGRESS_BAR if name in metrics}
             )
             progress.update()
             if should_save_checkpoint(step, schedule.save_freq, total) or runner.due(step):
@@ -108,29 +116,15 @@ def train(
 
 
 def iterate(
-    env: gym.vector.VectorEnv, algorithm: PolicyGradient, pipeline: Pipeline, rollout: RolloutBuffer,
-    seed: int,
-) -> dict[str, float]:  # fmt: skip
-    """Collect one rollout, update the policy on it, and return metrics."""
+    env: Any, algorithm: Algorithm, pipeline: Pipeline, rollout: RolloutBuffer, schedule: Schedule
+) -> dict[str, float]:
+    """Run one iteration of the algorithm on seeds of its own, and return metrics."""
     rank, processes = rank_and_size()
     num_envs = rollout.num_envs * processes
-    own_seed = first_seed(seed, algorithm.iteration, num_envs) + rank * rollout.num_envs
-    started = time.perf_counter()
-    collected = collect(env, algorithm.policy, pipeline, rollout, own_seed, algorithm.group_size)
-    rollout_end = time.perf_counter()
-    minibatches, targets = algorithm.prepare(rollout, pipeline)
-    quiet = True if rank else None  # None: shown only in a terminal
-    progress = tqdm(minibatches, "update", leave=False, unit="minibatch", disable=quiet)
-    stats = algorithm.update(iter(progress))
-    progress.close()
-    return {
-        **collected,
-        **targets,
-        **stats.to_log_dict(),
-        "rollout_s": rollout_end - started,
-        "update_s": time.perf_counter() - rollout_end,
-        "env_steps": algorithm.iteration * rollout.steps * num_envs,
-    }
+    seed = first_seed(schedule.seed, algorithm.iteration, num_envs) + rank * rollout.num_envs
+    last = algorithm.iteration + 1 == schedule.iterations
+    metrics = algorithm.iterate(env, pipeline, rollout, seed, last)
+    return {**metrics, "env_steps": algorithm.iteration * rollout.steps * num_envs}
 
 
 def make_tracker(
@@ -144,9 +138,7 @@ def make_tracker(
     return Tracker(output_dir, meters, SHOWN, schedule.log_freq, wandb)
 
 
-def save(
-    algorithm: PolicyGradient, output_dir: Path, total: int, save_pretrained: Callable[[Path], None]
-) -> Path:
+def save(algorithm: Algorithm, output_dir: Path, total: int, save_pretrained: Callable[[Path], None]) -> Path:
     """Write a whole checkpoint or none: policy, algorithm, optimiser, random states, iteration."""
     random_states = gather_random_states()
 
@@ -161,7 +153,7 @@ def save(
     return checkpoint_dir(output_dir, algorithm.iteration, total)
 
 
-def resume(algorithm: PolicyGradient, output_dir: Path) -> Path | None:
+def resume(algorithm: Algorithm, output_dir: Path) -> Path | None:
     """Load the latest checkpoint in `output_dir`, if there is one, and return it."""
     checkpoint = latest_checkpoint(output_dir)
     if checkpoint is None:

@@ -40,8 +40,10 @@ from lerobot_wmrl.common.errors import FieldError, require_at_least
 from lerobot_wmrl.common.precision import keep_freed_memory
 from lerobot_wmrl.common.presets import expand_preset, format_flags
 from lerobot_wmrl.common.tracking import make_wandb
+from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.rl.configuration_algorithms import PolicyGradientConfig, PPOConfig
 from lerobot_wmrl.rl.configuration_callbacks import CallbackSettings
+from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 
 PUBLISHING = ("push_to_hub", "repo_id", "private", "license", "tags")
@@ -77,9 +79,10 @@ class TrainConfig(CallbackSettings, RunConfig):
 
     Args:
         policy: the SFT policy to improve, `--policy.path=FOLDER`: a checkpoint, or the output folder of
-            lerobot-train. `cnn`, `act` and `openvla` can be trained.
+            lerobot-train. PPO and GRPO train `cnn`, `act` and `openvla`; distillation trains any policy that
+            lerobot-train can clone.
         env: `--env.type=world_model` or `wmrl_maniskill`, and its settings.
-        algorithm: `--algorithm.type=ppo` or `grpo`, and its settings.
+        algorithm: `--algorithm.type=ppo`, `grpo` or `distillation`, and its settings.
         peft: `--peft.method_type=LORA --peft.r=32`, as in lerobot-train, trains new adapters and the value
             function alone. A policy that has adapters already needs none of these flags.
         output_dir: folder of checkpoints and metrics. If it holds this run already, the run continues.
@@ -126,21 +129,39 @@ class TrainConfig(CallbackSettings, RunConfig):
         return draccus.encode(self)
 
 
-def check_config(cfg: TrainConfig) -> PolicyGradientConfig:
-    """Check the settings and return the algorithm's. FieldError names the first that is impossible."""
-    if not isinstance(cfg.algorithm, PolicyGradientConfig):
-        raise FieldError("algorithm.type", cfg.algorithm.type, "this command trains with ppo or grpo")
+def check_config(cfg: TrainConfig) -> None:
+    """Raise FieldError for the first setting that is impossible."""
+    if not isinstance(cfg.algorithm, PolicyGradientConfig | DistillationConfig):
+        raise FieldError(
+            "algorithm.type", cfg.algorithm.type, "this command trains with ppo, grpo or distillation"
+        )
     if cfg.env is None or not hasattr(cfg.env, "create_tensor_env"):
         raise FieldError("env.type", cfg.env and cfg.env.type, "choose world_model or wmrl_maniskill")
     require_at_least(cfg, 1, "num_envs", "iterations", "save_freq", "log_freq")
     if isinstance(cfg.algorithm, GRPOConfig):
         cfg.algorithm.check_num_envs(cfg.num_envs)
+    if isinstance(cfg.algorithm, DistillationConfig):
+        check_distillation(cfg.algorithm, cfg.env)
     if not 0 <= cfg.seed < EVALUATION_SEED:
         raise FieldError(
             "seed", cfg.seed, f"must be from 0 to {EVALUATION_SEED - 1}; those above are for evaluation"
         )
     cfg.check_callbacks(cfg.env, cfg.iterations)
-    return cfg.algorithm
+
+
+def check_distillation(algorithm: DistillationConfig, env: EnvConfig) -> None:
+    """Raise FieldError unless the planner can look ahead in the environment."""
+    if not isinstance(env, WorldModelEnv):
+        raise FieldError(
+            "algorithm.type", "distillation",
+            f"its planner looks ahead in a world model, and `env.type` is {env.type}",
+            "set `env.type` to world_model, or choose ppo or grpo",
+        )  # fmt: skip
+    if env.done_frames > algorithm.planner.horizon:
+        raise FieldError(
+            "algorithm.planner.horizon", algorithm.planner.horizon,
+            f"must be at least `env.done_frames`, {env.done_frames}",
+        )  # fmt: skip
 
 
 def rollout_length(cfg: TrainConfig, longest: int) -> int:
@@ -184,7 +205,7 @@ def train_policy(cfg: TrainConfig) -> None:
 
     from lerobot_wmrl.common.policies import load_policy, load_processors
 
-    algorithm = check_config(cfg)
+    check_config(cfg)
     config = load_config(cfg)
     PartialState(cpu=config.device == "cpu", timeout=LONGEST_WAIT)
     done = finished(cfg)
@@ -197,7 +218,7 @@ def train_policy(cfg: TrainConfig) -> None:
         policy, processors = load_policy(config), load_processors(config)
         env: Any = cfg.env.create_tensor_env(cfg.num_envs, config.device)  # type: ignore[union-attr]
         try:
-            train_in(env, cfg, algorithm, policy, processors)
+            train_in(env, cfg, policy, processors)
         finally:
             env.close()
     if rank_and_size()[0] == 0:
@@ -225,7 +246,6 @@ def finished(cfg: TrainConfig) -> bool:
 def train_in(
     env: Any,
     cfg: TrainConfig,
-    algorithm_config: PolicyGradientConfig,
     policy: Any,
     processors: tuple[Any, Any],
 ) -> None:
@@ -245,7 +265,7 @@ def train_in(
         check_fit(config, cfg.simulator.observation_shapes(), len(ACTION_NAMES))
     if cfg.peft is not None:
         policy = with_new_adapters(policy, cfg.peft)
-    algorithm = make_algorithm(policy, algorithm_config)
+    algorithm = make_algorithm(policy, cfg.algorithm, cfg.output_dir)
     buffer = RolloutBuffer(rollout_length(cfg, env.max_episode_steps), cfg.num_envs, config.device)
     trained = Trained(policy, processors, env, cfg.env)
     callbacks = make_callbacks(cfg, trained, cfg.output_dir, cfg.iterations)
@@ -278,10 +298,12 @@ def summary(cfg: TrainConfig) -> list[str]:
     iterations = [line for line in read_metrics(cfg.output_dir) if "success_rate" in line]
     first, last, checkpoint = iterations[0], iterations[-1], chosen_checkpoint(cfg)
     policy, env, algorithm = cfg.policy.type, cfg.env.type, cfg.algorithm.type.upper()  # type: ignore[union-attr]
+    planner = isinstance(cfg.algorithm, DistillationConfig)
+    acted = f"the planner's success in {env}" if planner else f"success in {env} with exploration"
     lines = [
         f"{cfg.output_dir}: {policy} policy after {last['step']} iterations of {algorithm}, "
         f"{last['env_steps']:,} steps in {env}",
-        f"success in {env} with exploration: {first['success_rate']:.0%} in iteration {first['step']}, "
+        f"{acted}: {first['success_rate']:.0%} in iteration {first['step']}, "
         f"{last['success_rate']:.0%} in iteration {last['step']}",
     ]
     if cfg.selection.freq:

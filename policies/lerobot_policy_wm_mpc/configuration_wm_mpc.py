@@ -8,13 +8,14 @@ from lerobot.configs.types import NormalizationMode
 
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
 from lerobot_wmrl.common.policy_configuration import SingleStepConfig
+from lerobot_wmrl.world_models.configuration_planner import PlannerSettings
 
 OBJECTIVES: Final = ("success", "goal")
 
 
 @PreTrainedConfig.register_subclass("wm_mpc")
 @dataclass
-class WmMpcConfig(SingleStepConfig):
+class WmMpcConfig(PlannerSettings, SingleStepConfig):
     """A policy that plans: it imagines action sequences and executes the beginning of the best one.
 
     The cross-entropy method (Rubinstein 1999) searches the sequences. It samples them around a mean and moves
@@ -25,12 +26,6 @@ class WmMpcConfig(SingleStepConfig):
         text_world_model_path: the text world model, for goal frames; only the objective `goal` needs it.
         objective: what is maximised: `success`, the smallest done logit of `done_frames` consecutive frames;
             `goal`, the similarity of the last frame to the goal frame.
-        horizon: frames that are imagined ahead.
-        execute: actions that are executed before planning again.
-        samples: sequences sampled in each iteration.
-        elites: best sequences, to whose mean the mean moves.
-        iterations: iterations of the cross-entropy method.
-        knots: actions of a sequence that are sampled, evenly spaced; those between are interpolated.
         done_frames: consecutive done frames that make a success, as in the environment.
         seed: seed of the samples.
     """
@@ -38,12 +33,6 @@ class WmMpcConfig(SingleStepConfig):
     world_model_path: str = ""
     text_world_model_path: str = ""
     objective: str = "success"
-    horizon: int = 40
-    execute: int = 8
-    samples: int = 64
-    elites: int = 8
-    iterations: int = 4
-    knots: int = 6
     done_frames: int = 3
     seed: int = 0
     normalization_mapping: dict[str, NormalizationMode] = field(
@@ -57,14 +46,10 @@ class WmMpcConfig(SingleStepConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_choice(self, "objective", OBJECTIVES)
-        require_at_least(self, 1, "horizon", "execute", "samples", "elites", "iterations", "done_frames")
-        if not 2 <= self.knots <= self.horizon:
-            raise FieldError("knots", self.knots, f"must be from 2 to `horizon`, {self.horizon}")
-        for name, most in (("elites", "samples"), ("execute", "horizon"), ("done_frames", "horizon")):
-            if getattr(self, name) > getattr(self, most):
-                raise FieldError(
-                    name, getattr(self, name), f"must be at most `{most}`, {getattr(self, most)}"
-                )
+        self.check_planner()
+        require_at_least(self, 1, "done_frames")
+        if self.done_frames > self.horizon:
+            raise FieldError("done_frames", self.done_frames, f"must be at most `horizon`, {self.horizon}")
 
     def validate_features(self) -> None:
         """Raise FieldError unless there is a world model to plan in."""
@@ -78,3 +63,8 @@ class WmMpcConfig(SingleStepConfig):
 
     def get_optimizer_preset(self) -> None:
         """Return None: nothing is trained."""
+
+
+WmMpcConfig.__doc__ = (
+    f"{WmMpcConfig.__doc__}\n    {PlannerSettings.__doc__}"  # --help shows its own docstring alone
+)

@@ -8,12 +8,11 @@ from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
 from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
-from lerobot_policy_wm_mpc.planning import Objective, interpolate_knots, plan_knots, success_logit
 from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW
 from lerobot_wmrl.data.frames import Context, Frames
 from lerobot_wmrl.world_models.checkpoint import check_same_tokenizer, load_model
-from lerobot_wmrl.world_models.goal import imagine_goal, similarity_to_goal
 from lerobot_wmrl.world_models.modeling_frame_tokenizer import stack_cameras
+from lerobot_wmrl.world_models.planning import Planner
 
 Observation = dict[str, Any]
 
@@ -31,15 +30,21 @@ class WmMpcPolicy(PreTrainedPolicy):
         super().__init__(config)
         config.validate_features()
         device = config.device or "cpu"
-        self._model = [load_model(config.world_model_path, "action_world_model", device)]
-        self._text_model = []
-        if config.text_world_model_path:
+        model, text_model = load_model(config.world_model_path, "action_world_model", device), None
+        if config.objective == "goal":
             text_model = load_model(config.text_world_model_path, "text_world_model", device)
-            path = config.text_world_model_path
-            check_same_tokenizer(self._model[0], text_model, "text_world_model_path", path)
-            self._text_model.append(text_model)
-        self.register_buffer("low", torch.tensor(ACTION_LOW), persistent=False)
-        self.register_buffer("high", torch.tensor(ACTION_HIGH), persistent=False)
+            check_same_tokenizer(model, text_model, "text_world_model_path", config.text_world_model_path)
+        low, high = (torch.tensor(bound, device=device) for bound in (ACTION_LOW, ACTION_HIGH))
+        self.planner = Planner(
+            model,
+            text_model,
+            config,
+            config.done_frames,
+            averaged=False,
+            low=low,
+            high=high,
+            seed=config.seed,
+        )
         self.reset()
 
     def get_optim_params(self) -> dict[str, Any]:
@@ -54,9 +59,8 @@ class WmMpcPolicy(PreTrainedPolicy):
         """Forget the plans and the first frame of the last episodes."""
         self._chunk: Tensor | None = None
         self._next = 0
-        self._knots: Tensor | None = None
         self._context: Context | None = None
-        self._generator = torch.Generator(self.low.device).manual_seed(self.config.seed)
+        self.planner.reset()
 
     @torch.no_grad()
     def select_action(self, batch: Observation, **_: Any) -> Tensor:
@@ -69,48 +73,10 @@ class WmMpcPolicy(PreTrainedPolicy):
     @torch.no_grad()
     def predict_action_chunk(self, batch: Observation, **_: Any) -> Tensor:
         """Plan from images (B, 3, H, W), state (B, P) and instructions. → (B, T, A)"""
-        model, config = self._model[0], self.config
+        model = self.planner.model
         images = stack_cameras(batch, model.config.tokenizer.camera_keys, model.config.tokenizer.image_size)
         if self._context is None:
             self._context = model.tokenizer.context(images)
         tokens = model.tokenizer.encode(images, self._context)
         state = batch.get(OBS_STATE, tokens.new_zeros(len(tokens), 0, dtype=torch.float32))
-        frames, instructions = Frames(tokens, state, self._context), list(batch.get("task", []))
-        # Statistics hold a std of 1 for components that never vary: these stay at their mean.
-        std = torch.where(model.action_std == 1, 0.0, model.action_std)
-        start = self._remaining_plans() if self._knots is not None else None
-        plans = []
-        for row in range(len(tokens)):
-            mean = model.action_mean.expand(config.knots, -1) if start is None else start[row]
-            plans.append(plan_knots(
-                self._objective(frames[[row]], instructions[row : row + 1]), mean, std, self.low, self.high,
-                horizon=config.horizon, samples=config.samples, elites=config.elites,
-                iterations=config.iterations, generator=self._generator,
-            ))  # fmt: skip
-        self._knots = torch.stack(plans)
-        return interpolate_knots(self._knots, config.horizon)
-
-    def _remaining_plans(self) -> Tensor:
-        """Return the knots of what is left of the plans, the last action held. → (B, N, A)"""
-        assert self._knots is not None
-        config = self.config
-        plans = interpolate_knots(self._knots, config.horizon)
-        ahead = torch.linspace(config.execute, config.execute + config.horizon - 1, config.knots)
-        return plans[:, ahead.round().long().clamp(max=config.horizon - 1)]
-
-    def _objective(self, frame: Frames, instruction: list[str]) -> Objective:
-        """Return the objective of action sequences that begin at one frame."""
-        model, config = self._model[0], self.config
-        goal = None
-        if config.objective == "goal":
-            goal = imagine_goal(self._text_model[0], frame, instruction).decoded
-
-        def value(actions: Tensor) -> Tensor:
-            frames = frame[[0] * len(actions)]
-            ahead = model.open_loop(frames, actions)
-            if goal is None:
-                return success_logit(ahead.done_logit, config.done_frames)
-            features = [layer.repeat(len(actions), 1, 1, 1) for layer in goal.features]
-            return similarity_to_goal(model.tokenizer, ahead.tokens, features, frames.context)
-
-        return value
+        return self.planner.plan(Frames(tokens, state, self._context), list(batch.get("task", [])))

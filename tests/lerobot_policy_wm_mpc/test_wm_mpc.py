@@ -10,8 +10,8 @@ from lerobot.scripts import lerobot_eval
 
 from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
 from lerobot_policy_wm_mpc.modeling_wm_mpc import WmMpcPolicy
-from lerobot_policy_wm_mpc.planning import interpolate_knots, plan_knots, success_logit
 from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW
+from lerobot_wmrl.world_models.planning import interpolate_knots, plan_knots, success_logit
 
 SMALL = {"horizon": 8, "execute": 3, "samples": 6, "elites": 2, "iterations": 2, "knots": 3, "device": "cpu"}
 IMAGE = "observation.images.third_view"
@@ -24,11 +24,28 @@ def test_the_planner_finds_the_sequence_that_is_wanted():
         return -(actions - wanted).square().sum((1, 2))
 
     low, high = torch.full((2,), -1.0), torch.ones(2)
-    found = plan_knots(
-        value, torch.zeros(4, 2), torch.ones(2), low, high, horizon=12, samples=64, elites=8, iterations=12,
-        generator=torch.Generator().manual_seed(0),
+    found, mean = plan_knots(
+        value, torch.zeros(1, 4, 2), torch.ones(2), low, high, horizon=12, samples=64, elites=8,
+        iterations=12, generator=torch.Generator().manual_seed(0),
     )  # fmt: skip
-    assert (interpolate_knots(found[None], 12)[0] - wanted).abs().max() < 0.1
+    actions = interpolate_knots(found, 12)
+    assert (actions[0] - wanted).abs().max() < 0.1
+    assert (interpolate_knots(mean, 12)[0] - wanted).abs().max() < 0.1
+
+
+def test_searches_at_once_find_what_each_wants():
+    wanted = torch.tensor([-0.6, 0.0, 0.6])
+
+    def value(actions: torch.Tensor) -> torch.Tensor:
+        goal = wanted.repeat_interleave(len(actions) // 3)[:, None, None]
+        return -(actions - goal).square().sum((1, 2))
+
+    low, high = torch.full((1,), -1.0), torch.ones(1)
+    found, _ = plan_knots(
+        value, torch.zeros(3, 4, 1), torch.ones(1), low, high, horizon=8, samples=64, elites=8,
+        iterations=12, generator=torch.Generator().manual_seed(0),
+    )  # fmt: skip
+    assert (found - wanted[:, None, None]).abs().max() < 0.1
 
 
 def test_the_planner_keeps_to_the_box_and_never_returns_worse_than_it_was_given():
@@ -39,8 +56,8 @@ def test_the_planner_keeps_to_the_box_and_never_returns_worse_than_it_was_given(
         asked.append(actions)
         return ((actions - 0.1).abs() < 1e-6).all((1, 2)).float()
 
-    mean = torch.full((3, 1), 0.1)
-    found = plan_knots(
+    mean = torch.full((2, 3, 1), 0.1)
+    found, _ = plan_knots(
         value, mean, torch.ones(1), low, high, horizon=6, samples=16, elites=4, iterations=3,
         generator=torch.Generator().manual_seed(0),
     )  # fmt: skip

@@ -84,7 +84,7 @@ def run(name: str, output_dir: Path) -> None:
     config, chunk = RUNS[name]
     torch.manual_seed(0)
     policy = SeeingIsDeciding(chunk)
-    algorithm = make_algorithm(policy, config)
+    algorithm = make_algorithm(policy, config, output_dir)
     num_envs = ENVS // rank_and_size()[1]
     buffer = RolloutBuffer(STEPS, num_envs, "cpu")
     pipeline = Pipeline(prepare=lambda observation: observation, to_action=lambda raw: raw * 0.1)

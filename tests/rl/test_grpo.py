@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -9,11 +10,13 @@ import torch
 
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 from lerobot_wmrl.rl.grpo import GRPO
 from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
 from lerobot_wmrl.rl.seeds import start_seeds
+from lerobot_wmrl.rl.trainer import Schedule, train
 from tests.rl.learning import assert_it_learns, update
 from tests.rl.point_env import PointEnv
 
@@ -75,9 +78,21 @@ def test_without_a_signal_nothing_is_learnt(make_policy: MakePolicy, pipeline: P
     before = copy.deepcopy(policy.state_dict())
     algorithm, buffer = one_rollout(policy, pipeline, least_group_std=1e3)
     logged = update(algorithm, buffer, pipeline).to_log_dict()
-    assert logged["updates"] == logged["groups_with_signal"] == logged["reference_kl"] == 0
+    assert logged["updates"] == logged["groups_with_signal"] == logged["rollout_reference_kl"] == 0
+    assert "reference_kl" not in logged
     assert all(torch.equal(value, before[name]) for name, value in policy.state_dict().items())
     assert algorithm.iteration == 1
+
+
+def test_an_iteration_without_a_signal_is_logged_as_any(
+    make_policy: MakePolicy, pipeline: Pipeline, tmp_path: Path
+) -> None:
+    """There is no update, so none of its metrics."""
+    policy = make_policy()
+    algorithm = GRPO(policy, GRPOConfig(group_size=GROUP, least_group_std=1e3))
+    buffer, schedule = RolloutBuffer(3, ENVS, "cpu"), Schedule(2, 2, 0)
+    train(PointEnv(ENVS), algorithm, pipeline, buffer, schedule, tmp_path, policy.save_pretrained)
+    assert [line["updates"] for line in read_metrics(tmp_path)] == [0, 0]
 
 
 def test_the_value_is_not_touched(make_policy: MakePolicy, pipeline: Pipeline) -> None:

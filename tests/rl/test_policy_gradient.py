@@ -10,6 +10,7 @@ import torch
 from torch import nn
 
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.ppo import PPO
@@ -105,10 +106,29 @@ def test_a_checkpoint_keeps_the_scale_of_the_returns_apart_from_the_policy(
 @pytest.mark.parametrize(("settings", "message"), [
     ({"clip": 0.0}, r"clip=0\.0"), ({"micro_batch_size": 0}, r"micro_batch_size=0"),
     ({"ratio": "sentence"}, "ratio=sentence: choose one of action, token"),
+    ({"initial_std": 0.0}, r"^initial_std=0\.0: must be above 0"),
+    ({"reference_coefficient": -0.1}, r"^reference_coefficient=-0\.1: must be at least 0"),
+    ({"max_reference_kl": 0.0}, r"^max_reference_kl=0\.0: must be above 0"),
 ])  # fmt: skip
 def test_impossible_settings_are_named(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         PPOConfig(**settings)
+
+
+def test_a_std_that_the_policy_refuses_is_named_as_the_algorithm_s(make_policy: MakePolicy) -> None:
+    with pytest.raises(FieldError, match=r"^algorithm\.initial_std=9\.0: must be between"):
+        PPO(make_policy(), PPOConfig(initial_std=9.0))
+
+
+def test_the_kl_to_the_reference_is_logged_before_and_during_the_update(
+    make_policy: MakePolicy, pipeline: Pipeline
+) -> None:
+    """In the first iteration the rollout's policy is the reference itself; the update moves away."""
+    _, first = improved(make_policy(), pipeline, iterations=1, target_kl=10.0)
+    assert first["rollout_reference_kl"] == pytest.approx(0, abs=1e-5)
+    assert first["reference_kl"] > 1e-5
+    _, second = improved(make_policy(), pipeline, iterations=2, target_kl=10.0)
+    assert second["rollout_reference_kl"] > 1e-5
 
 
 class Dropping(ChunkPolicy):

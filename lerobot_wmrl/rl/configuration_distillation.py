@@ -1,0 +1,50 @@
+"""Configuration of distillation, `algorithm.type` distillation."""
+
+from dataclasses import dataclass, field
+from typing import Any, Self
+
+from lerobot.rl.algorithms.configs import RLAlgorithmConfig
+
+from lerobot_wmrl.common.errors import require_at_least, within
+from lerobot_wmrl.world_models.configuration_planner import PlannerSettings
+
+
+def fast_planner() -> PlannerSettings:
+    """Return settings of a planner that is asked some hundred times."""
+    return PlannerSettings(horizon=28, samples=48, iterations=3)
+
+
+@RLAlgorithmConfig.register_subclass("distillation")
+@dataclass
+class DistillationConfig(RLAlgorithmConfig):
+    """Distillation of a planner into the policy, in imagination (DAgger, Ross et al. 2011).
+
+    The policy acts first, then the planner takes over. The policy is fitted, by its own supervised loss, to
+    the planner's actions in all episodes that succeeded. So any policy can be trained that lerobot-train can
+    clone, at its own learning rate (`policy.optimizer_lr`).
+
+    Args:
+        planner: how the planner searches.
+        longest_lead: steps for which the policy acts before the planner takes over, at most. Each iteration
+            draws a number, the first takes 0.
+        updates: optimizer steps in each iteration.
+        last_updates: optimizer steps in the last iteration, on all labels.
+        batch_size: labels in an optimizer step, in each process of `torchrun`.
+    """
+
+    planner: PlannerSettings = field(default_factory=fast_planner)
+    longest_lead: int = 16
+    updates: int = 150
+    last_updates: int = 1000
+    batch_size: int = 32
+
+    def __post_init__(self) -> None:
+        with within("planner"):
+            self.planner.check_planner()
+        require_at_least(self, 0, "longest_lead", "updates", "last_updates")
+        require_at_least(self, 1, "batch_size")
+
+    @classmethod
+    def from_policy_config(cls, policy_cfg: Any) -> Self:
+        """Return the defaults, which depend on no policy."""
+        return cls()

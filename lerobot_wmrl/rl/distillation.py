@@ -1,0 +1,212 @@
+"""Distillation of a planner into a policy, in imagination. T time, B environments, A action components."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from lerobot.rl.algorithms.base import RLAlgorithm
+from lerobot.rl.algorithms.configs import TrainingStats
+from torch import Tensor, nn
+from torch.optim import Optimizer
+from tqdm import tqdm
+
+from lerobot_wmrl.common.distributed import (
+    average_gradients,
+    gather_counts,
+    hidden_progress,
+    mean_over_processes,
+    rank_and_size,
+)
+from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.policies import load_trained_weights
+from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
+from lerobot_wmrl.rl.algorithm import TrainingStopped
+from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
+from lerobot_wmrl.rl.labels import Labels, action_chunks
+from lerobot_wmrl.rl.observations import TASK
+from lerobot_wmrl.rl.protocol import Pipeline
+from lerobot_wmrl.rl.rollout import RolloutBuffer
+from lerobot_wmrl.rl.seeds import seeded_noise
+from lerobot_wmrl.world_models.planning import Planner
+
+LABELS_FOLDER = "labels"
+
+
+class Demonstrated(NamedTuple):
+    """A rollout in which the planner took over: its actions (T, B, A), the steps of the planner in episodes
+    that succeeded (T, B) bool, and metrics."""
+
+    actions: Tensor
+    labelled: Tensor
+    metrics: dict[str, float]
+
+
+class Distillation(RLAlgorithm):
+    """Fit a policy to a planner's actions in states that the policy leads to (DAgger, Ross et al. 2011).
+
+    In each iteration the policy acts for some steps, and then the planner until success or the end. Its
+    actions in episodes that succeeded become labels, and the policy takes steps on its supervised loss over
+    the labels of all iterations.
+
+    Args:
+        policy: any policy of LeRobot that lerobot-train can train, trained in place.
+        config: the algorithm's configuration.
+        output_dir: the training's folder, where the labels are kept.
+    """
+
+    config_class = DistillationConfig
+    name = "distillation"
+    config: DistillationConfig
+    iteration: int
+    """Rollouts that were trained on."""
+
+    def __init__(self, policy: Any, config: DistillationConfig, output_dir: Path) -> None:
+        self.lerobot_policy, self.config, self.iteration = policy, config, 0
+        self.preset = policy.config.get_optimizer_preset()
+        if self.preset is None:
+            raise FieldError(
+                "policy.type", policy.config.type, "has nothing to train", "distil into another policy"
+            )
+        self.parameters = [each for each in policy.parameters() if each.requires_grad]
+        self.optimizer = self.make_optimizers_and_scheduler()[self.name]
+        indices = policy.config.action_delta_indices
+        self.chunk = len(indices) if indices else 0
+        self.labels = Labels(output_dir / LABELS_FOLDER, rank_and_size()[0])
+
+    def make_optimizers_and_scheduler(self) -> dict[str, Optimizer]:
+        """Return the policy's own optimizer in lerobot-train, at a constant rate."""
+        return {self.name: self.preset.build(self.lerobot_policy.get_optim_params())}
+
+    def load_weights(self, weights: dict[str, Any], device: str | torch.device = "cpu") -> None:
+        """Load the policy's weights from a checkpoint, and the labels of the iterations before it."""
+        load_trained_weights(self.lerobot_policy, weights)
+        self.labels.load(self.iteration)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return nothing: the policy's checkpoint has all weights."""
+        return {}
+
+    def load_state_dict(self, state_dict: dict[str, Tensor], device: str | torch.device = "cpu") -> None:
+        """Do nothing, as there is nothing in `state_dict`."""
+
+    def iterate(
+        self, env: WorldModelVectorEnv, pipeline: Pipeline, rollout: RolloutBuffer, seed: int, last: bool
+    ) -> dict[str, float]:
+        """Collect labels, fit the policy, and return metrics.
+
+        Args:
+            env: the world model.
+            pipeline: the policy's processors.
+            rollout: gives the number of steps and holds the observations.
+            seed: of this process's first environment in this iteration.
+            last: whether this is the training's last iteration.
+        """
+        started = time.perf_counter()
+        shown = self.demonstrate(env, pipeline, rollout, seed)
+        rows = shown.labelled.nonzero()
+        part = rollout.observations.read_stored((rows[:, 0] * env.num_envs + rows[:, 1]).cpu())
+        part |= action_chunks(shown.actions, shown.labelled, self.chunk)
+        self.labels.add(self.iteration, part, list(rollout.observations.instructions))
+        if not min(gather_counts(len(self.labels), env.device)):
+            raise TrainingStopped(
+                f"iteration {self.iteration + 1}: the planner has not succeeded in any imagined episode, so "
+                "there is nothing to learn from: raise `algorithm.planner.samples` or "
+                "`algorithm.planner.iterations`, lower `env.done_threshold`, or train the world model longer"
+            )
+        collected = time.perf_counter()
+        updates = self.config.last_updates if last else self.config.updates
+        stats = self.update(self.batches(updates, pipeline))
+        return {
+            **shown.metrics,
+            **stats.to_log_dict(),
+            "labels": float(len(self.labels)),
+            "rollout_s": collected - started,
+            "update_s": time.perf_counter() - collected,
+        }
+
+    @torch.no_grad()
+    def demonstrate(
+        self, env: WorldModelVectorEnv, pipeline: Pipeline, rollout: RolloutBuffer, seed: int
+    ) -> Demonstrated:
+        """Let the policy act for some steps, and then the planner, until every first episode has ended."""
+        policy, steps, count = self.lerobot_policy.eval(), rollout.steps, env.num_envs
+        policy.reset()
+        planner = self.make_planner(env, seed)
+        generator = torch.Generator().manual_seed(seed)
+        lead = int(torch.randint(self.config.longest_lead + 1, (), generator=generator))
+        lead = 0 if not self.iteration else min(lead, steps - 1)
+        actions = torch.zeros(steps, count, env.single_action_space.shape[0], device=env.device)
+        acting = torch.zeros(steps, count, dtype=torch.bool, device=env.device)
+        alive = torch.ones(count, dtype=torch.bool, device=env.device)
+        success, planned = torch.zeros_like(alive), torch.arange(count, device=env.device)
+        observation, _ = env.reset(seed=seed)
+        with seeded_noise(seed, env.device):
+            for step in tqdm(range(steps), "rollout", leave=False, unit="step", disable=hidden_progress()):
+                rollout.observations.write(step, observation)
+                if step < lead:
+                    seen = pipeline.prepare(rollout.observations.read_step(step))
+                    actions[step] = pipeline.to_action(policy.select_action(seen)).to(env.device)
+                else:
+                    ahead = (step - lead) % self.config.planner.execute
+                    if not ahead:
+                        planner.keep(alive[planned].nonzero()[:, 0])
+                        planned = planned[alive[planned]]
+                        tasks = [observation[TASK][row] for row in planned.tolist()]
+                        chunk = planner.plan(env.newest_frames()[planned], tasks)
+                    actions[step, planned] = chunk[:, ahead]
+                    acting[step] = alive
+                observation, _, terminated, truncated, _ = env.step(actions[step])
+                success |= terminated & alive
+                alive &= ~(terminated | truncated)
+                if not alive.any():
+                    break
+        metrics = {"success_rate": success.float().mean().item(), "lead": float(lead)}
+        return Demonstrated(actions, acting & success, mean_over_processes(metrics, env.device))
+
+    def make_planner(self, env: WorldModelVectorEnv, seed: int) -> Planner:
+        """Return a planner in the environment's world model, with its criterion of success.
+
+        It follows averages: labels vary less, and a policy fitted to them succeeds more often.
+        """
+        return Planner(
+            env.model, None, self.config.planner, env.config.done_frames, averaged=True,
+            low=env.action_low, high=env.action_high, seed=seed,
+        )  # fmt: skip
+
+    def batches(self, updates: int, pipeline: Pipeline) -> Iterator[dict[str, Any]]:
+        """Draw that many batches of labels."""
+        for _ in tqdm(range(updates), "update", leave=False, unit="step", disable=hidden_progress()):
+            yield pipeline.prepare(self.labels.draw(self.config.batch_size))
+
+    def update(self, batch_iterator: Iterator[dict[str, Any]]) -> TrainingStats:
+        """Take one optimizer step on each batch.
+
+        Raises:
+            TrainingStopped: a loss or gradient is not finite; the last checkpoint is kept.
+        """
+        losses, norms = [], []
+        self.lerobot_policy.train()
+        for batch in batch_iterator:
+            loss, _ = self.lerobot_policy.forward(batch)
+            self.optimizer.zero_grad()
+            loss.backward()
+            average_gradients(self.parameters)
+            norm = nn.utils.clip_grad_norm_(self.parameters, self.preset.grad_clip_norm)
+            if not (torch.isfinite(loss) and torch.isfinite(norm)):
+                raise TrainingStopped(
+                    f"iteration {self.iteration + 1}: the loss or its gradient is not finite; the last "
+                    "checkpoint is kept: lower `policy.optimizer_lr`"
+                )
+            self.optimizer.step()
+            self.optimization_step += 1
+            losses.append(loss.item())
+            norms.append(norm.item())
+        self.lerobot_policy.eval()
+        self.iteration += 1
+        count = max(len(losses), 1)
+        means = {"loss": sum(losses) / count, "norm": sum(norms) / count}
+        means = mean_over_processes(means, self.parameters[0].device)
+        extra = {"updates": float(len(losses))}
+        return TrainingStats({"policy_loss": means["loss"]}, {"policy": means["norm"]}, extra=extra)

@@ -1,0 +1,155 @@
+"""Distillation of the planner: labels, and lerobot-wmrl-train with it."""
+
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from safetensors.torch import load_file
+from torch import Tensor
+
+from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.tracking import read_metrics
+from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
+from lerobot_wmrl.rl.labels import Labels, action_chunks
+from lerobot_wmrl.scripts.train import main
+from lerobot_wmrl.world_models.configuration_planner import PlannerSettings
+from tests.rl.act_checkpoint import save_small_act
+from tests.rl.checkpoints import save_untrained_policy
+
+FAST = [
+    "--algorithm.type=distillation", "--algorithm.planner.horizon=6", "--algorithm.planner.samples=4",
+    "--algorithm.planner.elites=2", "--algorithm.planner.iterations=1", "--algorithm.planner.knots=3",
+    "--algorithm.planner.execute=2", "--algorithm.longest_lead=2", "--algorithm.updates=2",
+    "--algorithm.last_updates=3", "--algorithm.batch_size=4", "--num_envs=3", "--iterations=3",
+    "--save_freq=1",
+]  # fmt: skip
+
+
+@pytest.fixture
+def imagined(trained_models: dict[str, Path], small_dataset: LeRobotDataset) -> list[str]:
+    """Flags of a world model in which every episode succeeds after four frames."""
+    return [
+        "--env.type=world_model", f"--env.world_model_path={trained_models['action_world_model']}",
+        "--env.reward.type=general", "--env.reward.alpha=1", f"--env.dataset.root={small_dataset.root}",
+        "--env.episode_length=6", "--env.done_frames=4", "--env.done_threshold=1e-6", "--env.device=cpu",
+        "--gate.action=off",
+    ]  # fmt: skip
+
+
+def train(monkeypatch: pytest.MonkeyPatch, *flags: str) -> None:
+    monkeypatch.setattr(sys, "argv", ["lerobot-wmrl-train", *flags])
+    main()
+
+
+def weights(output_dir: Path) -> dict[str, Tensor]:
+    return load_file(output_dir / "checkpoints" / "last" / "pretrained_model" / "model.safetensors")
+
+
+def test_it_trains_on_the_planners_successes_and_resumes_as_if_nothing_had_happened(
+    imagined: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy, output_dir = save_untrained_policy(tmp_path / "policy", actions=7), tmp_path / "rl"
+    flags = [f"--policy.path={policy}", *FAST, *imagined, f"--output_dir={output_dir}"]
+    train(monkeypatch, *flags)
+    lines = read_metrics(output_dir)
+    assert [line["success_rate"] for line in lines] == [1, 1, 1]
+    assert lines[0]["lead"] == 0
+    assert lines[0]["labels"] == 3 * 4
+    expected = 0
+    for line in lines:
+        expected += 3 * (4 - int(line["lead"]))
+        assert line["labels"] == expected
+    assert [line["updates"] for line in lines] == [2, 2, 3]
+    before = load_file(policy / "model.safetensors")
+    after = weights(output_dir)
+    assert any(not torch.equal(before[name], value) for name, value in after.items())
+    for step in ("000002", "000003"):
+        shutil.rmtree(output_dir / "checkpoints" / step)
+    train(monkeypatch, *flags)
+    assert all(torch.equal(value, after[name]) for name, value in weights(output_dir).items())
+
+
+def test_policies_of_chunks_learn_chunks(
+    imagined: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy, output_dir = save_small_act(tmp_path / "act", state=8, actions=7), tmp_path / "rl"
+    train(monkeypatch, f"--policy.path={policy}", *FAST, *imagined, f"--output_dir={output_dir}")
+    assert read_metrics(output_dir)[-1]["labels"] >= 3 * 4
+    assert len(weights(output_dir))
+
+
+def test_without_a_success_there_is_nothing_to_learn_from(
+    imagined: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    policy = save_untrained_policy(tmp_path / "policy", actions=7)
+    flags = [f"--policy.path={policy}", *FAST, *imagined, f"--output_dir={tmp_path / 'rl'}"]
+    with pytest.raises(SystemExit):
+        train(monkeypatch, *flags, "--env.done_threshold=0.999999")
+    assert "`algorithm.planner.samples`" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("flags", "named"),
+    [
+        (["--env.type=wmrl_maniskill"], "--algorithm.type=distillation: its planner looks ahead"),
+        (
+            ["--env.done_frames=8", "--env.episode_length=20"],
+            "--algorithm.planner.horizon=6: must be",
+        ),
+        (["--algorithm.planner.elites=5"], "--algorithm.planner.elites=5: must be at most"),
+        (["--algorithm.updates=-1"], "--algorithm.updates=-1: must be at least 0"),
+    ],
+)
+def test_what_cannot_be_is_refused_by_its_flag(
+    flags: list[str], named: str, imagined: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    policy = save_untrained_policy(tmp_path / "policy", actions=7)
+    given = imagined if not flags[0].startswith("--env.type") else []
+    with pytest.raises(SystemExit):
+        train(
+            monkeypatch, f"--policy.path={policy}", *FAST, *given, *flags, f"--output_dir={tmp_path / 'rl'}"
+        )
+    assert named in capsys.readouterr().err
+    assert not (tmp_path / "rl").exists()
+
+
+def test_settings_of_the_planner_are_checked_where_they_are():
+    with pytest.raises(FieldError, match=r"^planner.knots=1"):
+        DistillationConfig(planner=PlannerSettings(knots=1))
+
+
+def test_a_chunk_ends_with_its_run_and_repeats_the_last_action():
+    actions = torch.arange(4.0)[:, None, None] + torch.tensor([0.0, 10.0])[:, None]  # (T, B, 1)
+    labelled = torch.tensor([[True, False], [True, True], [True, True], [False, True]])
+    found = action_chunks(actions, labelled, 2)
+    assert found["action"][..., 0].tolist() == [[0, 1], [1, 2], [11, 12], [2, 2], [12, 13], [13, 13]]
+    assert found["action_is_pad"].tolist() == [
+        [False, False], [False, False], [False, False], [False, True], [False, False], [False, True],
+    ]  # fmt: skip
+    assert action_chunks(actions, labelled, 0)["action"][:, 0].tolist() == [0, 1, 11, 2, 12, 13]
+
+
+def test_labels_are_the_same_when_they_are_read_again(tmp_path: Path):
+    labels = Labels(tmp_path, 0)
+    for iteration in range(3):
+        count = 2 * iteration  # the first iteration has none
+        part = {
+            "observation.images.top": torch.full((count, 3, 2, 2), 51 * iteration, dtype=torch.uint8),
+            "action": iteration + torch.arange(float(count))[:, None] / 10,
+            "task": torch.zeros(count, dtype=torch.long),
+        }
+        labels.add(iteration, part, [f"task {iteration}"])
+    again = Labels(tmp_path, 0)
+    again.load(3)
+    assert len(again) == len(labels) == 6
+    for store in (labels, again):
+        torch.manual_seed(0)
+        batch = store.draw(40)
+        values = batch["action"][:, 0]
+        assert set(values.tolist()) == set(torch.tensor([1, 1.1, 2, 2.1, 2.2, 2.3]).tolist())
+        assert torch.allclose(batch["observation.images.top"].mean((1, 2, 3)), values.floor() / 5)
+        assert batch["task"] == [f"task {int(value)}" for value in values]
