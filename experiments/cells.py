@@ -6,7 +6,7 @@ from typing import Any, Final
 Load = Callable[[str], dict[str, Any]]
 """Content of a file of docs/results by its stem."""
 
-DOMAINS: Final = {"ind": "known", "ood": "unseen", "drawn": "known, tokens drawn"}
+DOMAINS: Final = {"ind": "known", "ood": "unseen", "drawn": "known, sampled tokens"}
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
@@ -32,7 +32,7 @@ def percents(rates: Sequence[Mapping[str, Any]]) -> str:
 
 
 def points(change: Mapping[str, Any]) -> str:
-    """`+12.7 points (+7.7 to +18.0)`: a mean change; its interval draws starts."""
+    """`+12.7 points (+7.7 to +18.0)`: a mean change; its interval resamples starts."""
     mean, low, high = (100 * change[name] for name in ("mean", "low", "high"))
     return f"{mean:+.1f} points ({low:+.1f} to {high:+.1f})"
 

@@ -197,9 +197,9 @@ def measure(training: Training, iterations: int, seed: int) -> dict[str, float]:
     policy = ControlPolicy(env)
     pipeline = Pipeline(lambda observation: observation, policy.to_action)
     buffer = RolloutBuffer(env.max_episode_steps, training.num_envs, "cpu")
-    algorithm = make_algorithm(policy, training.config)
     began = time.process_time()
     with tempfile.TemporaryDirectory() as folder:
+        algorithm = make_algorithm(policy, training.config, Path(folder))
         train(
             env, algorithm, pipeline, buffer, Schedule(iterations, iterations, 1000 * seed), Path(folder),
             lambda path: path.mkdir(parents=True),

@@ -89,14 +89,19 @@ def _training(study: Study, name: str) -> dict[str, Any]:
     chosen = config["dataset"]["episodes"]
     dataset = Path(config["dataset"]["root"]) / "meta" / "info.json"
     return {
-        "steps": config["steps"],
-        "minutes": round(config["steps"] / read_metrics(folder)[-1]["steps_per_s"] / 60, 2),
+        **training_minutes(folder),
         "episodes": len(chosen) if chosen else json.loads(dataset.read_text())["total_episodes"],
         "parameters": sum(weight.numel() for weight in model.parameters() if weight.requires_grad),
         **{f"psnr_{step}": _at_step(replay, "psnr", step) for step in PSNR_STEPS},
         **{key: replay["headline"][key] for key in HEADLINE if key in replay["headline"]},
         "gate": {key: judged[key] for key in GATE},
     }
+
+
+def training_minutes(folder: Path) -> dict[str, Any]:
+    """Return the steps of a training and the minutes that they took."""
+    last = read_metrics(folder)[-1]
+    return {"steps": last["step"], "minutes": round(last["step"] / last["steps_per_s"] / 60, 2)}
 
 
 def _at_step(found: Mapping[str, Any], name: str, step: int) -> dict[str, Any]:

@@ -21,16 +21,16 @@ def demo(load: Load) -> str:
     head = ["seed", "known: SFT", "after PPO", "unseen: SFT", "after PPO", "false positives", "recall"]
     control = load("cloning_control")["cloned_from"]["180"]
     return f"""It does: {points(known["mean_change"])} in known scenes, {points(unseen["mean_change"])} in
-unseen ones. But the SFT policy is cloned from only eight demonstrations, while the world model learns from
-180 good episodes of the planner too. The same network cloned from those 180 reaches
+unseen ones. But the SFT policy is cloned from eight `optimal` planned episodes, while the world model's
+dataset has 1,200 episodes, 180 of them `optimal`. The same network cloned from those 180 reaches
 {100 * control["ind"]["share"]:.0f} and {100 * control["ood"]["share"]:.0f} % ([next
 section](#cloning_control)): on this task, cloning is the better use of the same data.
 
 {table(head, rows)}
 
-Each rate is over 100 starts, the same for all runs; three seeds. The SFT policy is cloned from eight planned
-episodes. *False positives*: failures of the SFT policy that the world model predicts as successes. *Recall*:
-successes of the SFT policy that it predicts as successes. The preset's iterations and KL penalty were chosen
+Each rate is over 100 starts, the same for all runs; three seeds. *False positives*: failures of the SFT
+policy that the world model predicts as successes. *Recall*: successes of the SFT policy that it predicts as
+successes. The preset's iterations and KL penalty were chosen
 on starts of the same seeds."""
 
 
@@ -106,9 +106,9 @@ def imagined_ppo(load: Load) -> str:
 
 def openvla_small(load: Load) -> str:
     found = load("openvla_small")["imagined"]
-    drawn, greedy = (found[domain]["policies"]["openvla"] for domain in ("drawn", "ind"))
-    return f"""When tokens are sampled, as in PPO: {100 * drawn["cloned"]["share"]:.0f} →
-{100 * drawn["trained"]["share"]:.0f} %. With greedy tokens, OpenVLA's default, the gain is
+    sampled, greedy = (found[domain]["policies"]["openvla"] for domain in ("drawn", "ind"))
+    return f"""When tokens are sampled, as in PPO: {100 * sampled["cloned"]["share"]:.0f} →
+{100 * sampled["trained"]["share"]:.0f} %. With greedy tokens, OpenVLA's default, the gain is
 within chance ({100 * greedy["cloned"]["share"]:.0f} → {100 * greedy["trained"]["share"]:.0f} %), and in
 unseen scenes there is none.
 

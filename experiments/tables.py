@@ -36,6 +36,7 @@ SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     "reward_curves": ("Trust", world_models.reward_curves),
     "four_tasks": ("World models", world_models.four_tasks),
     "learning_curve": ("World models", world_models.learning_curve),
+    "text_dynamics": ("World models", world_models.text_dynamics),
     "ablation": ("World models", world_models.ablation),
     "ablation_network": ("World models", world_models.ablation_network),
     "planners": ("Recording, algorithms, speed", world_models.planners),
@@ -52,7 +53,7 @@ Each section is a question, its answer, one table and its limits. The page is ge
 [`experiments/`](../experiments).
 
 - Success is success in ManiSkill unless a column says otherwise. *Known* scenes are those that policies and
-  world model were trained in; *unseen* ones are held out from all training. Starts are held out in both.
+  world model were trained in; *unseen* ones are in no training data. Starts are held out in both.
 - Intervals in parentheses are 95 %: Wilson's for a share, bootstrap over episodes for a mean, bootstrap over
   starts for a change. None of them covers other seeds of training.
 - All numbers come from CPUs and from earlier commits than the present one. The commit is under each
