@@ -10,6 +10,7 @@ from torch import Tensor
 from lerobot_wmrl.common.precision import compute_in
 from lerobot_wmrl.data.clips import Clip
 from lerobot_wmrl.data.frames import Context, Frames
+from lerobot_wmrl.world_models.anchored.imagination import AnchoredImagination
 from lerobot_wmrl.world_models.autoregressive.dynamics import AutoregressiveImagination
 from lerobot_wmrl.world_models.dynamics import Imagination as RunningImagination
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
@@ -67,20 +68,25 @@ class Imagination:
         condition = model.encode_actions(self.action[:, None].expand(-1, frames, -1))
         with compute_in(self.dtype, self.device):
             if isinstance(state, AutoregressiveImagination):
-                seen = (x.expand(-1, frames, *x.shape[2:]) for x in (state.codes, state.proprioception))
+                seen = (x.expand(-1, frames, *x.shape[2:]) for x in (state.codes, state.state))
                 depth = state.depth.expand(-1, frames, -1)
                 prediction, _ = model.dynamics.network(*seen, condition, depth=depth)
             else:
                 last = torch.full((self.batch, 1), frames - 1, device=self.device)
                 prediction = model.dynamics.network(
-                    state.codes, state.proprioception, condition, frames, last, state.context
+                    state.codes, state.state, condition, frames, last, state.context
                 )
         return model.dynamics.network.codebook.most_likely(prediction.logits[:, -1])
 
     def bytes_a_frame(self) -> float:
         """Weights, shared by the batch, and what one imagination remembers, each read once."""
         weights = sum(parameter.numel() for parameter in self.model.dynamics.network.parameters())
-        return (weights / self.batch + self.state.num_elements / self.batch) * self.dtype.itemsize
+        state = self.state
+        parts = [state.cache.keys, state.cache.values]
+        if isinstance(state, AnchoredImagination):
+            parts += [*(state.scene or ()), *(state.rollout or ())]
+        remembered = sum(part.numel() for part in parts)
+        return (weights / self.batch + remembered / self.batch) * self.dtype.itemsize
 
 
 def repeated(work: Work, graphed: bool) -> Work:
@@ -133,7 +139,7 @@ def training_step(model: ActionWorldModelRewardModel, clip: Clip, dtype: torch.d
 
     def descend() -> None:
         with compute_in(dtype, clip.tokens.device):
-            loss, _ = model.loss(clip)
+            loss, _ = model(clip)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

@@ -24,6 +24,7 @@ CONFIGURATIONS = (
     "lerobot_wmrl.envs.configuration_wmrl_maniskill",
     "lerobot_wmrl.rl.configuration_algorithms",
     "lerobot_wmrl.rl.configuration_grpo",
+    "lerobot_wmrl.rl.configuration_distillation",
     "lerobot_policy_cnn.configuration_cnn",
     "lerobot_policy_openvla.configuration_openvla",
     "lerobot_policy_wm_mpc.configuration_wm_mpc",

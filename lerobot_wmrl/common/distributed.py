@@ -18,6 +18,11 @@ def rank_and_size() -> tuple[int, int]:
     return 0, 1
 
 
+def hidden_progress() -> bool | None:
+    """Return tqdm's `disable`: in the first process None, which shows a bar in a terminal only; else True."""
+    return True if rank_and_size()[0] else None
+
+
 def mean_over_processes(metrics: Mapping[str, float], device: torch.device | str) -> dict[str, float]:
     """Return the mean of every process's metrics, which have the same names. All processes must call it."""
     _, size = rank_and_size()

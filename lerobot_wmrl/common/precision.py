@@ -54,7 +54,8 @@ def require_exact_updates(trained: Iterable[Tensor]) -> None:
 
 
 def compute_in(dtype: torch.dtype, device: torch.device | str) -> torch.autocast:
-    """Return a context in which matrix products and convolutions run in `dtype`; float32 changes nothing."""
+    """Return a context in which matrix products and convolutions run in `dtype`; float32 switches a
+    surrounding autocast off."""
     return torch.autocast(torch.device(device).type, dtype=dtype, enabled=dtype != torch.float32)
 
 

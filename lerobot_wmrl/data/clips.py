@@ -49,8 +49,8 @@ class Clip(NamedTuple):
         return Frames(self.tokens[:, 0], self.state[:, 0], self.context, depth)
 
 
-def take_rows(values: Tensor, index: Tensor) -> Tensor:
-    """Take the rows `index` (B, K) of every clip: values (B, T, …) → (B, K, …)."""
+def take_steps(values: Tensor, index: Tensor) -> Tensor:
+    """Take the steps `index` (B, K) of every clip: values (B, T, …) → (B, K, …)."""
     return values[torch.arange(len(values), device=values.device)[:, None], index]
 
 
@@ -191,7 +191,7 @@ def clip_from_windows(
         batch: action (B, T, A), observation.state (B, T, P), either (B, T) where it has one component;
             next.done (B,) or (B, 1), task, `*_is_pad` (B, T); all but the action may be missing.
         camera_key: the camera whose padding counts.
-        state_size: P, 0 for a model without proprioception.
+        state_size: P, 0 for a model without `observation.state`.
         depth: (B, T, S) metres, of the windows' frames.
 
     Raises:
@@ -217,8 +217,8 @@ def clip_from_windows(
     done, known = torch.zeros(rows, length, device=device), torch.zeros_like(last)
     if isinstance(batch.get(DONE), Tensor):  # LeRobot's processors put False where the dataset has none
         done, known = last * batch[DONE].reshape(rows, 1).float(), last & (before > 0)
-    tokens, state, action = (take_rows(values, index) for values in (tokens, state, action))
-    depth = depth if depth is None else take_rows(depth, index)
+    tokens, state, action = (take_steps(values, index) for values in (tokens, state, action))
+    depth = depth if depth is None else take_steps(depth, index)
     return Clip(tokens, state, action, done, valid, known, list(batch.get("task", [""] * rows)), depth)
 
 

@@ -53,20 +53,20 @@ class Frames:
 
     Args:
         tokens: (B, S), the tokenizer's.
-        proprioception: (B, P), in the dataset's units.
+        state: (B, P), in the dataset's units.
         context: of the first frames of the B episodes, where the tokenizer is conditioned on them.
         depth: (B, S) metres of each token, for world models that look at depth.
     """
 
     tokens: Tensor
-    proprioception: Tensor
+    state: Tensor
     context: Context = NO_CONTEXT
     depth: Tensor | None = None
 
     def __getitem__(self, rows: Any) -> "Frames":
         """Return some of the B rows: an index, mask or slice of the first dimension."""
         depth = None if self.depth is None else self.depth[rows]
-        return Frames(self.tokens[rows], self.proprioception[rows], self.context[rows], depth)
+        return Frames(self.tokens[rows], self.state[rows], self.context[rows], depth)
 
     def __len__(self) -> int:
         return len(self.tokens)

@@ -13,16 +13,18 @@ from torch import Tensor
 
 from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW, FPS
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.start_frames import FirstFrames, Goals, Starts, load_starts, read_first_frames
 from lerobot_wmrl.envs.uncertainty import entropies
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
-from lerobot_wmrl.rewards.general import consecutive_count, sparse_reward
+from lerobot_wmrl.rewards.general import consecutive_count, is_done
 from lerobot_wmrl.rewards.loading import Reward, load_reward
-from lerobot_wmrl.rewards.similarity import Similarity, make_similarity, select_features
+from lerobot_wmrl.rewards.similarity import Similarity, make_similarity
 from lerobot_wmrl.world_models.checkpoint import check_same_tokenizer, load_model
 from lerobot_wmrl.world_models.dynamics import Imagined
 from lerobot_wmrl.world_models.frame_tokenizer import Decoded
+from lerobot_wmrl.world_models.goal import select_features
 from lerobot_wmrl.world_models.modeling_world_model import (
     ActionWorldModelRewardModel,
     TextWorldModelRewardModel,
@@ -95,7 +97,7 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         self._done_streak = torch.zeros_like(self._elapsed)
         if self.goals is not None:
             self._similarity = self.goals.similarity[drawn]
-        return self._observe(self.starts.images[drawn], now.proprioception), {}
+        return self._observe(self.starts.images[drawn], now.state), {}
 
     @torch.no_grad()
     def step(self, actions: Tensor) -> tuple[Observation, Tensor, Tensor, Tensor, dict[str, Any]]:
@@ -109,7 +111,7 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         uncertainty = entropies(imagined)
         terminated, truncated = self._advance(imagined, uncertainty)
         decoded = self.model.decode(imagined.tokens, self._imagination.context)
-        observation = self._observe(decoded.images, imagined.proprioception)
+        observation = self._observe(decoded.images, imagined.state)
         parts = {"success": terminated.float(), **self._progress(decoded)}
         reward = self.reward.compute_reward({**observation, **parts, "hidden": imagined.hidden})
         reward = self.config.uncertainty.weigh(reward, uncertainty)
@@ -126,6 +128,10 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
             observation = self._restart(finished, observation)
         return observation, reward, terminated, truncated, info
 
+    def newest_frames(self) -> Frames:
+        """Return the newest imagined frames, from which a planner can look ahead."""
+        return self.model.newest(self._imagination)
+
     def adopt(self, model: ActionWorldModelRewardModel) -> None:
         """Imagine with a refreshed model from the next reset on.
 
@@ -138,7 +144,7 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
     def _advance(self, imagined: Imagined, uncertainty: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Count frames. Return terminated (k consecutive done frames) and truncated (at the horizon, or where
         the model is uncertain). → (B,) bool, (B,) bool"""
-        fired = sparse_reward(imagined.done_logit, self.config.done_threshold) > 0
+        fired = is_done(imagined.done_logit, self.config.done_threshold)
         self._done_streak = consecutive_count(self._done_streak, fired)
         self._elapsed = self._elapsed + 1
         uncertain = self.config.uncertainty.ends(uncertainty)
@@ -155,7 +161,7 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         self._done_streak = self._done_streak.masked_fill(mask, 0)
         if self.goals is not None:
             self._similarity = torch.where(mask, self.goals.similarity[index], self._similarity)
-        fresh = self._observe(starts.images[index], now.proprioception)
+        fresh = self._observe(starts.images[index], now.state)
         for key, value in observation.items():
             if isinstance(value, Tensor):
                 fresh[key] = torch.where(mask.reshape(-1, *[1] * (value.ndim - 1)), fresh[key], value)

@@ -112,13 +112,13 @@ def compare_frames(
 def predicts_tcp(recording: Recording, replay: EpisodeReplay) -> bool:
     """Whether the model predicts a state that begins with the TCP's position in metres."""
     names = recording.table.dataset.features.get(OBS_STATE, {}).get("names") or []
-    return bool(replay.proprioception.shape[-1]) and list(names[:3]) == list(STATE_NAMES[:3])
+    return bool(replay.state.shape[-1]) and list(names[:3]) == list(STATE_NAMES[:3])
 
 
 def tcp_error_mm(recording: Recording, replay: EpisodeReplay) -> Tensor:
     """Distance of the imagined from the recorded TCP in millimetres, (T − 1,)."""
     recorded = torch.from_numpy(recording.table.state[recording.rows(replay.episode)][1:, :3])
-    return 1000 * (replay.proprioception[:-1, :3].cpu() - recorded).norm(dim=-1)
+    return 1000 * (replay.state[:-1, :3].cpu() - recorded).norm(dim=-1)
 
 
 def by_step(measured: Sequence[EpisodeAccuracy], horizon: int) -> dict[str, Any]:

@@ -182,7 +182,8 @@ def predict_done(model: ActionWorldModelRewardModel, recording: Recording) -> It
     device, length = model.state_mean.device, recording.table.length
     for batch in in_batches(np.argsort(length, kind="stable")):
         actions = recording.actions(batch, min(int(length[batch].max()), MAX_ACTIONS), device)
-        probability = model.open_loop(recording.starts(model, batch), actions).done_logit.sigmoid()
+        ahead = model.open_loop(recording.starts(model, batch), actions, with_tokens=False)
+        probability = ahead.done_logit.sigmoid()
         for row, episode in enumerate(batch.tolist()):
             done = recording.table.done[recording.rows(episode)]
             yield PredictedDone(episode, probability[row, : len(done)], done)

@@ -23,7 +23,6 @@ from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer, feature_di
 from lerobot_wmrl.world_models.goal import imagine_goal
 from lerobot_wmrl.world_models.modeling_world_model import TextWorldModelRewardModel
 
-MAX_GOALS = 64
 MAX_FINALS = 200
 
 PROBE_VALIDATION_EVERY = 5
@@ -81,14 +80,14 @@ class Goals:
 
 @torch.no_grad()
 def imagine_goals(model: TextWorldModelRewardModel, recording: Recording, episodes: np.ndarray) -> Goals:
-    """Imagine goals from the first frames of at most `MAX_GOALS` episodes and find the nearest finals."""
-    tokenizer, starts = model.tokenizer, episodes[:MAX_GOALS]
-    frames = recording.starts(model, starts)
-    instructions = [recording.table.instructions[episode] for episode in starts]
+    """Imagine goals from the first frames of episodes (G,) and find the nearest finals."""
+    tokenizer = model.tokenizer
+    frames = recording.starts(model, episodes)
+    instructions = [recording.table.instructions[episode] for episode in episodes]
     goal = imagine_goal(model, frames, instructions)
     start = tokenizer.decode_with_features(frames.tokens, frames.context)
     finals = final_frames(tokenizer, recording)
-    nearest, distance = np.full(len(starts), -1), np.full(len(starts), np.nan)
+    nearest, distance = np.full(len(episodes), -1), np.full(len(episodes), np.nan)
     start_distance = distance
     if finals is not None:
         same = np.array(
@@ -99,7 +98,7 @@ def imagine_goals(model: TextWorldModelRewardModel, recording: Recording, episod
         pairs = feature_distances(start.features, finals.features, tokenizer.num_cameras)
         start_distance = least(pairs, same)[0]
     return Goals(
-        starts, start.images, goal.decoded.images, goal.reached.cpu().numpy(), finals,
+        episodes, start.images, goal.decoded.images, goal.reached.cpu().numpy(), finals,
         nearest, distance, start_distance,
     )  # fmt: skip
 

@@ -1,5 +1,6 @@
 """Open-loop replay of recorded episodes: imagined from their first frame, with their own actions."""
 
+import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -33,6 +34,14 @@ class Recording:
 
     table: EpisodeTable
     frames: np.ndarray
+
+    def __post_init__(self) -> None:
+        if cut := int((self.table.length > MAX_ACTIONS).sum()):
+            logging.warning(
+                "%s: %d of %d episodes are longer than %d frames and are read up to there; a success after "
+                "that counts as a failure",
+                self.table.dataset.root, cut, len(self.table.length), MAX_ACTIONS,
+            )  # fmt: skip
 
     def rows(self, episode: int) -> slice:
         """Return the rows of the episode that are replayed, at most `MAX_ACTIONS`."""
@@ -70,13 +79,13 @@ class ImaginedFrames(NamedTuple):
     Attributes:
         tokens: (B, T, S).
         done_probability: (B, T).
-        proprioception: (B, T, P).
+        state: (B, T, P).
         depth: (B, T, S) metres of each token, None if the model does not predict it.
     """
 
     tokens: Tensor
     done_probability: Tensor
-    proprioception: Tensor
+    state: Tensor
     depth: Tensor | None
 
 
@@ -89,7 +98,7 @@ class EpisodeReplay:
         context: of its first frame, one row.
         tokens: (T, S).
         done_probability: (T,).
-        proprioception: (T, P).
+        state: (T, P).
         shuffled: (S,), the frame at `DELTA_PSNR_STEP` under the actions of another episode; None where there
             is none.
         done: (T,), recorded success after each action.
@@ -101,7 +110,7 @@ class EpisodeReplay:
     context: Context
     tokens: Tensor
     done_probability: Tensor
-    proprioception: Tensor
+    state: Tensor
     shuffled: Tensor | None
     done: np.ndarray
     depth: tuple[Tensor, Tensor] | None = None
@@ -115,7 +124,7 @@ def imagine_frames(model: ActionWorldModelRewardModel, frames: Frames, actions: 
     return ImaginedFrames(
         torch.stack([step.tokens for step in steps], 1),
         torch.stack([step.done_logit.sigmoid() for step in steps], 1),
-        torch.stack([step.proprioception for step in steps], 1),
+        torch.stack([step.state for step in steps], 1),
         torch.stack(depth, 1) if depth else None,
     )
 
@@ -157,7 +166,7 @@ def _replay_batch(
         steps = slice(0, rows.stop - rows.start)
         yield EpisodeReplay(
             episode, frames.context[[row]], own.tokens[row, steps], own.done_probability[row, steps],
-            own.proprioception[row, steps], shuffled[row] if comparable[row] else None, table.done[rows],
+            own.state[row, steps], shuffled[row] if comparable[row] else None, table.done[rows],
             recorded_and_imagined_depth(
                 model, recording, rows, None if own.depth is None else own.depth[row, steps]
             ),

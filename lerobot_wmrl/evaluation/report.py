@@ -41,6 +41,9 @@ from lerobot_wmrl.world_models.modeling_world_model import (
     TextWorldModelRewardModel,
 )
 
+MAX_GOALS = 64
+"""Goal frames that a report looks at."""
+
 TOP_LEVEL = ("delta_psnr_15", "done_delay_frames")
 """Headline numbers that metrics.json also holds without their intervals."""
 
@@ -176,7 +179,7 @@ def report_goals(
     text_model: TextWorldModelRewardModel, recording: Recording, evaluation: Evaluation, folder: Path
 ) -> Report:
     """Report goal frames from the starts of the evaluated episodes, and save goal_frames.png in `folder`."""
-    goals = imagine_goals(text_model, recording, evaluation.attempts)
+    goals = imagine_goals(text_model, recording, evaluation.attempts[:MAX_GOALS])
     quality = goal_quality(goals, train_probe(text_model.tokenizer, recording))
     pictures.save_goals(goals, folder / "goal_frames.png")
     return Report({"goal_frames": quality}, goal_table(quality))

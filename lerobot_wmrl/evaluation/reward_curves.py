@@ -11,9 +11,9 @@ from lerobot_wmrl.data.frame_cache import frames_to_tensor
 from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.evaluation.replay import Recording
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
-from lerobot_wmrl.rewards.general import consecutive_count, general_reward, sparse_reward
-from lerobot_wmrl.rewards.similarity import make_similarity, select_features
-from lerobot_wmrl.world_models.goal import imagine_goal
+from lerobot_wmrl.rewards.general import consecutive_count, general_reward, is_done
+from lerobot_wmrl.rewards.similarity import make_similarity
+from lerobot_wmrl.world_models.goal import imagine_goal, select_features
 from lerobot_wmrl.world_models.modeling_world_model import (
     ActionWorldModelRewardModel,
     TextWorldModelRewardModel,
@@ -48,7 +48,7 @@ def reward_along_episode(
     clip = Clip(
         tokens[None], state[None], action[None], known.float(), known, known, instruction, depth, start
     )
-    done_logit = model.predict(clip, drawn=False).done_logit[0, :-1]
+    done_logit = model.predict(clip, with_tokens=False).done_logit[0, :-1]
     first_depth = text_model.recorded_depth(table.dataset, slice(rows.start, rows.start + 1))
     goal = imagine_goal(text_model, Frames(tokens[:1], state[:1], start, first_depth), instruction)
     measure, cameras = make_similarity(reward.similarity, device), model.tokenizer.num_cameras
@@ -75,7 +75,7 @@ def success_once(done_logit: Tensor, threshold: float, frames: int) -> Tensor:
     """Return 1 on the frame that completes the first run of `frames` done frames, else 0. (T,) → (T,)"""
     count, paid = done_logit.new_zeros((), dtype=torch.long), torch.zeros_like(done_logit)
     for step, logit in enumerate(done_logit):
-        count = consecutive_count(count, sparse_reward(logit, threshold) > 0)
+        count = consecutive_count(count, is_done(logit, threshold))
         if count >= frames:
             paid[step] = 1
             break

@@ -6,7 +6,7 @@ measures it. B is the number of environments.
 """
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Protocol
 
 import torch
 from torch import Tensor
@@ -16,9 +16,9 @@ from lerobot_wmrl.common.errors import FieldError, require_choice, require_share
 FORMS: Final = ("absolute", "potential")
 
 
-def sparse_reward(done_logit: Tensor, threshold: float) -> Tensor:
-    """Eq. 7: 1 where the done probability reaches θ. (B,) → (B,)"""
-    return (done_logit.sigmoid() >= threshold).float()
+def is_done(done_logit: Tensor, threshold: float) -> Tensor:
+    """Whether the done probability reaches θ (eq. 7). (B,) → (B,) bool"""
+    return done_logit.sigmoid() >= threshold
 
 
 def consecutive_count(count: Tensor, fired: Tensor) -> Tensor:
@@ -31,9 +31,9 @@ def dense_reward[Number: (float, Tensor)](
 ) -> Number:
     """Eq. 5 as published (`absolute`), or as the potential difference γ·s_t − s_{t−1}. (B,), (B,) → (B,)
 
-    The potential form telescopes: an episode earns γ^T·s_T − s_0 in all, so lingering near the goal costs a
-    little. A success keeps its last γ·s_T as a bonus for ending like the goal. Ng et al. (1999) would take it
-    back; with α near 1 it is small beside the sparse reward.
+    Discounted, the potential form sums to γ^T·s_T − s_0: staying near the goal costs (1 − γ)·s a step. Ng et
+    al. (1999) subtract the final γ·s_T; here a success keeps it, which with α near 1 is small beside the
+    sparse reward.
     """
     return similarity if form == "absolute" else gamma * similarity - previous
 
@@ -45,13 +45,20 @@ def general_reward[Number: (float, Tensor)](
     return alpha * sparse + (1 - alpha) * dense_reward(similarity, previous, form, gamma)
 
 
-def check_general_reward(settings: object) -> None:
-    """Raise FieldError unless `alpha`, `form` and `gamma` of `settings` are those of a general reward."""
+class GeneralRewardSettings(Protocol):
+    """What the configurations of the general reward have in common, in imagination and in a simulator."""
+
+    alpha: float
+    form: str
+    gamma: float
+
+
+def check_general_reward(settings: GeneralRewardSettings) -> None:
+    """Raise FieldError for the first of the settings that is out of its range."""
     require_choice(settings, "form", FORMS)
     require_share(settings, "alpha")
-    gamma = getattr(settings, "gamma")  # noqa: B009 (two configurations have it, without a common base)
-    if not 0 < gamma <= 1:
-        raise FieldError("gamma", gamma, "must be a discount above 0 and at most 1")
+    if not 0 < settings.gamma <= 1:
+        raise FieldError("gamma", settings.gamma, "must be a discount above 0 and at most 1")
 
 
 @dataclass

@@ -9,7 +9,7 @@ from lerobot.utils.constants import REWARD
 from torch import Tensor, nn
 
 from lerobot_wmrl.common.errors import FieldError, require_at_least
-from lerobot_wmrl.data.clips import take_rows, unpadded_rows
+from lerobot_wmrl.data.clips import take_steps, unpadded_rows
 from lerobot_wmrl.data.episodes import check_cameras, frame_size
 from lerobot_wmrl.rewards.configuration_rewards import EmbeddingConfig, GeneralConfig, ProxyConfig
 from lerobot_wmrl.rewards.general import general_reward
@@ -143,9 +143,9 @@ class EmbeddingRewardModel(HubCard, PreTrainedRewardModel):
     def forward(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, float]]:
         """Return the loss on LeRobot's windows (shapes as `clip_from_windows`), `next.reward` (B, T)."""
         clip = self.world_model.clip_from_batch(batch)
-        hidden = self.world_model.predict(clip, drawn=False).hidden
+        hidden = self.world_model.predict(clip, with_tokens=False).hidden
         reward = recorded_rewards(batch).reshape(clip.valid.shape)
-        in_order = take_rows(reward, unpadded_rows(~clip.valid))
+        in_order = take_steps(reward, unpadded_rows(~clip.valid))
         return regression_loss(self.head(hidden).squeeze(-1), in_order, clip.valid)
 
     def compute_reward(self, batch: dict[str, Any]) -> Tensor:
@@ -153,8 +153,8 @@ class EmbeddingRewardModel(HubCard, PreTrainedRewardModel):
         if "hidden" in batch:
             return self.head(batch["hidden"]).squeeze(-1)
         clip = self.world_model.clip_from_batch(batch)
-        hidden = self.world_model.predict(clip, drawn=False).hidden
-        return self.head(take_rows(hidden, clip.valid.sum(1, keepdim=True) - 1)[:, 0]).squeeze(-1)
+        hidden = self.world_model.predict(clip, with_tokens=False).hidden
+        return self.head(take_steps(hidden, clip.valid.sum(1, keepdim=True) - 1)[:, 0]).squeeze(-1)
 
 
 def recorded_rewards(batch: dict[str, Any]) -> Tensor:

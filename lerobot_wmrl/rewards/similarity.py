@@ -5,7 +5,6 @@ cameras each; features are a list of tensors (B·N, …), cameras as rows of the
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -41,7 +40,7 @@ class TokenizerSimilarity(Similarity):
     """LPIPS's formula on the features of the tokenizer's decoder, which decoding computes anyway."""
 
     def features(self, frame: Decoded) -> Features:
-        return list(frame.features)
+        return frame.features
 
     def distance(self, frame: Features, goal: Features) -> Tensor:
         return feature_distance(frame, goal)
@@ -86,9 +85,3 @@ def make_similarity(kind: str, device: torch.device) -> Similarity:
         require_backbone(net, "reward.similarity", kind, "tokenizer or mse")
         return PerceptualSimilarity(lpips_network(net, device))
     return PixelSimilarity() if kind == "mse" else TokenizerSimilarity()
-
-
-def select_features(features: Sequence[Tensor], rows: Tensor, cameras: int) -> Features:
-    """Return the features of some of K frames: [(K·N, …)], rows (B,) → [(B·N, …)]"""
-    each = (rows[:, None] * cameras + torch.arange(cameras, device=rows.device)).flatten()
-    return [part[each] for part in features]

@@ -28,7 +28,8 @@ class DynamicsConfig(ChoiceRegistry):
     heads: int = 4
     patch: int = 2
     code_width: int = 48
-    depth = False  # not a field: the anchored dynamics never look at depth
+    depth = False  # not a field: only autoregressive dynamics can look at depth
+    sees_context = False  # not a field: only anchored dynamics look at the tokenizer's context
 
     def __post_init__(self) -> None:
         for name in ("layers", "width", "heads", "patch", "code_width"):
@@ -58,7 +59,7 @@ class DynamicsConfig(ChoiceRegistry):
 @DynamicsConfig.register_subclass("anchored")
 @dataclass
 class AnchoredConfig(DynamicsConfig):
-    """Predicts from the episode's first frame and the actions since: errors in pictures do not add up.
+    """Predicts from the episode's first frame and the actions since, so errors in pictures do not add up.
 
     An imagination as long as a training clip (`clip_length`) takes its last frame as a new first frame.
 
@@ -67,6 +68,7 @@ class AnchoredConfig(DynamicsConfig):
     """
 
     dropout: float = 0.0
+    sees_context = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -84,12 +86,12 @@ class WorldModelConfig(RewardModelConfig):
     Args:
         tokenizer_path: frame tokenizer checkpoint to start from; a trained world model carries its own copy.
         tokenizer: that tokenizer's settings, filled in from its checkpoint.
-        state_size: width of `observation.state`, 0 to do without proprioception; filled in from the dataset.
+        state_size: width of `observation.state`, 0 to do without it; filled in from the dataset.
         dynamics: network that predicts frames, `dynamics.type=anchored` or `autoregressive`.
         clip_length: frames in a training clip. Success is learnt only up to this many frames after a start,
             so set it to the length of the episodes that will be imagined.
         from_start: share of training clips that begin with their episode; the others begin anywhere in it.
-        learning_rate: highest learning rate of the schedule.
+        learning_rate: peak learning rate; constant in lerobot-train.
     """
 
     tokenizer_path: str | None = None
@@ -127,15 +129,13 @@ class WorldModelConfig(RewardModelConfig):
         """Channels of the tokenizer's context, as far as the dynamics look at it; 0 if they do not."""
         if self.tokenizer is None or not self.tokenizer.context:
             return 0
-        return self.tokenizer.widths[-1] if isinstance(self.dynamics, AnchoredConfig) else 0
+        return self.tokenizer.widths[-1] if self.dynamics.sees_context else 0
 
     @property
     def observation_delta_indices(self) -> list[int]:
         return list(range(1 - self.clip_length, 1))
 
-    @property
-    def action_delta_indices(self) -> list[int]:
-        return list(range(1 - self.clip_length, 1))
+    action_delta_indices = observation_delta_indices
 
 
 @RewardModelConfig.register_subclass("action_world_model")

@@ -17,14 +17,14 @@ from lerobot_wmrl.world_models.layers import Condition, FrameNetwork, Prediction
 class Imagined(NamedTuple):
     """One imagined frame of every environment.
 
-    tokens (B, S); done_logit (B,); proprioception (B, P), which the dynamics return normalised and the model
+    tokens (B, S); done_logit (B,); state (B, P), which the dynamics return normalised and the model
     in the dataset's units; hidden (B, D); entropy (B,), the mean over code factors of the predictive entropy
     in nats; depth (B, S), metres of each token, None unless the dynamics predict it.
     """
 
     tokens: Tensor
     done_logit: Tensor
-    proprioception: Tensor
+    state: Tensor
     hidden: Tensor
     entropy: Tensor
     depth: Tensor | None = None
@@ -33,26 +33,26 @@ class Imagined(NamedTuple):
 class OpenLoopPrediction(NamedTuple):
     """Outcome of T actions in each of B imaginations.
 
-    done_logit (B, T) and proprioception (B, T, P) after each action, units as in `Imagined`; tokens (B, S)
-    of the last frame.
+    done_logit (B, T) and state (B, T, P) after each action, units as in `Imagined`; tokens (B, S) of the last
+    frame, None if they were not asked for.
     """
 
     done_logit: Tensor
-    proprioception: Tensor
-    tokens: Tensor
+    state: Tensor
+    tokens: Tensor | None
 
 
 @dataclass
 class Imagination:
     """State of B imaginations: their newest frames, and the keys and values of the frames before.
 
-    codes (B, 1, S, C) and proprioception (B, 1, P), normalised, are of the newest frames; the context is that
+    codes (B, 1, S, C) and state (B, 1, P), normalised, are of the newest frames; the context is that
     of the frames where the imaginations began; the condition is set if it is the same at every step.
-    Tensors are allocated once and advanced in place, so that a step can be captured in a CUDA graph.
+    A step advances its tensors in place; that of autoregressive dynamics can be captured in a CUDA graph.
     """
 
     codes: Tensor
-    proprioception: Tensor
+    state: Tensor
     cache: KVCache
     context: Context = NO_CONTEXT
     condition: Condition | None = None
@@ -62,26 +62,26 @@ class Imagination:
         """Number format in which the network computes."""
         return self.cache.dtype
 
-    @property
-    def num_elements(self) -> int:
-        """Numbers kept of past frames."""
-        return self.cache.num_elements
-
     def restart(self, mask: Tensor) -> None:
         """Begin anew in the environments in `mask` (B,): their past is masked, not moved."""
         self.cache.restart(mask)
 
-    def rewind(self, other: "Imagination", frames: int) -> None:
+    def start_before(self, other: "Imagination", frames: int) -> None:
         """Move to `frames` frames before the position of another imagination, with an empty past."""
-        self.cache.rewind(other.cache, frames)
+        self.cache.start_before(other.cache, frames)
 
     def put(self, rows: Tensor, other: "Imagination") -> None:
         """Replace the imaginations of the environments `rows` (R,) by the R imaginations of `other`."""
         self.codes.index_copy_(0, rows, other.codes)
-        self.proprioception.index_copy_(0, rows, other.proprioception)
+        self.state.index_copy_(0, rows, other.state)
         maps = zip(self.context.maps, other.context.maps, strict=True)
         self.context = Context(tuple(own.index_copy(0, rows, new) for own, new in maps))
         self.cache.put(rows, other.cache)
+
+
+def spread_rows(frames: int, sequences: int, device: torch.device) -> Tensor:
+    """Return the frame of each action sequence, 0, …, 0, 1, …, for as many a frame. → (sequences,)"""
+    return torch.arange(frames, device=device).repeat_interleave(sequences // frames)
 
 
 class Dynamics(nn.Module):
@@ -105,8 +105,11 @@ class Dynamics(nn.Module):
         """
         raise NotImplementedError
 
-    def predict(self, clip: Clip, condition: Condition, drawn: bool) -> Prediction:
-        """Predict the frame after every row of a clip. Without `drawn`, logits may be empty, (B, 0, S, V)."""
+    def predict(self, clip: Clip, condition: Condition, with_tokens: bool) -> Prediction:
+        """Predict the frame after every row of a clip.
+
+        Without `with_tokens`, logits may be empty, (B, 0, S, V).
+        """
         raise NotImplementedError
 
     def start(self, frames: Frames, dtype: torch.dtype | None = None) -> Imagination:
@@ -116,9 +119,14 @@ class Dynamics(nn.Module):
     def show(self, imagination: Imagination, mask: Tensor, frames: Frames) -> None:
         """Replace the newest frames of the environments in `mask` (B,); their past is kept."""
         codes = self.network.codebook.codes(frames.tokens)[:, None]
-        state = frames.proprioception[:, None]
+        state = frames.state[:, None]
         imagination.codes.copy_(torch.where(mask[:, None, None, None], codes, imagination.codes))
-        imagination.proprioception.copy_(torch.where(mask[:, None, None], state, imagination.proprioception))
+        imagination.state.copy_(torch.where(mask[:, None, None], state, imagination.state))
+
+    def newest(self, imagination: Imagination) -> Frames:
+        """Return the newest frames."""
+        tokens = self.network.codebook.tokens(imagination.codes[:, 0])
+        return Frames(tokens, imagination.state[:, 0].clone(), imagination.context)
 
     def restart(self, imagination: Imagination, mask: Tensor, frames: Frames) -> None:
         """Begin anew in the environments in `mask` (B,); frames are of all B."""
@@ -131,15 +139,22 @@ class Dynamics(nn.Module):
         raise NotImplementedError
 
     def open_loop(
-        self, frames: Frames, actions: Tensor, encode: Callable[[Tensor], Condition]
+        self, frames: Frames, actions: Tensor, encode: Callable[[Tensor], Condition], with_tokens: bool
     ) -> OpenLoopPrediction:
-        """Predict what follows actions (B, T, A), which `encode` turns into conditions."""
-        imagination = self.start(frames)
+        """Predict what follows action sequences.
+
+        Args:
+            frames: B of them.
+            actions: (B·J, T, A), J sequences for each frame, one frame's after another's.
+            encode: turns actions into conditions.
+            with_tokens: whether the tokens of the last frame are needed.
+        """
+        imagination = self.start(frames[spread_rows(len(frames), len(actions), actions.device)])
         steps = [self.step(imagination, encode(action[:, None])) for action in actions.unbind(1)]
         return OpenLoopPrediction(
             torch.stack([step.done_logit for step in steps], 1),
-            torch.stack([step.proprioception for step in steps], 1),
-            steps[-1].tokens,
+            torch.stack([step.state for step in steps], 1),
+            steps[-1].tokens if with_tokens else None,
         )
 
     def _first(self, frames: Frames, dtype: torch.dtype | None) -> tuple[Tensor, Tensor, torch.dtype]:
@@ -148,18 +163,18 @@ class Dynamics(nn.Module):
         # a copy: imagination advances its tensors in place
         return (
             self.network.codebook.codes(frames.tokens)[:, None],
-            frames.proprioception[:, None].clone(),
+            frames.state[:, None].clone(),
             dtype,
         )
 
     def _advance(self, imagination: Imagination, prediction: Prediction, codes: Tensor) -> Imagined:
         """Make the predicted frame, of codes (B, 1, S, C), the newest one."""
         imagination.codes.copy_(codes)
-        imagination.proprioception.copy_(prediction.proprioception)
+        imagination.state.copy_(prediction.state)
         return Imagined(
             self.network.codebook.tokens(imagination.codes[:, 0]),
             prediction.done_logit[:, 0],
-            prediction.proprioception[:, 0],
+            prediction.state[:, 0],
             prediction.hidden[:, 0],
             self.network.codebook.entropy(prediction.logits[:, 0]),
         )

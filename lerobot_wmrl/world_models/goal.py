@@ -1,16 +1,14 @@
 """Goal frames (eq. 6) and the similarity to them (eq. 5)."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import torch
 from torch import Tensor
 
 from lerobot_wmrl.data.frames import NO_CONTEXT, Context, Frames
 from lerobot_wmrl.world_models.frame_tokenizer import Decoded, FrameTokenizer, feature_distance
-
-if TYPE_CHECKING:
-    from lerobot_wmrl.world_models.modeling_world_model import TextWorldModelRewardModel
+from lerobot_wmrl.world_models.imagination import ImaginationMixin
 
 GOAL_THRESHOLD: Final = 0.5
 """θ of eq. 6, the done probability at which a frame becomes the goal frame."""
@@ -26,13 +24,13 @@ class Goal(NamedTuple):
 
 @torch.no_grad()
 def imagine_goal(
-    model: "TextWorldModelRewardModel", frames: Frames, instructions: Sequence[str],
+    model: ImaginationMixin, frames: Frames, instructions: Sequence[str],
     threshold: float = GOAL_THRESHOLD,
 ) -> Goal:  # fmt: skip
     """Imagine the goal frame (eq. 6): the first whose done probability reaches θ, else the likeliest.
 
     Args:
-        model: imagines `goal_horizon` frames at most.
+        model: a text world model; imagines `goal_horizon` frames at most.
         frames: where the imaginations begin.
         instructions: one for each.
         threshold: θ.
@@ -63,3 +61,8 @@ def similarity_to_goal(
 def similarity_from_distance(distance: Tensor, batch: int) -> Tensor:
     """1 − distance of each camera's frame (B·N,), averaged over its cameras, in [0, 1]. → (B,)"""
     return (1 - distance.unflatten(0, (batch, -1)).mean(1)).clamp(0, 1)
+
+
+def select_features(features: Sequence[Tensor], rows: Tensor, cameras: int) -> list[Tensor]:
+    """Return the features of some of K frames: [(K·N, …)], rows (B,) → [(B·N, …)]"""
+    return [part.unflatten(0, (-1, cameras))[rows].flatten(0, 1) for part in features]

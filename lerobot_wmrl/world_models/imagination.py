@@ -62,13 +62,17 @@ class ImaginationMixin:
         With a past, they start in an imagination of their own, as many frames back as the past is long. It
         follows the past up to now, and then replaces theirs.
         """
+        if imagination.condition is not None:
+            raise ValueError(
+                "restart: its instructions are those of the start; start a new imagination instead"
+            )
         if not past.frames:
             self.dynamics.restart(imagination, mask, self._normalized(frames))
             return
         rows = mask.nonzero().squeeze(1)
         first = replace(past.frames[0][rows], context=frames.context[rows])
         apart = self.dynamics.start(self._normalized(first), imagination.dtype)
-        apart.rewind(imagination, len(past.frames))
+        apart.start_before(imagination, len(past.frames))
         self._follow_past(apart, past[rows], frames[rows])
         imagination.put(rows, apart)
 
@@ -86,7 +90,12 @@ class ImaginationMixin:
         if condition is None:
             raise ValueError("this imagination needs an action each step, or an instruction at the start")
         imagined = self.dynamics.step(imagination, condition)
-        return imagined._replace(proprioception=self.denormalize_state(imagined.proprioception))
+        return imagined._replace(state=self.denormalize_state(imagined.state))
+
+    def newest(self, imagination: Imagination) -> Frames:
+        """Return the newest frames, from which another imagination can begin."""
+        frames = self.dynamics.newest(imagination)
+        return replace(frames, state=self.denormalize_state(frames.state))
 
     @torch.no_grad()
     def imagine(self, frames: Frames, actions: Tensor) -> list[Imagined]:
@@ -95,13 +104,15 @@ class ImaginationMixin:
         return [self.step(imagination, action) for action in actions.unbind(1)]
 
     @torch.no_grad()
-    def open_loop(self, frames: Frames, actions: Tensor) -> OpenLoopPrediction:
-        """Predict what follows actions (B, T, A).
+    def open_loop(self, frames: Frames, actions: Tensor, with_tokens: bool = True) -> OpenLoopPrediction:
+        """Predict what follows actions (B·J, T, A): J sequences for each of B frames, frame by frame.
 
-        No frame but the last is drawn where the dynamics can do without, so it is much faster than `imagine`.
+        Anchored dynamics encode each frame once for its J sequences and render no frame but the last, and
+        without `with_tokens` none, so it is much faster than `imagine`.
         """
-        prediction = self.dynamics.open_loop(self._normalized(frames), actions, self.encode_actions)
-        return prediction._replace(proprioception=self.denormalize_state(prediction.proprioception))
+        normalized = self._normalized(frames)
+        prediction = self.dynamics.open_loop(normalized, actions, self.encode_actions, with_tokens)
+        return prediction._replace(state=self.denormalize_state(prediction.state))
 
     @torch.no_grad()
     def decode(self, tokens: Tensor, context: Context = NO_CONTEXT) -> Decoded:
@@ -127,4 +138,4 @@ class ImaginationMixin:
         return state * self.state_std + self.state_mean
 
     def _normalized(self, frames: Frames) -> Frames:
-        return replace(frames, proprioception=self.normalize_state(frames.proprioception))
+        return replace(frames, state=self.normalize_state(frames.state))

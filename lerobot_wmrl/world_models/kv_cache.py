@@ -45,11 +45,6 @@ class KVCache:
         return self.keys.dtype
 
     @property
-    def num_elements(self) -> int:
-        """Keys and values that it holds."""
-        return 2 * self.keys.numel()
-
-    @property
     def window(self) -> int:
         """Frames that it holds at most."""
         return self.keys.shape[-2]
@@ -66,15 +61,16 @@ class KVCache:
         """Begin anew in the environments in `mask` (B,): their past is masked, not moved."""
         self.started.copy_(torch.where(mask, self.position, self.started))
 
-    def rewind(self, other: "KVCache", frames: int) -> None:
+    def start_before(self, other: "KVCache", frames: int) -> None:
         """Move to `frames` frames before the other cache's position, with its slots and rotations.
 
-        ValueError unless it has had so many, and the window is longer.
+        ValueError unless it has had as many, and the window is longer.
         """
         if not frames < min(self.window, int(other.position) + 1):
             raise ValueError(
                 f"a past of {frames} frames, of a world model that remembers {self.window} and imaginations "
-                f"that are {int(other.position)} frames old: it must be shorter than both"
+                f"that are {int(other.position)} frames old: it must be shorter than the first, "
+                "and no longer than the second"
             )
         self.position.copy_(other.position - frames)
         self.started.copy_(self.position.expand_as(self.started))

@@ -71,12 +71,12 @@ class Prediction(NamedTuple):
     """Predictions of frame t + 1 for each of T frames.
 
     logits (B, T, S, V), V the sum of the levels of all factors, or (B, K, S, V) if only K frames were asked
-    for; done_logit (B, T); proprioception (B, T, P), normalised; hidden (B, T, D).
+    for; done_logit (B, T); state (B, T, P), normalised; hidden (B, T, D).
     """
 
     logits: Tensor
     done_logit: Tensor
-    proprioception: Tensor
+    state: Tensor
     hidden: Tensor
 
 

@@ -21,16 +21,16 @@ MOTION_LEVELS: Final = 3
 """Steps (levels of FSQ, signs of LFQ) by which a token's codes must change to count as motion. Smaller
 changes are mostly noise of the tokenizer."""
 
-STATE_PRECISION: Final = 0.1
-"""Error at which the state's loss turns from squared to absolute, in `STATE_STEP`s: about a millimetre."""
+STATE_BETA: Final = 0.1
+"""Beta of the state's smooth L1 loss, in `STATE_STEP`s: about a millimetre."""
 
 TOKEN_NOISE = 0.02
 """Share of input code factors moved by one step in training: a level of FSQ, a sign of LFQ."""
 
 
 def masked_mean(values: Tensor, weight: Tensor) -> Tensor:
-    """Σ values · weight / Σ weight, both of one shape → (); 0 where nothing counts."""
-    return (values * weight).sum() / weight.detach().sum().float().clamp_min(1)
+    """Σ values · weight / Σ weight, weight broadcastable to values → (); 0 where nothing counts."""
+    return (values * weight).sum() / weight.expand_as(values).sum().float().clamp_min(1)
 
 
 def corrupt_codes(codes: Tensor, codebook: CodeBook) -> Tensor:
@@ -57,7 +57,7 @@ class TargetFrames(NamedTuple):
 def weighted_frames(codebook: CodeBook, target: Tensor, reference: Tensor, known: Tensor) -> TargetFrames:
     """Give the tokens of target frames their weights in the loss.
 
-    Most of a frame is still, and what moves decides. So tokens that have moved count more.
+    Most tokens do not move, and those that do decide success, so they count more.
 
     Args:
         codebook: measures how far codes are apart.
@@ -88,7 +88,7 @@ def next_frame_loss(
     prediction = Prediction(*(output.float() for output in prediction))
     logits = prediction.logits[:, : target.codes.shape[1]]
     token_loss = masked_mean(codebook.cross_entropy(logits, target.codes), target.weight)
-    state_loss = next_state_loss(prediction.proprioception, clip)
+    state_loss = next_state_loss(prediction.state, clip)
     done = F.binary_cross_entropy_with_logits(prediction.done_logit, clip.done, reduction="none")
     done_loss = masked_mean(done, clip.done_known & clip.valid)
     loss = token_loss + done_loss + STATE_WEIGHT * state_loss
@@ -105,5 +105,5 @@ def next_frame_loss(
 def next_state_loss(predicted: Tensor, clip: Clip) -> Tensor:
     """Smooth L1 of predicted states (B, T, P) against those of the next rows, in `STATE_STEP`s. → ()"""
     error = (predicted[:, :-1] - clip.state[:, 1:]) / STATE_STEP
-    losses = F.smooth_l1_loss(error, torch.zeros_like(error), reduction="none", beta=STATE_PRECISION)
-    return masked_mean(losses, known_transitions(clip.valid)[..., None].expand_as(losses))
+    losses = F.smooth_l1_loss(error, torch.zeros_like(error), reduction="none", beta=STATE_BETA)
+    return masked_mean(losses, known_transitions(clip.valid)[..., None])

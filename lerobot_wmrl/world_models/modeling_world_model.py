@@ -130,7 +130,7 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
         if self.config.depth:
             check_depth(features, sizes.camera_keys, sizes.image_size)
         if self.config.state_size and OBS_STATE not in features:
-            logging.info("the dataset has no observation.state: the world model does without proprioception")
+            logging.info("the dataset has no observation.state: the world model does without it")
         if self.config.state_size:
             self.config.state_size = features[OBS_STATE]["shape"][0] if OBS_STATE in features else 0
 
@@ -147,34 +147,30 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
     def normalize_state(self, state: Tensor) -> Tensor:
         """Dataset units (…, P) to zero mean and unit spread.
 
-        Clipped, so that rare collisions do not outweigh the rest.
-        Components beyond the model's `state_size` are dropped.
+        Clipped, so that rare collisions do not outweigh the rest. Without proprioception → (…, 0).
         """
         state = state[..., : self.config.state_size]
         return ((state - self.state_mean) / self.state_std).clamp(-STATE_LIMIT, STATE_LIMIT)
 
     def condition(self, clip: Clip) -> Condition:
-        """Return the condition (eq. 1's c) of every row of a clip."""
+        """Return the condition (eq. 1's c) of every row of a clip, tokens (B, T or 1, M, D)."""
         raise NotImplementedError
 
     def forward(self, batch: Clip | dict[str, Any], progress: float = 1.0) -> tuple[Tensor, dict[str, float]]:
-        """Return the loss and its parts on a clip, or on LeRobot's batch (see `clip_from_windows`).
+        """Compute the loss of eqs. 2-4 and its parts on a clip, or on LeRobot's batch (`clip_from_windows`).
 
-        progress: share of the training that is over, on which some losses depend.
+        progress: share of the training that is over, which lerobot-train does not give.
         """
-        return self.loss(batch if isinstance(batch, Clip) else self.clip_from_batch(batch), progress)
-
-    def loss(self, clip: Clip, progress: float = 1.0) -> tuple[Tensor, dict[str, float]]:
-        """Compute the loss of eqs. 2-4 on a clip of tokens."""
+        clip = batch if isinstance(batch, Clip) else self.clip_from_batch(batch)
         return self.dynamics.loss(self._normalized_clip(clip), self.condition(clip), progress)
 
     @torch.no_grad()
-    def predict(self, clip: Clip, drawn: bool = True) -> Prediction:
+    def predict(self, clip: Clip, with_tokens: bool = True) -> Prediction:
         """Predict the frame after every row of a clip, normalised; no prediction is fed back.
 
-        Where its tokens are not needed, `drawn` = False is faster.
+        Where its tokens are not needed, `with_tokens` = False is faster.
         """
-        return self.dynamics.predict(self._normalized_clip(clip), self.condition(clip), drawn)
+        return self.dynamics.predict(self._normalized_clip(clip), self.condition(clip), with_tokens)
 
     def _normalized_clip(self, clip: Clip) -> Clip:
         return clip._replace(state=self.normalize_state(clip.state))
@@ -239,7 +235,7 @@ class ActionWorldModelRewardModel(WorldModelRewardModel):
         """Return the probability that success holds after the window's last action. → (B,)"""
         clip = self.clip_from_batch(batch)
         last = clip.valid.sum(1, keepdim=True) - 1
-        return self.predict(clip, drawn=False).done_logit.gather(1, last).squeeze(1).sigmoid()
+        return self.predict(clip, with_tokens=False).done_logit.gather(1, last).squeeze(1).sigmoid()
 
 
 class TextWorldModelRewardModel(WorldModelRewardModel):

@@ -12,6 +12,11 @@ def test_products_are_in_the_chosen_format_and_weights_stay_as_they_are() -> Non
     assert layer.weight.dtype == torch.float32
 
 
+def test_float32_switches_a_surrounding_autocast_off() -> None:
+    with compute_in(torch.bfloat16, "cpu"), compute_in(torch.float32, "cpu"):
+        assert torch.nn.Linear(4, 4)(torch.zeros(2, 4)).dtype == torch.float32
+
+
 def test_auto_is_what_the_hardware_multiplies_in() -> None:
     fast = torch.bfloat16 if multiplies_bfloat16("cpu") else torch.float32
     assert training_dtype("auto", "cpu") == imagination_dtype("cpu") == fast

@@ -88,7 +88,7 @@ def test_truncated_at_the_horizon_with_the_final_observation_kept(env):
     assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
     assert not info["final_info"]["is_success"].any()
     assert info["final_info"]["episode_length"].tolist() == [5] * B
-    starts = env.starts.now.proprioception[env._start_index]
+    starts = env.starts.now.state[env._start_index]
     assert torch.equal(observation[STATE], starts)
     assert not torch.equal(info["final_obs"][STATE], starts)
 
@@ -255,7 +255,7 @@ def test_episodes_begin_in_saved_frames_as_in_those_of_the_dataset(config, env, 
     np.savez(path, **whole)
     found, spread = saved.create_tensor_env(2).starts, [0, 1, 3, 5]
     assert torch.equal(found.now.tokens, env.starts.now.tokens[spread])
-    assert torch.equal(found.now.proprioception, env.starts.now.proprioception[spread])
+    assert torch.equal(found.now.state, env.starts.now.state[spread])
     assert found.instructions == [env.starts.instructions[row] for row in spread]
     for name, value in (
         (IMAGE, whole[IMAGE][:, :16]), (STATE, whole[STATE][:, :3]), ("task", whole["task"][:3]),

@@ -24,7 +24,7 @@ from lerobot_wmrl.evaluation.accuracy import (
     robustness,
 )
 from lerobot_wmrl.evaluation.gate import Outcomes, gate_at, success_gate
-from lerobot_wmrl.evaluation.replay import EpisodeReplay, Recording, replay_episodes
+from lerobot_wmrl.evaluation.replay import MAX_ACTIONS, EpisodeReplay, Recording, replay_episodes
 from lerobot_wmrl.evaluation.report import evaluate
 from lerobot_wmrl.maniskill.recordings import scene_splits
 from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
@@ -155,6 +155,15 @@ def test_episodes_of_one_frame_are_named(source, model):
     table = replace(source.table, length=np.ones(6, int))
     with pytest.raises(ValueError, match="every chosen episode has a single frame"):
         evaluate(model, Recording(table, source.frames), np.arange(6))
+
+
+def test_episodes_that_are_cut_are_counted(source, caplog):
+    Recording(source.table, source.frames)
+    assert not caplog.records
+    length = source.table.length.copy()
+    length[:2] = MAX_ACTIONS + 1
+    Recording(replace(source.table, length=length), source.frames)
+    assert "2 of 6 episodes are longer than 300 frames" in caplog.text
 
 
 def test_the_gate_is_one_call(small_dataset, model):

@@ -7,16 +7,16 @@ import torch
 
 from lerobot_wmrl.evaluation.reward_curves import success_once
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
-from lerobot_wmrl.rewards.general import RuleBasedReward, consecutive_count, general_reward, sparse_reward
+from lerobot_wmrl.rewards.general import RuleBasedReward, consecutive_count, general_reward, is_done
 from lerobot_wmrl.rewards.modeling_rewards import GeneralRewardModel
 
 GAMMA = 0.97
 HORIZON = 40
 
 
-def test_the_sparse_part_pays_at_the_threshold():
-    logits = torch.logit(torch.tensor([0.49, 0.51]))
-    assert sparse_reward(logits, 0.5).tolist() == [0, 1]
+def test_a_frame_is_done_from_the_threshold_on():
+    logits = torch.tensor([-0.1, 0.0, 0.1])
+    assert is_done(logits, 0.5).tolist() == [False, True, True]
 
 
 def test_the_potential_form_pays_nothing_for_lingering_and_for_going_in_circles():

@@ -5,9 +5,10 @@ import torch
 from lpips import LPIPS
 
 from lerobot_wmrl.rewards.configuration_rewards import SIMILARITIES, GeneralConfig
-from lerobot_wmrl.rewards.similarity import PerceptualSimilarity, Similarity, make_similarity, select_features
+from lerobot_wmrl.rewards.similarity import PerceptualSimilarity, Similarity, make_similarity
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 from lerobot_wmrl.world_models.frame_tokenizer import Decoded, FrameTokenizer
+from lerobot_wmrl.world_models.goal import select_features
 
 CPU = torch.device("cpu")
 CAMERAS = 2
@@ -46,6 +47,12 @@ def test_what_is_nearer_to_the_goal_is_more_alike(measure):
     same, near, far = measure(features, goal, CAMERAS).tolist()
     assert same == pytest.approx(1)
     assert 0 <= far < near < same
+
+
+def test_the_features_of_a_frame_are_those_of_all_its_cameras():
+    features, rows = [torch.rand(4 * CAMERAS, 3, 8, 8), torch.rand(4 * CAMERAS, 5)], torch.tensor([2, 0, 2])
+    for part, chosen in zip(features, select_features(features, rows, CAMERAS), strict=True):
+        assert torch.equal(chosen, part[[4, 5, 0, 1, 4, 5]])
 
 
 def test_lpips_is_that_of_its_package(network):

@@ -55,7 +55,7 @@ def fit(model: TextWorldModelRewardModel, clip: Clip, steps: int) -> None:
     model.train()
     optimizer = torch.optim.Adam([p for p in model.parameters() if p.requires_grad], 1e-2)
     for _ in range(steps):
-        loss, _ = model.loss(clip)
+        loss, _ = model(clip)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

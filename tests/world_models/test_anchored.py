@@ -9,12 +9,12 @@ from draccus.utils import DecodingError
 from torch import Tensor
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.clips import Clip
+from lerobot_wmrl.data.clips import Clip, known_transitions, take_steps
 from lerobot_wmrl.data.frames import NO_CONTEXT, Context, Frames
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig
 from lerobot_wmrl.world_models import losses
 from lerobot_wmrl.world_models.anchored import dynamics as anchored_dynamics
-from lerobot_wmrl.world_models.anchored.dynamics import draw_rows, frames_after
+from lerobot_wmrl.world_models.anchored.dynamics import sample_steps
 from lerobot_wmrl.world_models.anchored.network import Dropout
 from lerobot_wmrl.world_models.codebook import CodeBook
 from lerobot_wmrl.world_models.configuration_world_model import (
@@ -75,13 +75,13 @@ def test_steps_are_one_pass_over_the_clip():
     assert torch.equal(over_time(steps, "tokens"), codebook.tokens(codebook.most_likely(whole.logits)))
     torch.testing.assert_close(over_time(steps, "done_logit"), whole.done_logit, atol=1e-4, rtol=0)
     torch.testing.assert_close(over_time(steps, "hidden"), whole.hidden, atol=1e-4, rtol=0)
-    state = whole.proprioception * model.state_std + model.state_mean
-    torch.testing.assert_close(over_time(steps, "proprioception"), state, atol=1e-4, rtol=0)
+    state = whole.state * model.state_std + model.state_mean
+    torch.testing.assert_close(over_time(steps, "state"), state, atol=1e-4, rtol=0)
 
 
 def test_what_is_not_drawn_is_predicted_all_the_same():
     model, clip = world_model(), random_clip()
-    drawn, undrawn = model.predict(clip), model.predict(clip, drawn=False)
+    drawn, undrawn = model.predict(clip), model.predict(clip, with_tokens=False)
     assert undrawn.logits.shape == (BATCH, 0, *drawn.logits.shape[2:])
     assert all(torch.equal(a, b) for a, b in zip(drawn[1:], undrawn[1:], strict=True))
 
@@ -93,8 +93,25 @@ def test_looking_ahead_ends_where_steps_do(length):
     steps = imagine(model, clip)
     ahead = model.open_loop(clip.first(), clip.action)
     assert torch.equal(ahead.tokens, steps[-1].tokens)
-    for name in ("done_logit", "proprioception"):
+    for name in ("done_logit", "state"):
         torch.testing.assert_close(getattr(ahead, name), over_time(steps, name), atol=1e-3, rtol=1e-4)
+
+
+@pytest.mark.parametrize("with_tokens", [True, False])
+def test_many_sequences_from_one_frame_are_predicted_as_each_alone(with_tokens):
+    model, clip = world_model(), random_clip()
+    frames, others = clip.first(), random_clip(seed=1)
+    actions = torch.stack([clip.action, others.action], 1).flatten(0, 1)  # two sequences for each frame
+    together = model.open_loop(frames, actions, with_tokens)
+    for index, one in enumerate((clip.action, others.action)):
+        alone = model.open_loop(frames, one)
+        for name in ("done_logit", "state"):
+            found = getattr(together, name)[index::2]
+            torch.testing.assert_close(found, getattr(alone, name), atol=1e-4, rtol=1e-4)
+        if with_tokens:
+            assert torch.equal(together.tokens[index::2], alone.tokens)
+        else:
+            assert together.tokens is None
 
 
 def test_nothing_comes_from_the_future_nor_from_later_frames():
@@ -116,7 +133,7 @@ def test_whoever_has_imagined_a_clip_begins_anew_at_its_last_frame():
     model, clip = world_model(), random_clip(length=2 * LENGTH)
     steps = imagine(model, clip)
     last = steps[LENGTH - 1]
-    again = model.start(Frames(last.tokens, last.proprioception, clip.context), dtype=torch.float32)
+    again = model.start(Frames(last.tokens, last.state, clip.context), dtype=torch.float32)
     for step, action in zip(steps[LENGTH:], clip.action[:, LENGTH:].unbind(1), strict=True):
         anew = model.step(again, action)
         assert torch.equal(anew.tokens, step.tokens)
@@ -145,7 +162,7 @@ def test_the_text_model_imagines_the_same_way():
     steps = [model.step(state) for _ in range(LENGTH)]
     expected = model.predict(clip).done_logit
     torch.testing.assert_close(over_time(steps, "done_logit"), expected, atol=1e-4, rtol=0)
-    assert model.loss(clip)[0].isfinite()
+    assert model(clip)[0].isfinite()
 
 
 def test_what_the_tokenizer_sees_in_the_first_frame_is_looked_at_and_needed():
@@ -172,7 +189,7 @@ def reached(clip: Clip) -> Clip:
 
 
 def test_frames_done_and_state_are_learnt_though_few_frames_are_drawn(monkeypatch):
-    monkeypatch.setattr(anchored_dynamics, "DRAWN_FRAMES", 1)
+    monkeypatch.setattr(anchored_dynamics, "RENDERED_FRAMES", 1)
     monkeypatch.setattr(losses, "TOKEN_NOISE", 0.0)
     torch.manual_seed(0)
     model = ActionWorldModelRewardModel(ActionWorldModelConfig(**nested(SIZES | {"state_size": 1}))).train()
@@ -180,14 +197,14 @@ def test_frames_done_and_state_are_learnt_though_few_frames_are_drawn(monkeypatc
     assert 0 < clip.done.mean() < 1
     optimizer = torch.optim.Adam(model.dynamics.network.parameters(), 3e-3)
     for _ in range(300):
-        loss, _ = model.loss(clip)
+        loss, _ = model(clip)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
     steps = imagine(model.eval(), clip)
     assert torch.equal(over_time(steps, "done_logit") > 0, clip.done > 0.5)
     assert (over_time(steps, "tokens")[:, :-1] == clip.tokens[:, 1:]).float().mean() > 0.9
-    assert (over_time(steps, "proprioception")[:, :-1] - clip.state[:, 1:]).abs().mean() < 0.03
+    assert (over_time(steps, "state")[:, :-1] - clip.state[:, 1:]).abs().mean() < 0.03
 
 
 def test_training_leaves_out_a_share_of_what_layers_add_and_imagination_nothing():
@@ -202,9 +219,9 @@ def test_training_leaves_out_a_share_of_what_layers_add_and_imagination_nothing(
     assert left.mean(1).sub(1).abs().max() < 0.15
 
 
-def test_rows_are_drawn_among_those_with_a_valid_next_one():
+def test_steps_are_sampled_among_those_with_a_valid_next_one():
     valid = torch.tensor([[True] * 6, [True] * 3 + [False] * 3, [True] + [False] * 5])
-    rows = torch.stack([draw_rows(valid, 5) for _ in range(200)])
+    rows = torch.stack([sample_steps(valid, 5) for _ in range(200)])
     assert [sorted(set(rows[:, clip].flatten().tolist())) for clip in range(3)] == [
         [0, 1, 2, 3, 4],
         [0, 1],
@@ -219,7 +236,9 @@ def test_tokens_that_are_not_as_at_the_start_count_more_and_padding_nothing(monk
     valid[1, 2:] = False
     tokens = clip.tokens.clone()
     tokens[0, 3] = tokens[0, 0]
-    frames = frames_after(torch.tensor([[2], [1], [0]]), codebook.codes(tokens), valid, codebook)
+    codes, steps = codebook.codes(tokens), torch.tensor([[2], [1], [0]])
+    known, target = (take_steps(x, steps) for x in (known_transitions(valid), codes[:, 1:]))
+    frames = losses.weighted_frames(codebook, target, codes[:, :1], known)
     assert torch.equal(frames.codes[0], codebook.codes(tokens[0, 3:4]))
     assert torch.equal(frames.weight[0], torch.ones(1, TOKENS))
     assert torch.equal(frames.weight[1], torch.zeros(1, TOKENS))

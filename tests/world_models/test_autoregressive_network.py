@@ -60,6 +60,6 @@ def test_every_input_reaches_the_prediction():
     condition = torch.randn(1, 2, 1, 16, requires_grad=True)
     codes = model.codebook.codes(torch.randint(0, 120, (1, 2, 32)))
     prediction, _ = model(codes, state, Condition(condition))
-    for output in (prediction.logits, prediction.done_logit, prediction.proprioception):
+    for output in (prediction.logits, prediction.done_logit, prediction.state):
         gradients = torch.autograd.grad(output[:, 1].sum(), (state, condition), retain_graph=True)
         assert all(gradient[:, 0].abs().sum() > 0 for gradient in gradients)

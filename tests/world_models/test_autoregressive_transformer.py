@@ -5,14 +5,15 @@ import torch
 from torch import Tensor
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.world_models.autoregressive.network import CONDITIONINGS, SpatialTemporalTransformer
+from lerobot_wmrl.world_models.autoregressive.configuration import CONDITIONINGS, AutoregressiveConfig
+from lerobot_wmrl.world_models.autoregressive.network import CONDITIONING_CLASSES, SpatialTemporalTransformer
 from lerobot_wmrl.world_models.kv_cache import KVCache
 from lerobot_wmrl.world_models.layers import ClipMemory, Condition
 
 WINDOW, TOKENS, WIDTH = 5, 6, 16
 
 
-@pytest.fixture(params=list(CONDITIONINGS))
+@pytest.fixture(params=list(CONDITIONING_CLASSES))
 def transformer(request: pytest.FixtureRequest) -> SpatialTemporalTransformer:
     torch.manual_seed(0)
     model = SpatialTemporalTransformer(2, WIDTH, 2, request.param).eval()
@@ -36,12 +37,12 @@ def whole(
 ) -> Tensor:
     """One pass over clips."""
     memory = ClipMemory(x.shape[1], WINDOW, WIDTH // 2, x.device)
-    return model(x, Condition(condition, mask), memory)
+    return model(x, Condition(condition, mask), memory)[0]
 
 
 def step(model: SpatialTemporalTransformer, x: Tensor, condition: Tensor, cache: KVCache, t: int) -> Tensor:
     """Frame t of clips against the cache."""
-    return model(x[:, t : t + 1], Condition(condition[:, t : t + 1]), cache.advance())
+    return model(x[:, t : t + 1], Condition(condition[:, t : t + 1]), cache.advance())[0]
 
 
 def unroll(
@@ -142,6 +143,10 @@ def test_adaptive_norms_begin_as_plain_ones_and_learn():
 
 def test_an_unknown_conditioning_is_named():
     with pytest.raises(
-        FieldError, match=r"^dynamics.conditioning=film: .*choose one of cross_attention, adaln"
+        FieldError, match=r"^dynamics.conditioning=film: choose one of adaln, cross_attention"
     ):
-        SpatialTemporalTransformer(1, WIDTH, 2, "film")
+        AutoregressiveConfig(conditioning="film")
+
+
+def test_every_conditioning_of_the_configuration_has_a_class():
+    assert set(CONDITIONING_CLASSES) == set(CONDITIONINGS)

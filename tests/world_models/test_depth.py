@@ -98,7 +98,7 @@ def test_depth_guides_the_tokens_and_nothing_sees_the_future():
     before = predict(model, clip)
     clip.depth[:, CHANGED] = FAR * torch.rand(BATCH, TOKENS)
     after = predict(model, clip)
-    for name in ("logits", "depth", "done_logit", "proprioception"):
+    for name in ("logits", "depth", "done_logit", "state"):
         frames = changed_frames(*(p[name][..., None] for p in (before, after)))
         assert frames[:4] == list(range(CHANGED, CHANGED + 4)), name
 
@@ -167,7 +167,7 @@ def test_a_moving_depth_is_learnt_and_imagined():
     clip = moving_depth_clip()
     optimizer = torch.optim.Adam(model.dynamics.network.parameters(), 3e-3)
     for _ in range(120):
-        loss, _ = model.loss(clip)
+        loss, _ = model(clip)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -182,7 +182,7 @@ def test_depth_that_is_missing_or_on_another_grid_is_named():
     with pytest.raises(ValueError, match=r"depth: none, .*`dynamics\.depth`"):
         model.start(replace(clip.first(), depth=None))
     with pytest.raises(ValueError, match=r"depth: shape \(3, 12, 8\), .*shape \(3, 12, 32\)"):
-        model.loss(clip._replace(depth=clip.depth[..., :8]))
+        model(clip._replace(depth=clip.depth[..., :8]))
 
 
 @torch.no_grad()
@@ -191,7 +191,7 @@ def test_rollouts_in_training_show_the_depth_that_was_imagined():
     depth = normalize_depth(clip.depth, clip.tokens)
     codes, state = model.dynamics.network.codebook.codes(clip.tokens), model.normalize_state(clip.state)
     real, normalized = Inputs(codes, state, depth), clip._replace(state=state)
-    seen = model.dynamics.inputs(real, normalized, model.condition(clip), 1.0).depth
+    seen = model.dynamics.network_inputs(real, normalized, model.condition(clip), 1.0).depth
     imagination = model.start(clip.first())
     imagined = model.step(imagination, clip.action[:, 0]).depth
     assert torch.equal(seen[:, 0], depth[:, 0])

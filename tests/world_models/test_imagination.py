@@ -71,7 +71,7 @@ def test_bfloat16_computes_about_the_same_and_answers_in_float32():
     exact = model.start(frames, dtype=torch.float32)
     assert half.cache.keys.dtype == torch.bfloat16
     rough, fine = model.step(half, action), model.step(exact, action)
-    for name in ("done_logit", "proprioception", "hidden", "entropy"):
+    for name in ("done_logit", "state", "hidden", "entropy"):
         value, expected = getattr(rough, name), getattr(fine, name)
         assert value.dtype == torch.float32
         torch.testing.assert_close(value, expected, atol=0.1, rtol=0.05)

@@ -3,7 +3,7 @@ import torch
 
 from lerobot_wmrl.data.clips import Clip, known_transitions
 from lerobot_wmrl.world_models import losses
-from lerobot_wmrl.world_models.autoregressive.dynamics import Inputs, force_predictions
+from lerobot_wmrl.world_models.autoregressive.dynamics import Inputs, replace_by_predictions
 from lerobot_wmrl.world_models.codebook import CodeBook
 from lerobot_wmrl.world_models.layers import Prediction
 from lerobot_wmrl.world_models.losses import corrupt_codes, next_frame_loss, weighted_frames
@@ -42,7 +42,7 @@ def test_padding_does_not_count():
     for tensor in prediction[:3]:
         tensor[1, 3:] += 100
     prediction.logits[1, 2] += torch.randn(6, 7)
-    prediction.proprioception[1, 2] += 5
+    prediction.state[1, 2] += 5
     codes[1, 3:] = 0
     again, _ = loss_of(prediction, codes, clip)
     torch.testing.assert_close(loss, again)
@@ -53,7 +53,7 @@ def test_no_transition_is_learnt_out_of_padding_before_an_episode():
     valid = torch.tensor([[False, False, True, True, True], [True] * 5])
     clip, prediction, codes = clip_and_prediction(valid)
     loss, _ = loss_of(prediction, codes, clip)
-    for tensor in (prediction.logits, prediction.proprioception):
+    for tensor in (prediction.logits, prediction.state):
         tensor[0, 1] += torch.randn_like(tensor[0, 1])
     again, _ = loss_of(prediction, codes, clip)
     torch.testing.assert_close(loss, again)
@@ -81,11 +81,11 @@ def test_forcing_replaces_later_frames_only_and_only_by_predictions():
     clip, prediction, codes = clip_and_prediction(torch.ones(2, 5, dtype=torch.bool))
     depth, next_depth = torch.randn(2, 5, 6), torch.randn(2, 5, 6)
     real = Inputs(codes, clip.state, depth)
-    seen = force_predictions(prediction, next_depth, CODEBOOK, real, share=1.0)
+    seen = replace_by_predictions(prediction, next_depth, CODEBOOK, real, share=1.0)
     for replaced, first in zip(seen, real, strict=True):
         assert torch.equal(replaced[:, 0], first[:, 0])
     assert torch.equal(seen.codes[:, 1:], CODEBOOK.most_likely(prediction.logits[:, :-1]))
-    assert torch.equal(seen.state[:, 1:], prediction.proprioception[:, :-1])
+    assert torch.equal(seen.state[:, 1:], prediction.state[:, :-1])
     assert torch.equal(seen.depth[:, 1:], next_depth[:, :-1])
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from lerobot_wmrl.world_models.autoregressive.configuration import AutoregressiveConfig
 from lerobot_wmrl.world_models.autoregressive.maskgit import (
     DraftMemory,
-    FramesSeen,
+    FirstPass,
     MaskGit,
     fixed_counts,
     most_confident,
@@ -44,22 +44,22 @@ def frames(batch: int) -> Tensor:
     return torch.stack([first, coin], -1)
 
 
-def look(model: NextFrameNetwork, codes: Tensor) -> FramesSeen:
+def look(model: NextFrameNetwork, codes: Tensor) -> FirstPass:
     """One pass over clips, without state or anything to be told by the condition."""
     batch, length = codes.shape[:2]
     memory = model.clip_memory(length, codes.device)
     condition = Condition(torch.zeros(batch, 1, 1, WIDTH))
     prediction, depth = model(codes, torch.zeros(batch, length, 0), condition, memory)
-    return FramesSeen(codes, condition, prediction, depth, memory)
+    return FirstPass(codes, condition, prediction, depth, memory)
 
 
-def seen_last(model: NextFrameNetwork, codes: Tensor) -> FramesSeen:
+def seen_last(model: NextFrameNetwork, codes: Tensor) -> FirstPass:
     """The last of these frames, seen against the cache."""
     cache = model.make_cache(len(codes), codes.device, torch.float32)
     condition, state = Condition(torch.zeros(len(codes), 1, 1, WIDTH)), torch.zeros(len(codes), 1, 0)
     for t in range(codes.shape[1]):
         prediction, depth = model(codes[:, t : t + 1], state, condition, cache.advance())
-    return FramesSeen(codes[:, -1:], condition, prediction, depth, cache)
+    return FirstPass(codes[:, -1:], condition, prediction, depth, cache)
 
 
 def next_frames(model: NextFrameNetwork, decoding: MaskGit, codes: Tensor) -> Tensor:
@@ -121,7 +121,7 @@ def test_drafts_against_the_ring_equal_drafts_in_a_clip(trained):
     for t in range(2 * FRAMES):
         now = slice(t, t + 1)
         prediction, depth = model(codes[:, now], torch.zeros(3, 1, 0), seen.condition, cache.advance())
-        frame = FramesSeen(codes[:, now], seen.condition, prediction, depth, cache)
+        frame = FirstPass(codes[:, now], seen.condition, prediction, depth, cache)
         memory = DraftMemory.after(cache)
         draft = decoding.draft_logits(model, frame, memory, codes[:, now], fixed[:, now])
         torch.testing.assert_close(draft, whole[:, now], atol=1e-4, rtol=0)

@@ -60,7 +60,7 @@ def test_who_begins_anew_among_others_is_as_if_all_began(model, before):
     alone = [model.step(fresh, second.action[:, AGO + row]) for row in range(5)]
     for one, other in zip(together, alone, strict=True):
         torch.testing.assert_close(one.done_logit[1], other.done_logit[1], atol=1e-4, rtol=1e-4)
-        torch.testing.assert_close(one.proprioception[1], other.proprioception[1], atol=1e-4, rtol=1e-4)
+        torch.testing.assert_close(one.state[1], other.state[1], atol=1e-4, rtol=1e-4)
     unmoved = begun(model, first)
     for row in range(before):
         model.step(unmoved, first.action[:, row])
@@ -73,5 +73,5 @@ def test_a_past_longer_than_the_memory_is_refused(model):
     clip = random_clip()
     running = begun(model, clip)
     long = Past(past_of(clip, 0).frames * 2, past_of(clip, 0).actions * 2)
-    with pytest.raises(ValueError, match=r"a past of 4 frames.*shorter than both"):
+    with pytest.raises(ValueError, match=r"a past of 4 frames.*shorter than the first"):
         model.restart(running, torch.ones(BATCH, dtype=torch.bool), frames_of(clip, AGO), long)

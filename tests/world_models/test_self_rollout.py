@@ -45,7 +45,7 @@ def no_noise(monkeypatch):
 def seen_by(model: WorldModelRewardModel, clip: Clip, progress: float = 1.0) -> Inputs:
     codes, state = model.dynamics.network.codebook.codes(clip.tokens), model.normalize_state(clip.state)
     real = Inputs(codes, state, torch.zeros(*state.shape[:2], 0))
-    return model.dynamics.inputs(real, clip._replace(state=state), model.condition(clip), progress)
+    return model.dynamics.network_inputs(real, clip._replace(state=state), model.condition(clip), progress)
 
 
 @pytest.mark.parametrize("name", CONFIGS)
@@ -54,10 +54,10 @@ def test_clips_show_what_the_model_imagines_of_them(name, trained_models, small_
     model, clip = model_and_clip(name, trained_models, small_dataset, self_rollout=1.0)
     instructions = clip.instructions if name == "text_world_model" else None
     imagination = model.start(clip.first(), instructions)
-    frames, states = [clip.tokens[:, 0]], [imagination.proprioception[:, 0].clone()]
+    frames, states = [clip.tokens[:, 0]], [imagination.state[:, 0].clone()]
     for action in clip.action[:, :-1].unbind(1):
         frames.append(model.step(imagination, None if instructions else action).tokens)
-        states.append(imagination.proprioception[:, 0].clone())
+        states.append(imagination.state[:, 0].clone())
     codes, state, _ = seen_by(model, clip)
     tokens = model.dynamics.network.codebook.tokens(codes)
     assert torch.equal(tokens, torch.stack(frames, 1))
@@ -69,7 +69,7 @@ def test_clips_show_what_the_model_imagines_of_them(name, trained_models, small_
 @torch.no_grad()
 def test_the_real_frames_are_still_what_is_to_be_predicted(name, trained_models, small_dataset):
     model, clip = model_and_clip(name, trained_models, small_dataset, self_rollout=1.0)
-    loss, _ = model.loss(clip)
+    loss, _ = model(clip)
     network, codebook = model.dynamics.network, model.dynamics.network.codebook
     real, (codes, state, _) = codebook.codes(clip.tokens), seen_by(model, clip)
     prediction, _ = network(codes, state, model.condition(clip))

@@ -78,7 +78,7 @@ def test_one_instruction_for_two_episodes_is_refused():
         with pytest.raises(ValueError, match=f"task: {len(wrong)} instructions for 2 episodes"):
             imagine_goal(model, clip.first(), wrong)
         with pytest.raises(ValueError, match=f"task: {len(wrong)} instructions for 2 episodes"):
-            model.loss(clip._replace(instructions=wrong))
+            model(clip._replace(instructions=wrong))
 
 
 def test_a_checkpoint_carries_its_frozen_t5_in_files_that_lerobot_publishes(trained, tmp_path):

@@ -163,11 +163,10 @@ def test_training_goes_on_bit_for_bit_after_a_stop(build, precision, small_datas
 def test_a_world_model_learns_one_batch_by_heart(sampler, trained_models):
     torch.manual_seed(0)
     model = load_model(trained_models["action_world_model"], "action_world_model").train()
-    model.config.self_forcing = model.config.token_noise = 0.0
     clip = sampler.clips(np.arange(6), np.zeros(6, int))
     optimizer = torch.optim.Adam([p for p in model.parameters() if p.requires_grad], 1e-2)
     for _ in range(120):
-        loss, metrics = model.loss(clip)
+        loss, metrics = model(clip)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -188,7 +187,7 @@ def test_imagination_equals_the_teacher_forced_pass_on_its_own_frames(sampler, t
     state = model.start(clip.first())
     steps = [model.step(state, clip.action[:, t]) for t in range(11)]
     frames = torch.stack([clip.tokens[:, 0], *[step.tokens for step in steps]], 1)
-    states = torch.stack([clip.state[:, 0], *[step.proprioception for step in steps]], 1)
+    states = torch.stack([clip.state[:, 0], *[step.state for step in steps]], 1)
     prediction = model.predict(clip._replace(tokens=frames, state=states))
     codebook = model.dynamics.network.codebook
     again = codebook.tokens(codebook.most_likely(prediction.logits))

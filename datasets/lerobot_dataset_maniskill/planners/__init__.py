@@ -1,14 +1,15 @@
 """Scripted planners, one per task, and the motions between their waypoints."""
 
+from collections.abc import Callable
 from typing import Final
 
 import numpy as np
 
-from lerobot_dataset_maniskill.planners.follower import MOTIONS, Follower, Motion, Plan, straight_lines
+from lerobot_dataset_maniskill.planners.follower import Follower, Plan
 from lerobot_dataset_maniskill.planners.grasp import MoveToAimPlanner, PickPlacePlanner
 from lerobot_dataset_maniskill.planners.kinds import TASK_KINDS, Planner
 from lerobot_dataset_maniskill.planners.slide import PullPlanner, PushPlanner
-from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS
+from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS, ContainerSpec, ObjectSpec
 from lerobot_wmrl.maniskill.scenes import Scene
 from lerobot_wmrl.maniskill.tasks import Start
 
@@ -18,6 +19,29 @@ PLANNERS: Final[dict[str, type[Planner]]] = {
     "push": PushPlanner, "pull": PullPlanner, "pick_place": PickPlacePlanner, "move_to_aim": MoveToAimPlanner,
 }  # fmt: skip
 """Task → planner."""
+
+
+Motion = Callable[[Plan, ObjectSpec, ContainerSpec, Start], Plan]
+"""Inserts points between a plan's waypoints, which stay as they are."""
+
+
+def straight_lines(plan: Plan, spec: ObjectSpec, container: ContainerSpec, start: Start) -> Plan:
+    """Return the plan as it is: the follower goes straight by itself."""
+    return plan
+
+
+def joint_space_motion() -> Motion:
+    """Return the motion that MPLib plans in joint space, around what stands on the table."""
+    from lerobot_dataset_maniskill.planners.joint_space import JointSpaceMotion  # needs MPLib
+
+    return JointSpaceMotion()
+
+
+MOTIONS: Final[dict[str, Callable[[], Motion]]] = {
+    "cartesian": lambda: straight_lines,
+    "mplib": joint_space_motion,
+}
+"""Value of the recorder's setting `planner` → what makes its motion."""
 
 
 def follow_plan(

@@ -1,4 +1,4 @@
-"""Plans, the proportional actions that follow them, and the motions between their waypoints. Pure numpy."""
+"""Plans, and the proportional actions that follow them. Pure numpy."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -8,8 +8,6 @@ import numpy as np
 
 from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW
 from lerobot_wmrl.maniskill.episode import WORKSPACE_FLOOR
-from lerobot_wmrl.maniskill.objects import ContainerSpec, ObjectSpec
-from lerobot_wmrl.maniskill.tasks import Start
 
 GAIN: Final = 2.0
 """Commanded delta over remaining distance. The arm achieves about a third of a command in one step."""
@@ -117,29 +115,6 @@ def _reached(waypoint: Waypoint, tcp: np.ndarray) -> bool:
 def above_table(position: np.ndarray) -> np.ndarray:
     """Return the position (3,), raised to the lowest height that the simulator lets the TCP go to."""
     return np.array([position[0], position[1], max(position[2], WORKSPACE_FLOOR)])
-
-
-Motion = Callable[[Plan, ObjectSpec, ContainerSpec, Start], Plan]
-"""Inserts points between a plan's waypoints, which stay as they are."""
-
-
-def straight_lines(plan: Plan, spec: ObjectSpec, container: ContainerSpec, start: Start) -> Plan:
-    """Return the plan as it is: the follower goes straight by itself."""
-    return plan
-
-
-def joint_space_motion() -> Motion:
-    """Return the motion that MPLib plans in joint space, around what stands on the table."""
-    from lerobot_dataset_maniskill.planners.joint_space import JointSpaceMotion  # needs MPLib
-
-    return JointSpaceMotion()
-
-
-MOTIONS: Final[dict[str, Callable[[], Motion]]] = {
-    "cartesian": lambda: straight_lines,
-    "mplib": joint_space_motion,
-}
-"""Value of the recorder's setting `planner` → what makes its motion."""
 
 
 def resample(path: np.ndarray, spacing: float) -> np.ndarray:

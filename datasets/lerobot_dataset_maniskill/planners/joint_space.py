@@ -31,7 +31,7 @@ CHECK_SPACING: Final = 0.01
 
 
 class JointSpaceMotion:
-    """A `follower.Motion` that keeps off the table, the container and, until it must be touched, the object.
+    """A `planners.Motion` that keeps off the table, the container and, until it must be touched, the object.
 
     A leg that must keep clear of the object (`Waypoint.clear`) is planned in joint space. The other legs
     push, grasp or carry the object: they stay straight lines where table and container permit, and are

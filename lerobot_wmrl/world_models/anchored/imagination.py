@@ -24,18 +24,13 @@ class AnchoredImagination(Imagination):
     frame: int = 0
     phases: set[int] = field(default_factory=lambda: {0})
 
-    @property
-    def num_elements(self) -> int:
-        held = [*(self.scene or ()), *(self.rollout or ())]
-        return self.cache.num_elements + sum(tensor.numel() for tensor in held)
-
     def restart(self, mask: Tensor) -> None:
         self.phases.add(self._phase)
         super().restart(mask)
 
-    def rewind(self, other: Imagination, frames: int) -> None:
+    def start_before(self, other: Imagination, frames: int) -> None:
         assert isinstance(other, AnchoredImagination)
-        super().rewind(other, frames)
+        super().start_before(other, frames)
         self.frame = other.frame - frames
         self.phases = {self._phase}
 

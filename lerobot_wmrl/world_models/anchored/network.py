@@ -2,10 +2,11 @@
 
 Four parts. The scene encoder encodes the first frame, once. The state rollout follows the robot's state,
 action by action. The trajectory, one token a frame, attends to its own past and to the scene; done is read
-from it. The renderer draws any frame that is asked for, from the scene and the trajectory's token.
+from it. The renderer predicts the tokens of any frame, from the scene and the trajectory's token.
 
-No imagined frame is ever an input. So errors in pictures do not add up, training meets what imagination
-meets, and a training step need not draw every frame that it learns from.
+Within `clip_length` frames no imagined frame is an input: errors in pictures do not add up, and a training
+step need not render every frame that it learns from. A longer imagination takes its last frame as a new first
+frame (`AnchoredImagination`), which training never shows.
 """
 
 from collections.abc import Iterable
@@ -16,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lerobot_wmrl.common.precision import compute_in
-from lerobot_wmrl.data.clips import take_rows
+from lerobot_wmrl.data.clips import take_steps
 from lerobot_wmrl.data.frames import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.configuration_world_model import AnchoredConfig
 from lerobot_wmrl.world_models.layers import (
@@ -64,6 +65,11 @@ class StateRollout(NamedTuple):
     def last(self) -> "StateRollout":
         """Return the last step, T = 1, from which the rollout goes on."""
         return StateRollout(*(tensor[:, -1:] for tensor in self))
+
+
+def spread(tensor: Tensor, rows: int) -> Tensor:
+    """Repeat what B first frames gave for each of their J clips: (B, …) → (`rows` = B·J, …)."""
+    return tensor if len(tensor) == rows else tensor.repeat_interleave(rows // len(tensor), 0)
 
 
 class ContextEmbedding(nn.Module):
@@ -123,15 +129,13 @@ class StateRolloutNetwork(nn.Module):
         with compute_in(torch.float32, state.device):
             return StateRollout(state, torch.zeros_like(state), self.start(state).tanh())
 
-    def forward(self, begin: StateRollout, summary: Tensor, condition: Tensor) -> StateRollout:
+    def forward(self, begin: StateRollout, summary: Tensor, mean: Tensor) -> StateRollout:
         """Go T steps further under the conditions' means (B, T, D), in a scene of this summary (B, 1, D)."""
-        with compute_in(torch.float32, condition.device):
-            condition = condition.float()
-            given = self.condition_in(torch.cat([condition, summary.float().expand_as(condition)], -1))
+        with compute_in(torch.float32, mean.device):
+            mean = mean.float()
+            given = self.condition_in(torch.cat([mean, summary.float().expand_as(mean)], -1))
             steps, now = [], StateRollout(*(tensor[:, 0] for tensor in begin))
-            for known, change in zip(
-                given.unbind(1), self.condition_change(condition).unbind(1), strict=True
-            ):
+            for known, change in zip(given.unbind(1), self.condition_change(mean).unbind(1), strict=True):
                 now = self._step(now, known, change)
                 steps.append(now)
             return StateRollout(*(torch.stack(tensors, 1) for tensors in zip(*steps, strict=True)))
@@ -145,7 +149,7 @@ class StateRolloutNetwork(nn.Module):
 
 
 class SpatialBlock(nn.Module):
-    """Attention within a frame, then an MLP; between them a projected condition is added, if there is one."""
+    """Attention within a frame, then an MLP; between them a projected vector of the frame, if any."""
 
     def __init__(self, width: int, heads: int, project: nn.Linear | None = None) -> None:
         super().__init__()
@@ -153,11 +157,11 @@ class SpatialBlock(nn.Module):
         self.project = project
         self.mlp = make_mlp(width)
 
-    def forward(self, x: Tensor, condition: Tensor | None = None) -> Tensor:
-        """x (B, T, M, D), condition (B, T, D) → like x."""
+    def forward(self, x: Tensor, frame: Tensor | None = None) -> Tensor:
+        """x (B, T, M, D), vectors of the frames (B, T, D) → like x."""
         x = x + self.space.merge_heads(attention(*self.space.split_heads(self.space.norm(x))))
         if self.project is not None:
-            x = x + self.project(condition)[:, :, None]
+            x = x + self.project(frame)[:, :, None]
         return x + self.mlp(x)
 
 
@@ -187,10 +191,11 @@ class TrajectoryBlock(nn.Module):
         self.mlp = make_mlp(width)
 
     def forward(self, x: Tensor, keys_values: Tensor, layer: int, memory: TemporalMemory) -> Tensor:
-        """x (B, 1, T, D) → same; keys_values (B, 1, 2, h, M, d) are this block's projections of the scene."""
+        """x (B·J, 1, T, D) → same; keys_values (B, 1, 2, h, M, d), this block's projections of the scenes."""
         heads = self.time.split_heads(self.time.norm(x))
         x = x + self.dropout(self.time.merge_heads(memory.attend(layer, *heads)))
-        x = x + self.dropout(self.scene.cross_attend(x, keys_values))
+        by_scene = x.reshape(len(keys_values), 1, -1, x.shape[-1])  # (B, 1, J·T, D)
+        x = x + self.dropout(self.scene.cross_attend(by_scene, keys_values).reshape(x.shape))
         return x + self.dropout(self.mlp(x))
 
 
@@ -219,23 +224,27 @@ class AnchoredNetwork(FrameNetwork):
         self.scene_norm, self.norm, self.drawn_norm = (nn.LayerNorm(width) for _ in range(3))
 
     def forward(
-        self, codes: Tensor, state: Tensor, condition: Condition, length: int, rows: Tensor | None = None,
+        self, codes: Tensor, state: Tensor, condition: Condition, length: int, steps: Tensor | None = None,
         context: Context = NO_CONTEXT,
     ) -> Prediction:  # fmt: skip
-        """Predict the frames after T = `length` rows at once, from the first row's frame.
+        """Predict the frames after each of T = `length` steps at once, from the first frame.
+
+        There may be J conditions for each first frame, one frame's after another's: the prediction is then of
+        B·J clips, and each frame is encoded once.
 
         Args:
             codes: of the first frame, (B, 1, S, C).
             state: of the first frame, (B, 1, P), normalised.
-            condition: of every row, tokens (B, T or 1, M, D).
-            length: rows, T.
-            rows: (B, K), those whose next frame is drawn; by default all.
+            condition: of every step, tokens (B·J, T or 1, M, D).
+            length: steps, T.
+            steps: (B·J, K), those whose next frame is rendered; by default all.
             context: of the first frame.
         """
         memory = ClipMemory(length, self.window, self.head_width, codes.device)
-        mean = condition.mean().expand(-1, length, -1)  # (B, T, D)
+        mean = condition.mean().expand(-1, length, -1)  # (B·J, T, D)
         scene, begin = self.encode(codes, state, context)
-        return self.follow(scene, begin, mean, memory, rows)[0]
+        begin = StateRollout(*(spread(tensor, len(mean)) for tensor in begin))
+        return self.follow(scene, begin, mean, memory, steps)[0]
 
     def encode(self, codes: Tensor, state: Tensor, context: Context) -> tuple[Scene, StateRollout]:
         """Encode first frames: codes (B, 1, S, C), states (B, 1, P) and their episodes' context.
@@ -260,37 +269,31 @@ class AnchoredNetwork(FrameNetwork):
         return scene, self.state_rollout.begin(state)
 
     def follow(
-        self, scene: Scene, begin: StateRollout, mean: Tensor, memory: TemporalMemory, rows: Tensor | None
+        self, scene: Scene, begin: StateRollout, mean: Tensor, memory: TemporalMemory, steps: Tensor | None
     ) -> tuple[Prediction, StateRollout]:
-        """Roll the states on from `begin` under the conditions' means (B, T, D), and predict the frames.
-
-        Args:
-            scene: of the first frames.
-            begin: state rollout of T = 1 from which this one goes on.
-            mean: (B, T, D).
-            memory: what a frame sees along time.
-            rows: (B, K), those whose next frame is drawn; by default all.
+        """Predict T frames of a scene under the conditions' means (B, T, D), from a state rollout (T = 1) on.
 
         Returns:
-            The prediction, and the state rollout of these T steps.
+            The prediction, with logits of the frames after `steps` (B, K) alone, and the state rollout.
         """
-        rollout = self.state_rollout(begin, scene.summary, mean)
+        rollout = self.state_rollout(begin, spread(scene.summary, len(mean)), mean)
         x = self.register + mean + self.motion(rollout.hidden) + self.state_in(rollout.state)  # (B, T, D)
         x = x[:, None]  # (B, 1, T, D): space before time
         for layer, block in enumerate(self.trajectory):
             x = block(x, scene.keys_values[:, :, layer], layer, memory)
         hidden = self.norm(x)[:, 0]  # (B, T, D)
-        logits = self._draw(scene, hidden if rows is None else take_rows(hidden, rows))
+        logits = self._render(scene, hidden if steps is None else take_steps(hidden, steps))
         with compute_in(torch.float32, x.device):
             hidden = hidden.float()
             return Prediction(logits, self.done(hidden).squeeze(-1), rollout.state, hidden), rollout
 
-    def _draw(self, scene: Scene, hidden: Tensor) -> Tensor:
-        """Draw frames of the scene from the trajectory's tokens (B, K, D). → logits (B, K, S, V)"""
+    def _render(self, scene: Scene, hidden: Tensor) -> Tensor:
+        """Predict the codes of frames from the trajectory's tokens (B, K, D). → logits (B, K, S, V)"""
         count = hidden.shape[1]
         if not count:  # convolutions refuse an empty batch
             sizes = scene.codes.shape[2], len(self.codebook.factor_of_logit)
             return hidden.new_zeros(len(hidden), 0, *sizes)
+        scene = Scene(*(spread(tensor, len(hidden)) for tensor in scene))
         x = scene.tokens.expand(-1, count, -1, -1)
         for block in self.renderer:
             x = block(x, hidden)

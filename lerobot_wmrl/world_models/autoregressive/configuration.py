@@ -1,9 +1,12 @@
 """Configuration of the autoregressive dynamics, `dynamics.type=autoregressive`."""
 
 from dataclasses import dataclass
+from typing import Final
 
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.world_models.configuration_world_model import DynamicsConfig
+
+CONDITIONINGS: Final = ("adaln", "cross_attention", "additive")
 
 
 @DynamicsConfig.register_subclass("autoregressive")
@@ -18,9 +21,11 @@ class AutoregressiveConfig(DynamicsConfig):
             a second pass in training too). 0: all tokens in the pass that predicts the frame.
         depth: take in and predict each camera's depth beside its tokens (RoboScape's depth branch). The
             dataset must have `observation.images.<camera>_depth`.
-        self_forcing: share of input frames replaced by the model's own predictions in training.
+        self_forcing: share of input frames that training replaces by the model's one-pass predictions of them
+            (scheduled sampling, Mihaylova & Martins 2019), from half time on.
         self_rollout: share of clips whose input frames, in the last quarter of training, are the model's own
-            imagination from the first frame and the actions. The targets stay the recorded frames.
+            imagination from the first frame and the actions. The targets stay the recorded frames. With
+            lerobot-train, which does not say how far it is, these two act from the first step.
         keypoint_weight: weight of RoboScape's keypoint consistency: the tokens that move most keep the
             appearance that they have at the clip's start. 0: off.
     """
@@ -35,6 +40,10 @@ class AutoregressiveConfig(DynamicsConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.conditioning not in CONDITIONINGS:
+            raise FieldError(
+                "dynamics.conditioning", self.conditioning, f"choose one of {', '.join(CONDITIONINGS)}"
+            )
         self._require_at_least("window", 1)
         self._require_at_least("maskgit_steps", 0)
         self._require_at_least("keypoint_weight", 0)

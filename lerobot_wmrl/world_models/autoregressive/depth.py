@@ -5,9 +5,7 @@ its hidden states, projected, are added to those of the tokens (additive fusion)
 zero, so the model begins as the one without depth. Nothing flows from the tokens' branch to this one.
 """
 
-import math
 from collections.abc import Sequence
-from functools import partial
 from typing import Final
 
 import torch
@@ -15,7 +13,7 @@ from torch import Tensor, nn
 
 from lerobot_wmrl.data.clips import known_transitions
 from lerobot_wmrl.world_models.autoregressive.configuration import AutoregressiveConfig
-from lerobot_wmrl.world_models.autoregressive.network import LayerHook, SpatialTemporalTransformer
+from lerobot_wmrl.world_models.autoregressive.network import SpatialTemporalTransformer
 from lerobot_wmrl.world_models.layers import Condition, FrameEmbedding, FrameHead, FrameSizes, TemporalMemory
 from lerobot_wmrl.world_models.losses import masked_mean
 
@@ -44,11 +42,6 @@ def require_depth(depth: Tensor | None, shape: Sequence[int]) -> Tensor:
     return depth
 
 
-def add_layer(added: Sequence[Tensor], layer: int, x: Tensor) -> Tensor:
-    """Return the sum of x (B, T, S', D) and what the depth branch adds after this layer."""
-    return x + added[layer]
-
-
 class DepthBranch(nn.Module):
     """Predicts the depth of N cameras, a number a token, from the frame before."""
 
@@ -69,7 +62,7 @@ class DepthBranch(nn.Module):
 
     def forward(
         self, depth: Tensor | None, register: Tensor, condition: Condition, memory: TemporalMemory
-    ) -> tuple[LayerHook, Tensor]:
+    ) -> tuple[list[Tensor], Tensor]:
         """Predict the next frames' depth.
 
         Args:
@@ -79,27 +72,21 @@ class DepthBranch(nn.Module):
             memory: shared with the tokens' branch.
 
         Returns:
-            The hook to call after each layer of the tokens' branch, and the depth (B, T, S).
+            What it adds to the tokens after each layer, (B, T, 1 + S', D) each, and the depth (B, T, S).
         """
         grids = (self.num_cameras, self.grid, self.grid)
-        frames, depth = register.shape[:2], require_depth(depth, (*register.shape[:2], math.prod(grids)))
+        frames = register.shape[:2]
+        depth = require_depth(depth, (*frames, self.num_cameras * self.grid**2))
         tokens, local = self.embedding(depth.unflatten(2, grids).flatten(0, 2)[:, None])
         tokens = (tokens.unflatten(0, (*frames, self.num_cameras)) + self.camera).flatten(2, 3)
-        added: list[Tensor] = []
-        x = torch.cat([register, tokens], 2)
-        x = self.transformer(x, condition, memory, partial(self._project, added))
+        x, added = self.transformer(torch.cat([register, tokens], 2), condition, memory, fusion=self.fusion)
         change, _ = self.head(x[:, :, 1:].unflatten(2, (self.num_cameras, -1)).flatten(0, 2), local)
-        return partial(add_layer, added), depth + change.float().reshape(depth.shape)
-
-    def _project(self, added: list[Tensor], layer: int, x: Tensor) -> Tensor:
-        """Keep what this layer's hidden states add to the tokens' branch, and hand them on."""
-        added.append(self.fusion[layer](x))
-        return x
+        return added, depth + change.float().reshape(depth.shape)
 
 
 def depth_loss(predicted: Tensor, depth: Tensor, valid: Tensor) -> tuple[Tensor, dict[str, float]]:
     """Mean absolute error of predicted (B, T, S) against the next frames' depth where valid (B, T)."""
     errors = (predicted[:, :-1].float() - depth[:, 1:]).abs()
     known = known_transitions(valid)[..., None]
-    error = masked_mean(errors, known.expand_as(errors))
+    error = masked_mean(errors, known)
     return error, {"depth_error_mm": 1000 * FAR / 2 * error.item()}

@@ -1,6 +1,6 @@
 """Autoregressive dynamics: the inputs of a training step, the loss, and imagination."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple
 
 import torch
@@ -12,7 +12,7 @@ from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.world_models.autoregressive.configuration import AutoregressiveConfig
 from lerobot_wmrl.world_models.autoregressive.depth import DepthBranch, depth_loss, metres, normalize_depth
 from lerobot_wmrl.world_models.autoregressive.keypoints import keypoint_loss
-from lerobot_wmrl.world_models.autoregressive.maskgit import FramesSeen, MaskGit
+from lerobot_wmrl.world_models.autoregressive.maskgit import FirstPass, MaskGit
 from lerobot_wmrl.world_models.autoregressive.network import NextFrameNetwork
 from lerobot_wmrl.world_models.codebook import CodeBook
 from lerobot_wmrl.world_models.dynamics import Dynamics, Imagination, Imagined
@@ -23,7 +23,8 @@ DEPTH_WEIGHT: Final = 1.0
 """Weight of the depth branch's loss."""
 
 SELF_ROLLOUT_FROM: Final = 0.75
-"""Progress of the training after which rollouts replace clips. Earlier ones soon leave the data."""
+"""Share of the training after which self-rollouts begin. Before, the model's own frames leave the data within
+a few steps."""
 
 
 class Inputs(NamedTuple):
@@ -37,7 +38,7 @@ class Inputs(NamedTuple):
     depth: Tensor
 
 
-def forced_share(target: float, progress: float) -> float:
+def replaced_share(target: float, progress: float) -> float:
     """Return the share of input frames to replace after `progress` (0 to 1) of the training.
 
     It is 0 in the first quarter, when predictions are noise, and has risen to `target` at half time.
@@ -45,7 +46,7 @@ def forced_share(target: float, progress: float) -> float:
     return target * min(1.0, max(0.0, 4 * progress - 1))
 
 
-def force_predictions(
+def replace_by_predictions(
     guess: Prediction, next_depth: Tensor, codebook: CodeBook, real: Inputs, share: float
 ) -> Inputs:
     """Replace a share of the input frames by one-pass predictions of them: scheduled sampling in parallel."""
@@ -54,7 +55,7 @@ def force_predictions(
     frames = torch.where(swap[..., None, None], predicted, real.codes[:, 1:])
     states, depths = (
         torch.where(swap[..., None], own[:, :-1].to(seen.dtype), seen[:, 1:])
-        for own, seen in ((guess.proprioception, real.state), (next_depth, real.depth))
+        for own, seen in ((guess.state, real.state), (next_depth, real.depth))
     )
     return Inputs(
         torch.cat([real.codes[:, :1], frames], 1),
@@ -64,7 +65,7 @@ def force_predictions(
 
 
 def self_rollout_rows(share: float, progress: float, batch: int, device: torch.device) -> Tensor:
-    """Draw the clips that show rollouts instead of real frames, after `progress` (0 to 1). → rows (R,)"""
+    """Choose at random the clips that show rollouts instead of recorded frames. → rows (R,)"""
     if share <= 0 or progress < SELF_ROLLOUT_FROM:
         return torch.empty(0, dtype=torch.long, device=device)
     return (torch.rand(batch, device=device) < share).nonzero().squeeze(1)
@@ -104,7 +105,7 @@ class AutoregressiveDynamics(Dynamics):
         """Eqs. 2-4, with part of the inputs replaced by the dynamics' own predictions."""
         network, codebook, config = self.network, self.network.codebook, self.config
         real = Inputs(codebook.codes(clip.tokens), clip.state, self._depth(clip.depth, clip.tokens))
-        seen = self.inputs(real, clip, condition, progress)
+        seen = self.network_inputs(real, clip, condition, progress)
         torch.clear_autocast_cache()  # older torch keeps the casts made without gradients
         memory = network.clip_memory(real.codes.shape[1], real.codes.device)
         prediction, next_depth = network(seen.codes, seen.state, condition, memory, seen.depth)
@@ -112,8 +113,8 @@ class AutoregressiveDynamics(Dynamics):
         target = weighted_frames(codebook, real.codes[:, 1:], real.codes[:, :-1], known)
         loss, metrics = next_frame_loss(prediction, codebook, target, clip)
         if self.maskgit is not None:
-            frames = FramesSeen(seen.codes, condition, prediction, next_depth, memory)
-            draft_loss, parts = self.maskgit.loss(network, frames, target.codes, target.weight)
+            first = FirstPass(seen.codes, condition, prediction, next_depth, memory)
+            draft_loss, parts = self.maskgit.loss(network, first, target.codes, target.weight)
             loss, metrics = loss + draft_loss, metrics | parts
         if network.depth is not None:
             error, parts = depth_loss(next_depth, real.depth, clip.valid)
@@ -126,16 +127,16 @@ class AutoregressiveDynamics(Dynamics):
         return loss, metrics
 
     @torch.no_grad()
-    def inputs(self, real: Inputs, clip: Clip, condition: Condition, progress: float) -> Inputs:
+    def network_inputs(self, real: Inputs, clip: Clip, condition: Condition, progress: float) -> Inputs:
         """Return what the network sees instead of the real frames.
 
         Against drift: noise, one-pass predictions of single frames, and whole rollouts from first frames.
         """
         seen = real._replace(codes=corrupt_codes(real.codes, self.network.codebook))
-        share = forced_share(self.config.self_forcing, progress)
+        share = replaced_share(self.config.self_forcing, progress)
         if share > 0:
             guess, next_depth = self.network(seen.codes, seen.state, condition, depth=seen.depth)
-            seen = force_predictions(guess, next_depth, self.network.codebook, seen, share)
+            seen = replace_by_predictions(guess, next_depth, self.network.codebook, seen, share)
         rows = self_rollout_rows(self.config.self_rollout, progress, len(real.codes), real.codes.device)
         if len(rows):
             rolled = self._roll_out_rows(rows, clip, condition)
@@ -168,11 +169,10 @@ class AutoregressiveDynamics(Dynamics):
         return Inputs(*(torch.cat(parts, 1) for parts in zip(*frames, strict=True)))
 
     @torch.no_grad()
-    def predict(self, clip: Clip, condition: Condition, drawn: bool) -> Prediction:
+    def predict(self, clip: Clip, condition: Condition, with_tokens: bool) -> Prediction:
         """Predict each frame from the real ones before it; logits cost little and are always there."""
         codes, depth = self.network.codebook.codes(clip.tokens), self._depth(clip.depth, clip.tokens)
-        prediction: Prediction = self.network(codes, clip.state, condition, depth=depth)[0]
-        return prediction
+        return self.network(codes, clip.state, condition, depth=depth)[0]
 
     def start(self, frames: Frames, dtype: torch.dtype | None = None) -> AutoregressiveImagination:
         """Begin at these frames, with an empty cache. ValueError if their depth is needed and missing."""
@@ -188,6 +188,12 @@ class AutoregressiveDynamics(Dynamics):
         depth = self._depth(frames.depth, frames.tokens)[:, None]
         imagination.depth.copy_(torch.where(mask[:, None, None], depth, imagination.depth))
 
+    def newest(self, imagination: Imagination) -> Frames:
+        """Return the newest frames, with their depth if there is a depth branch."""
+        assert isinstance(imagination, AutoregressiveImagination)
+        depth = None if self.network.depth is None else metres(imagination.depth[:, 0])
+        return replace(super().newest(imagination), depth=depth)
+
     @torch.no_grad()
     def step(self, imagination: Imagination, condition: Condition) -> Imagined:
         """Predict from the newest frame and the cache, to which its keys and values are added."""
@@ -195,14 +201,16 @@ class AutoregressiveDynamics(Dynamics):
         network, codes, cache = self.network, imagination.codes, imagination.cache
         with compute_in(imagination.dtype, codes.device):
             prediction, depth = network(
-                codes, imagination.proprioception, condition, cache.advance(), imagination.depth
+                codes, imagination.state, condition, cache.advance(), imagination.depth
             )
             if self.maskgit is None:
-                drawn = network.codebook.most_likely(prediction.logits)
+                predicted = network.codebook.most_likely(prediction.logits)
             else:
-                drawn = self.maskgit.decode(network, FramesSeen(codes, condition, prediction, depth, cache))
+                predicted = self.maskgit.decode(
+                    network, FirstPass(codes, condition, prediction, depth, cache)
+                )
         imagination.depth.copy_(depth)
-        imagined = self._advance(imagination, prediction, drawn)
+        imagined = self._advance(imagination, prediction, predicted)
         return imagined if network.depth is None else imagined._replace(depth=metres(depth[:, 0]))
 
     def _depth(self, depth: Tensor | None, tokens: Tensor) -> Tensor:
@@ -214,4 +222,4 @@ class AutoregressiveDynamics(Dynamics):
 
 def _newest(imagination: AutoregressiveImagination) -> Inputs:
     """Copy the newest frames, which the next step overwrites in place."""
-    return Inputs(imagination.codes.clone(), imagination.proprioception.clone(), imagination.depth.clone())
+    return Inputs(imagination.codes.clone(), imagination.state.clone(), imagination.depth.clone())

@@ -93,4 +93,4 @@ def keypoint_loss(
     own = codebook.values(codes[:, 0]).gather(1, start)
     with compute_in(torch.float32, logits.device):
         apart = (codebook.expected_values(along.float()) - own[:, None]).square().mean(-1)
-    return masked_mean(apart, tracks.moving[:, 1:].float())
+    return masked_mean(apart, tracks.moving[:, 1:])

@@ -20,11 +20,11 @@ from lerobot_wmrl.world_models.layers import ClipMemory, Condition, Prediction, 
 from lerobot_wmrl.world_models.losses import masked_mean
 
 
-class FramesSeen(NamedTuple):
+class FirstPass(NamedTuple):
     """The first pass over frames, which the others refine.
 
     Its inputs are codes (B, T, S, C) and the condition; its outputs the prediction of the next frames, their
-    depth, and the memory that it has filled.
+    depth (B, T, S or 0), and the memory that it has filled.
     """
 
     codes: Tensor
@@ -86,19 +86,19 @@ class MaskGit(nn.Module):
         self.mark = nn.Conv2d(1 + channels, config.code_width, 3, padding=1)
         self.role = nn.Parameter(torch.randn(config.width) * 0.02)
 
-    def decode(self, network: NextFrameNetwork, seen: FramesSeen) -> Tensor:
-        """Return the codes of the frames after those seen, (B, T, S, C)."""
-        codebook, logits, memory = network.codebook, seen.prediction.logits, DraftMemory.after(seen.memory)
+    def decode(self, network: NextFrameNetwork, first: FirstPass) -> Tensor:
+        """Return the codes of the frames after those of the first pass, (B, T, S, C)."""
+        codebook, logits, memory = network.codebook, first.prediction.logits, DraftMemory.after(first.memory)
         codes = codebook.most_likely(logits)
         fixed = torch.zeros_like(codes[..., 0], dtype=torch.bool)
         for count in fixed_counts(codes.shape[2], self.passes)[:-1]:
             fixed = most_confident(-codebook.cross_entropy(logits, codes), fixed, count)
-            logits = self.draft_logits(network, seen, memory, codes, fixed)
+            logits = self.draft_logits(network, first, memory, codes, fixed)
             codes = torch.where(fixed[..., None], codes, codebook.most_likely(logits))
         return codes
 
     def loss(
-        self, network: NextFrameNetwork, seen: FramesSeen, target: Tensor, weight: Tensor
+        self, network: NextFrameNetwork, first: FirstPass, target: Tensor, weight: Tensor
     ) -> tuple[Tensor, dict[str, float]]:
         """Cross-entropy of masked tokens; a frame's masked share is cos(π/2 · u), u uniform (eq. 1 there).
 
@@ -106,30 +106,29 @@ class MaskGit(nn.Module):
 
         Args:
             network: the one that made the first pass.
-            seen: frames (B, T, …).
+            first: pass over frames (B, T, …).
             target: codes (B, T − 1, S, C) of the frames after all but the last.
             weight: of their tokens, (B, T − 1, S).
         """
-        following = torch.cat([target, seen.codes[:, -1:]], 1)  # (B, T, S, C)
+        following = torch.cat([target, first.codes[:, -1:]], 1)  # (B, T, S, C)
         chance = torch.rand(following.shape[:2], device=target.device)[..., None]
-        drawn = torch.rand(following.shape[:3], device=target.device)
-        masked = drawn < (chance * math.pi / 2).cos()
-        memory = DraftMemory.after(seen.memory)
-        logits = self.draft_logits(network, seen, memory, following, ~masked)[:, :-1]
+        masked = torch.rand(following.shape[:3], device=target.device) < (chance * math.pi / 2).cos()
+        memory = DraftMemory.after(first.memory)
+        logits = self.draft_logits(network, first, memory, following, ~masked)[:, :-1]
         losses = network.codebook.cross_entropy(logits.float(), target)
         loss = masked_mean(losses, weight * masked[:, :-1])
         return loss, {"draft_loss": loss.item()}
 
     def draft_logits(
-        self, network: NextFrameNetwork, seen: FramesSeen, memory: DraftMemory, codes: Tensor, fixed: Tensor
+        self, network: NextFrameNetwork, first: FirstPass, memory: DraftMemory, codes: Tensor, fixed: Tensor
     ) -> Tensor:
-        """Logits of the next frames, given those of their codes (B, T, S, C) that are `fixed` (B, T, S)."""
-        draft = torch.where(fixed[..., None], codes, seen.codes)
+        """Logits (B, T, S, V) of the next frames, given those of their codes that are `fixed`."""
+        draft = torch.where(fixed[..., None], codes, first.codes)
         known = fixed[..., None].float()
         values = network.codebook.values(draft)
         mark = self.mark(network.grids(torch.cat([known, known * values], -1)))
-        state = seen.prediction.proprioception.detach()
-        x, local = network.embed(draft, state, seen.condition.mean(), mark)
-        after_layer, _ = network.guide(seen.next_depth.detach(), x[:, :, :1], seen.condition, memory)
-        hidden = network.transformer(x + self.role, seen.condition, memory, after_layer)
+        state = first.prediction.state.detach()
+        x, local = network.embed(draft, state, first.condition.mean(), mark)
+        added, _ = network.predict_depth(first.next_depth.detach(), x[:, :, :1], first.condition, memory)
+        hidden, _ = network.transformer(x + self.role, first.condition, memory, added)
         return network.token_logits(hidden, local, draft)

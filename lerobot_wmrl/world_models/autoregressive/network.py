@@ -4,14 +4,13 @@ A spatial-temporal transformer: attention inside a frame, causal attention along
 pass predicts every token of the next frame, the next proprioceptive state and whether success holds there.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import Final, NamedTuple, Protocol
 
 import torch
 from torch import Tensor, nn
 
-from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.precision import compute_in
 from lerobot_wmrl.world_models.autoregressive.configuration import AutoregressiveConfig
 from lerobot_wmrl.world_models.kv_cache import KVCache
@@ -29,41 +28,34 @@ from lerobot_wmrl.world_models.layers import (
     make_mlp,
 )
 
-if TYPE_CHECKING:
-    from lerobot_wmrl.world_models.autoregressive.depth import DepthBranch
 
-LayerHook = Callable[[int, Tensor], Tensor]
-"""Takes a layer's index and output (B, T, S, D), and returns what the next layer is given."""
+class DepthPredictor(Protocol):
+    """What the network asks of RoboScape's depth branch, if it has one."""
 
-
-def unchanged(layer: int, x: Tensor) -> Tensor:
-    """Hand every layer's output on as it is."""
-    return x
-
-
-class Branch:
-    """A branch of a block (space, time or MLP) that the condition does not modulate."""
-
-    def modulate(self, normed: Tensor) -> Tensor:
-        """Return what the branch sees: (B, T, S, D) after its norm → same."""
-        return normed
-
-    def gated(self, update: Tensor) -> Tensor:
-        """Return what the branch adds to the tokens: (B, T, S, D) → same."""
-        return update
+    def __call__(
+        self, depth: Tensor | None, register: Tensor, condition: Condition, memory: TemporalMemory
+    ) -> tuple[list[Tensor], Tensor]:
+        """Return what it adds to the tokens after each layer, and the next frames' depth."""
+        ...
 
 
-class ModulatedBranch(Branch):
-    """A branch with scale, shift and gate, (B, T or 1, 1, D) each; 0 leaves it as it is."""
+class Modulation(NamedTuple):
+    """How the condition modulates a branch of a block (space, time or MLP).
 
-    def __init__(self, scale: Tensor, shift: Tensor, gate: Tensor) -> None:
-        self.scale, self.shift, self.gate = scale, shift, gate
+    scale, shift, gate: (B, T or 1, 1, D) each, zeros are the identity; None without modulation.
+    """
 
-    def modulate(self, normed: Tensor) -> Tensor:
-        return normed * (1 + self.scale) + self.shift
+    scale: Tensor | None = None
+    shift: Tensor | None = None
+    gate: Tensor | None = None
 
-    def gated(self, update: Tensor) -> Tensor:
-        return update * (1 + self.gate)
+    def input(self, x: Tensor) -> Tensor:
+        """Modulate what the branch sees, (B, T, S, D)."""
+        return x if self.scale is None or self.shift is None else x * (1 + self.scale) + self.shift
+
+    def output(self, x: Tensor) -> Tensor:
+        """Modulate what the branch adds to the tokens, (B, T, S, D)."""
+        return x if self.gate is None else x * (1 + self.gate)
 
 
 class Conditioning(nn.Module):
@@ -73,9 +65,9 @@ class Conditioning(nn.Module):
     or both. `mean` (B, T or 1, D) is that of the condition's tokens.
     """
 
-    def branches(self, mean: Tensor) -> tuple[Branch, Branch, Branch]:
-        """Return the branches of space, time and MLP."""
-        return Branch(), Branch(), Branch()
+    def modulations(self, mean: Tensor) -> tuple[Modulation, Modulation, Modulation]:
+        """Return the modulations of space, time and MLP."""
+        return Modulation(), Modulation(), Modulation()
 
     def forward(self, x: Tensor, condition: Condition, mean: Tensor) -> Tensor:
         """Condition the tokens (B, T, S, D) between time and MLP. → same"""
@@ -107,9 +99,9 @@ class AdaptiveLayerNorm(Conditioning):
         nn.init.zeros_(self.modulation.weight)
         nn.init.zeros_(self.modulation.bias)
 
-    def branches(self, mean: Tensor) -> tuple[Branch, Branch, Branch]:
+    def modulations(self, mean: Tensor) -> tuple[Modulation, Modulation, Modulation]:
         parts = self.modulation(nn.functional.silu(mean))[:, :, None].chunk(9, -1)
-        return ModulatedBranch(*parts[:3]), ModulatedBranch(*parts[3:6]), ModulatedBranch(*parts[6:])
+        return Modulation(*parts[:3]), Modulation(*parts[3:6]), Modulation(*parts[6:])
 
 
 class AddedCondition(Conditioning):
@@ -123,20 +115,11 @@ class AddedCondition(Conditioning):
         return x + self.project(mean)[:, :, None]
 
 
-CONDITIONINGS: Final[dict[str, type[Conditioning]]] = {
+CONDITIONING_CLASSES: Final[dict[str, type[Conditioning]]] = {
     "cross_attention": CrossAttentionConditioning,
     "adaln": AdaptiveLayerNorm,
     "additive": AddedCondition,
 }
-
-
-def make_conditioning(kind: str, width: int, heads: int) -> Conditioning:
-    """Make one block's conditioning. FieldError for an unknown kind."""
-    if kind not in CONDITIONINGS:
-        raise FieldError(
-            "dynamics.conditioning", kind, "no such conditioning", f"choose one of {', '.join(CONDITIONINGS)}"
-        )
-    return CONDITIONINGS[kind](width, heads)
 
 
 class SpatialTemporalBlock(nn.Module):
@@ -146,7 +129,7 @@ class SpatialTemporalBlock(nn.Module):
         super().__init__()
         self.space = SelfAttention(width, heads)
         self.time = SelfAttention(width, heads)
-        self.condition = make_conditioning(conditioning, width, heads)
+        self.condition = CONDITIONING_CLASSES[conditioning](width, heads)
         self.mlp = make_mlp(width)
 
     def forward(
@@ -154,14 +137,14 @@ class SpatialTemporalBlock(nn.Module):
         attend_time: Callable[[Tensor, Tensor, Tensor], Tensor],
     ) -> Tensor:  # fmt: skip
         """x (B, T, S, D) → same; `attend_time` maps query, key and value (B, S, h, T, d) to the attended."""
-        space, time, mlp = self.condition.branches(mean)
-        heads = self.space.split_heads(space.modulate(self.space.norm(x)))
-        x = x + space.gated(self.space.merge_heads(attention(*heads)))
-        heads = self.time.split_heads(time.modulate(self.time.norm(x)).transpose(1, 2))
-        x = x + time.gated(self.time.merge_heads(attend_time(*heads)).transpose(1, 2))
+        space, time, mlp = self.condition.modulations(mean)
+        heads = self.space.split_heads(space.input(self.space.norm(x)))
+        x = x + space.output(self.space.merge_heads(attention(*heads)))
+        heads = self.time.split_heads(time.input(self.time.norm(x)).transpose(1, 2))
+        x = x + time.output(self.time.merge_heads(attend_time(*heads)).transpose(1, 2))
         x = self.condition(x, condition, mean)
         norm, expand, activate, contract = self.mlp
-        return x + mlp.gated(contract(activate(expand(mlp.modulate(norm(x))))))
+        return x + mlp.output(contract(activate(expand(mlp.input(norm(x))))))
 
 
 class SpatialTemporalTransformer(nn.Module):
@@ -177,21 +160,34 @@ class SpatialTemporalTransformer(nn.Module):
         self.norm = nn.LayerNorm(width)
 
     def forward(
-        self, x: Tensor, condition: Condition, memory: TemporalMemory, after_layer: LayerHook = unchanged
-    ) -> Tensor:
-        """x (B, T, S, D) → (B, T, S, D); `memory` says what a frame sees along time."""
-        mean = condition.mean()
+        self, x: Tensor, condition: Condition, memory: TemporalMemory,
+        added: Sequence[Tensor] = (), fusion: Sequence[nn.Module] = (),
+    ) -> tuple[Tensor, list[Tensor]]:  # fmt: skip
+        """Run the blocks.
+
+        Args:
+            x: tokens (B, T, S, D).
+            condition: tokens (B, T or 1, M, D).
+            memory: what a frame sees along time.
+            added: for each layer, what joins the tokens after it; nothing by default.
+            fusion: for each layer, a projection of the tokens after it, for another transformer.
+
+        Returns:
+            Tokens (B, T, S, D), and the projections.
+        """
+        mean, projected = condition.mean(), []
         for layer, block in enumerate(self.blocks):
-            attend_time = partial(memory.attend, self.first_layer + layer)
-            x = after_layer(layer, block(x, condition, mean, attend_time))
-        return self.norm(x)
+            x = block(x, condition, mean, partial(memory.attend, self.first_layer + layer))
+            if fusion:
+                projected.append(fusion[layer](x))
+            if added:
+                x = x + added[layer]
+        return self.norm(x), projected
 
 
 class NextFrameNetwork(FrameNetwork):
-    """Embeds frames, runs the transformer, reads the predictions from its tokens.
-
-    A register token a frame carries the proprioceptive state and the mean of the condition, attends to all
-    visual tokens, and is where done and the next state are read from.
+    """Embeds frames, runs the transformer, reads the predictions from its tokens, done and the next state
+    from the register.
     """
 
     def __init__(self, config: AutoregressiveConfig, sizes: FrameSizes) -> None:
@@ -200,7 +196,7 @@ class NextFrameNetwork(FrameNetwork):
         self.window, self.heads, self.head_width = config.window, config.heads, width // config.heads
         self.state_out = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, state_size))
         self.transformer = SpatialTemporalTransformer(config.layers, width, config.heads, config.conditioning)
-        self.depth: DepthBranch | None = None  # added after construction, where it is wanted
+        self.depth: DepthPredictor | None = None  # set by the dynamics, if configured
 
     def forward(
         self, codes: Tensor, state: Tensor, condition: Condition, memory: TemporalMemory | None = None,
@@ -220,21 +216,24 @@ class NextFrameNetwork(FrameNetwork):
         """
         memory = memory or self.clip_memory(codes.shape[1], codes.device)
         x, local = self.embed(codes, state, condition.mean())
-        after_layer, next_depth = self.guide(depth, x[:, :, :1], condition, memory)
-        x = self.transformer(x, condition, memory, after_layer)
+        added, next_depth = self.predict_depth(depth, x[:, :, :1], condition, memory)
+        x, _ = self.transformer(x, condition, memory, added)
         logits, hidden = self.token_logits(x, local, codes), x[:, :, 0].float()
         with compute_in(torch.float32, x.device):
             next_state = state + STATE_STEP * self.state_out(hidden)
             return Prediction(logits, self.done(hidden).squeeze(-1), next_state, hidden), next_depth
 
-    def guide(
+    def predict_depth(
         self, depth: Tensor | None, register: Tensor, condition: Condition, memory: TemporalMemory
-    ) -> tuple[LayerHook, Tensor]:
-        """Run the depth branch: return what it adds after each layer, and the next depth, as in `forward`."""
+    ) -> tuple[list[Tensor], Tensor]:
+        """Run the depth branch, if there is one.
+
+        Returns:
+            What it adds to the tokens after each layer, and the next frames' depth (B, T, S or 0).
+        """
         if self.depth is None:
-            return unchanged, register.new_zeros(*register.shape[:2], 0)
-        hook, next_depth = self.depth(depth, register, condition, memory)
-        return hook, next_depth
+            return [], register.new_zeros(*register.shape[:2], 0)
+        return self.depth(depth, register, condition, memory)
 
     def clip_memory(self, length: int, device: torch.device) -> ClipMemory:
         """Return the memory of one pass over clips of `length` frames."""
