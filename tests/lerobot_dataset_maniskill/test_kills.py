@@ -4,6 +4,7 @@ Frames are made up here, for what is tested is how files come to be.
 """
 
 import random
+import signal
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -52,13 +53,16 @@ def test_twenty_kills_cost_nothing_that_was_finished(tmp_path: Path, writers: Wr
     one_part = time.monotonic() - began
     rng, finished = random.Random(0), {}
     for _ in range(KILLS):
-        writers.run(replace(order, kill_after=rng.uniform(0.01, 2 * one_part)))
+        kill_after = rng.uniform(0.01, 2 * one_part)
+        status = writers.run(replace(order, kill_after=kill_after))
+        assert status == -signal.SIGKILL, "it was not interrupted"
         info = {part.name: work / part.name / "meta" / "info.json" for part in parts}
         now = {name: path.stat().st_mtime_ns for name, path in info.items() if path.exists()}
         assert finished.items() <= now.items(), "a finished part was lost or written again"
         assert all(find_damage(work / name, 2) is None for name in now.keys() - finished.keys())
+        # A busy machine may have made the first measurement too long: later kills come sooner.
+        one_part = min(one_part, kill_after / max(1, len(now) - len(finished)))
         finished = now
-    assert len(finished) < len(parts), "it was never interrupted"
     write_missing(order.config, work)
     merge(order.config, work, parts)
     assert find_damage(tmp_path / "dataset", count_episodes(parts)) is None
