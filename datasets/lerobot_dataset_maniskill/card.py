@@ -29,6 +29,7 @@ KIND_MEANINGS = {
     "near_miss": "a planner that misses on purpose",
     "policy": "a policy's rollouts",
     "play": "moving, pushing and lifting at random, without a reset",
+    "human_like": "a planner with pauses, detours, tremor and uneven speed, as in teleoperation",
 }
 """Kind, one of `constants.KINDS` → how its actions were made."""
 

@@ -20,8 +20,9 @@ TASKS: Final = ("push", "pull", "pick_place", "move_to_aim")
 """Vocabulary of the column `start.task`."""
 
 PLAY: Final = "play"
-KINDS: Final = ("optimal", "waypoint", "interpolated", "noisy", "near_miss", "policy", PLAY)
-"""Vocabulary of the column `start.kind`: how an episode's actions were made."""
+HUMAN_LIKE: Final = "human_like"
+KINDS: Final = ("optimal", "waypoint", "interpolated", "noisy", "near_miss", "policy", PLAY, HUMAN_LIKE)
+"""Vocabulary of the column `start.kind`: how an episode's actions were made. Datasets store the index."""
 
 START_COLUMNS: Final = ("start.task", "start.scene", "start.seed", "start.kind")
 """int64 (1,) columns from which an episode's start can be rebuilt in the simulator."""

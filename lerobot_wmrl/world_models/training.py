@@ -25,7 +25,7 @@ from torch.optim import Optimizer
 from tqdm import tqdm
 
 from lerobot_wmrl.common.checkpoints import latest_checkpoint, write_checkpoint
-from lerobot_wmrl.common.constants import KINDS, START_KIND
+from lerobot_wmrl.common.constants import HUMAN_LIKE, KINDS, START_KIND
 from lerobot_wmrl.common.distributed import mean_over_processes
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.lerobot_compat import (
@@ -76,10 +76,10 @@ def build_model(config: RewardModelConfig, table: EpisodeTable, output_dir: Path
 def golden_episodes(table: EpisodeTable) -> np.ndarray:
     """Mark the episodes that the text world model learns from. (E,)
 
-    They are successes of an optimal planner, or all successes of a dataset that does not say who acted.
+    They are successful demonstrations, or all successes of a dataset that does not say who acted.
     """
     kind = table.column(START_KIND)
-    return table.success & ((kind == KINDS.index("optimal")) | (kind == -1))
+    return table.success & np.isin(kind, (-1, KINDS.index("optimal"), KINDS.index(HUMAN_LIKE)))
 
 
 def make_sampler(

@@ -33,6 +33,7 @@ class Waypoint:
         aim: replaces `position` by one that depends on where the object is now. Such a waypoint never counts
             as reached, so it needs `patience`.
         patience: steps after which the follower goes on to the next waypoint.
+        speed: largest command along an axis (m) on the way there; by default the plan's.
         clear: whether a motion planner must keep the way there clear of the object.
     """
 
@@ -42,6 +43,7 @@ class Waypoint:
     dwell: int = 0
     aim: Aim | None = None
     patience: int | None = None
+    speed: float | None = None
     clear: bool = False
 
 
@@ -82,7 +84,7 @@ class Follower:
         waypoint = self._advance(tcp)
         target = waypoint.position if waypoint.aim is None else waypoint.aim(object_now)
         delta = GAIN * (target - tcp)
-        delta *= min(1.0, self.plan.speed / max(np.abs(delta).max(), 1e-9))
+        delta *= min(1.0, (waypoint.speed or self.plan.speed) / max(np.abs(delta).max(), 1e-9))
         action = np.array([*delta, 0.0, 0.0, 0.0, waypoint.gripper])
         noise = self.plan.noise
         action[:3] += self.rng.normal(0.0, 1.0, 3) * noise.position

@@ -1,5 +1,5 @@
-"""The kinds of plans that every task has, from its essential waypoints: optimal, suboptimal, near misses,
-play.
+"""The kinds of plans that every task has, from its essential waypoints: optimal, human-like, suboptimal, near
+misses, play.
 
 Suboptimal plans also get noise on their actions, so that the data contains what a stochastic policy does
 around a good trajectory. Pure numpy."""
@@ -23,7 +23,7 @@ from lerobot_dataset_maniskill.planners.follower import (
     Waypoints,
     above_table,
 )
-from lerobot_wmrl.common.constants import KINDS, PLAY
+from lerobot_wmrl.common.constants import HUMAN_LIKE, KINDS, PLAY
 from lerobot_wmrl.maniskill.objects import ContainerSpec, ObjectSpec
 from lerobot_wmrl.maniskill.tasks import Start
 
@@ -40,6 +40,22 @@ CALM_SHARE: Final = {"waypoint": 0.3, "interpolated": 0.3, "noisy": 0.5, "near_m
 """Share of each suboptimal kind whose actions have no noise, like those of optimal trajectories. If only good
 episodes were calm, a world model would take calm actions for success, but an SFT policy is also calm when it
 fails."""
+
+
+DETOUR_SHARE: Final = 0.3
+"""Share of human-like episodes that begin with a detour."""
+
+CURVE_SHARE: Final = 0.5
+"""Share of the ways between waypoints that are curved in human-like episodes."""
+
+PAUSE_SHARE: Final = 0.35
+"""Share of the waypoints at which a human-like episode pauses."""
+
+PAUSE: Final = (2, 8)
+"""Shortest pause in steps, and one more than the longest."""
+
+TREMOR: Final = 0.003
+"""Standard deviation of the noise on human-like actions (m)."""
 
 
 class Planner(ABC):
@@ -72,6 +88,8 @@ class Planner(ABC):
             return Plan(self.essential(), speed=OPTIMAL_SPEED)
         if kind == PLAY:
             return Plan(play_waypoints(self.spec, rng), noise=Noise(rng.uniform(0.0, 0.01)))
+        if kind == HUMAN_LIKE:
+            return Plan(self.human_like(rng), noise=Noise(TREMOR))
         plan = Plan((), OPTIMAL_SPEED)
         if rng.random() >= CALM_SHARE[kind]:
             noise = Noise(rng.uniform(0.0, 0.015))
@@ -79,6 +97,22 @@ class Planner(ABC):
                 noise = Noise(noise.position, rng.uniform(0.0, 0.05), rng.uniform(0.0, 0.3))
             plan = Plan((), rng.uniform(0.55, 1.0) * TOP_SPEED, noise)
         return replace(plan, waypoints=getattr(self, kind)(rng))
+
+    def human_like(self, rng: np.random.Generator) -> Waypoints:
+        """Draw how a person would teleoperate: uneven speed, pauses, curved ways, now and then a detour."""
+        points: list[Waypoint] = []
+        first, essential = self.start.tcp, jittered(self.essential(), rng, 0.004)
+        if rng.random() < DETOUR_SHARE:
+            points.append(Waypoint(self.detour(rng), 0.025, essential[0].gripper, clear=True))
+            first = points[0].position
+        for waypoint in essential:
+            if rng.random() < CURVE_SHARE:
+                between = (first + waypoint.position) / 2 + rng.normal(0.0, 0.012, 3)
+                points.append(replace(waypoint, position=above_table(between), tolerance=0.02, dwell=0))
+            pause = int(rng.integers(*PAUSE)) if rng.random() < PAUSE_SHARE else 0
+            points.append(replace(waypoint, dwell=waypoint.dwell + pause))
+            first = waypoint.position
+        return tuple(replace(point, speed=rng.uniform(0.5, 1.0) * TOP_SPEED) for point in points)
 
     def waypoint(self, rng: np.random.Generator) -> Waypoints:
         """Draw a detour, then follow the essential waypoints."""
