@@ -187,7 +187,7 @@ def test_human_like_plans_pause_curve_detour_and_change_speed(task: str) -> None
     plans = [planner(task, seed).plan("human_like", np.random.default_rng(seed)) for seed in range(20)]
     essential = planner(task, 0).essential()
     dwells = [sum(waypoint.dwell for waypoint in plan.waypoints) for plan in plans]
-    assert min(dwells) == sum(waypoint.dwell for waypoint in essential)
+    assert min(dwells) >= sum(waypoint.dwell for waypoint in essential)
     assert max(dwells) > min(dwells), "some pause"
     assert len({len(plan.waypoints) for plan in plans}) > 1, "some have further waypoints"
     speeds = [waypoint.speed for plan in plans for waypoint in plan.waypoints]
