@@ -4,9 +4,13 @@
     python -m experiments.run experiments/gate.yaml steps=200 output_dir=outputs/short --docs=outputs/docs
     python -m experiments.run experiments/rl_comparison.yaml --dry_run
 
+    python -m experiments.run experiments/value_push.yaml demonstrations=8 seed=[0,1]
+
 Commands are printed before they run. The same call again continues: a finished step is not repeated. A step
 whose command has changed since it was finished is refused, unless `--repeat` says that it and the steps after
-it are to run again. `name=value` sets one of the study's variables.
+it are to run again. `name=value` sets one of the study's variables, or restricts its cells. A study with
+cells runs one after the other; a cell whose results are in docs/ already is left out, unless `--repeat` is
+given.
 """
 
 import argparse
@@ -21,7 +25,7 @@ import time
 from pathlib import Path
 from typing import Any, Final
 
-from experiments.study import ROOT, Step, Study, read_study
+from experiments.study import ROOT, Step, Study, read_cells
 from lerobot_wmrl.common.files import write_json
 
 RECORDS: Final = "steps"
@@ -152,6 +156,15 @@ def machine() -> str:
     return f"{processor}, {cores} cores" + (f", {gpu}" if gpu else "")
 
 
+def is_published(study: Study, docs: Path) -> bool:
+    """Return whether the results of a study's cell are in docs/; a study without cells is always run."""
+    cell = study.variables.get("cell")
+    published = bool(cell) and all((docs / result).exists() for result in study.results)
+    if published:
+        print(f"{study.name}, {cell}: its results are in {docs}")
+    return published
+
+
 def show(study: Study) -> None:
     """Print what a study asks, its commands, and what it writes."""
     print(f"{study.name}: {study.question}\n")
@@ -177,16 +190,17 @@ def main() -> None:
     """Entry point."""
     given = make_parser().parse_args()
     try:
-        study = read_study(given.study, given.variables)
-        if given.dry_run:
-            show(study)
-            return
-        run_study(study, given.repeat)
-        for path in publish(study, given.docs):
-            print(f"wrote {path}")
+        for study in read_cells(given.study, given.variables):
+            if given.dry_run:
+                show(study)
+            elif given.repeat or not is_published(study, given.docs):
+                run_study(study, given.repeat)
+                for path in publish(study, given.docs):
+                    print(f"wrote {path}")
     except (ValueError, StudyError) as error:
         sys.exit(f"error: {error}")
-    print("Next: python -m experiments.tables, which writes docs/results.md")
+    if not given.dry_run:
+        print("Next: python -m experiments.tables, which writes docs/results.md")
 
 
 if __name__ == "__main__":

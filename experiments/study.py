@@ -6,10 +6,13 @@ A file has these keys:
     needs      studies whose folders its commands read; `$gate` is the folder of gate.yaml
     extends    another study, whose keys hold where this one has none of its own
     variables  names for commands; a later one may use an earlier one
+    cells      variables with a list of values each: the study is run once for every combination, in a folder
+               `$cell` of its own, and publishes each one's results as soon as it is finished
     steps      name, command; `for`: repeat the step for every combination; `fresh: true`: delete first what
                an interrupted run of it has left, since the command refuses that
     collect    a function of this package, `module.function(study)`, that returns results by their stem
-    results    what appears in docs/, made by a step or by `collect` in the study's folder
+    results    what appears in docs/, made by a step or by `collect` in the study's folder; with `$cell` in
+               the name where the study has cells
 
 `$name` in a command is a variable, `$$` a dollar sign, and bash runs the command.
 """
@@ -27,7 +30,7 @@ import yaml
 
 ROOT: Final = Path(__file__).parents[1]
 OUTPUTS: Final = Path("outputs/experiments")
-KEYS: Final = {"question", "needs", "extends", "variables", "steps", "collect", "results"}
+KEYS: Final = {"question", "needs", "extends", "variables", "cells", "steps", "collect", "results"}
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Study:
-    """A study with all variables filled in."""
+    """A study, or one cell of it, with all variables filled in."""
 
     name: str
     question: str
@@ -70,19 +73,52 @@ class Study:
 
 
 def read_study(path: Path, given: Sequence[str] = ()) -> Study:
-    """Read a study.
+    """Read a study without cells, or one cell of a study; see `read_cells`. ValueError if there are more."""
+    studies = read_cells(path, given)
+    if len(studies) > 1:
+        names = ", ".join(cells_of(path))
+        raise ValueError(f"{path}: {len(studies)} cells; choose one by name=value for {names}")
+    return studies[0]
+
+
+def read_cells(path: Path, given: Sequence[str] = ()) -> list[Study]:
+    """Read a study, once for each of its cells.
 
     Args:
         path: the YAML file.
-        given: `name=value` for variables, `output_dir` and needed studies included.
+        given: `name=value` for variables, `output_dir` and needed studies included. A value or a list of
+            values for a variable that makes cells restricts them.
 
     Raises:
         ValueError: a key, variable or value is not known.
     """
-    content = read_keys(path)
+    content, cells = read_keys(path), dict(cells_of(path))
+    rest = []
+    for assignment in given:
+        name, _, value = assignment.partition("=")
+        if name in cells:
+            chosen = yaml.safe_load(value)
+            cells[name] = chosen if isinstance(chosen, list) else [chosen]
+        else:
+            rest.append(assignment)
+    combinations = (dict(zip(cells, values, strict=True)) for values in product(*cells.values()))
+    return [_read_cell(path, content, cell, rest) for cell in combinations]
+
+
+def cells_of(path: Path) -> Mapping[str, list[Any]]:
+    """Return the variables that make a study's cells, with their values."""
+    return read_keys(path).get("cells", {})
+
+
+def _read_cell(
+    path: Path, content: Mapping[str, Any], cell: Mapping[str, Any], given: Sequence[str]
+) -> Study:
+    """Return a study with the variables of one cell, in that cell's folder."""
     needs = tuple(content.get("needs", ()))
-    folders = {"output_dir": str(OUTPUTS / path.stem), **{name: str(OUTPUTS / name) for name in needs}}
-    variables = resolve({**folders, **content.get("variables", {})}, given)
+    name = "_".join(f"{key}{value}" for key, value in cell.items())
+    folders = {"output_dir": str(OUTPUTS / path.stem), **{need: str(OUTPUTS / need) for need in needs}}
+    known = {**folders, **({"cell": name, **cell} if cell else {}), **content.get("variables", {})}
+    variables = resolve(known, given, name)
     steps = tuple(step for entry in content["steps"] for step in repeated(entry, variables))
     names = [step.name for step in steps]
     if twice := {name for name in names if names.count(name) > 1}:
@@ -96,7 +132,7 @@ def read_study(path: Path, given: Sequence[str] = ()) -> Study:
         variables,
         steps,
         content.get("collect"),
-        tuple(content.get("results", ())),
+        tuple(fill(result, variables) for result in content.get("results", ())),
     )
 
 
@@ -114,14 +150,19 @@ def read_keys(path: Path) -> dict[str, Any]:
     return {**base, "results": (), "collect": None, **content, "variables": variables}
 
 
-def resolve(variables: Mapping[str, Any], given: Sequence[str]) -> dict[str, Any]:
-    """Return the variables, with those `given` as `name=value` in their place and all `$name` filled in."""
+def resolve(variables: Mapping[str, Any], given: Sequence[str], cell: str = "") -> dict[str, Any]:
+    """Return the variables, with those `given` as `name=value` in their place and all `$name` filled in.
+
+    The output folder is that of the cell, if there is one.
+    """
     chosen = dict(variables)
     for assignment in given:
         name, equals, value = assignment.partition("=")
         if not equals or name not in chosen:
             raise ValueError(f"{assignment}: give name=value, with one of {', '.join(chosen)}")
         chosen[name] = yaml.safe_load(value)
+    if cell:
+        chosen["output_dir"] = str(Path(chosen["output_dir"]) / cell)
     filled: dict[str, Any] = {}
     for name, value in chosen.items():
         filled[name] = fill(value, filled) if isinstance(value, str) else value

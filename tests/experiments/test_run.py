@@ -1,12 +1,13 @@
 """The runner of studies: it resumes, refuses what has changed, and publishes with provenance."""
 
 import json
+import sys
 from pathlib import Path
 
 import pytest
 
-from experiments.run import StudyError, publish, run_study
-from experiments.study import Study, read_study
+from experiments.run import StudyError, main, publish, run_study
+from experiments.study import Study, read_cells, read_study
 
 COUNT = """
 question: How often
@@ -141,3 +142,47 @@ def test_a_study_may_extend_another(study_file: Path) -> None:
     study = read(other)
     assert "hello three" in study.steps[0].command
     assert (study.name, study.results) == ("other", ())
+
+
+CELLS = """
+question: How many?
+cells: {size: [1, 2], word: [a, b]}
+steps:
+  - name: say
+    command: mkdir -p $output_dir && echo '{"n":' $size'}' > $output_dir/$cell.json
+results: [results/sizes/$cell.json]
+"""
+
+
+def test_every_cell_has_a_folder_and_results_of_its_own(tmp_path: Path) -> None:
+    path = tmp_path / "sizes.yaml"
+    path.write_text(CELLS)
+    cells = read_cells(path, [f"output_dir={tmp_path / 'out'}", "word=b"])
+    assert [cell.variables["cell"] for cell in cells] == ["size1_wordb", "size2_wordb"]
+    for cell in cells:
+        run_study(cell)
+        assert publish(cell, tmp_path / "docs") == [
+            tmp_path / "docs/results/sizes" / f"{cell.variables['cell']}.json"
+        ]
+        assert (cell.folder / "steps" / "say.json").exists()
+    assert json.loads((tmp_path / "docs/results/sizes/size2_wordb.json").read_text())["n"] == 2
+
+
+def test_a_cell_whose_results_are_published_is_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "sizes.yaml"
+    path.write_text(CELLS)
+    flags = [str(path), f"output_dir={tmp_path / 'out'}", f"--docs={tmp_path / 'docs'}"]
+    for given, ran in ((["size=1"], 2), ([], 2), ([], 0)):
+        monkeypatch.setattr(sys, "argv", ["run", *flags, *given])
+        main()
+        assert capfd.readouterr().out.count("$ mkdir") == ran
+
+
+def test_one_cell_must_be_chosen_where_one_is_wanted(tmp_path: Path) -> None:
+    path = tmp_path / "sizes.yaml"
+    path.write_text(CELLS)
+    with pytest.raises(ValueError, match="4 cells; choose one by name=value for size, word"):
+        read_study(path)
+    assert read_study(path, ["size=2", "word=a"]).variables["cell"] == "size2_worda"

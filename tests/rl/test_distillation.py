@@ -2,7 +2,9 @@
 
 import shutil
 import sys
+from itertools import count
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -12,6 +14,7 @@ from torch import Tensor
 
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.tracking import read_metrics
+from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
 from lerobot_wmrl.rl.labels import Labels, action_chunks
 from lerobot_wmrl.scripts.train import main
@@ -70,6 +73,24 @@ def test_it_trains_on_the_planners_successes_and_resumes_as_if_nothing_had_happe
         shutil.rmtree(output_dir / "checkpoints" / step)
     train(monkeypatch, *flags)
     assert all(torch.equal(value, after[name]) for name, value in weights(output_dir).items())
+
+
+def test_nothing_is_labelled_after_an_episode_has_ended(
+    imagined: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole_step, steps = WorldModelVectorEnv.step, count()
+
+    def step(env: WorldModelVectorEnv, actions: Tensor) -> tuple[Any, ...]:
+        """End the first environment's episode after two steps, those of the others after four."""
+        observation, reward, terminated, truncated, info = whole_step(env, actions)
+        terminated[0] |= next(steps) == 1
+        return observation, reward, terminated, truncated, info
+
+    monkeypatch.setattr(WorldModelVectorEnv, "step", step)
+    policy, output_dir = save_untrained_policy(tmp_path / "policy", actions=7), tmp_path / "rl"
+    flags = [f"--policy.path={policy}", *FAST, "--iterations=1", *imagined]
+    train(monkeypatch, *flags, f"--output_dir={output_dir}")
+    assert read_metrics(output_dir)[-1]["labels"] == 2 + 4 + 4
 
 
 def test_policies_of_chunks_learn_chunks(
