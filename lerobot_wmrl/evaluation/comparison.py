@@ -13,7 +13,7 @@ from lerobot_wmrl.evaluation.sequential import SequentialTest
 
 
 class Episode(NamedTuple):
-    """One start, the `seed` of a suite's task, and whether each policy succeeded, in the order of policies."""
+    """One start, the `seed` of a suite's task, and whether each policy succeeded, in their order."""
 
     suite: str
     task_id: int
@@ -161,9 +161,8 @@ def save_picture(comparison: Comparison, path: Path) -> None:
     for place, rate in enumerate(rates.values()):
         low, high = rate.interval
         axes.barh(place, rate.share, 0.6, color="#2b6cb0")
-        axes.errorbar(
-            rate.share, place, xerr=[[rate.share - low], [high - rate.share]], color="#333", capsize=4
-        )
+        distances = [[rate.share - low], [high - rate.share]]
+        axes.errorbar(rate.share, place, xerr=distances, color="#333", capsize=4)
     axes.set_yticks(range(len(rates)), list(rates))
     axes.invert_yaxis()
     axes.set_xlim(0, 1)

@@ -4,10 +4,10 @@
         --env.task=push --n_episodes=200 --batch_size=2 --output_dir=outputs/comparison
 
 Any LeRobot policy and any LeRobot environment will do. All policies run from the same seeds, a batch at a
-time. By default the comparison stops when every pair is decided. A sequential test decides, which may be looked
-at after every batch: it calls equal policies different with a probability of at most `--alpha`. With
-`--stop_early=false` all `--n_episodes` run, and McNemar's exact test decides. Wilson's intervals of the success
-rates hold for a number of starts that was fixed before; after an early stop they are approximate.
+time. By default the comparison stops when every pair is decided. A sequential test decides, which may be
+looked at after every batch: it calls equal policies different with a probability of at most `--alpha`. With
+`--stop_early=false` all `--n_episodes` run, and McNemar's exact test decides. Wilson's intervals of the
+success rates hold for a number of starts that was fixed before; after an early stop they are approximate.
 
 The results are in comparison.json and comparison.png. Running the same command again continues after the last
 finished batch. With early stopping `--n_episodes` may then be higher: the test stays valid.
