@@ -10,8 +10,10 @@ from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 
 
-def save_untrained_policy(folder: Path, camera: str = "third_view", size: int = 32, actions: int = 3) -> Path:
-    """A policy that sees one camera, with its processors."""
+def save_untrained_policy(
+    folder: Path, camera: str = "third_view", size: int = 32, actions: int = 3, constant: float | None = None
+) -> Path:
+    """A policy that sees one camera, with its processors; with `constant` all its actions are that number."""
     image = PolicyFeature(type=FeatureType.VISUAL, shape=(3, size, size))
     action = PolicyFeature(type=FeatureType.ACTION, shape=(actions,))
     config = CnnConfig(
@@ -20,7 +22,8 @@ def save_untrained_policy(folder: Path, camera: str = "third_view", size: int = 
         output_features={"action": action},
     )
     CnnPolicy(config).save_pretrained(folder)
-    stats = {"action": {"mean": torch.zeros(actions), "std": torch.ones(actions)}}
+    mean, std = (0.0, 1.0) if constant is None else (constant, 0.0)
+    stats = {"action": {"mean": torch.full((actions,), mean), "std": torch.full((actions,), std)}}
     for processor in make_pre_post_processors(config, dataset_stats=stats):
         processor.save_pretrained(folder)
     return folder

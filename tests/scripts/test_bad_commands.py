@@ -9,6 +9,7 @@ import pytest
 
 from lerobot_dataset_maniskill.record import main as record
 from lerobot_wmrl.maniskill import backend
+from lerobot_wmrl.scripts.compare import main as compare
 from lerobot_wmrl.scripts.convert_openvla import main as convert_openvla
 from lerobot_wmrl.scripts.demo import main as demo
 from lerobot_wmrl.scripts.eval_world_model import main as eval_world_model
@@ -20,6 +21,8 @@ Command = Callable[[], None]
 REPLAY = ["--model.path={action_world_model}", "--dataset.root={data}"]
 SIMULATOR = ["--env.type=wmrl_maniskill"]
 TRAIN = ["--dataset.root={data}", "--model.type=frame_tokenizer", "--model.tokenizer.image_size=32"]
+TWO = "--policies=[{policy},{other}]"
+FITTING = ["--policies=[{cnn},{copy}]", *SIMULATOR]
 NEW = "--target={foreign}/new"
 IMPORT = ["--direction=import", "--source={policy}"]
 ROLL_OUT = ["--policy.path={policy}", *SIMULATOR, "--num_episodes=1"]
@@ -42,6 +45,18 @@ ROLL_OUT = ["--policy.path={policy}", *SIMULATOR, "--num_episodes=1"]
     (eval_world_model, [*REPLAY, "--output_dir={foreign}"], "foreign holds something else"),
     (eval_world_model, ["--model.path={frame_tokenizer}", "--dataset.root={data}"], "action_world_model"),
     (eval_world_model, [*REPLAY, "--max_episodes=0"], "--max_episodes=0: must be at least 1"),
+    (compare, ["--policies=[{policy}]", *SIMULATOR], "policy]: a comparison needs at least two"),
+    (compare, ["--policies=[{cnn},{cnn}]", *SIMULATOR], "cnn: is given twice; give every"),
+    (compare, ["--policies=[{cnn},{foreign}]", *SIMULATOR], "foreign: no checkpoint there"),
+    (compare, ["--policies=[{cnn},{action_world_model}]", *SIMULATOR], "no policy can be loaded from it"),
+    (compare, [TWO], "--env.type: is missing: policies are compared in an environment"),
+    (compare, [TWO, *SIMULATOR], "third_view of shape (3, 32, 32), the environment has"),
+    (compare, [TWO, *SIMULATOR, "--env.image_size=32"], "has 3 action components, the environment 7"),
+    (compare, [TWO, *SIMULATOR, "--against=none"], "--against=none: choose one of first, all"),
+    (compare, [TWO, *SIMULATOR, "--n_episodes=0"], "--n_episodes=0: must be at least 1"),
+    (compare, [TWO, *SIMULATOR, "--n_episodes=3"], "--batch_size=4: there are 3 episodes; lower it"),
+    (compare, [TWO, *SIMULATOR, "--alpha=1"], "--alpha=1.0: must be a probability"),
+    (compare, [*FITTING, "--output_dir={foreign}"], "foreign holds something else"),
     (convert_openvla, ["--direction=sideways", NEW], "--direction=sideways: choose one of import"),
     (convert_openvla, ["--direction=import", NEW], "--source: give the checkpoint to convert"),
     (convert_openvla, [*IMPORT, "--target={foreign}"], "foreign: choose a new folder"),
@@ -61,6 +76,9 @@ def test_bad_input_is_one_line_and_changes_nothing(
     (foreign / "thesis.txt").write_text("precious")
     paths = {
         "policy": save_untrained_policy(tmp_path / "policy"),
+        "other": save_untrained_policy(tmp_path / "other"),
+        "cnn": save_untrained_policy(tmp_path / "cnn", size=128, actions=7),
+        "copy": save_untrained_policy(tmp_path / "copy", size=128, actions=7),
         "foreign": foreign,
         "data": small_dataset.root,
     }

@@ -1,0 +1,173 @@
+"""Policies run from the same starts of an environment, block by block, until it is decided who is better."""
+
+import logging
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.envs import close_envs, make_env, make_env_pre_post_processors
+from lerobot.envs.configs import EnvConfig
+from lerobot.envs.utils import env_to_policy_features
+from lerobot.scripts.lerobot_eval import eval_policy
+from lerobot.utils.constants import ACTION, PRETRAINED_MODEL_DIR
+from lerobot.utils.random_utils import set_seed
+
+from lerobot_wmrl.common.checkpoints import resolve_checkpoint
+from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.policies import (
+    adopt_features,
+    check_fit,
+    check_weights,
+    load_policy,
+    load_processors,
+    read_policy_config,
+)
+from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
+from lerobot_wmrl.evaluation.comparison import Comparison, Episode
+
+type Envs = dict[str, dict[int, gym.vector.VectorEnv]]
+"""Suite → task → vector environment, as LeRobot's make_env returns them."""
+
+
+class LoadedPolicy(NamedTuple):
+    """A policy with its configuration and its pre- and postprocessor."""
+
+    config: PreTrainedConfig
+    policy: Any
+    processors: tuple[Any, Any]
+
+
+def checkpoint_name(path: str) -> str:
+    """Return the checkpoint behind a training's output folder or its link `last`, which a longer training
+    moves on. A path that is no folder is returned as it is: it may be a hub id."""
+    folder = resolve_checkpoint(path)
+    if not folder.is_dir():
+        return path
+    folder = folder.resolve()
+    folder = folder.parent if folder.name == PRETRAINED_MODEL_DIR else folder
+    return str(folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder)
+
+
+def read_policies(paths: Sequence[str], env: EnvConfig) -> dict[str, PreTrainedConfig]:
+    """Read the configurations of policies, by the names of their checkpoints.
+
+    Raises:
+        FieldError: there is no checkpoint, it is given twice, or it does not fit the environment.
+    """
+    configs: dict[str, PreTrainedConfig] = {}
+    for path in paths:
+        name = checkpoint_name(path)
+        if name in configs:
+            raise FieldError("policies", path, "is given twice", "give every checkpoint once")
+        with _about_policy(path):
+            configs[name] = read_policy_config(name, [])
+            check_weights(configs[name])
+            _check_environment(configs[name], env)
+    return configs
+
+
+@contextmanager
+def _about_policy(path: str) -> Iterator[None]:
+    """Let a FieldError that leaves the block be about the policy at `path`."""
+    try:
+        yield
+    except FieldError as error:
+        field = "" if error.field == "policy.path" else f"{error.field}={error.value}: "
+        raise FieldError("policies", path, f"{field}{error.problem}", error.remedy) from error
+
+
+def _check_environment(config: PreTrainedConfig, env: EnvConfig) -> None:
+    """Raise FieldError unless policy and environment fit; a policy without features takes the environment's.
+
+    Only this project's environments are checked: LeRobot's own may show a policy more than they declare.
+    """
+    if not hasattr(env, "create_tensor_env"):
+        return
+    features = env_to_policy_features(env)
+    action = features.pop(ACTION)
+    shown = {name: tuple(feature.shape) for name, feature in features.items()}
+    adopt_features(config, shown)
+    config.output_features = config.output_features or {ACTION: action}
+    check_fit(config, shown, action.shape[0])
+
+
+def load_policies(configs: Mapping[str, PreTrainedConfig]) -> list[LoadedPolicy]:
+    """Load the policies with their processors. FieldError if one cannot be loaded."""
+    loaded = []
+    for name, config in configs.items():
+        with _about_policy(name):
+            loaded.append(LoadedPolicy(config, load_policy(config), load_processors(config)))
+    return loaded
+
+
+@contextmanager
+def opened(config: EnvConfig, n_envs: int, trust_remote_code: bool) -> Iterator[Envs]:
+    """Make the environment for `n_envs` episodes at once, and close it in the end."""
+    envs = make_env(config, n_envs, use_async_envs=True, trust_remote_code=trust_remote_code)
+    try:
+        yield envs
+    finally:
+        for env in _flat(envs):
+            if hasattr(env, "results"):
+                env.results.episodes.clear()  # ManiSkill's table by scene counts a seed for one policy only
+        close_envs(envs)
+
+
+def _flat(envs: Envs) -> list[Any]:
+    return [env for tasks in envs.values() for env in tasks.values()]
+
+
+def require_new_starts(envs: Envs, config: EnvConfig, n_episodes: int) -> None:
+    """Raise FieldError if a world model has too few start frames: episodes would repeat and count twice."""
+    if not isinstance(config, WorldModelEnv):
+        return
+    fewest = min(len(env.env.starts) for env in _flat(envs))
+    if n_episodes > fewest:
+        raise FieldError(
+            "n_episodes", n_episodes,
+            f"the world model has {fewest} start frames for a task, and an episode that is repeated says "
+            f"nothing new", f"set it to at most {fewest}, or give more with `env.dataset.max_starts`",
+        )  # fmt: skip
+
+
+def run_comparison(
+    comparison: Comparison, envs: Envs, config: EnvConfig, policies: Sequence[LoadedPolicy],
+    batch_size: int, seed: int, save: Callable[[], None],
+) -> None:  # fmt: skip
+    """Add blocks of `batch_size` starts of each task until the comparison is finished.
+
+    Args:
+        seed: of the first start of each task; each further one adds one.
+        save: called after every block.
+    """
+    while not comparison.finished:
+        done = comparison.starts_per_task
+        count = min(batch_size, comparison.n_episodes - done)
+        comparison.episodes.extend(run_block(envs, config, policies, count, seed + done))
+        save()
+        shares = (f"{name} {rate.share:.0%}" for name, rate in comparison.rates().items())
+        logging.info("%d starts: %s", len(comparison.episodes), ", ".join(shares))
+
+
+@torch.no_grad()
+def run_block(
+    envs: Envs, config: EnvConfig, policies: Sequence[LoadedPolicy], count: int, seed: int
+) -> list[Episode]:
+    """Run every policy from the same `count` starts of each task."""
+    outcomes: list[dict[tuple[str, int, int], bool]] = []
+    for loaded in policies:
+        set_seed(seed)  # a comparison that is continued draws the same random actions
+        processors = *make_env_pre_post_processors(config, loaded.config), *loaded.processors
+        outcomes.append({
+            (suite, task, episode["seed"]): bool(episode["success"])
+            for suite, tasks in envs.items()
+            for task, env in tasks.items()
+            for episode in eval_policy(
+                env, loaded.policy, *processors, n_episodes=count, start_seed=seed
+            )["per_episode"]
+        })  # fmt: skip
+    return [Episode(*start, [own[start] for own in outcomes]) for start in outcomes[0]]

@@ -1,0 +1,171 @@
+"""Success rates of policies on the same starts, their pairs, and which pairs are decided."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from matplotlib.figure import Figure
+
+from lerobot_wmrl.common.statistics import PairedChange, Proportion
+from lerobot_wmrl.evaluation.sequential import SequentialTest
+
+
+class Episode(NamedTuple):
+    """One start, the `seed` of a suite's task, and whether each policy succeeded, in their order."""
+
+    suite: str
+    task_id: int
+    seed: int
+    successes: list[bool]
+
+
+class Pair(NamedTuple):
+    """Policy `after` against policy `before` on the same starts.
+
+    Args:
+        change: starts gained and lost, with McNemar's p-value, which is valid if their number was fixed.
+        sequential: the test that is valid at any time of stopping; None if the number of starts is fixed.
+        level: p-value that decides; 0 while McNemar's test waits for the number of starts that was fixed.
+    """
+
+    before: str
+    after: str
+    change: PairedChange
+    sequential: SequentialTest | None
+    level: float
+
+    @property
+    def p_value(self) -> float:
+        """The p-value that decides."""
+        return (self.sequential or self.change).p_value
+
+    @property
+    def better(self) -> str | None:
+        """The policy that succeeds more often; None if that is not decided."""
+        if self.p_value > self.level:
+            return None
+        gained = self.sequential.sign if self.sequential else self.change.gained - self.change.lost
+        return self.after if gained > 0 else self.before
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the pair as JSON. `p_value` decides; `mcnemar_p_value` is valid without early stopping."""
+        return {
+            "before": self.before, "after": self.after, "gained": self.change.gained,
+            "lost": self.change.lost, "better": self.better, "p_value": self.p_value,
+            "test": "sequential" if self.sequential else "mcnemar", "mcnemar_p_value": self.change.p_value,
+        }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Outcomes of several policies on the same starts.
+
+    Args:
+        policies: names of the policies.
+        n_episodes: most starts of each task.
+        against: which are paired: every policy with the `first` one, or with `all` others.
+        alpha: probability that equal policies are called different, for all pairs together.
+        stop_early: whether the comparison ends once every pair is decided.
+        episodes: in the order in which they ran.
+    """
+
+    policies: Sequence[str]
+    n_episodes: int
+    against: str = "first"
+    alpha: float = 0.05
+    stop_early: bool = True
+    episodes: list[Episode] = field(default_factory=list)
+
+    @property
+    def starts_per_task(self) -> int:
+        """Starts of each task so far."""
+        return len({episode.seed for episode in self.episodes})
+
+    @property
+    def complete(self) -> bool:
+        """Whether every task has had all its starts."""
+        return self.starts_per_task >= self.n_episodes
+
+    @property
+    def finished(self) -> bool:
+        """Whether the comparison is complete, or every pair is decided and it may stop early."""
+        return self.complete or (self.stop_early and all(pair.better for pair in self.pairs()))
+
+    def rates(self) -> dict[str, Proportion]:
+        """Return each policy's success rate."""
+        return {name: Proportion(sum(own), len(own)) for name, own in self._outcomes().items()}
+
+    def pairs(self) -> list[Pair]:
+        """Return the pairs, each decided at alpha over their number (Bonferroni)."""
+        outcomes, names = self._outcomes(), self._pair_names()
+        level = self.alpha / len(names) if self.stop_early or self.complete else 0.0
+        found = []
+        for before, after in names:
+            both = outcomes[before], outcomes[after]
+            sequential = SequentialTest.between(*both) if self.stop_early else None
+            change = PairedChange.between(*both)
+            found.append(Pair(before, after, change, sequential, level))
+        return found
+
+    def _pair_names(self) -> list[tuple[str, str]]:
+        pairs = list(combinations(self.policies, 2))
+        return pairs if self.against == "all" else pairs[: len(self.policies) - 1]
+
+    def _outcomes(self) -> dict[str, list[bool]]:
+        return {
+            name: [episode.successes[index] for episode in self.episodes]
+            for index, name in enumerate(self.policies)
+        }
+
+    def as_json(self) -> dict[str, Any]:
+        """Return results and episodes as JSON, from which `read_episodes` continues."""
+        return {
+            "policies": {name: rate.as_json() for name, rate in self.rates().items()},
+            "alpha": self.alpha,
+            "finished": self.finished,
+            "pairs": [pair.as_json() for pair in self.pairs()],
+            "episodes": [episode._asdict() for episode in self.episodes],
+        }
+
+    def __str__(self) -> str:
+        width = max(map(len, self.policies))
+        rates = [f"{name:<{width}}  {rate}" for name, rate in self.rates().items()]
+        return "\n".join([*rates, "", *map(self._verdict, self.pairs()), self._explanation()])
+
+    def _verdict(self, pair: Pair) -> str:
+        found = f"{pair.change.gained} gained, {pair.change.lost} lost, p = {pair.p_value:.2g}"
+        if pair.better is None:
+            said = f"not decided after {len(self.episodes)} starts"
+        else:
+            worse = pair.before if pair.better == pair.after else pair.after
+            said = f"{pair.better} succeeds more often than {worse}"
+        return f"{pair.after} against {pair.before}: {found}: {said}"
+
+    def _explanation(self) -> str:
+        valid = "p is valid at any time of stopping" if self.stop_early else "p is McNemar's exact one"
+        return f"{valid}; p up to {self.alpha / len(self._pair_names()):.2g} decides."
+
+
+def read_episodes(results: Mapping[str, Any]) -> list[Episode]:
+    """Return the episodes of a comparison that was written as JSON."""
+    return [Episode(**episode) for episode in results["episodes"]]
+
+
+def save_picture(comparison: Comparison, path: Path) -> None:
+    """Draw the success rates with their 95 % intervals."""
+    rates = comparison.rates()
+    figure = Figure(figsize=(7, 1.2 + 0.5 * len(rates)), layout="constrained")
+    axes = figure.subplots()
+    for place, rate in enumerate(rates.values()):
+        low, high = rate.interval
+        axes.barh(place, rate.share, 0.6, color="#2b6cb0")
+        distances = [[rate.share - low], [high - rate.share]]
+        axes.errorbar(rate.share, place, xerr=distances, color="#333", capsize=4)
+    axes.set_yticks(range(len(rates)), list(rates))
+    axes.invert_yaxis()
+    axes.set_xlim(0, 1)
+    axes.set_xlabel(f"success rate over {len(comparison.episodes)} starts, with 95 % intervals")
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path, dpi=130)

@@ -1,0 +1,142 @@
+"""lerobot-wmrl-compare: compare the success of policies on the same starts of an environment.
+
+    lerobot-wmrl-compare --policies=[outputs/cloned,outputs/improved] --env.type=wmrl_maniskill \\
+        --env.task=push --n_episodes=200 --batch_size=2 --output_dir=outputs/comparison
+
+Any LeRobot policy and any LeRobot environment will do. All policies run from the same seeds, a batch at a
+time. By default the comparison stops when every pair is decided. A sequential test decides, which may be
+looked at after every batch: it calls equal policies different with a probability of at most `--alpha`. With
+`--stop_early=false` all `--n_episodes` run, and McNemar's exact test decides. Wilson's intervals of the
+success rates hold for a number of starts that was fixed before; after an early stop they are approximate.
+
+The results are in comparison.json and comparison.png. Running the same command again continues after the last
+finished batch. With early stopping `--n_episodes` may then be higher: the test stays valid.
+"""
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import draccus
+from lerobot.envs.configs import EnvConfig
+
+from lerobot_wmrl.common.command_line import RunConfig, claim_output_dir, require_free, run_command
+from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
+from lerobot_wmrl.common.files import write_json, writing
+
+if TYPE_CHECKING:
+    from lerobot.configs import PreTrainedConfig
+
+    from lerobot_wmrl.evaluation.comparison import Comparison
+
+RESULTS: Final = "comparison.json"
+
+
+@dataclass
+class CompareConfig(RunConfig):
+    """Compare the success of policies on the same starts of an environment.
+
+    Args:
+        policies: checkpoints of policies, or output folders of trainings, of which the last checkpoint is
+            taken. All of them are in memory at the same time.
+        env: `--env.type=wmrl_maniskill`, `world_model` or one of LeRobot's environments, and its settings.
+        against: pairs that are compared: every policy with the `first` one, or with `all` others.
+        n_episodes: most episodes of each policy, in each task of the environment.
+        batch_size: environments that run at once. After every batch it is checked whether all is decided.
+        seed: seed of the first episode; each further one adds one.
+        alpha: probability of calling equal policies different, for all pairs together (Bonferroni).
+        stop_early: stop when every pair is decided. Then the sequential p-value decides, which is valid
+            at any time of stopping; otherwise McNemar's.
+        trust_remote_code: allow an environment of the hub to run its code here, as in lerobot-eval.
+        output_dir: folder of comparison.json and comparison.png.
+    """
+
+    policies: list[str] = field(default_factory=list)
+    env: EnvConfig | None = None
+    against: str = "first"
+    n_episodes: int = 200
+    batch_size: int = 4
+    seed: int = EVALUATION_SEED
+    alpha: float = 0.05
+    stop_early: bool = True
+    trust_remote_code: bool = False
+    output_dir: Path = Path("outputs/comparison")
+
+    def check(self) -> None:
+        """Raise FieldError for a setting that cannot be."""
+        if len(self.policies) < 2:
+            raise FieldError(
+                "policies", self.policies, "a comparison needs at least two", "give their checkpoints: [a,b]"
+            )
+        if self.env is None:
+            raise FieldError(
+                "env.type", None, "is missing: policies are compared in an environment",
+                "set it to wmrl_maniskill, world_model or one of LeRobot's, with its settings",
+            )  # fmt: skip
+        require_choice(self, "against", ("first", "all"))
+        require_at_least(self, 1, "n_episodes", "batch_size")
+        require_at_least(self, 0, "seed")
+        if self.batch_size > self.n_episodes:
+            raise FieldError(
+                "batch_size", self.batch_size, f"there are {self.n_episodes} episodes",
+                "lower it, or raise `n_episodes`",
+            )  # fmt: skip
+        if not 0 < self.alpha < 1:
+            raise FieldError("alpha", self.alpha, "must be a probability between 0 and 1")
+
+
+def compare(cfg: CompareConfig) -> None:
+    """Run the policies, or what is missing of their episodes; write comparison.json and comparison.png."""
+    from lerobot_wmrl.evaluation.compare import read_policies
+    from lerobot_wmrl.evaluation.comparison import Comparison, read_episodes, save_picture
+
+    cfg.check()
+    assert cfg.env is not None
+    configs = read_policies(cfg.policies, cfg.env)
+    cfg.policies = list(configs)
+    require_free(cfg.output_dir, draccus.encode(cfg), may_differ(cfg))
+    results = cfg.output_dir / RESULTS
+    episodes = read_episodes(json.loads(results.read_text())) if results.is_file() else []
+    comparison = Comparison(cfg.policies, cfg.n_episodes, cfg.against, cfg.alpha, cfg.stop_early, episodes)
+    if not comparison.finished:
+        run(cfg, comparison, configs)
+    save_picture(comparison, cfg.output_dir / "comparison.png")
+    print(f"{comparison}\n{RESULTS} and comparison.png are in {cfg.output_dir}")
+
+
+def may_differ(cfg: CompareConfig) -> list[str]:
+    """Return the settings that may change when a comparison is continued: McNemar's test needs a number of
+    starts that was fixed before, the sequential test does not."""
+    return ["n_episodes"] if cfg.stop_early else []
+
+
+def run(cfg: CompareConfig, comparison: "Comparison", configs: "dict[str, PreTrainedConfig]") -> None:
+    """Run the episodes that are missing; write the results after every batch."""
+    from lerobot_wmrl.evaluation.compare import load_policies, opened, require_new_starts, run_comparison
+
+    assert cfg.env is not None
+    settings: dict[str, Any] = draccus.encode(cfg)
+
+    def save() -> None:
+        content = {"env": settings["env"], "seed": cfg.seed, **comparison.as_json()}
+        write_json(cfg.output_dir / RESULTS, content)
+
+    with (
+        writing("output_dir", cfg.output_dir),
+        opened(cfg.env, cfg.batch_size, cfg.trust_remote_code) as envs,
+    ):
+        require_new_starts(envs, cfg.env, cfg.n_episodes)
+        policies = load_policies(configs)
+        claim_output_dir(cfg.output_dir, settings, may_differ(cfg))
+        run_comparison(comparison, envs, cfg.env, policies, cfg.batch_size, cfg.seed, save)
+
+
+def main() -> None:
+    """Run the console command."""
+    run_command(compare, CompareConfig, list)
+
+
+if __name__ == "__main__":
+    main()

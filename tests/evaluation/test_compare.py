@@ -1,0 +1,285 @@
+"""Policies compared on the same starts, in environments that LeRobot makes and evaluates."""
+
+import json
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from lerobot.configs.types import FeatureType, PolicyFeature
+from lerobot.envs.configs import EnvConfig
+from lerobot.policies.factory import make_pre_post_processors
+
+from lerobot_policy_cnn.modeling_cnn import CnnPolicy
+from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
+from lerobot_policy_wm_mpc.modeling_wm_mpc import WmMpcPolicy
+from lerobot_wmrl.common.checkpoints import link_checkpoint
+from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
+from lerobot_wmrl.evaluation import compare as running
+from lerobot_wmrl.evaluation.compare import checkpoint_name
+from lerobot_wmrl.evaluation.comparison import Comparison, Episode
+from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
+from lerobot_wmrl.scripts.compare import CompareConfig, compare
+from tests.rl.checkpoints import save_untrained_policy
+
+TASKS = {"lift": (0, 1), "push": (0,)}
+
+
+def difficulty(suite: str, task: int, seed: int) -> float:
+    """What an action must exceed in that task's episode."""
+    return float(np.random.default_rng([len(suite) + ord(suite[0]), task, seed]).random())
+
+
+class ThresholdEnv(gym.Env):
+    """An episode of one step succeeds if its action is above the difficulty of its seed."""
+
+    metadata: ClassVar[dict[str, Any]] = {"render_fps": 10}
+    observation_space = gym.spaces.Dict(
+        {"pixels": gym.spaces.Dict({"third_view": gym.spaces.Box(0, 255, (32, 32, 3), np.uint8)})}
+    )
+    action_space = gym.spaces.Box(-1, 1, (3,), np.float32)
+    _max_episode_steps = 1
+    task = task_description = "exceed it"
+
+    def __init__(self, suite: str, number: int, harder: float) -> None:
+        self.suite, self.number, self.harder = suite, number, harder
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
+        if seed is not None:
+            self.threshold = difficulty(self.suite, self.number, seed) + self.harder
+        return {"pixels": {"third_view": np.zeros((32, 32, 3), np.uint8)}}, {}
+
+    def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        return self.reset()[0], 0.0, False, True, {"is_success": bool(action[0] > self.threshold)}
+
+
+@EnvConfig.register_subclass("test_threshold")
+@dataclass
+class ThresholdConfig(EnvConfig):
+    """Two suites of tasks, as LeRobot's benchmarks have them."""
+
+    harder: float = 0.0
+    features: dict[str, PolicyFeature] = field(
+        default_factory=lambda: {"action": PolicyFeature(FeatureType.ACTION, (3,))}
+    )
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        return {}
+
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, SyncVectorEnv]]:
+        def make(suite: str, task: int) -> SyncVectorEnv:
+            return SyncVectorEnv(
+                [lambda: ThresholdEnv(suite, task, self.harder)] * n_envs,
+                autoreset_mode=AutoresetMode.SAME_STEP,
+            )
+
+        return {suite: {task: make(suite, task) for task in tasks} for suite, tasks in TASKS.items()}
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> CompareConfig:
+    """Three policies with success rates of 60, 90 and 60 %; the first and the last are equal."""
+    policies = [
+        str(save_untrained_policy(tmp_path / name, constant=rate))
+        for name, rate in {"fair": 0.6, "good": 0.9, "twin": 0.6}.items()
+    ]
+    return CompareConfig(
+        policies=policies, env=ThresholdConfig(), n_episodes=60, batch_size=4, output_dir=tmp_path / "out"
+    )
+
+
+@pytest.fixture
+def imagination(small_dataset: Any, trained_models: dict[str, Path]) -> WorldModelEnv:
+    return WorldModelEnv(
+        world_model_path=str(trained_models["action_world_model"]), device="cpu", episode_length=2,
+        dataset=StartFrames(root=str(small_dataset.root)), reward=GeneralConfig(alpha=1.0),
+        done_threshold=0.0001, done_frames=1,
+    )  # fmt: skip
+
+
+def results_of(config: CompareConfig) -> dict[str, Any]:
+    compare(config)
+    return json.loads((config.output_dir / "comparison.json").read_text())
+
+
+def test_a_clear_difference_stops_early_and_every_outcome_is_of_its_task_and_seed(config, capsys):
+    config.policies = config.policies[:2]
+    found = results_of(config)
+    episodes = [Episode(**episode) for episode in found["episodes"]]
+    assert found["finished"]
+    assert 0 < len(episodes) < 60 * 3
+    assert len(episodes) % (config.batch_size * 3) == 0
+    for suite, task, seed, successes in episodes:
+        assert successes == [rate > difficulty(suite, task, seed) for rate in (0.6, 0.9)]
+    last = EVALUATION_SEED + len(episodes) // 3
+    starts = {
+        (suite, task, seed)
+        for suite, tasks in TASKS.items()
+        for task in tasks
+        for seed in range(EVALUATION_SEED, last)
+    }
+    assert {episode[:3] for episode in episodes} == starts
+    (pair,) = found["pairs"]
+    fair, good = config.policies
+    assert (pair["better"], pair["test"], pair["lost"]) == (good, "sequential", 0)
+    assert pair["p_value"] == pytest.approx((pair["gained"] + 1) / 2 ** pair["gained"])
+    assert pair["mcnemar_p_value"] == pytest.approx(2 / 2 ** pair["gained"])
+    assert pair["gained"] == found["policies"][good]["k"] - found["policies"][fair]["k"]
+    said = capsys.readouterr().out
+    assert f"{good} succeeds more often than {fair}" in said
+    assert "p is valid at any time of stopping; p up to 0.05 decides" in said
+    assert (config.output_dir / "comparison.png").is_file()
+
+
+def test_equal_policies_are_not_decided_after_all_starts(config, capsys):
+    config.policies, config.n_episodes = config.policies[::2], 6
+    found = results_of(config)
+    assert found["pairs"][0]["better"] is None
+    assert len(found["episodes"]) == 6 * 3
+    assert "0 gained, 0 lost, p = 1: not decided after 18 starts" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("stop", ["killed", "too few"])
+def test_a_comparison_that_stopped_continues_to_the_same_result(config, stop, tmp_path, monkeypatch):
+    """Bit for bit, though the policies draw their actions."""
+    monkeypatch.setattr(CnnPolicy, "select_action", lambda self, batch: torch.rand(4, 3))
+    config.policies = [str(save_untrained_policy(tmp_path / name)) for name in ("one", "another")]
+    config.n_episodes = 16
+    whole = results_of(replace(config, output_dir=tmp_path / "whole"))
+    if stop == "killed":
+        kill_in_third_block(config, monkeypatch)
+    else:
+        compare(replace(config, n_episodes=8))
+    assert len(json.loads((config.output_dir / "comparison.json").read_text())["episodes"]) == 8 * 3
+    assert results_of(config) == whole
+    assert {True, False} == {success for episode in whole["episodes"] for success in episode["successes"]}
+
+
+def kill_in_third_block(config: CompareConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Interrupt a comparison after two blocks."""
+    run_block, blocks = running.run_block, []
+
+    def killed(*args: Any) -> list[Episode]:
+        blocks.append(args)
+        if len(blocks) == 3:
+            raise KeyboardInterrupt
+        return run_block(*args)
+
+    monkeypatch.setattr(running, "run_block", killed)
+    with pytest.raises(KeyboardInterrupt):
+        compare(config)
+    monkeypatch.setattr(running, "run_block", run_block)
+
+
+def test_a_finished_comparison_makes_no_environment_again(config, monkeypatch):
+    config.n_episodes = 4
+    first = results_of(config)
+    monkeypatch.setattr(ThresholdConfig, "create_envs", None)
+    assert results_of(config) == first
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"env": ThresholdConfig(harder=0.1)}, "env.harder 0.0 → 0.1"),
+        ({"seed": 7}, "seed 1000000 → 7"),
+        ({"stop_early": False}, "stop_early True → False"),
+    ],
+)
+def test_results_of_other_settings_are_not_mixed(config, changed, message):
+    config.n_episodes = 4
+    before = results_of(config)
+    with pytest.raises(ValueError, match=message):
+        compare(replace(config, **changed))
+    assert json.loads((config.output_dir / "comparison.json").read_text()) == before
+
+
+def test_with_mcnemars_test_the_number_of_starts_is_fixed(config):
+    config.stop_early, config.n_episodes = False, 4
+    results_of(config)
+    with pytest.raises(ValueError, match="n_episodes 4 → 8"):
+        compare(replace(config, n_episodes=8))
+
+
+def test_mcnemars_test_decides_when_all_starts_are_there() -> None:
+    episodes = [Episode("suite", 0, seed, [False, True]) for seed in range(10)]
+    (waiting,) = Comparison("ab", 11, stop_early=False, episodes=episodes).pairs()
+    (decided,) = Comparison("ab", 10, stop_early=False, episodes=episodes).pairs()
+    assert (waiting.better, decided.better) == (None, "b")
+    assert decided.p_value == pytest.approx(2 / 2**10)
+
+
+@pytest.mark.parametrize(("against", "pairs"), [("first", ["ab", "ac"]), ("all", ["ab", "ac", "bc"])])
+def test_pairs_share_alpha(against: str, pairs: list[str]) -> None:
+    found = Comparison("abc", 10, against, alpha=0.06).pairs()
+    assert [pair.before + pair.after for pair in found] == pairs
+    assert {pair.level for pair in found} == {0.06 / len(pairs)}
+
+
+def test_a_link_to_a_checkpoint_names_the_checkpoint(tmp_path, monkeypatch):
+    """`last` moves on as a training continues: the episodes of two checkpoints must not be mixed."""
+    monkeypatch.chdir(tmp_path)
+    for step in ("000010", "000020"):
+        folder = Path("run/checkpoints", step)
+        save_untrained_policy(folder / "pretrained_model")
+        link_checkpoint(folder, "last")
+        for given in ("run", "run/checkpoints/last", "run/checkpoints/last/pretrained_model"):
+            assert checkpoint_name(given) == str(folder)
+    assert checkpoint_name("lerobot/pusht") == "lerobot/pusht"
+
+
+def test_a_world_model_compares_a_policy_with_a_planner(imagination, tmp_path):
+    """From each of its six start frames once: a threshold that every frame reaches makes all succeed."""
+    planner = tmp_path / "planner"
+    settings = WmMpcConfig(
+        world_model_path=imagination.world_model_path, device="cpu", horizon=4, execute=2, samples=4,
+        elites=2, iterations=1, knots=2,
+    )  # fmt: skip
+    WmMpcPolicy(settings).save_pretrained(planner)
+    for processor in make_pre_post_processors(settings):
+        processor.save_pretrained(planner)
+    policy = save_untrained_policy(tmp_path / "policy", actions=7)
+    config = CompareConfig(
+        policies=[str(policy), str(planner)], env=imagination, n_episodes=7, output_dir=tmp_path / "out"
+    )
+    with pytest.raises(ValueError, match=r"n_episodes=7: the world model has 6 start frames .* at most 6"):
+        compare(config)
+    assert not config.output_dir.exists()
+    found = results_of(replace(config, n_episodes=6))
+    assert [rate["k"] for rate in found["policies"].values()] == [6, 6]
+    assert found["env"]["type"] == "world_model"
+
+
+@pytest.mark.parametrize(
+    ("saved", "message"),
+    [
+        ({"actions": 3}, "has 3 action components, the environment 7"),
+        ({"actions": 7, "camera": "wrist"}, "needs observation.images.wrist, which the environment does not"),
+        ({"actions": 7, "size": 16}, r"of shape \(3, 16, 16\), the environment has \(3, 32, 32\)"),
+    ],
+)
+def test_a_policy_must_fit_the_environment(imagination, saved, message, tmp_path):
+    fits, other = (
+        str(save_untrained_policy(tmp_path / name, **shapes))
+        for name, shapes in {"fits": {"actions": 7}, "other": saved}.items()
+    )
+    config = CompareConfig([fits, other], imagination, n_episodes=6, output_dir=tmp_path / "out")
+    with pytest.raises(ValueError, match=f"policies={other}: .*{message}"):
+        compare(config)
+    assert not config.output_dir.exists()
+
+
+def test_policies_are_compared_in_maniskill(tmp_path, caplog):
+    """Success by scene is not logged: the table counts every seed once, whichever policy ran from it."""
+    policies = [str(save_untrained_policy(tmp_path / name, actions=7, constant=0.0)) for name in "ab"]
+    env = WmrlManiSkillEnv(image_size=32, episode_length=2, scenes=[0])
+    found = results_of(CompareConfig(policies, env, n_episodes=2, batch_size=1, output_dir=tmp_path / "out"))
+    assert [episode["successes"] for episode in found["episodes"]] == [[False, False]] * 2
+    assert "Success by scene" not in caplog.text
