@@ -14,14 +14,12 @@ from lerobot.envs.configs import EnvConfig
 
 from lerobot_dataset_maniskill.planners import MOTIONS
 from lerobot_wmrl.common.command_line import RunConfig
-from lerobot_wmrl.common.constants import EVALUATION_SEED, KINDS
+from lerobot_wmrl.common.constants import EVALUATION_SEED, KINDS, POLICY
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
 from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.maniskill.tasks import task_of
-
-POLICY_KIND = "policy"
 
 LOCAL = "local"
 """Namespace of datasets that are not on the hub."""
@@ -97,6 +95,11 @@ class RecordConfig(RunConfig):
     largest action. Each episode draws its own level from 0 to this one. The noise is correlated over about
     ten steps."""
 
+    budget: Path | None = None
+    """Ledger of the real episodes that a method may learn from, a JSON file with limits (docs/protocol.md).
+    The recording is entered there, and refused if it is beyond a limit, has evaluation seeds or unseen
+    scenes. Imagined episodes cost nothing."""
+
     push_to_hub: bool = False
     """Publish the dataset as repo_id on the Hugging Face hub when it is complete."""
 
@@ -162,7 +165,7 @@ class RecordConfig(RunConfig):
             )
 
     def _validate_kinds(self) -> None:
-        planned = [kind for kind in KINDS if kind != POLICY_KIND]
+        planned = [kind for kind in KINDS if kind != POLICY]
         unknown = [kind for kind in self.kinds if kind not in planned]
         if unknown or min(self.kinds.values(), default=0) < 0 or sum(self.kinds.values()) <= 0:
             problem = f"must be shares of {', '.join(planned)}, at least one above 0"
@@ -241,7 +244,7 @@ class RecordConfig(RunConfig):
             "part_episodes": self.part_episodes,
             "shard": list(self.shard_of),
             "seed": self.seed,
-            "kinds": self.kinds if self.policy is None else {POLICY_KIND: 1.0},
+            "kinds": self.kinds if self.policy is None else {POLICY: 1.0},
             "planner": self.planner if self.policy is None else None,
             "policy": None if self.policy is None else str(self.policy.pretrained_path),
             "exploration": self.exploration,

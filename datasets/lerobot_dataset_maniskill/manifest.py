@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lerobot_dataset_maniskill.configuration import POLICY_KIND, RecordConfig
-from lerobot_wmrl.common.constants import KINDS, START_COLUMNS, TASKS
+from lerobot_dataset_maniskill.configuration import RecordConfig
+from lerobot_wmrl.common.constants import KINDS, POLICY, START_COLUMNS, TASKS
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 from lerobot_wmrl.maniskill.scenes import SCENES, Scene, scene_for_seed
@@ -95,7 +95,7 @@ def imagined_episodes(config: RecordConfig) -> list[EpisodePlan]:
     for number in range(config.num_episodes):
         start = (config.seed + number) % len(starts)
         task, scene, seed = (int(real[name][starts[start]]) for name in ("task", "scene", "seed"))
-        plans.append(EpisodePlan(TASKS[task], POLICY_KIND, SCENES[scene], seed, start))
+        plans.append(EpisodePlan(TASKS[task], POLICY, SCENES[scene], seed, start))
     return plans
 
 
@@ -107,7 +107,7 @@ def task_for_seed(tasks: Sequence[str], scenes: int, seed: int) -> str:
 def planned_kinds(config: RecordConfig) -> list[str]:
     """Return the kinds of the episodes: exactly the shares (largest remainders), in random order."""
     if config.policy is not None:
-        return [POLICY_KIND] * config.num_episodes
+        return [POLICY] * config.num_episodes
     names = sorted(config.kinds, key=KINDS.index)
     shares = np.array([config.kinds[name] for name in names], dtype=np.float64)
     ideal = shares / shares.sum() * config.num_episodes

@@ -87,12 +87,23 @@ def run(config: RecordConfig) -> None:
     silence_libraries()
     if config.merge_shards:
         config.validate()
+        check_shards(config)
         with writing("output_dir", config.root):
             merge_shards(config.merge_shards, config.root, config.dataset_id)
     else:
         record(config)
     if config.push_to_hub:
         publish(HfApi(), config.root, config.dataset_id, config.private)
+
+
+def check_shards(config: RecordConfig) -> None:
+    """Raise FieldError unless the shards are in the ledger, if one is given: then it knows the whole too."""
+    from lerobot_wmrl.data.budget import Ledger
+    from lerobot_wmrl.data.episodes import open_dataset, read_episodes
+
+    if config.budget is not None:
+        for shard in config.merge_shards:
+            Ledger(config.budget).require_known(read_episodes(open_dataset(shard)), field="merge_shards")
 
 
 def main() -> None:

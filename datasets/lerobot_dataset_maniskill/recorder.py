@@ -19,9 +19,12 @@ from lerobot_dataset_maniskill.manifest import Part, planned_parts
 from lerobot_dataset_maniskill.merging import already_recorded, finish, merge_folders, require_same
 from lerobot_dataset_maniskill.worker import EpisodeResult, PartRecorder, Report, serve_parts
 from lerobot_dataset_maniskill.writer import find_damage
-from lerobot_wmrl.common.constants import ACTION_NAMES, KINDS
+from lerobot_wmrl.common.constants import ACTION_NAMES, EVALUATION_SEED, GATE_SEED, KINDS
+from lerobot_wmrl.common.errors import FieldError, within
 from lerobot_wmrl.common.files import foreign_files, write_json, writing
 from lerobot_wmrl.common.policies import check_fit, check_weights
+from lerobot_wmrl.data.budget import Ledger, spending
+from lerobot_wmrl.data.episodes import open_dataset, read_episodes
 from lerobot_wmrl.maniskill.backend import render_backend, simulating_context
 
 CONTENT_FILE: Final = "recording.json"
@@ -35,9 +38,14 @@ def record(config: RecordConfig) -> None:
     config.validate()
     root, content = config.root, config.recorded_content()
     work, parts = root.parent / f".{root.name}.recording", planned_parts(config)
+    ledger = None if config.budget is None else Ledger(config.budget)
+    if ledger is not None:
+        check_sources(config, ledger, parts)
     if already_recorded(root, content, count_episodes(parts)):
         discard(work, content)
     else:
+        if ledger is not None and config.imagination is None:
+            ledger.require_left(Counter(spending(plan.kind) for part in parts for plan in part.episodes))
         if config.policy is not None:
             check_weights(config.policy)
         if config.imagination is None:
@@ -46,6 +54,32 @@ def record(config: RecordConfig) -> None:
             record_parts(config, work, parts)
             merge(config, work, parts)
         shutil.rmtree(work, ignore_errors=True)
+    if ledger is not None:
+        ledger.charge(read_episodes(open_dataset(root)), imagined=config.imagination is not None)
+
+
+def check_sources(config: RecordConfig, ledger: Ledger, parts: list[Part]) -> None:
+    """Raise FieldError for episodes from which a method under a budget must not learn.
+
+    The gate's rollouts have seeds of their own, on which nothing is reported.
+    """
+    if config.imagination is not None:
+        from lerobot_wmrl.envs.start_frames import check_starts
+
+        with within("env"):
+            check_starts(config.imagination.dataset, ledger)
+        return
+    if config.maniskill.split == "ood":
+        raise FieldError(
+            "env.split", "ood", "under a budget, nothing is recorded in unseen scenes", "choose ind"
+        )
+    seeds = {plan.seed for part in parts for plan in part.episodes}
+    if any(EVALUATION_SEED <= seed < GATE_SEED for seed in seeds):
+        raise FieldError(
+            "seed", config.seed,
+            f"under a budget, seeds from {EVALUATION_SEED} on are for evaluation; these reach {max(seeds)}",
+            "choose a smaller one",
+        )  # fmt: skip
 
 
 def check_simulation(config: RecordConfig) -> None:

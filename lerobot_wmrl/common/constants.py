@@ -19,9 +19,10 @@ ACTION_HIGH: Final = (0.05, 0.05, 0.05, 0.25, 0.25, 0.25, 1.0)
 TASKS: Final = ("push", "pull", "pick_place", "move_to_aim")
 """Vocabulary of the column `start.task`."""
 
+POLICY: Final = "policy"
 PLAY: Final = "play"
 HUMAN_LIKE: Final = "human_like"
-KINDS: Final = ("optimal", "waypoint", "interpolated", "noisy", "near_miss", "policy", PLAY, HUMAN_LIKE)
+KINDS: Final = ("optimal", "waypoint", "interpolated", "noisy", "near_miss", POLICY, PLAY, HUMAN_LIKE)
 """Vocabulary of the column `start.kind`: how an episode's actions were made. Datasets store the index."""
 
 START_COLUMNS: Final = ("start.task", "start.scene", "start.seed", "start.kind")

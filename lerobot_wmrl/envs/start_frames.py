@@ -18,6 +18,7 @@ from torch import Tensor
 
 from lerobot_wmrl.common.constants import ACTION_LOW, START_SCENE, START_TASK, TASKS
 from lerobot_wmrl.common.errors import FieldError, within
+from lerobot_wmrl.data.budget import Ledger
 from lerobot_wmrl.data.episodes import (
     EpisodeTable,
     choose_episodes,
@@ -29,7 +30,7 @@ from lerobot_wmrl.data.frame_cache import cached_frames, frames_to_tensor
 from lerobot_wmrl.data.frames import Frames, Past
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
-from lerobot_wmrl.maniskill.recordings import scene_splits
+from lerobot_wmrl.maniskill.recordings import require_unreported, scene_splits
 from lerobot_wmrl.maniskill.scenes import scene_for_seed
 from lerobot_wmrl.maniskill.tasks import task_of
 from lerobot_wmrl.rewards.similarity import Features, Similarity
@@ -134,6 +135,31 @@ def chosen_episodes(table: EpisodeTable, source: StartFrames) -> np.ndarray:
     if source.past:
         wanted &= undecided_after(table, source.past)
     return choose_episodes(table, source.split, source.max_starts, scene_splits(scene, source.split), wanted)
+
+
+def check_starts(source: StartFrames, ledger: Ledger | None) -> None:
+    """Raise FieldError for starts from which nothing may be learnt.
+
+    These are starts that results are reported on, and, if there is a ledger, starts that are not in it.
+    """
+    if ledger is not None and not source.root:
+        kind = "frames" if source.frames else "resets"
+        raise FieldError(
+            f"dataset.{kind}", getattr(source, kind), "under a budget, episodes start in recorded ones",
+            "give `dataset.root`",
+        )  # fmt: skip
+    if source.resets and source.split == "ood":
+        raise FieldError(
+            "dataset.split", "ood", "results are reported on unseen scenes: nothing may be learnt in them",
+            "choose ind",
+        )  # fmt: skip
+    if not source.root:
+        return
+    table = read_episodes(open_dataset(source.root, source.repo_id))
+    episodes = chosen_episodes(table, source)
+    require_unreported(table, episodes, "choose others with `dataset.split=ind` or `dataset.scenes`")
+    if ledger is not None:
+        ledger.require_known(table, episodes)
 
 
 def undecided_after(table: EpisodeTable, frames: int) -> np.ndarray:

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 
-from lerobot_wmrl.common.constants import START_COLUMNS
+from lerobot_wmrl.common.constants import EVALUATION_SEED, START_COLUMNS, START_SCENE, START_SEED
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.episodes import parquet_files
+from lerobot_wmrl.data.episodes import EpisodeTable, parquet_files
 from lerobot_wmrl.maniskill.scenes import scenes_of
 
 
@@ -51,3 +51,29 @@ def scene_splits(
         )  # fmt: skip
     held_out = np.isin(scene, [each.index for each in scenes_of("ood")] if unseen is None else list(unseen))
     return {"ind": (scene >= 0) & ~held_out, "ood": (scene >= 0) & held_out}
+
+
+def require_unreported(
+    table: EpisodeTable, episodes: np.ndarray, remedy: str, field: str = "dataset.root"
+) -> None:
+    """Raise FieldError if results are reported on some of the episodes, so that nothing may learn from them.
+
+    These have evaluation seeds, from `EVALUATION_SEED` on, or unseen scenes. A dataset without seeds and
+    scenes passes.
+
+    Args:
+        table: the dataset.
+        episodes: indices of the episodes to learn from. (K,)
+        remedy: how to choose others.
+        field: the setting that names the dataset.
+    """
+    seed, scene = table.column(START_SEED)[episodes], table.column(START_SCENE)[episodes]
+    reported = (seed >= EVALUATION_SEED) | np.isin(scene, [each.index for each in scenes_of("ood")])
+    if reported.any():
+        first = int(np.argmax(reported))
+        raise FieldError(
+            field, table.dataset.root,
+            f"{reported.sum()} of {len(episodes)} episodes to learn from have evaluation seeds or unseen "
+            f"scenes, the first is episode {episodes[first]} (seed {seed[first]}, scene {scene[first]})",
+            f"{remedy}, or record with seeds below {EVALUATION_SEED} in known scenes",
+        )  # fmt: skip

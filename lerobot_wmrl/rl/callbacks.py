@@ -160,12 +160,14 @@ class RolloutRecorder:
         num_workers: simulators at once.
         cameras: names of the recorded cameras.
         depth: whether depth is recorded too.
+        budget: ledger in which the episodes are entered; None without.
     """
 
     env: WmrlManiSkillEnv
     num_workers: int
     cameras: Sequence[str]
     depth: bool
+    budget: Path | None = None
 
     def record(
         self, checkpoint: Path, episodes: int, seed: int, folder: Path, exploration: float = 0.0
@@ -175,8 +177,14 @@ class RolloutRecorder:
             "policy.path": str(checkpoint / PRETRAINED_MODEL_DIR), **env_flags(self.env),
             "env.cameras": str(list(self.cameras)), "depth": self.depth, "num_workers": self.num_workers,
             "num_episodes": episodes, "seed": seed, "exploration": exploration, "output_dir": str(folder),
+            **budget_flags(self.budget),
         }  # fmt: skip
         run_subcommand(["lerobot-wmrl-record", *format_flags(flags)])
+
+
+def budget_flags(budget: Path | None) -> Flags:
+    """Return the flag that keeps a command within the budget of this training, if it has one."""
+    return {} if budget is None else {"budget": str(budget)}
 
 
 def env_flags(env: EnvConfig) -> Flags:

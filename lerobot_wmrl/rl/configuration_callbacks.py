@@ -1,6 +1,7 @@
 """Configuration of what runs between iterations: `--selection.*`, `--gate.*`, `--dyna.*`, `--real_env.*`."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Final
 
 from lerobot.envs.configs import EnvConfig
@@ -96,8 +97,10 @@ class DynaConfig:
 
 @dataclass
 class CallbackSettings:
-    """What runs between iterations, and `real_env`, the environment outside the world model."""
+    """What runs between iterations, `real_env`, the environment outside the world model, and the budget of
+    real episodes."""
 
+    budget: Path | None = None
     real_env: EnvConfig | None = None
     real_num_envs: int = 2
     selection: SelectionConfig = field(default_factory=SelectionConfig)
@@ -113,6 +116,8 @@ class CallbackSettings:
         self._check_dyna_sizes(iterations)
         if self.dyna.rounds:
             self._check_dyna(env)
+        if self.budget is not None and self.selection.freq:
+            self._check_selection_is_imagined(env)
 
     @property
     def simulator(self) -> WmrlManiSkillEnv | None:
@@ -133,6 +138,15 @@ class CallbackSettings:
             require_share(self.gate, "limit")
             require_at_least(self.gate, 0, "freq")
             require_at_least(self.gate, 1, "n_episodes")
+
+    def _check_selection_is_imagined(self, env: EnvConfig) -> None:
+        if self.real_env is not None or not isinstance(env, WorldModelEnv):
+            raise FieldError(
+                "selection.freq", self.selection.freq,
+                "under a budget, selection must be in a world model: its episodes in the simulator would be "
+                "counted nowhere",
+                "leave out `real_env.type`, or `selection.freq`",
+            )  # fmt: skip
 
     def _check_gate_has_labels(self) -> None:
         if not self.gate.dataset.root and self.simulator is None:

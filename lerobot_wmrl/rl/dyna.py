@@ -18,7 +18,7 @@ from lerobot_wmrl.common.processes import run_subcommand
 from lerobot_wmrl.data.episodes import DatasetSource, open_dataset
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.rl.algorithm import TrainingStopped
-from lerobot_wmrl.rl.callbacks import REAL_STEPS, Record, RolloutRecorder, record_folder
+from lerobot_wmrl.rl.callbacks import REAL_STEPS, Record, RolloutRecorder, budget_flags, record_folder
 from lerobot_wmrl.rl.configuration_callbacks import DYNA_SEEDS, DynaConfig
 from lerobot_wmrl.world_models.checkpoint import load_model
 
@@ -49,6 +49,7 @@ class DynaRounds:
         learnt: the dataset that the world model was trained on.
         output_dir: the training's output folder.
         total: iterations of the training.
+        budget: ledger that knows every dataset; None without.
     """
 
     config: DynaConfig
@@ -57,6 +58,7 @@ class DynaRounds:
     learnt: DatasetSource
     output_dir: Path
     total: int
+    budget: Path | None = None
     name: str = "dyna"
 
     def __post_init__(self) -> None:
@@ -121,6 +123,7 @@ class DynaRounds:
             "steps": self.config.steps, "batch_size": self.config.batch_size,
             "save_freq": max(1, self.config.steps // 4), "seed": number, "output_dir": str(output_dir),
             **({"dataset.repo_id": self.learnt.repo_id} if self.learnt.repo_id else {}),
+            **budget_flags(self.budget),
         }  # fmt: skip
         run_subcommand(["lerobot-wmrl-train-world-model", *format_flags(flags)])
 

@@ -37,7 +37,8 @@ def make_callbacks(
         if settings.dyna.rounds:
             learnt, elsewhere = settings.learnt(trained.config), settings.dyna.dataset.roots is not None
             callbacks.append(DynaRounds(
-                settings.dyna, trained.env, None if elsewhere else recorder, learnt, output_dir, iterations
+                settings.dyna, trained.env, None if elsewhere else recorder, learnt, output_dir, iterations,
+                settings.budget,
             ))  # fmt: skip
         if settings.gate.action != "off":
             refreshed = frozenset(round_iterations(settings.dyna.rounds, iterations))
@@ -54,7 +55,7 @@ def make_recorder(settings: CallbackSettings, env: WorldModelVectorEnv) -> Rollo
     if simulator is None:
         return None
     cameras = list(dict.fromkeys([*simulator.cameras, *model.tokenizer.cameras]))
-    return RolloutRecorder(simulator, settings.real_num_envs, cameras, model.depth)
+    return RolloutRecorder(simulator, settings.real_num_envs, cameras, model.depth, settings.budget)
 
 
 def make_measures(settings: CallbackSettings, trained: Trained) -> dict[str, Measure]:

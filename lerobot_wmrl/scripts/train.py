@@ -97,6 +97,9 @@ class TrainConfig(CallbackSettings, RunConfig):
             the same command begins or continues.
         wandb: `--wandb.enable=true` sends the metrics to Weights & Biases too, as lerobot-train does.
         job_name: name of the run in Weights & Biases.
+        budget: ledger of the real episodes that a method may learn from, a JSON file (docs/protocol.md). It
+            must know the episodes of all datasets. Recordings in `real_env` are entered, and so are the steps
+            of a training in the simulator, as rollouts. Selection in a simulator is refused.
         real_env: simulator for selection, gate and Dyna, `--real_env.type=wmrl_maniskill` and its settings.
         real_num_envs: simulators that run at once in `real_env`.
         selection: choice of the checkpoint that is kept as `checkpoints/best`; off by default.
@@ -204,8 +207,10 @@ def train_policy(cfg: TrainConfig) -> None:
     from lerobot.utils.random_utils import set_seed
 
     from lerobot_wmrl.common.policies import load_policy, load_processors
+    from lerobot_wmrl.rl.budget import check_data
 
     check_config(cfg)
+    check_data(cfg, cfg.env)
     config = load_config(cfg)
     PartialState(cpu=config.device == "cpu", timeout=LONGEST_WAIT)
     done = finished(cfg)
@@ -251,6 +256,7 @@ def train_in(
 ) -> None:
     """Check that policy and environment fit, then train."""
     from lerobot_wmrl.common.policies import adopt_features, check_fit, with_new_adapters
+    from lerobot_wmrl.rl.budget import charge_steps
     from lerobot_wmrl.rl.make_callbacks import Trained, make_callbacks
     from lerobot_wmrl.rl.policy_adapters import make_pipeline
     from lerobot_wmrl.rl.rollout import RolloutBuffer
@@ -271,6 +277,9 @@ def train_in(
     callbacks = make_callbacks(cfg, trained, cfg.output_dir, cfg.iterations)
     if rank_and_size()[0] == 0:
         claim_output_dir(cfg.output_dir, settings, MAY_DIFFER)
+        if cfg.budget is not None and not isinstance(cfg.env, WorldModelEnv):
+            steps = cfg.iterations * cfg.num_envs * rank_and_size()[1] * buffer.steps
+            charge_steps(cfg.budget, cfg.output_dir, steps, env.max_episode_steps)
 
     def save_pretrained(folder: Path) -> None:
         for part in (policy, config, *processors, cfg):

@@ -46,6 +46,8 @@ class TrainWorldModelConfig(RunConfig):
         model: `--model.type=frame_tokenizer|action_world_model|text_world_model` and its settings. Or
             `--model.path=FOLDER`, a trained model to train further, and the settings that change.
         dataset: the LeRobotDataset to learn from.
+        budget: ledger of the real episodes that a method may learn from, a JSON file (docs/protocol.md). It
+            must know all episodes of `dataset`.
         output_dir: folder of checkpoints and metrics. If it holds this run already, the run continues.
         steps: optimizer steps.
         batch_size: frames (tokenizer) or clips (world models) in a step. Under `torchrun --nproc_per_node=N`
@@ -67,6 +69,7 @@ class TrainWorldModelConfig(RunConfig):
 
     model: RewardModelConfig = field(default_factory=FrameTokenizerConfig)
     dataset: TrainingData = field(default_factory=TrainingData)
+    budget: Path | None = None
     output_dir: Path = Path("outputs/world_model")
     steps: int = 20_000
     batch_size: int = 8
@@ -107,6 +110,24 @@ def check_processes(cfg: TrainWorldModelConfig, processes: int) -> None:
         )
 
 
+def check_data(cfg: TrainWorldModelConfig, table: EpisodeTable) -> None:
+    """Raise FieldError for an episode that must not be learnt from.
+
+    These are episodes on which results are reported, and, with a budget, those that are not in its ledger.
+    """
+    from lerobot_wmrl.data.budget import Ledger
+    from lerobot_wmrl.data.episodes import open_dataset, read_episodes
+    from lerobot_wmrl.maniskill.recordings import require_unreported
+
+    more = [("dataset.more", read_episodes(open_dataset(root)), None) for root in cfg.dataset.more]
+    for name, each, chosen in (("dataset.root", table, cfg.dataset.episodes), *more):
+        episodes = each.among(chosen).nonzero()[0]
+        learnt = episodes[~each.validation[episodes]]
+        require_unreported(each, learnt, "choose others with `dataset.episodes`", name)
+        if cfg.budget is not None:
+            Ledger(cfg.budget).require_known(each, episodes, name)
+
+
 def train_world_model(cfg: TrainWorldModelConfig) -> None:
     """Build or reload the model, train it, measure it on held-out episodes, publish it."""
     from lerobot.utils.random_utils import set_seed
@@ -124,6 +145,7 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
     processes = PartialState(cpu=cfg.model.device == "cpu", timeout=LONGEST_WAIT)
     check_processes(cfg, processes.num_processes)
     table = read_episodes(open_dataset(cfg.dataset.root, cfg.dataset.repo_id))
+    check_data(cfg, table)
     given = draccus.encode(cfg)
     checkpoint = latest_checkpoint(cfg.output_dir)
     set_seed(cfg.seed)

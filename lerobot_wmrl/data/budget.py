@@ -1,0 +1,211 @@
+"""The ledger of real episodes: how many a method may learn from, and which ones these are.
+
+A study that compares methods at equal real data gives each the same limits. The ledger is one JSON file:
+
+    {"limits": {"demonstrations": 8, "rollouts": 300, "play": 0},
+     "episodes": {"<digest>": {"spent": "rollouts", "dataset": "explored"}, …},
+     "trainings": {"rl": 120}}
+
+An episode is known by a digest of its start and actions, which stays the same when a dataset is merged, split
+or copied.
+"""
+
+import fcntl
+import json
+import os
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from hashlib import sha256
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from lerobot_wmrl.common.constants import KINDS, PLAY, POLICY, START_COLUMNS, START_KIND
+from lerobot_wmrl.common.errors import FieldError, require_at_least
+from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.data.episodes import EpisodeTable
+
+DEMONSTRATIONS: Final = "demonstrations"
+ROLLOUTS: Final = "rollouts"
+IMAGINED: Final = "imagined"
+"""Entry of an episode of a world model: known, but of no cost."""
+
+FIRST_LEDGER: Final = 'write it: {"limits": {"demonstrations": 8, "rollouts": 300, "play": 0}}'
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Numbers of real episodes that a method may learn from.
+
+    Args:
+        demonstrations: planned or taught episodes.
+        rollouts: episodes of a policy.
+        play: episodes without a task.
+    """
+
+    demonstrations: int = 0
+    rollouts: int = 0
+    play: int = 0
+
+    def __post_init__(self) -> None:
+        require_at_least(self, 0, DEMONSTRATIONS, ROLLOUTS, PLAY)
+
+
+@dataclass
+class Entries:
+    """Content of a ledger.
+
+    Args:
+        limits: what may be spent.
+        episodes: digest → what the episode is `spent` on, and the name of its `dataset`'s folder.
+        trainings: folder of a training in the simulator, relative to the ledger → rollouts that it has cost.
+    """
+
+    limits: Limits
+    episodes: dict[str, dict[str, str]] = field(default_factory=dict)
+    trainings: dict[str, int] = field(default_factory=dict)
+
+    def require_left(self, path: Path, wanted: Mapping[str, int]) -> None:
+        """Raise FieldError unless the limits allow the `wanted` episodes too."""
+        spent = Counter(entry["spent"] for entry in self.episodes.values())
+        spent[ROLLOUTS] += sum(self.trainings.values())
+        for name, limit in asdict(self.limits).items():
+            count, left = wanted.get(name, 0), limit - spent[name]
+            if count > left:
+                raise FieldError(
+                    "budget", path, f"{count} more {name} are wanted, {left} of {limit} are left",
+                    "record fewer, or give every method that is compared a larger limit",
+                )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Ledger:
+    """The ledger at `path`. Every change is written whole, and locked against other processes."""
+
+    path: Path
+
+    @classmethod
+    def create(cls, path: Path, limits: Limits) -> "Ledger":
+        """Write an empty ledger, or open the one that is there. FieldError if that has other limits."""
+        ledger = cls(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with ledger._locked():
+            if not path.exists():
+                ledger._write(Entries(limits))
+            elif (found := ledger.read().limits) != limits:
+                raise FieldError(
+                    "budget", path, f"has other limits ({asdict(found)}) than {asdict(limits)}",
+                    "repeat its limits, or choose another file",
+                )  # fmt: skip
+        return ledger
+
+    def read(self) -> Entries:
+        """Return what the file holds. FieldError if it is missing or holds no ledger."""
+        try:
+            content = json.loads(self.path.read_text())
+            limits = Limits(**content["limits"])
+        except FileNotFoundError:
+            raise FieldError("budget", self.path, "there is no such file", FIRST_LEDGER) from None
+        except (ValueError, TypeError, KeyError) as error:
+            raise FieldError("budget", self.path, f"is no ledger ({error})", FIRST_LEDGER) from error
+        return Entries(limits, content.get("episodes", {}), content.get("trainings", {}))
+
+    def require_left(self, wanted: Mapping[str, int]) -> None:
+        """Raise FieldError unless so many more episodes, by what they are spent on, are within the limits."""
+        self.read().require_left(self.path, wanted)
+
+    def charge(self, table: EpisodeTable, imagined: bool = False) -> None:
+        """Enter a dataset's episodes, those that are not there yet.
+
+        Args:
+            table: the dataset.
+            imagined: whether a world model made it; its episodes cost nothing.
+
+        Raises:
+            FieldError: they exceed a limit. Nothing is entered.
+        """
+        kinds = [KINDS[kind] if kind >= 0 else "" for kind in table.column(START_KIND)]
+        spent = [IMAGINED if imagined else spending(kind) for kind in kinds]
+        source = Path(table.dataset.root).name
+        found = dict(zip(episode_digests(table), spent, strict=True))
+        with self._changing() as entries:
+            new = {digest: name for digest, name in found.items() if digest not in entries.episodes}
+            entries.require_left(self.path, Counter(new.values()))
+            entries.episodes |= {digest: {"spent": name, "dataset": source} for digest, name in new.items()}
+
+    def charge_training(self, output_dir: Path, rollouts: int) -> None:
+        """Enter the rollouts of a training in the simulator. A training that is resumed is charged once.
+
+        Args:
+            output_dir: its folder, by which it is known.
+            rollouts: episodes of the whole training.
+
+        Raises:
+            FieldError: they exceed the limit. Nothing is entered.
+        """
+        name = os.path.relpath(output_dir, self.path.parent)
+        with self._changing() as entries:
+            before = entries.trainings.get(name, 0)
+            entries.require_left(self.path, {ROLLOUTS: max(rollouts - before, 0)})
+            entries.trainings[name] = max(rollouts, before)
+
+    def require_known(
+        self, table: EpisodeTable, episodes: Sequence[int] | np.ndarray | None = None,
+        field: str = "dataset.root",
+    ) -> None:  # fmt: skip
+        """Raise FieldError unless the ledger has every episode that is to be learnt from.
+
+        Args:
+            table: the dataset.
+            episodes: indices of the episodes, by default all.
+            field: the setting that names the dataset.
+        """
+        known, digests = self.read().episodes, episode_digests(table)
+        chosen = range(len(digests)) if episodes is None else episodes
+        unknown = [int(episode) for episode in chosen if digests[episode] not in known]
+        if unknown:
+            raise FieldError(
+                field, table.dataset.root,
+                f"{len(unknown)} of {len(chosen)} episodes are not in the budget {self.path}, the first is "
+                f"episode {unknown[0]}",
+                f"record them with lerobot-wmrl-record --budget={self.path}, or choose others",
+            )  # fmt: skip
+
+    @contextmanager
+    def _changing(self) -> Iterator[Entries]:
+        """Yield the entries, and write them unless an error leaves the block."""
+        self.read()  # where there is no ledger, no lock is left
+        with self._locked():
+            entries = self.read()
+            yield entries
+            self._write(entries)
+
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        """Wait until no other process changes the ledger. It is replaced, so a file beside it is locked."""
+        with self.path.with_name(f".{self.path.name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            yield
+
+    def _write(self, entries: Entries) -> None:
+        write_json(self.path, asdict(entries))
+
+
+def spending(kind: str) -> str:
+    """Return what an episode of a kind is spent on."""
+    return {POLICY: ROLLOUTS, PLAY: PLAY}.get(kind, DEMONSTRATIONS)
+
+
+def episode_digests(table: EpisodeTable) -> list[str]:
+    """Return a digest of each episode: sha256 of its task, scene, seed and kind, and its actions. [E]"""
+    starts = np.stack([table.column(name) for name in START_COLUMNS], 1).astype("<i8")  # (E, 4)
+    rows = [
+        table.action[first : first + length] for first, length in zip(table.start, table.length, strict=True)
+    ]
+    return [
+        sha256(start.tobytes() + actions.astype("<f4").tobytes()).hexdigest()
+        for start, actions in zip(starts, rows, strict=True)
+    ]

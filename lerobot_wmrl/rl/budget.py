@@ -1,0 +1,51 @@
+"""What a training by reinforcement learning may learn from, and what it costs in real episodes."""
+
+import math
+from pathlib import Path
+
+from lerobot.envs.configs import EnvConfig
+
+from lerobot_wmrl.common.errors import within
+from lerobot_wmrl.data.budget import Ledger
+from lerobot_wmrl.data.episodes import open_dataset, read_episodes
+from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
+from lerobot_wmrl.envs.start_frames import check_starts
+from lerobot_wmrl.rl.configuration_callbacks import CallbackSettings
+
+
+def check_data(settings: CallbackSettings, env: EnvConfig) -> None:
+    """Raise FieldError for a dataset that a training in `env` must not learn from.
+
+    Starts must not be among those that results are reported on. With a budget its ledger must know the
+    episodes of every dataset that decides something: starts, gate, selection and Dyna rounds.
+    """
+    ledger = None if settings.budget is None else Ledger(settings.budget)
+    if isinstance(env, WorldModelEnv):
+        with within("env"):
+            check_starts(env.dataset, ledger)
+    if ledger is None:
+        return
+    datasets = {
+        "gate.dataset.root": [settings.gate.dataset.root],
+        "selection.dataset.root": [settings.selection.dataset.root],
+        "dyna.learnt.root": [settings.learnt(env).root] if settings.dyna.rounds else [],
+        "dyna.dataset.roots": settings.dyna.dataset.roots or [],
+    }
+    for field, roots in datasets.items():
+        for root in filter(None, roots):
+            ledger.require_known(read_episodes(open_dataset(root)), field=field)
+
+
+def charge_steps(budget: Path, output_dir: Path, steps: int, episode_length: int) -> None:
+    """Enter a training outside a world model in the ledger, its steps counted as the longest episodes.
+
+    Args:
+        budget: the ledger.
+        output_dir: folder of the training.
+        steps: environment steps of the whole training.
+        episode_length: steps of the longest episode.
+
+    Raises:
+        FieldError: so many rollouts are not left.
+    """
+    Ledger(budget).charge_training(output_dir, math.ceil(steps / episode_length))
