@@ -25,6 +25,8 @@ import time
 from pathlib import Path
 from typing import Any, Final
 
+from experiments import budget
+from experiments.budget import StudyError
 from experiments.study import ROOT, Step, Study, read_cells
 from lerobot_wmrl.common.files import write_json
 
@@ -32,19 +34,17 @@ RECORDS: Final = "steps"
 PROVENANCE: Final = "provenance"
 
 
-class StudyError(RuntimeError):
-    """A study cannot go on; the message says why and what to do."""
-
-
 def run_study(study: Study, repeat: bool = False) -> None:
     """Run every step that is not finished.
 
     Raises:
-        StudyError: a needed study is not finished, a command has changed, or a command fails.
+        StudyError: a needed study is not finished, a command has changed, a command fails, or learns from
+            episodes that are not in the study's budget.
     """
     for name in study.needs:
         if not (study.folder_of(name) / RECORDS).is_dir():
             raise StudyError(f"needs {name}: run experiments/{name}.yaml first, or give {name}=FOLDER")
+    budget.begin(study)
     for number, step in enumerate(study.steps, start=1):
         heading = f"[{number}/{len(study.steps)}] {step.name}"
         record = read_record(study, step)
@@ -70,6 +70,7 @@ def run_step(study: Study, step: Step, heading: str) -> None:
     """Print one command, run it, and record that it is finished."""
     if step.fresh:
         delete_output(study, step)
+    checked = budget.check_datasets(study, step)
     print(f"\n{heading}\n$ {step.command}", flush=True)
     commands = Path(sys.executable).parent
     environment = {**os.environ, "PATH": f"{commands}{os.pathsep}{os.environ['PATH']}"}
@@ -77,6 +78,7 @@ def run_step(study: Study, step: Step, heading: str) -> None:
     status = subprocess.run(["bash", "-euo", "pipefail", "-c", step.command], env=environment).returncode
     if status != 0:
         raise StudyError(f"{step.name}: exit status {status}. Run the study again to continue here.")
+    budget.check_datasets(study, step, checked)
     seconds = round(time.monotonic() - began, 1)
     finished = {"command": step.command, "seconds": seconds, "commit": commit(), "machine": machine()}
     write_json(record_path(study, step), finished)

@@ -5,6 +5,8 @@ A file has these keys:
     question   what the study answers
     needs      studies whose folders its commands read; `$gate` is the folder of gate.yaml
     extends    another study, whose keys hold where this one has none of its own
+    budget     real episodes that all its methods may learn from: demonstrations, rollouts, play. `$budget` is
+               the ledger, $output_dir/budget.json, which commands are given as --budget=$budget
     variables  names for commands; a later one may use an earlier one
     cells      variables with a list of values each: the study is run once for every combination, in a folder
                `$cell` of its own, and publishes each one's results as soon as it is finished
@@ -28,9 +30,14 @@ from typing import Any, Final
 
 import yaml
 
+BUDGET: Final = "budget"
+"""Key of the limits, and variable with the ledger."""
+
 ROOT: Final = Path(__file__).parents[1]
 OUTPUTS: Final = Path("outputs/experiments")
-KEYS: Final = {"question", "needs", "extends", "variables", "cells", "steps", "collect", "results"}
+KEYS: Final = {
+    "question", "needs", "extends", "budget", "variables", "cells", "steps", "collect", "results",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -61,11 +68,18 @@ class Study:
     collect: str | None
     results: tuple[str, ...]
     """Paths below docs/, such as `results/rl_comparison.json`."""
+    limits: Mapping[str, int] | None = None
+    """Real episodes by what they are spent on; None without a budget."""
 
     @property
     def folder(self) -> Path:
         """Where everything that the study makes lies."""
         return Path(self.variables["output_dir"])
+
+    @property
+    def budget(self) -> Path:
+        """The ledger of a study with a budget."""
+        return Path(self.variables[BUDGET])
 
     def folder_of(self, study: str) -> Path:
         """The folder of a study that this one needs."""
@@ -117,6 +131,8 @@ def _read_cell(
     needs = tuple(content.get("needs", ()))
     name = "_".join(f"{key}{value}" for key, value in cell.items())
     folders = {"output_dir": str(OUTPUTS / path.stem), **{need: str(OUTPUTS / need) for need in needs}}
+    if BUDGET in content:
+        folders[BUDGET] = "$output_dir/budget.json"
     known = {**folders, **({"cell": name, **cell} if cell else {}), **content.get("variables", {})}
     variables = resolve(known, given, name)
     steps = tuple(step for entry in content["steps"] for step in repeated(entry, variables))
@@ -134,6 +150,15 @@ def _read_cell(
         content.get("collect"),
         tuple(fill(result, variables) for result in content.get("results", ())),
     )
+
+
+def read_limits(budget: Mapping[str, Any], variables: Mapping[str, Any]) -> dict[str, int]:
+    """Return the limits of a budget, with variables filled in. ValueError names one that is no number."""
+    filled = {name: yaml.safe_load(fill(as_text(limit), variables)) for name, limit in budget.items()}
+    for name, limit in filled.items():
+        if not isinstance(limit, int):
+            raise ValueError(f"budget: {name} must be a number of episodes, not {limit}")
+    return filled
 
 
 def read_keys(path: Path) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from experiments.budget import check_commands
 from experiments.run import provenance
 from experiments.study import ROOT, Step, read_study
 from experiments.tables import SECTIONS, results_page
@@ -28,6 +29,11 @@ def test_a_study_writes_into_its_own_folder(name: str) -> None:
     study = STUDIES[name]
     for step in study.steps:
         assert step.output is None or study.folder in [step.output, *step.output.parents], step.name
+
+
+@pytest.mark.parametrize("name", [name for name, study in STUDIES.items() if study.limits])
+def test_every_command_of_a_study_with_a_budget_has_it(name: str) -> None:
+    check_commands(STUDIES[name])
 
 
 @pytest.mark.parametrize("name", STUDIES)
