@@ -149,6 +149,7 @@ def _read_cell(
         steps,
         content.get("collect"),
         tuple(fill(result, variables) for result in content.get("results", ())),
+        read_limits(content[BUDGET], variables) if BUDGET in content else None,
     )
 
 
