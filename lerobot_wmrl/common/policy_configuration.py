@@ -45,6 +45,11 @@ class ClonedConfig(SingleStepConfig):
     optimizer_weight_decay: float = 1e-4
     optimizer_grad_clip_norm: float = 1.0
 
+    @property
+    def chunk_size(self) -> int:
+        """Frames that one prediction acts for; lerobot-train asks for it to weight samples."""
+        return 1
+
     def get_optimizer_preset(self) -> AdamWConfig:
         return AdamWConfig(
             lr=self.optimizer_lr,

@@ -38,7 +38,7 @@ UNDOCUMENTED = {
     "lerobot.datasets.dataset_metadata": {"CODEBASE_VERSION", "LeRobotDatasetMetadata"},
     "lerobot.datasets.depth_utils": {"MM_PER_METRE", "dequantize_depth"},
     "lerobot.datasets.video_utils": {"decode_video_frames"},
-    "lerobot.envs.utils": {"FreezeAfterEpisodeEnd"},
+    "lerobot.envs.utils": {"FreezeAfterEpisodeEnd", "env_to_policy_features"},
     "lerobot.optim.optimizers": {"AdamWConfig"},
     "lerobot.optim.schedulers": {"CosineDecayWithWarmupSchedulerConfig", "LRSchedulerConfig"},
     "lerobot.policies.factory": {"get_policy_class", "make_pre_post_processors"},

@@ -173,9 +173,9 @@ def test_a_cell_whose_results_are_published_is_left_out(
 ) -> None:
     path = tmp_path / "sizes.yaml"
     path.write_text(CELLS)
-    flags = [str(path), f"output_dir={tmp_path / 'out'}", f"--docs={tmp_path / 'docs'}"]
     for given, ran in ((["size=1"], 2), ([], 2), ([], 0)):
-        monkeypatch.setattr(sys, "argv", ["run", *flags, *given])
+        places = f"output_dir={tmp_path / 'out'}", f"--docs={tmp_path / 'docs'}"
+        monkeypatch.setattr(sys, "argv", ["run", str(path), *given, *places])
         main()
         assert capfd.readouterr().out.count("$ mkdir") == ran
 

@@ -3,8 +3,10 @@
 from pathlib import Path
 from typing import Any
 
+import draccus
 import pytest
 import torch
+from lerobot.configs import PreTrainedConfig
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.configs.types import FeatureType, PolicyFeature
@@ -275,3 +277,12 @@ def test_a_published_policy_is_the_trained_one_and_its_card_says_what_it_is(
     prepared = pre(dict(batch))
     loaded = CnnPolicy.from_pretrained("somebody/cnn")
     assert torch.equal(loaded.select_action(prepared), policy.select_action(prepared))
+
+
+def test_a_chunk_of_one_action_is_no_setting_that_is_saved(tmp_path: Path) -> None:
+    """lerobot-train asks for `chunk_size` where it weights samples."""
+    config = CnnConfig(device="cpu")
+    assert config.chunk_size == 1
+    assert "chunk_size" not in draccus.encode(config)
+    config._save_pretrained(tmp_path)
+    assert PreTrainedConfig.from_pretrained(tmp_path) == config
