@@ -29,6 +29,8 @@ class DistillationConfig(RLAlgorithmConfig):
             draws a number, the first takes 0.
         updates: optimizer steps in each iteration.
         last_updates: optimizer steps in the last iteration, on all labels.
+        recorded: whether the policy also learns from the successful episodes of `env.dataset`, if there are
+            any.
         batch_size: labels in an optimizer step, in each process of `torchrun`.
     """
 
@@ -36,6 +38,7 @@ class DistillationConfig(RLAlgorithmConfig):
     longest_lead: int = 16
     updates: int = 150
     last_updates: int = 1000
+    recorded: bool = True
     batch_size: int = 32
 
     def __post_init__(self) -> None:

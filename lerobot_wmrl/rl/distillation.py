@@ -24,7 +24,7 @@ from lerobot_wmrl.common.policies import load_trained_weights
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
-from lerobot_wmrl.rl.labels import Labels, action_chunks
+from lerobot_wmrl.rl.labels import Labels, Part, action_chunks, recorded_successes
 from lerobot_wmrl.rl.observations import TASK
 from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer
@@ -48,7 +48,7 @@ class Distillation(RLAlgorithm):
 
     In each iteration the policy acts for some steps, and then the planner until success or the end. Its
     actions in episodes that succeeded become labels, and the policy takes steps on its supervised loss over
-    the labels of all iterations.
+    the labels of all iterations and the successful episodes of the dataset.
 
     Args:
         policy: any policy of LeRobot that lerobot-train can train, trained in place.
@@ -104,12 +104,17 @@ class Distillation(RLAlgorithm):
             last: whether this is the training's last iteration.
         """
         started = time.perf_counter()
+        if self.config.recorded and not self.labels.recorded:
+            model = env.model.config
+            self.labels.recorded = recorded_successes(
+                env.config.dataset, model.tokenizer.camera_keys, model.state_size, self.chunk
+            )
         shown = self.demonstrate(env, pipeline, rollout, seed)
         rows = shown.labelled.nonzero()
         part = rollout.observations.read_stored((rows[:, 0] * env.num_envs + rows[:, 1]).cpu())
         part |= action_chunks(shown.actions, shown.labelled, self.chunk)
-        self.labels.add(self.iteration, part, list(rollout.observations.instructions))
-        if not min(gather_counts(len(self.labels), env.device)):
+        self.labels.add(self.iteration, Part(part, list(rollout.observations.instructions)))
+        if not min(gather_counts(sum(map(len, self.labels.imagined)), env.device)):
             raise TrainingStopped(
                 f"iteration {self.iteration + 1}: the planner has not succeeded in any imagined episode, so "
                 "there is nothing to learn from: raise `algorithm.planner.samples` or "

@@ -1,21 +1,45 @@
 """Observations labelled with actions to imitate, on the CPU and on disk. N labels, n steps of a chunk."""
 
 import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
-from lerobot.utils.constants import ACTION
+from lerobot.utils.constants import ACTION, OBS_STATE
 from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from lerobot_wmrl.data.episodes import open_dataset, read_episodes
+from lerobot_wmrl.data.frame_cache import cached_frames
+from lerobot_wmrl.envs.configuration_world_model import StartFrames
+from lerobot_wmrl.envs.start_frames import chosen_episodes
 from lerobot_wmrl.rl.observations import TASK, decoded
 from lerobot_wmrl.rl.policy_adapters import ACTION_IS_PAD
 
 
+@dataclass(frozen=True)
+class Part:
+    """N labels from one place.
+
+    Args:
+        tensors: observations with images as bytes, `task` as an index into the instructions, `action`, and
+            for chunks `action_is_pad`; (N, …) each.
+        instructions: of the tasks.
+    """
+
+    tensors: dict[str, Tensor]
+    instructions: list[str]
+
+    def __len__(self) -> int:
+        return len(self.tensors[ACTION])
+
+
 class Labels:
-    """Labels of all iterations, one file each, so that a resumed training has them too.
+    """Labels of a dataset, and those of all iterations, one file each, so that a resumed training has them.
 
     Args:
         folder: of the files.
@@ -24,31 +48,24 @@ class Labels:
 
     def __init__(self, folder: Path, process: int) -> None:
         self.folder, self.process = folder, process
-        self.parts: list[dict[str, Tensor]] = []
-        self.instructions: list[list[str]] = []
+        self.recorded: list[Part] = []
+        self.imagined: list[Part] = []
 
     def __len__(self) -> int:
-        return sum(len(part[ACTION]) for part in self.parts)
+        return sum(map(len, (*self.recorded, *self.imagined)))
 
     def path(self, iteration: int) -> Path:
         """Return the file of an iteration."""
         return self.folder / f"{iteration:06d}-{self.process}.safetensors"
 
-    def add(self, iteration: int, part: dict[str, Tensor], instructions: list[str]) -> None:
-        """Add an iteration's labels, on disk first.
-
-        Args:
-            iteration: that made them.
-            part: observations with images as bytes, `task` as an index into the instructions, `action`, and
-                for chunks `action_is_pad`; (N, …) each.
-            instructions: of the tasks.
-        """
+    def add(self, iteration: int, part: Part) -> None:
+        """Add an iteration's labels, on disk first."""
         self.folder.mkdir(parents=True, exist_ok=True)
         partial = self.path(iteration).with_suffix(".partial")
-        part = {name: value.cpu().contiguous() for name, value in part.items()}
-        save_file(part, partial, {"instructions": json.dumps(instructions)})
+        tensors = {name: value.cpu().contiguous() for name, value in part.tensors.items()}
+        save_file(tensors, partial, {"instructions": json.dumps(part.instructions)})
         partial.replace(self.path(iteration))
-        self._append(part, instructions)
+        self._append(Part(tensors, part.instructions))
 
     def load(self, iterations: int) -> None:
         """Read the labels of the iterations before `iterations`, in place of those in memory.
@@ -56,33 +73,65 @@ class Labels:
         Raises:
             FileNotFoundError: a file is missing.
         """
-        self.parts, self.instructions = [], []
+        self.imagined = []
         for iteration in range(iterations):
             with safe_open(self.path(iteration), framework="pt") as file:
-                part = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-                self._append(part, json.loads(file.metadata()["instructions"]))
+                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+                self._append(Part(tensors, json.loads(file.metadata()["instructions"])))
 
     def draw(self, count: int) -> dict[str, Any]:
         """Draw a batch of labels at random, as LeRobot's datasets would give them: images in [0, 1]."""
-        ends = torch.tensor([len(part[ACTION]) for part in self.parts]).cumsum(0)
+        parts = [*self.recorded, *self.imagined]
+        ends = torch.tensor([len(part) for part in parts]).cumsum(0)
         drawn = torch.randint(int(ends[-1]), (count,))
         part_of = torch.searchsorted(ends, drawn, right=True)
         taken: list[dict[str, Any]] = []
         for index in part_of.unique().tolist():
-            part, begin = self.parts[index], int(ends[index - 1]) if index else 0
+            part, begin = parts[index], int(ends[index - 1]) if index else 0
             rows = drawn[part_of == index] - begin
-            chosen = {name: value[rows] for name, value in part.items()}
-            taken.append(decoded(chosen, self.instructions[index]))
+            chosen = {name: value[rows] for name, value in part.tensors.items()}
+            taken.append(decoded(chosen, part.instructions))
         return {
             name: [text for batch in taken for text in batch[name]] if name == TASK
             else torch.cat([batch[name] for batch in taken])
             for name in taken[0]
         }  # fmt: skip
 
-    def _append(self, part: dict[str, Tensor], instructions: list[str]) -> None:
-        if len(part[ACTION]):
-            self.parts.append(part)
-            self.instructions.append(instructions)
+    def _append(self, part: Part) -> None:
+        if len(part):
+            self.imagined.append(part)
+
+
+def recorded_successes(
+    source: StartFrames, cameras: Sequence[str], state_size: int, chunk: int
+) -> list[Part]:
+    """Return the actions of a dataset's successful episodes as labels; nothing without a dataset or success.
+
+    Args:
+        source: the episodes, those of its split, tasks and scenes.
+        cameras: keys of the images.
+        state_size: components of the state, 0 for observations without it.
+        chunk: actions of a chunk, n; 0 for policies without chunks.
+    """
+    if not source.root:
+        return []
+    table = read_episodes(open_dataset(source.root, source.repo_id))
+    episodes = chosen_episodes(table, replace(source, max_starts=len(table.start)))
+    episodes = episodes[table.success[episodes]]
+    if not len(episodes):
+        return []
+    steps = np.arange(table.length[episodes].max())[:, None]  # (T, E) below
+    acting = torch.from_numpy(steps < table.length[episodes])
+    rows = np.minimum(table.start[episodes] + steps, table.start[episodes] + table.length[episodes] - 1)
+    labels = action_chunks(torch.from_numpy(table.action[rows]), acting, chunk)
+    step, episode = acting.nonzero(as_tuple=True)
+    chosen = rows[step, episode]
+    frames = torch.from_numpy(cached_frames(table.dataset, cameras)[chosen]).permute(1, 0, 4, 2, 3)
+    labels |= dict(zip(cameras, frames.contiguous(), strict=True))
+    if state_size:
+        labels[OBS_STATE] = torch.from_numpy(table.state[chosen])
+    labels[TASK] = episode
+    return [Part(labels, [table.instructions[each] for each in episodes])]
 
 
 def action_chunks(actions: Tensor, labelled: Tensor, length: int) -> dict[str, Tensor]:

@@ -14,9 +14,11 @@ from torch import Tensor
 
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.tracking import read_metrics
+from lerobot_wmrl.data.episodes import read_episodes
+from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
-from lerobot_wmrl.rl.labels import Labels, action_chunks
+from lerobot_wmrl.rl.labels import Labels, Part, action_chunks, recorded_successes
 from lerobot_wmrl.scripts.train import main
 from lerobot_wmrl.world_models.configuration_planner import PlannerSettings
 from tests.rl.act_checkpoint import save_small_act
@@ -26,8 +28,8 @@ FAST = [
     "--algorithm.type=distillation", "--algorithm.planner.horizon=6", "--algorithm.planner.samples=4",
     "--algorithm.planner.elites=2", "--algorithm.planner.iterations=1", "--algorithm.planner.knots=3",
     "--algorithm.planner.execute=2", "--algorithm.longest_lead=2", "--algorithm.updates=2",
-    "--algorithm.last_updates=3", "--algorithm.batch_size=4", "--num_envs=3", "--iterations=3",
-    "--save_freq=1",
+    "--algorithm.last_updates=3", "--algorithm.batch_size=4", "--algorithm.recorded=false",
+    "--num_envs=3", "--iterations=3", "--save_freq=1",
 ]  # fmt: skip
 
 
@@ -91,6 +93,41 @@ def test_nothing_is_labelled_after_an_episode_has_ended(
     flags = [f"--policy.path={policy}", *FAST, "--iterations=1", *imagined]
     train(monkeypatch, *flags, f"--output_dir={output_dir}")
     assert read_metrics(output_dir)[-1]["labels"] == 2 + 4 + 4
+
+
+@pytest.mark.parametrize("chunk", [0, 3])
+def test_recorded_successes_are_labels_as_they_were_recorded(small_dataset: LeRobotDataset, chunk: int):
+    camera = "observation.images.third_view"
+    source = StartFrames(root=str(small_dataset.root), max_starts=1)
+    (part,) = recorded_successes(source, [camera], state_size=8, chunk=chunk)
+    table = read_episodes(small_dataset)
+    episodes = table.success.nonzero()[0]
+    assert len(part) == table.length[episodes].sum()
+    last = [small_dataset[int(table.start[each] + table.length[each] - 1)] for each in episodes]
+    for episode, row in zip(range(len(episodes)), last, strict=True):
+        end = int((part.tensors["task"] == episode).nonzero()[-1])  # labels are in the order of their steps
+        image = part.tensors[camera][end].float() / 255
+        assert (image - row[camera]).abs().max() < 0.01
+        assert torch.equal(part.tensors["observation.state"][end], row["observation.state"])
+        actions = part.tensors["action"][end].reshape(-1, 7)
+        assert torch.equal(actions, row["action"].expand(max(1, chunk), 7))
+        assert part.instructions[episode] == row["task"]
+
+
+def test_recorded_successes_are_learnt_too_and_a_resumed_training_reads_them_again(
+    imagined: list[str], small_dataset: LeRobotDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy, output_dir = save_untrained_policy(tmp_path / "policy", actions=7), tmp_path / "rl"
+    flags = [f"--policy.path={policy}", *FAST, "--algorithm.recorded=true", *imagined]
+    train(monkeypatch, *flags, f"--output_dir={output_dir}")
+    table = read_episodes(small_dataset)
+    recorded = table.length[table.success.nonzero()[0]].sum()
+    assert recorded
+    assert read_metrics(output_dir)[0]["labels"] == recorded + 3 * 4
+    after = weights(output_dir)
+    shutil.rmtree(output_dir / "checkpoints" / "000003")
+    train(monkeypatch, *flags, f"--output_dir={output_dir}")
+    assert all(torch.equal(value, after[name]) for name, value in weights(output_dir).items())
 
 
 def test_policies_of_chunks_learn_chunks(
@@ -163,7 +200,7 @@ def test_labels_are_the_same_when_they_are_read_again(tmp_path: Path):
             "action": iteration + torch.arange(float(count))[:, None] / 10,
             "task": torch.zeros(count, dtype=torch.long),
         }
-        labels.add(iteration, part, [f"task {iteration}"])
+        labels.add(iteration, Part(part, [f"task {iteration}"]))
     again = Labels(tmp_path, 0)
     again.load(3)
     assert len(again) == len(labels) == 6
