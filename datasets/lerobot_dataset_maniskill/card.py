@@ -190,8 +190,13 @@ def frames_to_success(dataset: LeRobotDataset) -> np.ndarray:
         end = min(int(success.argmax()) + 2, end)  # success shows in the frame after its row
     rows = [dataset[int(index)] for index in evenly_spaced(end, FRAMES)]
     coloured = [name for name in dataset.meta.camera_keys if name not in dataset.meta.depth_keys]
-    cameras = [np.stack([row[name].numpy() for row in rows]) for name in coloured]
+    cameras = [np.stack([as_bytes(row[name].numpy()) for row in rows]) for name in coloured]
     return np.concatenate(cameras, 2).transpose(0, 2, 3, 1)
+
+
+def as_bytes(image: np.ndarray) -> np.ndarray:
+    """Return an image as uint8; LeRobot reads stored images, unlike videos, as floats in [0, 1]."""
+    return image if image.dtype == np.uint8 else (255 * image).round().astype(np.uint8)
 
 
 DEPTH = "- `observation.images.<camera>_depth`: LeRobot depth maps, millimetres along the camera's axis.\n"
@@ -245,7 +250,7 @@ Those with split `ind` may be trained on; those with `ood` are held out.
 
 ## Columns
 
-- {cameras}: video of {size}x{size} pixels.
+- {cameras}: pictures of {size}x{size} pixels.
 {depth}- `observation.state`: TCP position (m), TCP quaternion (wxyz), gripper opening in [0, 1].
 - `action`: commanded TCP delta (m), rotation (rad) in base axes, gripper in [-1, 1] (+1 opens), inside the
   box from {low} to {high}.

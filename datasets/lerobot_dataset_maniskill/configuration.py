@@ -67,6 +67,10 @@ class RecordConfig(RunConfig):
     depth: bool = False
     """Also record every camera's depth, as LeRobot's depth maps (observation.images.<camera>_depth)."""
 
+    video: bool = True
+    """Store the cameras as videos. As images (false) the dataset takes more space, and lerobot-train reads it
+    faster: single frames need no decoding of a video."""
+
     kinds: dict[str, float] = field(default_factory=default_kinds)
     """Share of each kind of planned trajectory; the shares need not sum to 1."""
 
@@ -239,6 +243,7 @@ class RecordConfig(RunConfig):
         return {
             **(self._simulated_content() if self.imagination is None else imagined_content(self.imagination)),
             "depth": self.depth,
+            **({} if self.video else {"video": False}),
             "episode_length": self.env.episode_length,
             "num_episodes": self.num_episodes,
             "part_episodes": self.part_episodes,

@@ -141,7 +141,7 @@ def whole_part(
     """Yield an empty dataset to fill; unless an error is raised, move it to `folder` as the part."""
     partial = folder / f".{part.name}.{os.getpid()}.partial"
     shutil.rmtree(partial, ignore_errors=True)
-    dataset = create_dataset(partial, config.dataset_id, cameras, image_size, config.depth)
+    dataset = create_dataset(partial, config.dataset_id, cameras, image_size, config.depth, config.video)
     yield dataset
     dataset.finalize()
     partial.replace(folder / part.name)

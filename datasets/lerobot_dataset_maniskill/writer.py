@@ -47,12 +47,18 @@ def depth_encoder() -> DepthEncoderConfig:
     return DepthEncoderConfig(depth_min=0.0, depth_max=2.5, use_log=False, extra_options=quiet)
 
 
-def dataset_features(cameras: Sequence[str], image_size: int, depth: bool) -> dict[str, dict[str, Any]]:
-    """Return LeRobot's description of the columns."""
-    camera_columns = {f"observation.images.{camera}": _video_feature(image_size, 3) for camera in cameras}
+def dataset_features(
+    cameras: Sequence[str], image_size: int, depth: bool, video: bool = True
+) -> dict[str, dict[str, Any]]:
+    """Return LeRobot's description of the columns. Depth is always video."""
+    kind = "video" if video else "image"
+    camera_columns = {
+        f"observation.images.{camera}": _camera_feature(kind, image_size, 3) for camera in cameras
+    }
     if depth:
         camera_columns |= {
-            f"observation.images.{camera}_depth": _video_feature(image_size, 1) for camera in cameras
+            f"observation.images.{camera}_depth": _camera_feature("video", image_size, 1)
+            for camera in cameras
         }
     scalars = {
         "next.reward": "float32",
@@ -69,20 +75,21 @@ def dataset_features(cameras: Sequence[str], image_size: int, depth: bool) -> di
     }
 
 
-def _video_feature(image_size: int, channels: int) -> dict[str, Any]:
+def _camera_feature(kind: str, image_size: int, channels: int) -> dict[str, Any]:
     """Return the description of a camera's column; one channel is depth."""
     shape = (image_size, image_size, channels)
     info = {"info": {"is_depth_map": True}} if channels == 1 else {}
-    return {"dtype": "video", "shape": shape, "names": ["height", "width", "channels"], **info}
+    return {"dtype": kind, "shape": shape, "names": ["height", "width", "channels"], **info}
 
 
 def create_dataset(
-    root: Path, repo_id: str, cameras: Sequence[str], image_size: int, depth: bool = False
-) -> LeRobotDataset:
+    root: Path, repo_id: str, cameras: Sequence[str], image_size: int, depth: bool = False,
+    video: bool = True,
+) -> LeRobotDataset:  # fmt: skip
     """Create an empty dataset at `root`, which must not exist."""
     return LeRobotDataset.create(
-        repo_id, FPS, dataset_features(cameras, image_size, depth), root=root, robot_type="panda",
-        use_videos=True, streaming_encoding=True, encoder_threads=1,
+        repo_id, FPS, dataset_features(cameras, image_size, depth, video), root=root, robot_type="panda",
+        use_videos=video or depth, streaming_encoding=True, encoder_threads=1,
         rgb_encoder=video_encoder(), depth_encoder=depth_encoder(),
     )  # fmt: skip
 

@@ -20,6 +20,8 @@ from lerobot_dataset_maniskill.manifest import planned_parts
 from lerobot_dataset_maniskill.recorder import follow_workers, missing_parts, record
 from lerobot_dataset_maniskill.writer import HOLD_FRAMES, find_damage
 from lerobot_wmrl.common.constants import KINDS, STATE_NAMES
+from lerobot_wmrl.data.episodes import open_dataset
+from lerobot_wmrl.data.frame_cache import cached_frames
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
@@ -171,3 +173,17 @@ def test_a_worker_that_is_killed_does_not_leave_the_command_waiting() -> None:
     finally:
         waiting.kill()
         waiting.join()
+
+
+def test_stored_images_are_what_the_camera_saw_and_read_like_videos(tmp_path: Path) -> None:
+    shown = {}
+    for video in (True, False):
+        record(config(tmp_path / str(video), num_episodes=2, video=video))
+        root = tmp_path / str(video) / "dataset"
+        assert (root / "README.md").is_file()
+        dataset = open_dataset(root)
+        shown[video] = cached_frames(dataset, dataset.meta.camera_keys).astype(int)
+        assert bool(list(root.rglob("*.mp4"))) is video
+    assert shown[True].shape == shown[False].shape
+    difference = np.abs(shown[True] - shown[False])
+    assert 0 < difference.mean() < 4, "a video is compressed with losses, an image is not"
