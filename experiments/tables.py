@@ -7,20 +7,22 @@ python -m experiments.tables --check
 import argparse
 import json
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 from experiments import policy_sections as policies
+from experiments import value_sections as value
 from experiments import world_model_sections as world_models
 from experiments.cells import Load
-from experiments.study import ROOT, Study, read_study
+from experiments.study import ROOT, Study, read_cells
 from lerobot_wmrl.common.files import write_text
 
 DOCS: Final = ROOT / "docs"
 STUDIES: Final = ROOT / "experiments"
 
 SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
+    "value_push": ("Policies", value.value_push),
     "demo": ("Policies", policies.demo),
     "cloning_control": ("Policies", policies.cloning_control),
     "rl_comparison": ("Policies", policies.rl_comparison),
@@ -63,21 +65,29 @@ Each section is a question, its answer, one table and its limits. The page is ge
 """
 
 
-def results_page(docs: Path = DOCS) -> str:
-    """Return docs/results.md."""
+def loader(docs: Path) -> Load:
+    """Return what reads a file of docs/results by its stem."""
 
     def load(stem: str) -> dict[str, Any]:
         content: dict[str, Any] = json.loads((docs / "results" / f"{stem}.json").read_text())
         return content
 
+    return load
+
+
+def results_page(docs: Path = DOCS) -> str:
+    """Return docs/results.md."""
+
+    load = loader(docs)
     parts, chapter = [INTRODUCTION], ""
     for name, (title, section) in SECTIONS.items():
         if title != chapter:
             chapter = title
             parts.append(f"## {chapter}\n")
-        study = read_study(STUDIES / f"{name}.yaml")
+        cells = read_cells(STUDIES / f"{name}.yaml")
         parts.append(
-            f'### {study.question}<a id="{name}"></a>\n\n{joined(section(load))}\n\n{origin(study, load)}\n'
+            f'### {cells[0].question}<a id="{name}"></a>\n\n{joined(section(load))}\n\n'
+            f"{origin(cells, load, docs)}\n"
         )
     return "\n".join(parts)
 
@@ -88,17 +98,24 @@ def joined(text: str) -> str:
     return "\n\n".join(block if block.startswith("|") else " ".join(block.split()) for block in blocks)
 
 
-def origin(study: Study, load: Load) -> str:
-    """Return the line that says where numbers come from and how to repeat them."""
-    sources = [load(Path(result).stem)["provenance"] for result in study.results if result.endswith(".json")]
+def origin(cells: Sequence[Study], load: Load, docs: Path) -> str:
+    """Return the line that says where numbers come from and how to repeat them: of published cells alone."""
+    results = [
+        result
+        for study in cells
+        for result in study.results
+        if result.endswith(".json") and (len(cells) == 1 or (docs / result).exists())
+    ]
+    sources = [
+        load(result.removeprefix("results/").removesuffix(".json"))["provenance"] for result in results
+    ]
     commits = ", ".join(dict.fromkeys(source["commit"] for source in sources))
     machines = "; ".join(dict.fromkeys(source["machine"] for source in sources if "machine" in source))
-    files = ", ".join(
-        f"[{Path(result).name}]({result})" for result in study.results if result.endswith(".json")
-    )
     where = f", {machines}" if machines else ""
     where += "".join(f". {source['note']}" for source in sources if "note" in source).removesuffix(".")
-    return f"*Commit {commits}{where}; {files}; `python -m experiments.run experiments/{study.name}.yaml`*"
+    parts = [f"Commit {commits}{where}"] if sources else []
+    parts += [", ".join(f"[{Path(result).name}]({result})" for result in results)] if results else []
+    return f"*{'; '.join([*parts, f'`python -m experiments.run experiments/{cells[0].name}.yaml`'])}*"
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -117,6 +134,7 @@ def main() -> None:
         if not target.exists() or target.read_text() != page:
             sys.exit("docs/results.md is not what the JSON says: run python -m experiments.tables")
         return
+    value.draw_value(loader(DOCS), "value_push", DOCS / "images" / "value_push.png")
     write_text(target, page)
     print(f"wrote {target.relative_to(ROOT)}")
 

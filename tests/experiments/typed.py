@@ -37,7 +37,7 @@ class Stopped(BaseException):
 
 def words_of(command: str) -> list[str]:
     """Split a command, the last one of a list. What the shell would insert is the number 0 here."""
-    inserted = re.sub(r"\$\([^)]*\)|\$episodes", "0", command)
+    inserted = re.sub(r"\$\(\(.*?\)\)|\$\([^)]*\)|\$episodes", "0", command)
     words = shlex.split(inserted.rpartition("&&")[2])
     return words[2:] if words[0] == "env" else words
 

@@ -1,0 +1,97 @@
+"""What imagination is worth: a cell is collected, and the section says what the cells hold."""
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from experiments import value
+from experiments.run import record_path
+from experiments.study import ROOT, read_cells
+from experiments.tables import loader
+from experiments.value_sections import TITLES, best, draw_value, gain, groups, value_push
+from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.common.statistics import RunsMean
+
+STUDY = ROOT / "experiments" / "value_push.yaml"
+SUCCESSES = {"cloning": 5, "filtered": 7, "weighted": 6, "conditioned": 6, "distilled": 9}
+
+
+def made_up_cell(demonstrations: int, seed: int) -> dict[str, Any]:
+    """Ten starts, of which each method succeeds in the first ones; one more in the second seed."""
+    methods = {}
+    for name, successes in SUCCESSES.items():
+        k = successes + bool(seed)
+        rate = {"outcomes": [1] * k + [0] * (10 - k)}
+        methods[name] = {"ind": rate, "ood": rate, "minutes": 2.0}
+    return {"demonstrations": demonstrations, "rollouts": 300, "seed": seed, "methods": methods}
+
+
+@pytest.fixture
+def docs(tmp_path: Path) -> Path:
+    """Two seeds of one budget are published, of nine cells."""
+    for cell in read_cells(STUDY, ["demonstrations=8", "seed=[0,100000]"]):
+        content = made_up_cell(8, cell.variables["seed"])
+        write_json(tmp_path / "results" / "value_push" / f"{cell.variables['cell']}.json", content)
+    return tmp_path
+
+
+def test_the_section_compares_the_best_with_and_without_a_world_model(docs: Path) -> None:
+    cells = groups(loader(docs), "value_push")[8, 300]
+    assert len(cells) == 2
+    assert best(cells, ["cloning", "filtered", "weighted"], "ind") == "filtered"
+    change = gain(cells, "distilled", "filtered", "ood")
+    assert change.mean == pytest.approx(0.2)
+    assert change.low < 0.2 < change.high
+    text = value_push(loader(docs))
+    assert "the planner distilled in imagination against cloning of demonstrations and successful" in text
+    assert "+20.0 points" in text
+    assert "| 8 | 300 | cloning of the demonstrations | 50, 60 → 55 %" in text
+
+
+def test_the_figure_has_a_line_for_every_method(docs: Path) -> None:
+    path = docs / "images" / "value.png"
+    draw_value(loader(docs), "value_push", path)
+    assert path.stat().st_size > 10_000
+
+
+def test_without_a_cell_the_section_says_so(tmp_path: Path) -> None:
+    assert value_push(loader(tmp_path)) == "No cell of this study has been run yet."
+    draw_value(loader(tmp_path), "value_push", tmp_path / "value.png")
+    assert not (tmp_path / "value.png").exists()
+
+
+def test_a_cell_keeps_outcomes_and_minutes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    study = read_cells(STUDY, ["demonstrations=8", "seed=0", f"output_dir={tmp_path}"])[0]
+    for name, k in SUCCESSES.items():
+        for domain in ("ind", "ood"):
+            task = {"metrics": {"successes": [True] * k + [False] * (10 - k)}}
+            write_json(study.folder / f"eval_{name}_{domain}" / "eval_info.json", {"per_task": [task]})
+    table = {"episode": np.arange(308), "success": np.arange(308) < 140}
+    monkeypatch.setattr(value, "recorded_episodes", lambda root: table)
+    with pytest.raises(ValueError, match="step cloning is not finished"):
+        value.cell(study)
+    for step in study.steps:
+        write_json(record_path(study, SimpleNamespace(name=step.name)), {"seconds": 60.0})
+    (content,) = value.cell(study).values()
+    assert (content["real_episodes"], content["real_successes"]) == (308, 140)
+    assert content["methods"]["distilled"]["minutes"] == 5
+    assert content["methods"]["filtered"]["ind"]["outcomes"] == [1] * 7 + [0] * 3
+    assert content["methods"].keys() == TITLES.keys()
+    json.dumps(content)
+
+
+def test_an_interval_over_runs_and_starts_covers_the_mean_of_both() -> None:
+    """Runs and starts have effects of their own; the interval misses the true mean in few cases."""
+    rng, missed = np.random.default_rng(0), {"both": 0, "starts": 0}
+    for _ in range(60):
+        rate = 0.5 + rng.normal(0, 0.1, (8, 1)) + rng.normal(0, 0.15, (1, 60))
+        found = (rng.random((8, 60)) < rate).astype(float)
+        both, pooled = RunsMean.over(found), RunsMean.over(found.reshape(1, -1))
+        missed["both"] += not both.low <= 0.5 <= both.high
+        missed["starts"] += not pooled.low <= 0.5 <= pooled.high
+    assert missed["both"] <= 8
+    assert missed["starts"] > 2 * missed["both"], "outcomes of the same runs are not independent"
