@@ -1,13 +1,14 @@
 """What imagination is worth: its section of docs/results.md, and the figure, from published cells."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from experiments.cells import Load, table
+from experiments.cells import Load, points, table
 from experiments.figures import DOMAINS
 from experiments.study import ROOT, read_cells
 from lerobot_wmrl.common.statistics import RunsMean
@@ -71,7 +72,7 @@ def value_push(load: Load) -> str:
             change = gain(cells, ours, rival, domain)
             sentences.append(
                 f"With {demonstrations} demonstrations and {rollouts} rollouts, {DOMAINS[domain]}, seeds: "
-                f"{len(cells)}: the {TITLES[ours]} against {TITLES[rival]}, {points(change)}."
+                f"{len(cells)}: the {TITLES[ours]} against {TITLES[rival]}, {points(asdict(change))}."
             )
         rows += [
             [demonstrations, rollouts, title, *(shares(cells, method, domain) for domain in ("ind", "ood")),
@@ -96,12 +97,6 @@ def shares(cells: Sequence[Cell], method: str, domain: str) -> str:
     each = ", ".join(f"{100 * sum(run) / len(run):.0f}" for run in found)
     mean = RunsMean.over(found)
     return f"{each} → {100 * mean.mean:.0f} % ({100 * mean.low:.0f}–{100 * mean.high:.0f})"
-
-
-def points(change: RunsMean) -> str:
-    """`+3.0 points (-1.0 to +7.0)`."""
-    mean, low, high = (100 * value for value in (change.mean, change.low, change.high))
-    return f"{mean:+.1f} points ({low:+.1f} to {high:+.1f})"
 
 
 def draw_value(load: Load, study: str, path: Path) -> None:
