@@ -4,13 +4,11 @@ import json
 import shutil
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.envs.configs import EnvConfig
 
 from lerobot_wmrl.data.budget import Ledger, Limits
 from lerobot_wmrl.data.episodes import read_episodes
@@ -21,7 +19,7 @@ from lerobot_wmrl.scripts.train import TrainConfig
 from lerobot_wmrl.scripts.train import main as train
 from lerobot_wmrl.scripts.train_world_model import main as train_world_model
 from tests.rl.checkpoints import save_untrained_policy
-from tests.rl.point_env import PointEnv
+from tests.scripts.point_config import PointConfig
 
 TOKENIZER = [
     "--model.type=frame_tokenizer", "--model.device=cpu", "--model.tokenizer.image_size=32",
@@ -41,23 +39,10 @@ IMAGINED = [
     "--env.reward.type=general", "--env.reward.alpha=1", "--env.episode_length=4", "--env.done_frames=1",
     "--env.device=cpu", *SHORT,
 ]  # fmt: skip
-SIMULATED = ["--policy.path={pointing}", "--env.type=test_budget_point", *SHORT]
+SIMULATED = ["--policy.path={pointing}", "--env.type=test_point", *SHORT]
 UNCHECKED = "--gate.action=warn"
 REAL = ["--real_env.type=wmrl_maniskill", "--real_env.image_size=32"]
 UNKNOWN = "={other}: 4 of 4 episodes are not in the budget"
-
-
-@EnvConfig.register_subclass("test_budget_point")
-@dataclass
-class PointConfig(EnvConfig):
-    """An environment outside a world model whose episodes last at most four steps."""
-
-    @property
-    def gym_kwargs(self) -> dict[str, Any]:
-        return {}
-
-    def create_tensor_env(self, n_envs: int, device: str) -> PointEnv:
-        return PointEnv(n_envs, horizon=4, image_size=32)
 
 
 @pytest.fixture(scope="module")

@@ -4,14 +4,12 @@ import json
 import shutil
 import subprocess
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.envs.configs import EnvConfig
 from safetensors.torch import load_file
 
 from lerobot_wmrl.common.tracking import read_metrics
@@ -19,7 +17,7 @@ from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 from lerobot_wmrl.scripts.train import TrainConfig, check_config, main, rollout_length
 from tests.hub_server import Hub
 from tests.rl.checkpoints import save_untrained_policy
-from tests.rl.point_env import PointEnv
+from tests.scripts.point_config import PointConfig
 
 BIN = Path(sys.executable).parent
 SIMULATOR = ["--env.type=wmrl_maniskill", "--env.image_size=32", "--env.episode_length=4"]
@@ -31,19 +29,6 @@ SHORT = [
     "--algorithm.value_iterations=1",
 ]
 POINT = ["--env.type=test_point"]
-
-
-@EnvConfig.register_subclass("test_point")
-@dataclass
-class PointConfig(EnvConfig):
-    """The point environment, drawn in 32x32 pixels: a world that is built at once."""
-
-    @property
-    def gym_kwargs(self) -> dict[str, Any]:
-        return {}
-
-    def create_tensor_env(self, n_envs: int, device: str) -> PointEnv:
-        return PointEnv(n_envs, horizon=4, image_size=32)
 
 
 def run(program: str, *flags: str) -> None:
