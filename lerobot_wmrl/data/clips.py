@@ -29,6 +29,7 @@ class Clip(NamedTuple):
         valid: (B, T), False where the episode is padded.
         done_known: (B, T), False where `done` is unknown.
         instructions: B of them.
+        features: (B, T, F) of the frames, by the tokenizer's success classifier, if it has one.
         depth: (B, T, S) metres of each token, for models that look at depth.
         context: of the B episodes' first frames, for models that look at it.
     """
@@ -42,6 +43,7 @@ class Clip(NamedTuple):
     instructions: list[str]
     depth: Tensor | None = None
     context: Context = NO_CONTEXT
+    features: Tensor | None = None
 
     def first(self) -> Frames:
         """Return the clips' first frames."""
@@ -77,6 +79,7 @@ class ClipSampler:
         device: where the clips go.
         depth: (rows, S) metres of each token, for models that look at depth.
         context: (E, N, C, g, g) of the episodes' first frames, for models that look at it.
+        features: (rows, F) of the tokenizer's success classifier, for models that predict them.
         done_known: False if done must not be learnt from this table.
     """
 
@@ -90,6 +93,7 @@ class ClipSampler:
     device: str
     depth: np.ndarray | None = None
     context: np.ndarray | None = None
+    features: np.ndarray | None = None
     done_known: bool = True
 
     def __call__(self, step: int) -> Clip:
@@ -120,6 +124,7 @@ class ClipSampler:
             [self.table.instructions[episode] for episode in episodes],
             None if self.depth is None else self._tensor(self.depth[rows]),
             context,
+            None if self.features is None else self._tensor(self.features[rows]),
         )
 
     def _tensor(self, array: np.ndarray) -> Tensor:
@@ -149,13 +154,17 @@ class FrameSampler:
     device: str
 
     def __call__(self, step: int) -> dict[str, Tensor]:
-        """Draw the batch of one step: `observation.images.*` and `reference.*`, (B, 3, H, W) each."""
+        """Draw the batch of one step.
+
+        `observation.images.*` and `reference.*`, (B, 3, H, W) each, and `success` (B,), whether it holds.
+        """
         rng = np.random.default_rng([self.seed, step])
         episodes = rng.choice(self.episodes, self.batch_size)
         start = self.table.start[episodes]
         rows = start + rng.integers(0, self.table.length[episodes])
         images, reference = (frames_to_tensor(self.frames[index]).to(self.device) for index in (rows, start))
-        batch = {}
+        seen = (rows > start) & self.table.done[np.maximum(rows - 1, start)]
+        batch = {"success": torch.from_numpy(seen).to(self.device)}
         for index, camera in enumerate(self.cameras):
             batch[f"observation.images.{camera}"] = images[:, index]
             batch[f"reference.{camera}"] = reference[:, index]
@@ -177,8 +186,9 @@ class InTurn:
 
 
 def clip_from_windows(
-    tokens: Tensor, batch: Mapping[str, Any], camera_key: str, state_size: int, depth: Tensor | None = None
-) -> Clip:
+    tokens: Tensor, batch: Mapping[str, Any], camera_key: str, state_size: int, depth: Tensor | None = None,
+    features: Tensor | None = None,
+) -> Clip:  # fmt: skip
     """Make clips of windows as lerobot-train gives them.
 
     A window ends at its row of the dataset. LeRobot fills a window that would begin before its episode with
@@ -193,6 +203,7 @@ def clip_from_windows(
         camera_key: the camera whose padding counts.
         state_size: P, 0 for a model without `observation.state`.
         depth: (B, T, S) metres, of the windows' frames.
+        features: (B, T, F), of the windows' frames.
 
     Raises:
         ValueError: the action is missing or has another length than the frames; NaN or infinity in a number.
@@ -218,8 +229,9 @@ def clip_from_windows(
     if isinstance(batch.get(DONE), Tensor):  # LeRobot's processors put False where the dataset has none
         done, known = last * batch[DONE].reshape(rows, 1).float(), last & (before > 0)
     tokens, state, action = (take_steps(values, index) for values in (tokens, state, action))
-    depth = depth if depth is None else take_steps(depth, index)
-    return Clip(tokens, state, action, done, valid, known, list(batch.get("task", [""] * rows)), depth)
+    depth, features = (each if each is None else take_steps(each, index) for each in (depth, features))
+    clip = Clip(tokens, state, action, done, valid, known, list(batch.get("task", [""] * rows)), depth)
+    return clip._replace(features=features)
 
 
 def unpadded_rows(padded: Tensor) -> Tensor:

@@ -46,6 +46,9 @@ class FrameEncoder(Protocol):
     def encode(self, images: Tensor, context: Context = NO_CONTEXT) -> Tensor:
         """Return the tokens (B, S) of frames (B, N, 3, H, W) in [0, 1]."""
 
+    def success_features(self, first: Tensor, images: Tensor) -> Tensor:
+        """Return features (B, F) of frames (B, N, 3, H, W) in [0, 1], given their episodes' first frames."""
+
 
 def cache_dir(dataset: LeRobotDataset) -> Path:
     """Return the folder of a dataset's caches."""
@@ -112,6 +115,30 @@ def cached_context(
 
     shape = (len(starts), *features(starts[:1]).shape[1:])
     return memory_map(encoded_path("context", dataset, camera_keys, tokenizer), shape, np.float32, fill)
+
+
+def cached_features(
+    dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer: FrameEncoder
+) -> np.ndarray:
+    """Return the success classifier's features of all frames as a read-only memory map.
+
+    float32 (rows, F), encoded on the first call.
+    """
+    frames, device = cached_frames(dataset, camera_keys), next(tokenizer.parameters()).device
+    episodes = dataset.meta.episodes
+    starts = np.repeat(np.asarray(episodes["dataset_from_index"]), np.asarray(episodes["length"]))
+
+    def features(part: slice) -> np.ndarray:
+        first, images = (frames_to_tensor(frames[rows]).to(device) for rows in (starts[part], part))
+        with torch.no_grad():
+            return tokenizer.success_features(first, images).cpu().numpy()
+
+    def fill(target: np.ndarray) -> None:
+        for begin in tqdm(range(0, len(frames), ENCODE_BATCH), desc="Encoding features", unit="batch"):
+            target[begin : begin + ENCODE_BATCH] = features(slice(begin, begin + ENCODE_BATCH))
+
+    shape = (len(frames), *features(slice(0, 1)).shape[1:])
+    return memory_map(encoded_path("features", dataset, camera_keys, tokenizer), shape, np.float32, fill)
 
 
 def encoded_path(

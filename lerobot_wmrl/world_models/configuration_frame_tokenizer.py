@@ -39,6 +39,8 @@ class TokenizerConfig:
         levels: codes of each factor of a token; with `lfq` the same power of two for all, such as [512,512]
             for 18 bits.
         context: show encoder and decoder the episode's first frame too, so that tokens encode what moves.
+        success: learn to classify success in frames too. An anchored world model then predicts the
+            classifier's features, and reads success from them. Needs labels of success, and `context`.
     """
 
     cameras: list[str] = field(default_factory=lambda: ["third_view"])
@@ -47,10 +49,17 @@ class TokenizerConfig:
     quantizer: str = "fsq"
     levels: list[int] = field(default_factory=lambda: [5, 5, 5, 5, 5, 5])
     context: bool = False
+    success: bool = False
 
     def __post_init__(self) -> None:
         if not self.cameras or len(set(self.cameras)) < len(self.cameras):
             raise FieldError("tokenizer.cameras", self.cameras, "give at least one camera, each once")
+        if self.success and not self.context:
+            raise FieldError(
+                "tokenizer.success", True,
+                "success can depend on the episode's first frame, which tokens without `tokenizer.context` "
+                "do not show", "set `tokenizer.context` to true",
+            )  # fmt: skip
         self._check_sizes()
         self._check_levels()
 

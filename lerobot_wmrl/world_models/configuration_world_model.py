@@ -30,6 +30,7 @@ class DynamicsConfig(ChoiceRegistry):
     code_width: int = 48
     depth = False  # not a field: only autoregressive dynamics can look at depth
     sees_context = False  # not a field: only anchored dynamics look at the tokenizer's context
+    predicts_success = False  # not a field: only anchored dynamics predict the success classifier's features
 
     def __post_init__(self) -> None:
         for name in ("layers", "width", "heads", "patch", "code_width"):
@@ -69,6 +70,7 @@ class AnchoredConfig(DynamicsConfig):
 
     dropout: float = 0.0
     sees_context = True
+    predicts_success = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -130,6 +132,11 @@ class WorldModelConfig(RewardModelConfig):
         if self.tokenizer is None or not self.tokenizer.context:
             return 0
         return self.tokenizer.widths[-1] if self.dynamics.sees_context else 0
+
+    @property
+    def predicts_success(self) -> bool:
+        """Whether the dynamics predict the features of the tokenizer's success classifier."""
+        return self.tokenizer is not None and self.tokenizer.success and self.dynamics.predicts_success
 
     @property
     def observation_delta_indices(self) -> list[int]:

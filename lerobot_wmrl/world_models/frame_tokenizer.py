@@ -16,6 +16,7 @@ from lerobot_wmrl.world_models.autoencoder import ContextEncoder, Decoder, Encod
 from lerobot_wmrl.world_models.codebook import make_codebook
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 from lerobot_wmrl.world_models.quantizer import make_quantizer
+from lerobot_wmrl.world_models.success import SuccessClassifier
 
 MOTION_THRESHOLD = 0.08
 """A pixel has moved when a colour, in [0, 1], differs by more from the episode's first frame."""
@@ -55,6 +56,7 @@ class FrameTokenizer(nn.Module):
         self.quantizer = make_quantizer(config.quantizer, config.levels)
         self.whiten = nn.ModuleList(nn.BatchNorm2d(width, affine=False) for width in (widths[-1], widths[0]))
         self.context_encoder = ContextEncoder(widths) if context else None
+        self.success = SuccessClassifier(self.num_cameras) if config.success else None
 
     @property
     def tokens_per_frame(self) -> int:
@@ -88,6 +90,25 @@ class FrameTokenizer(nn.Module):
     def decode(self, tokens: Tensor, context: Context = NO_CONTEXT) -> Tensor:
         """Tokens (B, S) → images (B, N, 3, H, W) in [0, 1]."""
         return self.decode_with_features(tokens, context).images
+
+    def success_features(self, first: Tensor, images: Tensor) -> Tensor:
+        """Return the success classifier's features of frames.
+
+        Args:
+            first: first frames of their episodes, (B, N, 3, H, W) in [0, 1].
+            images: (B, N, 3, H, W) in [0, 1].
+
+        Returns:
+            (B, F), of mean 0 and variance 1 over the training frames.
+
+        Raises:
+            ValueError: the tokenizer was trained without the option `success`.
+        """
+        if self.success is None:
+            raise ValueError("this tokenizer has no success classifier; train one with `tokenizer.success`")
+        self._check_images(first)
+        self._check_images(images)
+        return self.success.features(first, images)
 
     def _check_images(self, images: Tensor) -> None:
         expected = (self.num_cameras, 3, self.image_size, self.image_size)

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lerobot_wmrl.world_models.codebook import make_codebook
+from lerobot_wmrl.world_models.success import PredictedSuccess
 
 STATE_STEP: Final = 0.1
 """State heads predict changes in units of a tenth of the state's standard deviation."""
@@ -208,6 +209,7 @@ class FrameSizes:
         state_size: components of the proprioceptive state, P; 0 without.
         clip_length: frames of a training clip.
         context_channels: channels of the coarsest features of the tokenizer's context; 0 without.
+        success: whether done is read from predicted features of the tokenizer's success classifier.
     """
 
     levels: Sequence[int]
@@ -217,6 +219,7 @@ class FrameSizes:
     state_size: int
     clip_length: int
     context_channels: int = 0
+    success: bool = False
 
 
 class FrameNetwork(nn.Module):
@@ -235,7 +238,9 @@ class FrameNetwork(nn.Module):
         self.register = nn.Parameter(torch.randn(width) * 0.02)
         self.state_in = nn.Linear(sizes.state_size, width)
         self.head = FrameHead(len(sizes.levels), sum(sizes.levels), patch, code_width, width)
-        self.done = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, 1))
+        self.done: nn.Module = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, 1))
+        if sizes.success:
+            self.done = PredictedSuccess(width, sizes.num_cameras)
 
     @property
     def tokens_per_frame(self) -> int:

@@ -21,6 +21,12 @@ MOTION_LEVELS: Final = 3
 """Steps (levels of FSQ, signs of LFQ) by which a token's codes must change to count as motion. Smaller
 changes are mostly noise of the tokenizer."""
 
+FEATURE_WEIGHT: Final = 4.0
+"""Weight of the loss of the success classifier's features."""
+
+FEATURE_BETA: Final = 0.3
+"""Beta of their smooth L1 loss, in their standard deviations."""
+
 STATE_BETA: Final = 0.1
 """Beta of the state's smooth L1 loss, in `STATE_STEP`s: about a millimetre."""
 
@@ -100,6 +106,15 @@ def next_frame_loss(
         "token_accuracy": masked_mean(right, target.weight > 0).item(),
         "moving_token_accuracy": masked_mean(right, target.moved).item(),
     }
+
+
+def feature_loss(predicted: Tensor, clip: Clip) -> Tensor:
+    """Smooth L1 of predicted features (B, T, F) against those of the next rows, averaged over F. → ()"""
+    assert clip.features is not None
+    losses = F.smooth_l1_loss(
+        predicted[:, :-1].float(), clip.features[:, 1:], reduction="none", beta=FEATURE_BETA
+    )
+    return masked_mean(losses, known_transitions(clip.valid)[..., None])
 
 
 def next_state_loss(predicted: Tensor, clip: Clip) -> Tensor:

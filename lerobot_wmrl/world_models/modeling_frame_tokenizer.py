@@ -1,20 +1,23 @@
 """The frame tokenizer as a LeRobot reward model: trained, saved and published like one."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Final
 
 import torch
 from lerobot.rewards.pretrained import PreTrainedRewardModel
 from torch import Tensor
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.episodes import check_cameras
+from lerobot_wmrl.data.episodes import check_cameras, success_column
 from lerobot_wmrl.data.frames import NO_CONTEXT
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer, ImageLoss, motion_weight
 from lerobot_wmrl.world_models.goal import similarity_to_goal
 from lerobot_wmrl.world_models.hub_card import HubCard
 from lerobot_wmrl.world_models.perceptual import PerceptualLoss, lpips_network, require_backbone
+
+SUCCESS_WEIGHT: Final = 0.1
+"""Weight of the success classifier's loss. They share no weights, only the limit on the gradient's norm."""
 
 
 def stack_cameras(batch: dict[str, Tensor], keys: Sequence[str], size: int) -> Tensor:
@@ -50,6 +53,11 @@ class FrameTokenizerRewardModel(HubCard, PreTrainedRewardModel):
         sizes = config.tokenizer
         if dataset_meta is not None:
             check_cameras(dataset_meta.features, sizes.camera_keys, sizes.image_size)
+            if sizes.success and success_column(dataset_meta.features) is None:
+                raise FieldError(
+                    "tokenizer.success", True, "the dataset has neither next.success nor next.done",
+                    "label its episodes, or leave `tokenizer.success` out",
+                )  # fmt: skip
             if config.perceptual_weight:
                 require_backbone("vgg", "perceptual_weight", config.perceptual_weight, "0")
         self.tokenizer = FrameTokenizer(sizes)
@@ -57,15 +65,21 @@ class FrameTokenizerRewardModel(HubCard, PreTrainedRewardModel):
     def forward(self, batch: dict[str, Tensor], progress: float = 1.0) -> tuple[Tensor, dict[str, float]]:
         """Return the reconstruction loss of `observation.images.*` (B, 3, H, W) and metrics.
 
-        `reference.*` are the episodes' first frames, needed with the option `context`. The loss is the same
-        at any `progress` of the training.
+        `reference.*` are the episodes' first frames, needed with the option `context`; `success` (B,) bool,
+        whether it holds at the frames, is needed with the option `success`, which adds the classifier's loss.
+        The loss is the same at any `progress` of the training.
         """
         images, reference = self._stack(batch, "observation.images"), self._reference(batch)
         weight, context = None, NO_CONTEXT
         if reference is not None:
             weight = motion_weight(images, reference)
             context = self.tokenizer.context(reference)
-        return self.tokenizer(images, weight, self._perceptual_loss(images.device), context)
+        loss, metrics = self.tokenizer(images, weight, self._perceptual_loss(images.device), context)
+        if self.tokenizer.success is None:
+            return loss, metrics
+        assert reference is not None  # success needs context, and context the reference
+        success_loss, success_metrics = self.tokenizer.success.loss(reference, images, batch["success"])
+        return loss + SUCCESS_WEIGHT * success_loss, metrics | success_metrics
 
     def _stack(self, batch: dict[str, Tensor], prefix: str) -> Tensor:
         keys = [f"{prefix}.{camera}" for camera in self.config.tokenizer.cameras]

@@ -70,7 +70,7 @@ def make_dynamics(config: WorldModelConfig, grid: int) -> Dynamics:
         raise FieldError("dynamics.patch", chosen.patch, f"must divide the tokenizer's grid, {grid}")
     sizes = FrameSizes(
         tokenizer.levels, tokenizer.quantizer, grid, len(tokenizer.cameras), config.state_size,
-        config.clip_length, config.context_channels,
+        config.clip_length, config.context_channels, config.predicts_success,
     )  # fmt: skip
     if isinstance(chosen, AnchoredConfig):
         return AnchoredDynamics(chosen, sizes)
@@ -103,9 +103,11 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
             self.tokenizer.load_state_dict(source.tokenizer.state_dict())
         self.tokenizer.eval()
         self.dynamics = make_dynamics(config, self.tokenizer.grid)
-        if dataset_meta is not None and success_column(dataset_meta.features) is None:
-            last: Any = self.dynamics.network.done[-1]
-            nn.init.constant_(last.bias, UNLABELLED_DONE)
+        done: Any = self.dynamics.network.done
+        if config.predicts_success:
+            done.head.load_state_dict(self.tokenizer.success.head.state_dict())  # type: ignore[union-attr]
+        elif dataset_meta is not None and success_column(dataset_meta.features) is None:
+            nn.init.constant_(done[-1].bias, UNLABELLED_DONE)
         self._register_statistics("state", OBS_STATE, config.state_size, dataset_stats, STATE_SPREAD)
 
     def train(self, mode: bool = True) -> "WorldModelRewardModel":
@@ -190,7 +192,12 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
         depth = None
         if self.config.depth:
             depth = depth_of_windows(batch, sizes.camera_keys, self.tokenizer.grid)
-        clip = clip_from_windows(tokens, batch, sizes.camera_keys[0], self.config.state_size, depth)
+        features = None
+        if self.config.predicts_success:
+            first = images[:, :1].expand_as(images)
+            features = self.tokenizer.success_features(first.flatten(0, 1), images.flatten(0, 1))
+            features = features.unflatten(0, shape)
+        clip = clip_from_windows(tokens, batch, sizes.camera_keys[0], self.config.state_size, depth, features)
         return clip._replace(context=context)
 
 

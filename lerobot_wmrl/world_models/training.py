@@ -43,7 +43,13 @@ from lerobot_wmrl.data.episodes import (
     open_dataset,
     read_episodes,
 )
-from lerobot_wmrl.data.frame_cache import cached_context, cached_depth, cached_frames, cached_tokens
+from lerobot_wmrl.data.frame_cache import (
+    cached_context,
+    cached_depth,
+    cached_features,
+    cached_frames,
+    cached_tokens,
+)
 from lerobot_wmrl.world_models.checkpoint import check_dataset, load_model
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import cosine_schedule
 from lerobot_wmrl.world_models.configuration_world_model import TextWorldModelConfig
@@ -133,7 +139,7 @@ def make_sampler(
 def make_clip_sampler(
     model: Any, table: EpisodeTable, episodes: np.ndarray, batch_size: int, seed: int, done_known: bool = True
 ) -> ClipSampler:
-    """Make a sampler of clips from these episodes, with depth and context if the model looks at them."""
+    """Make a sampler of clips from these episodes, with what else the model looks at or predicts."""
     config, tokenizer, dataset = model.config, model.tokenizer, table.dataset
     cameras = config.tokenizer.camera_keys
     return ClipSampler(
@@ -147,6 +153,7 @@ def make_clip_sampler(
         config.device,
         depth=cached_depth(dataset, cameras, tokenizer.grid) if config.depth else None,
         context=cached_context(dataset, cameras, tokenizer) if config.context_channels else None,
+        features=cached_features(dataset, cameras, tokenizer) if config.predicts_success else None,
         done_known=done_known,
     )
 

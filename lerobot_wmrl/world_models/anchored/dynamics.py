@@ -15,7 +15,14 @@ from lerobot_wmrl.world_models.configuration_world_model import AnchoredConfig
 from lerobot_wmrl.world_models.dynamics import Dynamics, Imagination, Imagined, OpenLoopPrediction
 from lerobot_wmrl.world_models.kv_cache import KVCache
 from lerobot_wmrl.world_models.layers import Condition, FrameSizes, Prediction
-from lerobot_wmrl.world_models.losses import corrupt_codes, next_frame_loss, weighted_frames
+from lerobot_wmrl.world_models.losses import (
+    FEATURE_WEIGHT,
+    corrupt_codes,
+    feature_loss,
+    next_frame_loss,
+    weighted_frames,
+)
+from lerobot_wmrl.world_models.success import PredictedSuccess
 
 RENDERED_FRAMES: Final = 4
 """Frames of each clip, sampled at random, whose tokens a training step learns. Done and state are learnt from
@@ -41,7 +48,8 @@ class AnchoredDynamics(Dynamics):
     def loss(self, clip: Clip, condition: Condition, progress: float) -> tuple[Tensor, dict[str, float]]:
         """Eqs. 2-4, with the tokens of `RENDERED_FRAMES` frames a clip.
 
-        Those that differ from the first frame's count more.
+        Those that differ from the first frame's count more. With a tokenizer that classifies success, the
+        loss of the classifier's features takes the place of that of done, which is then only measured.
         """
         network, codebook = self.network, self.network.codebook
         codes = codebook.codes(clip.tokens)  # (B, T, S, C)
@@ -50,7 +58,12 @@ class AnchoredDynamics(Dynamics):
         prediction = network(first, clip.state[:, :1], condition, codes.shape[1], steps, clip.context)
         known, target = (take_steps(x, steps) for x in (known_transitions(clip.valid), codes[:, 1:]))
         frames = weighted_frames(codebook, target, codes[:, :1], known)
-        return next_frame_loss(prediction, codebook, frames, clip)
+        if not isinstance(network.done, PredictedSuccess):
+            return next_frame_loss(prediction, codebook, frames, clip)
+        features = FEATURE_WEIGHT * feature_loss(network.done.features(prediction.hidden), clip)
+        prediction = prediction._replace(done_logit=prediction.done_logit.detach())
+        loss, metrics = next_frame_loss(prediction, codebook, frames, clip)
+        return loss + features, metrics | {"feature_loss": features.item() / FEATURE_WEIGHT}
 
     @torch.no_grad()
     def predict(self, clip: Clip, condition: Condition, with_tokens: bool) -> Prediction:

@@ -1,0 +1,157 @@
+"""Success seen in pictures: a classifier of frames, whose features a world model learns to predict.
+
+A world model that learns one outcome an episode from a few hundred episodes soon knows these by heart. Frames
+are many, and shifted and brightened copies are more, so a classifier of frames needs few episodes. Its
+features say where things are. A world model that predicts them in every frame (latent prediction, as in
+TD-MPC2, Hansen et al. 2024) learns what decides success, and reads success from the predicted features.
+
+B frames of N cameras, F features.
+"""
+
+from typing import Final
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+WIDTH: Final = 16
+"""Channels of the first convolution."""
+
+HIDDEN: Final = 128
+"""Features that combine all cameras."""
+
+GRID: Final = 8
+"""Cells on each side of the pooled feature map."""
+
+GRID_CHANNELS: Final = 16
+"""Channels of the pooled feature map."""
+
+DROPOUT: Final = 0.3
+
+POSITIVE_WEIGHT: Final = 5.0
+"""Weight of a frame with success in the loss. Such frames are rare: episodes end soon after success."""
+
+MAX_SHIFT: Final = 4
+"""Pixels by which pictures are shifted at most, in training."""
+
+MAX_GAIN: Final = 0.2
+"""Share by which contrast changes at most, in training; brightness changes by half as much."""
+
+
+def coordinates(maps: Tensor) -> Tensor:
+    """Return the row and the column of every cell of maps (B, C, h, w), from −1 to 1. → (2, h, w)"""
+    sides = (torch.linspace(-1, 1, side, device=maps.device, dtype=maps.dtype) for side in maps.shape[2:])
+    return torch.stack(torch.meshgrid(*sides, indexing="ij"))
+
+
+def soft_positions(maps: Tensor) -> Tensor:
+    """Return each channel's expected row and column (spatial softmax, Levine et al. 2016).
+
+    (B, C, h, w) → (B, 2C)
+    """
+    weights = maps.flatten(2).softmax(-1)  # (B, C, h·w)
+    return (weights @ coordinates(maps).flatten(1).T).flatten(1)
+
+
+class PairEncoder(nn.Module):
+    """Encode one camera's first and present frame: positions of C channels, and a coarse map."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        wide = 2 * WIDTH
+        self.stem = nn.Conv2d(6 + 2, WIDTH, 5, stride=2, padding=2)
+        self.down = nn.Conv2d(WIDTH, wide, 3, stride=2, padding=1)
+        self.fine = nn.Conv2d(wide, wide, 3, padding=1)
+        self.coarse = nn.Conv2d(wide, wide, 3, stride=2, padding=1)
+        self.grid = nn.Conv2d(wide, GRID_CHANNELS, 1)
+        self.sharpness = nn.Parameter(torch.full((wide, 1, 1), 2.0))
+
+    def forward(self, pair: Tensor) -> tuple[Tensor, Tensor]:
+        """pair (B, 6, H, W), centred → positions (B, 4·WIDTH), coarse map (B, GRID_CHANNELS·GRID²)."""
+        where = coordinates(pair).expand(len(pair), -1, -1, -1)
+        x = F.relu(self.down(F.relu(self.stem(torch.cat([pair, where], 1)))))
+        fine = self.fine(x)
+        coarse = self.grid(F.relu(self.coarse(F.relu(fine))))
+        positions = soft_positions(self.sharpness * F.layer_norm(fine, fine.shape[2:]))
+        return positions, F.adaptive_avg_pool2d(coarse, GRID).flatten(1)
+
+
+class SuccessClassifier(nn.Module):
+    """Tell from a frame and its episode's first frame whether success holds.
+
+    Success can depend on where the episode began: an object pushed by 10 cm.
+
+    Args:
+        cameras: N.
+    """
+
+    def __init__(self, cameras: int) -> None:
+        super().__init__()
+        self.encoders = nn.ModuleList(PairEncoder() for _ in range(cameras))
+        encoded = cameras * (4 * WIDTH + GRID_CHANNELS * GRID**2)
+        self.mix = nn.Sequential(
+            nn.Linear(encoded, HIDDEN), nn.LayerNorm(HIDDEN), nn.SiLU(), nn.Dropout(DROPOUT),
+            nn.Linear(HIDDEN, HIDDEN), nn.SiLU(),
+        )  # fmt: skip
+        self.scale = nn.BatchNorm1d(num_features(cameras), affine=False)
+        self.head = nn.Linear(HIDDEN, 1)
+
+    def features(self, first: Tensor, frames: Tensor) -> Tensor:
+        """Return features of frames, of mean 0 and variance 1: positions, then what all cameras show.
+
+        first, frames: (B, N, 3, H, W) in [0, 1] → (B, F)
+        """
+        pair = 4 * (torch.cat([first, frames], 2) - 0.5)
+        encoded = [encoder(pair[:, camera].contiguous()) for camera, encoder in enumerate(self.encoders)]
+        positions, maps = (torch.cat(parts, 1) for parts in zip(*encoded, strict=True))
+        return self.scale(torch.cat([positions, self.mix(torch.cat([positions, maps], 1))], 1))
+
+    def logit(self, features: Tensor) -> Tensor:
+        """Return the logit of success. (…, F) → (…)"""
+        return self.head(features[..., -HIDDEN:]).squeeze(-1)
+
+    def loss(self, first: Tensor, frames: Tensor, success: Tensor) -> tuple[Tensor, dict[str, float]]:
+        """Return binary cross-entropy on shifted and brightened frames, and metrics. success: (B,) bool"""
+        logit = self.logit(self.features(*augment(first, frames)))
+        weight = logit.new_tensor(POSITIVE_WEIGHT)
+        loss = F.binary_cross_entropy_with_logits(logit, success.float(), pos_weight=weight)
+        right = ((logit > 0) == success).float().mean()
+        return loss, {"success_loss": loss.item(), "success_accuracy": right.item()}
+
+
+class PredictedSuccess(nn.Module):
+    """Predict the classifier's features of frames that are not seen, and read success from them.
+
+    Args:
+        width: of the hidden states.
+        cameras: N.
+    """
+
+    def __init__(self, width: int, cameras: int) -> None:
+        super().__init__()
+        self.features = nn.Linear(width, num_features(cameras))
+        self.head = nn.Linear(HIDDEN, 1).requires_grad_(False)  # the classifier's own
+
+    def forward(self, hidden: Tensor) -> Tensor:
+        """Hidden states (…, D) → logits of success (…, 1)."""
+        return self.head(self.features(hidden)[..., -HIDDEN:])
+
+
+def num_features(cameras: int) -> int:
+    """Return F, the number of features that a classifier of N cameras has."""
+    return cameras * 4 * WIDTH + HIDDEN
+
+
+def augment(first: Tensor, frames: Tensor) -> tuple[Tensor, Tensor]:
+    """Shift, brighten and contrast both frames of each pair alike, each camera by a shift of its own.
+
+    (B, N, 3, H, W) twice → the same
+    """
+    batch, cameras, _, height, width = frames.shape
+    gain, offset = (2 * torch.rand(2, batch, 1, 1, 1, 1, device=frames.device) - 1) * MAX_GAIN
+    pair = ((torch.cat([first, frames], 2) - 0.5) * (1 + gain) + 0.5 + offset / 2).flatten(0, 1)
+    # one pixel is 2 / (side − 1) of the grid's range
+    shift = torch.randint(-MAX_SHIFT, MAX_SHIFT + 1, (len(pair), 1, 1, 2), device=frames.device)
+    grid = coordinates(pair).permute(1, 2, 0).flip(-1) + 2 * shift / pair.new_tensor([width - 1, height - 1])
+    shifted = F.grid_sample(pair, grid, padding_mode="border", align_corners=True)
+    return tuple(shifted.unflatten(0, (batch, cameras)).split(3, 2))
