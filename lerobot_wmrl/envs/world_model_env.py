@@ -1,6 +1,6 @@
 """The world model as a natively batched environment: many imagined episodes, one forward pass a step."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import gymnasium as gym
@@ -132,6 +132,26 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         """Return the newest imagined frames, from which a planner can look ahead."""
         return self.model.newest(self._imagination)
 
+    @torch.no_grad()
+    def look_ahead(self, act: Callable[[Observation], Tensor], rows: Tensor, steps: int) -> Tensor:
+        """Return what a policy would do from the newest frames of the environments `rows` (R,) on.
+
+        Their episodes do not go on. act: observations of the R environments → actions (R, A).
+
+        Returns:
+            (R, steps, A), clipped to the box.
+        """
+        frames = self.newest_frames()[rows]
+        instructions = [self._instructions[row] for row in rows.tolist()]
+        imagination, tokens, state, actions = self.model.start(frames), frames.tokens, frames.state, []
+        for _ in range(steps):
+            images = self.model.decode(tokens, frames.context).images
+            action = act(self._observe(images, state, instructions)).to(self.device)
+            actions.append(action.clamp(self.action_low, self.action_high))
+            imagined = self.model.step(imagination, actions[-1])
+            tokens, state = imagined.tokens, imagined.state
+        return torch.stack(actions, 1)
+
     def adopt(self, model: ActionWorldModelRewardModel) -> None:
         """Imagine with a refreshed model from the next reset on.
 
@@ -211,14 +231,16 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
             "goal_reached": self.goals.reached[self._start_index],
         }
 
-    def _observe(self, images: Tensor, state: Tensor) -> Observation:
+    def _observe(
+        self, images: Tensor, state: Tensor, instructions: Sequence[str] | None = None
+    ) -> Observation:
         observation: Observation = {
             f"{OBS_IMAGES}.{camera}": images[:, index]
             for index, camera in enumerate(self.model.config.tokenizer.cameras)
         }
         if self.model.config.state_size:
             observation[OBS_STATE] = state
-        observation["task"] = list(self._instructions)
+        observation["task"] = list(self._instructions if instructions is None else instructions)
         return observation
 
 

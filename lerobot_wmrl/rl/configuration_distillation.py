@@ -11,7 +11,7 @@ from lerobot_wmrl.world_models.configuration_planner import PlannerSettings
 
 def fast_planner() -> PlannerSettings:
     """Return settings of a planner that is asked some hundred times."""
-    return PlannerSettings(horizon=28, samples=48, iterations=3)
+    return PlannerSettings(horizon=28, samples=48, iterations=2, spread=0.5)
 
 
 @RLAlgorithmConfig.register_subclass("distillation")

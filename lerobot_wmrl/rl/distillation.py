@@ -25,8 +25,8 @@ from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
 from lerobot_wmrl.rl.labels import Labels, Part, action_chunks, recorded_successes
-from lerobot_wmrl.rl.observations import TASK
-from lerobot_wmrl.rl.protocol import Pipeline
+from lerobot_wmrl.rl.observations import TASK, as_read_back
+from lerobot_wmrl.rl.protocol import Observation, Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer
 from lerobot_wmrl.rl.seeds import seeded_noise
 from lerobot_wmrl.world_models.planning import Planner
@@ -135,8 +135,17 @@ class Distillation(RLAlgorithm):
     def demonstrate(
         self, env: WorldModelVectorEnv, pipeline: Pipeline, rollout: RolloutBuffer, seed: int
     ) -> Demonstrated:
-        """Let the policy act for some steps, and then the planner, until every first episode has ended."""
+        """Let the policy act for some steps, and then the planner, until every first episode has ended.
+
+        The planner's search begins at what the policy would do: near the policy's actions, which the dataset
+        resembles, the world model is most often right.
+        """
         policy, steps, count = self.lerobot_policy.eval(), rollout.steps, env.num_envs
+        horizon = self.config.planner.horizon
+
+        def act(observation: Observation) -> Tensor:
+            return pipeline.to_action(policy.select_action(pipeline.prepare(as_read_back(observation))))
+
         policy.reset()
         planner = self.make_planner(env, seed)
         generator = torch.Generator().manual_seed(seed)
@@ -156,10 +165,11 @@ class Distillation(RLAlgorithm):
                 else:
                     ahead = (step - lead) % self.config.planner.execute
                     if not ahead:
-                        planner.keep(alive[planned].nonzero()[:, 0])
                         planned = planned[alive[planned]]
                         tasks = [observation[TASK][row] for row in planned.tolist()]
-                        chunk = planner.plan(env.newest_frames()[planned], tasks)
+                        policy.reset()
+                        proposed = env.look_ahead(act, planned, horizon)
+                        chunk = planner.plan(env.newest_frames()[planned], tasks, proposed)
                     actions[step, planned] = chunk[:, ahead]
                     acting[step] = alive
                 observation, _, terminated, truncated, _ = env.step(actions[step])

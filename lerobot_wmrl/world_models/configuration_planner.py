@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from lerobot_wmrl.common.errors import FieldError, require_at_least
+from lerobot_wmrl.common.errors import FieldError, require_at_least, require_positive
 
 
 @dataclass
@@ -16,6 +16,7 @@ class PlannerSettings:
         elites: best sequences, to whose mean the mean moves.
         iterations: iterations of the cross-entropy method.
         knots: actions of a sequence that are sampled, evenly spaced; those between are interpolated.
+        spread: standard deviation of the first samples, as a share of that of the dataset's actions.
     """
 
     horizon: int = 40
@@ -24,10 +25,12 @@ class PlannerSettings:
     elites: int = 8
     iterations: int = 4
     knots: int = 6
+    spread: float = 1.0
 
     def check_planner(self) -> None:
         """Raise FieldError for a setting that cannot be."""
         require_at_least(self, 1, "horizon", "execute", "samples", "elites", "iterations")
+        require_positive(self, "spread")
         if not 2 <= self.knots <= self.horizon:
             raise FieldError("knots", self.knots, f"must be from 2 to `horizon`, {self.horizon}")
         for name, most in (("elites", "samples"), ("execute", "horizon")):

@@ -97,14 +97,25 @@ class Planner:
         self.generator = torch.Generator(self.low.device).manual_seed(self.seed)
 
     @torch.no_grad()
-    def plan(self, frames: Frames, instructions: Sequence[str]) -> Tensor:
-        """Plan from these frames on. The search begins at what is left of the last plans. → (B, T, A)"""
+    def plan(self, frames: Frames, instructions: Sequence[str], proposed: Tensor | None = None) -> Tensor:
+        """Plan from these frames on.
+
+        Args:
+            frames: B of them.
+            instructions: one a frame.
+            proposed: actions that the search begins at (B, T, A); by default what is left of the last plans.
+
+        Returns:
+            (B, T, A)
+        """
         model, settings = self.model, self.settings
         # Statistics hold a std of 1 for components that never vary: these stay at their mean.
-        std = torch.where(model.action_std == 1, 0.0, model.action_std)
+        std = settings.spread * torch.where(model.action_std == 1, 0.0, model.action_std)
         mean = model.action_mean.expand(len(frames), settings.knots, -1)
-        if self.knots is not None:
-            mean = self._remaining_plans(self.knots)
+        if proposed is not None:
+            mean = self._knots_of(proposed, 0)
+        elif self.knots is not None:
+            mean = self._knots_of(interpolate_knots(self.knots, settings.horizon), settings.execute)
         best, average = plan_knots(
             self._objective(frames, instructions), mean, std, self.low, self.high,
             horizon=settings.horizon, samples=settings.samples, elites=settings.elites,
@@ -113,16 +124,11 @@ class Planner:
         self.knots = average if self.averaged else best
         return interpolate_knots(self.knots, settings.horizon)
 
-    def keep(self, rows: Tensor) -> None:
-        """Forget the plans of all imaginations but `rows` (R,)."""
-        self.knots = None if self.knots is None else self.knots[rows]
-
-    def _remaining_plans(self, knots: Tensor) -> Tensor:
-        """Return the knots of what is left of the plans, the last action held. (B, N, A) → (B, N, A)"""
+    def _knots_of(self, plans: Tensor, first: int) -> Tensor:
+        """Return the knots of plans from step `first` on, the last action held. (B, T, A) → (B, N, A)"""
         settings = self.settings
-        plans = interpolate_knots(knots, settings.horizon)
-        ahead = torch.linspace(settings.execute, settings.execute + settings.horizon - 1, settings.knots)
-        return plans[:, ahead.round().long().clamp(max=settings.horizon - 1)]
+        steps = torch.linspace(first, first + settings.horizon - 1, settings.knots)
+        return plans[:, steps.round().long().clamp(max=settings.horizon - 1)]
 
     def _objective(self, frames: Frames, instructions: Sequence[str]) -> Objective:
         """Return the objective of action sequences that begin at these frames."""

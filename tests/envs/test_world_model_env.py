@@ -67,6 +67,29 @@ def test_the_same_seed_and_actions_give_the_same_episode(env):
         assert torch.equal(a, b)
 
 
+def test_looking_ahead_shows_what_a_policy_would_do_and_moves_no_episode(config):
+    """From a start on, imagination is the same whether the episode goes on or not."""
+    env, other = config.create_tensor_env(B), config.create_tensor_env(B)
+
+    def act(observation) -> torch.Tensor:
+        """Depends on every part of the observation."""
+        seen = observation[IMAGE].mean((1, 2, 3)) + observation[STATE].sum(1)
+        told = torch.tensor([len(text) for text in observation["task"]])
+        return (0.01 * (seen + told)[:, None] - 0.1).expand(-1, 7)
+
+    observation, _ = other.reset(seed=3)
+    taken = []
+    for _ in range(4):
+        taken.append(act(observation).clamp(env.action_low, env.action_high))
+        observation, *_ = other.step(taken[-1])
+    env.reset(seed=3)
+    rows = torch.tensor([2, 0])
+    torch.testing.assert_close(env.look_ahead(act, rows, 4), torch.stack(taken, 1)[rows], atol=1e-4, rtol=0)
+    for step in range(4):
+        seen, *_ = env.step(taken[step])
+    torch.testing.assert_close(seen[IMAGE], observation[IMAGE])
+
+
 def test_environments_with_one_seed_begin_alike(env):
     observation, _ = env.reset(seed=[1_000_003, 1_000_003, 4, 4])
     for values in (observation[IMAGE], observation[STATE]):

@@ -11,7 +11,10 @@ from lerobot.scripts import lerobot_eval
 from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
 from lerobot_policy_wm_mpc.modeling_wm_mpc import WmMpcPolicy
 from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW
-from lerobot_wmrl.world_models.planning import interpolate_knots, plan_knots, success_logit
+from lerobot_wmrl.data.frames import Frames
+from lerobot_wmrl.world_models.checkpoint import load_model
+from lerobot_wmrl.world_models.configuration_planner import PlannerSettings
+from lerobot_wmrl.world_models.planning import Planner, interpolate_knots, plan_knots, success_logit
 
 SMALL = {"horizon": 8, "execute": 3, "samples": 6, "elites": 2, "iterations": 2, "knots": 3, "device": "cpu"}
 IMAGE = "observation.images.third_view"
@@ -64,6 +67,25 @@ def test_the_planner_keeps_to_the_box_and_never_returns_worse_than_it_was_given(
     assert torch.equal(found, mean)
     assert torch.cat(asked).min() >= low - 1e-6
     assert torch.cat(asked).max() <= high + 1e-6
+
+
+def test_a_search_begins_at_the_proposed_actions_and_stays_near_them(trained_models):
+    """One sample is the proposal itself; others leave it by no more than a few of the given deviations."""
+    model = load_model(trained_models["action_world_model"], "action_world_model").eval()
+    proposed = interpolate_knots(0.02 * torch.rand(2, 3, 7, generator=torch.Generator().manual_seed(0)), 9)
+    frames = Frames(torch.zeros(2, model.tokenizer.tokens_per_frame, dtype=torch.long), torch.zeros(2, 8))
+    low, high = torch.tensor(ACTION_LOW), torch.tensor(ACTION_HIGH)
+
+    def plan(samples: int, spread: float) -> torch.Tensor:
+        settings = PlannerSettings(
+            horizon=9, execute=3, samples=samples, elites=1, iterations=1, knots=3, spread=spread
+        )
+        planner = Planner(model, None, settings, 2, averaged=True, low=low, high=high, seed=0)
+        return planner.plan(frames, ["", ""], proposed)
+
+    torch.testing.assert_close(plan(1, 1.0), proposed)
+    moved = (plan(8, 0.1) - proposed).abs().amax((0, 1)) / model.action_std
+    assert 0 < moved.max() < 0.5
 
 
 def test_done_counts_as_long_as_it_holds():
