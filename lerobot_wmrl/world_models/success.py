@@ -31,6 +31,9 @@ DROPOUT: Final = 0.3
 POSITIVE_WEIGHT: Final = 5.0
 """Weight of a frame with success in the loss. Such frames are rare: episodes end soon after success."""
 
+SCALE_MOMENTUM: Final = 0.01
+"""Weight of a batch in the running mean and variance of features."""
+
 MAX_SHIFT: Final = 4
 """Pixels by which pictures are shifted at most, in training."""
 
@@ -76,6 +79,28 @@ class PairEncoder(nn.Module):
         return positions, F.adaptive_avg_pool2d(coarse, GRID).flatten(1)
 
 
+class SuccessHead(nn.Module):
+    """Scale features, and read success from scaled ones.
+
+    Args:
+        cameras: N.
+    """
+
+    def __init__(self, cameras: int) -> None:
+        super().__init__()
+        self.scale = nn.BatchNorm1d(num_features(cameras), affine=False, momentum=SCALE_MOMENTUM)
+        self.linear = nn.Linear(HIDDEN, 1)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Scaled features (…, F) → logits of success (…)."""
+        hidden = slice(-HIDDEN, None)
+        mean, variance = self.scale.running_mean, self.scale.running_var
+        assert mean is not None
+        assert variance is not None
+        std = (variance[hidden] + self.scale.eps).sqrt()
+        return self.linear(features[..., hidden] * std + mean[hidden]).squeeze(-1)
+
+
 class SuccessClassifier(nn.Module):
     """Tell from a frame and its episode's first frame whether success holds.
 
@@ -93,26 +118,24 @@ class SuccessClassifier(nn.Module):
             nn.Linear(encoded, HIDDEN), nn.LayerNorm(HIDDEN), nn.SiLU(), nn.Dropout(DROPOUT),
             nn.Linear(HIDDEN, HIDDEN), nn.SiLU(),
         )  # fmt: skip
-        self.scale = nn.BatchNorm1d(num_features(cameras), affine=False)
-        self.head = nn.Linear(HIDDEN, 1)
+        self.head = SuccessHead(cameras)
 
-    def features(self, first: Tensor, frames: Tensor) -> Tensor:
-        """Return features of frames, of mean 0 and variance 1: positions, then what all cameras show.
-
-        first, frames: (B, N, 3, H, W) in [0, 1] → (B, F)
-        """
+    def unscaled(self, first: Tensor, frames: Tensor) -> Tensor:
+        """Return positions, then what all cameras show. (B, N, 3, H, W) in [0, 1], twice → (B, F)"""
         pair = 4 * (torch.cat([first, frames], 2) - 0.5)
         encoded = [encoder(pair[:, camera].contiguous()) for camera, encoder in enumerate(self.encoders)]
         positions, maps = (torch.cat(parts, 1) for parts in zip(*encoded, strict=True))
-        return self.scale(torch.cat([positions, self.mix(torch.cat([positions, maps], 1))], 1))
+        return torch.cat([positions, self.mix(torch.cat([positions, maps], 1))], 1)
 
-    def logit(self, features: Tensor) -> Tensor:
-        """Return the logit of success. (…, F) → (…)"""
-        return self.head(features[..., -HIDDEN:]).squeeze(-1)
+    def features(self, first: Tensor, frames: Tensor) -> Tensor:
+        """Return features of mean 0 and variance 1. (B, N, 3, H, W) in [0, 1], twice → (B, F)"""
+        return self.head.scale(self.unscaled(first, frames))
 
     def loss(self, first: Tensor, frames: Tensor, success: Tensor) -> tuple[Tensor, dict[str, float]]:
         """Return binary cross-entropy on shifted and brightened frames, and metrics. success: (B,) bool"""
-        logit = self.logit(self.features(*augment(first, frames)))
+        unscaled = self.unscaled(*augment(first, frames))
+        self.head.scale(unscaled.detach())  # which follows their mean and variance
+        logit = self.head.linear(unscaled[:, -HIDDEN:]).squeeze(-1)
         weight = logit.new_tensor(POSITIVE_WEIGHT)
         loss = F.binary_cross_entropy_with_logits(logit, success.float(), pos_weight=weight)
         right = ((logit > 0) == success).float().mean()
@@ -130,11 +153,11 @@ class PredictedSuccess(nn.Module):
     def __init__(self, width: int, cameras: int) -> None:
         super().__init__()
         self.features = nn.Linear(width, num_features(cameras))
-        self.head = nn.Linear(HIDDEN, 1).requires_grad_(False)  # the classifier's own
+        self.head = SuccessHead(cameras).requires_grad_(False)  # the classifier's own
 
     def forward(self, hidden: Tensor) -> Tensor:
         """Hidden states (…, D) → logits of success (…, 1)."""
-        return self.head(self.features(hidden)[..., -HIDDEN:])
+        return self.head(self.features(hidden)).unsqueeze(-1)
 
 
 def num_features(cameras: int) -> int:
