@@ -19,11 +19,12 @@ TITLES: Final = {
     "filtered": "cloning of demonstrations and successful rollouts",
     "weighted": "advantage-weighted cloning (RA-BC)",
     "conditioned": "advantage-conditioned cloning (RECAP)",
+    "imagined_ppo": "PPO in imagination",
     "distilled": "planner distilled in imagination",
 }
 """Methods in the order of the table."""
 
-IMAGINED: Final = ("distilled",)
+IMAGINED: Final = ("imagined_ppo", "distilled")
 """Methods that use a world model."""
 
 Cell = dict[str, Any]
@@ -110,7 +111,7 @@ def draw_value(load: Load, study: str, path: Path) -> None:
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     panels = figure.subplots(1, 2, sharey=True)
     for axes, domain in zip(panels, ("ind", "ood"), strict=True):
-        for colour, (method, title) in zip((*COLOURS, "#333333"), TITLES.items(), strict=True):
+        for colour, (method, title) in zip((*COLOURS, "#b83280", "#333333"), TITLES.items(), strict=True):
             _draw_line(axes, found, method, domain, {"color": colour, "label": title})
         axes.set_title(DOMAINS[domain])
         axes.set_xlabel("real episodes")
