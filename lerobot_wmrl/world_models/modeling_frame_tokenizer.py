@@ -8,7 +8,7 @@ from lerobot.rewards.pretrained import PreTrainedRewardModel
 from torch import Tensor
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.episodes import check_cameras, success_column
+from lerobot_wmrl.data.episodes import check_cameras
 from lerobot_wmrl.data.frames import NO_CONTEXT
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer, ImageLoss, motion_weight
@@ -53,11 +53,6 @@ class FrameTokenizerRewardModel(HubCard, PreTrainedRewardModel):
         sizes = config.tokenizer
         if dataset_meta is not None:
             check_cameras(dataset_meta.features, sizes.camera_keys, sizes.image_size)
-            if sizes.success and success_column(dataset_meta.features) is None:
-                raise FieldError(
-                    "tokenizer.success", True, "the dataset has neither next.success nor next.done",
-                    "label its episodes, or leave `tokenizer.success` out",
-                )  # fmt: skip
             if config.perceptual_weight:
                 require_backbone("vgg", "perceptual_weight", config.perceptual_weight, "0")
         self.tokenizer = FrameTokenizer(sizes)

@@ -117,6 +117,12 @@ def make_sampler(
         )  # fmt: skip
     config: Any = model.config
     if model.name == "frame_tokenizer":
+        if config.tokenizer.success and not table.done_known:
+            raise FieldError(
+                "tokenizer.success", True,
+                f"{table.dataset.root} has neither next.success nor next.done, so its frames cannot be told "
+                "apart", "label its episodes, or leave `tokenizer.success` out",
+            )  # fmt: skip
         frames = cached_frames(table.dataset, config.tokenizer.camera_keys)
         cameras = config.tokenizer.cameras
         return FrameSampler(table, frames, episodes.nonzero()[0], cameras, batch_size, seed, config.device)

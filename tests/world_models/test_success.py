@@ -1,7 +1,6 @@
 """Success classified in frames, and read by a world model from the features that it predicts."""
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,15 +10,17 @@ from torch import Tensor
 
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.clips import FrameSampler
-from lerobot_wmrl.data.episodes import read_episodes
+from lerobot_wmrl.data.episodes import TrainingData, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_features, cached_frames, frames_to_tensor
+from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig, train_world_model
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 from lerobot_wmrl.world_models.losses import feature_loss
 from lerobot_wmrl.world_models.modeling_frame_tokenizer import FrameTokenizerRewardModel
 from lerobot_wmrl.world_models.success import SuccessClassifier, augment, coordinates, soft_positions
 from lerobot_wmrl.world_models.training import make_sampler
-from tests.trained import action_config, run_training, small_tokenizer, text_config, tokenizer_config
+from tests.relabelled import UNLABELLED, relabelled
+from tests.trained import action_config, run_training, text_config, tokenizer_config
 
 CAMERA = "observation.images.third_view"
 
@@ -183,14 +184,25 @@ def test_lerobots_windows_have_features_too(models, small_dataset):
     torch.testing.assert_close(clip.features[:, 3], expected, atol=1e-5, rtol=1e-5)
 
 
-def test_what_success_needs_is_named(small_dataset):
+def test_what_success_needs_is_named():
     with pytest.raises(FieldError, match=r"tokenizer\.success=True.*tokenizer\.context"):
         TokenizerConfig(success=True)
     plain = FrameTokenizerRewardModel(tokenizer_config(context=True)).tokenizer
     with pytest.raises(ValueError, match="no success classifier"):
         plain.success_features(torch.zeros(1, 1, 3, 32, 32), torch.zeros(1, 1, 3, 32, 32))
-    unlabelled = {name: each for name, each in small_dataset.features.items() if "next" not in name}
-    meta = SimpleNamespace(features=unlabelled)
-    with pytest.raises(FieldError, match=r"tokenizer\.success=True.*next\.success"):
-        FrameTokenizerRewardModel(tokenizer_config(context=True, success=True), dataset_meta=meta)
-    assert small_tokenizer(context=True, success=True).success
+
+
+def test_a_dataset_without_labels_is_refused_also_as_a_further_one(small_dataset, tmp_path):
+    """Its successes would be learnt as failures."""
+    root = Path(small_dataset.root)
+    unlabelled = relabelled(root, tmp_path / "unlabelled", UNLABELLED)
+    config = tokenizer_config(context=True, success=True)
+    with pytest.raises(FieldError, match=r"tokenizer\.success=True.*unlabelled has neither next\.success"):
+        run_training(config, unlabelled, tmp_path / "alone")
+    with pytest.raises(FieldError, match=r"tokenizer\.success=True.*unlabelled has neither next\.success"):
+        train_world_model(
+            TrainWorldModelConfig(
+                model=config, dataset=TrainingData(str(root), more=[str(unlabelled)]),
+                output_dir=tmp_path / "beside", steps=1, batch_size=2, save_freq=1, log_freq=1,
+            )
+        )  # fmt: skip
