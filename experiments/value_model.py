@@ -16,9 +16,10 @@ from scipy.stats import mannwhitneyu
 from torch import Tensor
 
 from lerobot_policy_cnn.modeling_cnn import STATE_LIMIT, VALUE_WIDTH
-from lerobot_policy_cnn.networks import Trunk, random_shift
+from lerobot_policy_cnn.networks import Trunk
 from lerobot_policy_cnn.processor_cnn import MIN_DATASET_STD
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.images import random_shift
 from lerobot_wmrl.data.episodes import EpisodeTable
 from lerobot_wmrl.data.frame_cache import cached_frames, frames_to_tensor
 

@@ -14,6 +14,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from lerobot_wmrl.common.images import coordinates, random_shift, soft_positions
+
 WIDTH: Final = 16
 """Channels of the first convolution."""
 
@@ -41,21 +43,6 @@ MAX_GAIN: Final = 0.2
 """Share by which contrast changes at most, in training; brightness changes by half as much."""
 
 
-def coordinates(maps: Tensor) -> Tensor:
-    """Return the row and the column of every cell of maps (B, C, h, w), from −1 to 1. → (2, h, w)"""
-    sides = (torch.linspace(-1, 1, side, device=maps.device, dtype=maps.dtype) for side in maps.shape[2:])
-    return torch.stack(torch.meshgrid(*sides, indexing="ij"))
-
-
-def soft_positions(maps: Tensor) -> Tensor:
-    """Return each channel's expected row and column (spatial softmax, Levine et al. 2016).
-
-    (B, C, h, w) → (B, 2C)
-    """
-    weights = maps.flatten(2).softmax(-1)  # (B, C, h·w)
-    return (weights @ coordinates(maps).flatten(1).T).flatten(1)
-
-
 class PairEncoder(nn.Module):
     """Encode one camera's first and present frame: positions of C channels, and a coarse map."""
 
@@ -71,7 +58,7 @@ class PairEncoder(nn.Module):
 
     def forward(self, pair: Tensor) -> tuple[Tensor, Tensor]:
         """pair (B, 6, H, W), centred → positions (B, 4·WIDTH), coarse map (B, GRID_CHANNELS·GRID²)."""
-        where = coordinates(pair).expand(len(pair), -1, -1, -1)
+        where = torch.stack(coordinates(pair.shape[2], pair.shape[3], pair)).expand(len(pair), -1, -1, -1)
         x = F.relu(self.down(F.relu(self.stem(torch.cat([pair, where], 1)))))
         fine = self.fine(x)
         coarse = self.grid(F.relu(self.coarse(F.relu(fine))))
@@ -170,11 +157,8 @@ def augment(first: Tensor, frames: Tensor) -> tuple[Tensor, Tensor]:
 
     (B, N, 3, H, W) twice → the same
     """
-    batch, cameras, _, height, width = frames.shape
+    batch, cameras = frames.shape[:2]
     gain, offset = (2 * torch.rand(2, batch, 1, 1, 1, 1, device=frames.device) - 1) * MAX_GAIN
-    pair = ((torch.cat([first, frames], 2) - 0.5) * (1 + gain) + 0.5 + offset / 2).flatten(0, 1)
-    # one pixel is 2 / (side − 1) of the grid's range
-    shift = torch.randint(-MAX_SHIFT, MAX_SHIFT + 1, (len(pair), 1, 1, 2), device=frames.device)
-    grid = coordinates(pair).permute(1, 2, 0).flip(-1) + 2 * shift / pair.new_tensor([width - 1, height - 1])
-    shifted = F.grid_sample(pair, grid, padding_mode="border", align_corners=True)
-    return tuple(shifted.unflatten(0, (batch, cameras)).split(3, 2))
+    pair = (torch.cat([first, frames], 2) - 0.5) * (1 + gain) + 0.5 + offset / 2
+    shifted = random_shift(pair.flatten(0, 1), MAX_SHIFT).unflatten(0, (batch, cameras))
+    return shifted[:, :, :3], shifted[:, :, 3:]

@@ -13,7 +13,8 @@ from torch import Tensor, nn
 from torch.distributions import Normal
 
 from lerobot_policy_cnn.configuration_cnn import MAX_STD, MIN_STD, CnnConfig, check_std
-from lerobot_policy_cnn.networks import Trunk, random_shift
+from lerobot_policy_cnn.networks import Trunk
+from lerobot_wmrl.common.images import random_shift
 
 STATE_LIMIT = 10.0
 """Normalised states are clamped to ± this: a state far from the demonstrations must not drown the image."""

@@ -8,6 +8,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from lerobot_wmrl.common.images import coordinates, soft_positions
+
 GRID = 8
 """Cells on each side of the pooled feature map."""
 
@@ -19,20 +21,6 @@ LANGUAGE_BUCKETS = 256
 
 LANGUAGE_SIZE = 32
 """Width of an instruction's embedding."""
-
-
-def coordinates(height: int, width: int, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Return row and column positions in [-1, 1]. → (H, W), (H, W)"""
-    rows = torch.linspace(-1, 1, height, device=like.device, dtype=like.dtype)
-    columns = torch.linspace(-1, 1, width, device=like.device, dtype=like.dtype)
-    return torch.meshgrid(rows, columns, indexing="ij")  # type: ignore[return-value]
-
-
-def soft_positions(maps: Tensor) -> Tensor:
-    """Return each channel's expected position (B, 2C) (spatial softmax, Levine et al. 2016). (B, C, H, W)"""
-    rows, columns = coordinates(maps.shape[2], maps.shape[3], maps)
-    attention = maps.flatten(2).softmax(dim=-1)
-    return torch.cat([attention @ rows.flatten(), attention @ columns.flatten()], dim=1)
 
 
 def instance_norm(maps: Tensor) -> Tensor:
@@ -125,15 +113,3 @@ class Trunk(nn.Module):
         features = [encoder(image) for encoder, image in zip(self.encoders, images, strict=True)]
         parts = [*features, *([] if state is None else [state]), self.instruction(instructions)]
         return self.head(self.mix(torch.cat(parts, dim=1)))
-
-
-def random_shift(images: Tensor, pixels: int) -> Tensor:
-    """Shift each image by up to `pixels` along both axes, repeating its edges. (B, 3, H, W) → (B, 3, H, W)"""
-    batch, _, height, width = images.shape
-    padded = F.pad(images, (pixels,) * 4, mode="replicate")
-    top, left = (torch.randint(0, 2 * pixels + 1, (batch, 1), device=images.device) for _ in range(2))
-    rows = (top + torch.arange(height, device=images.device))[:, None, :, None]
-    columns = (left + torch.arange(width, device=images.device))[:, None, None, :]
-    batch_index = torch.arange(batch, device=images.device)[:, None, None, None]
-    channel_index = torch.arange(images.shape[1], device=images.device)[None, :, None, None]
-    return padded[batch_index, channel_index, rows, columns]

@@ -17,8 +17,9 @@ from torch.distributions import Normal
 
 from lerobot_policy_cnn.configuration_cnn import MAX_STD, MIN_STD, CnnConfig
 from lerobot_policy_cnn.modeling_cnn import SUMMARY, UNKNOWN_POLICY, CnnPolicy
-from lerobot_policy_cnn.networks import ImageEncoder, InstructionEncoder, instance_norm, random_shift
+from lerobot_policy_cnn.networks import ImageEncoder, InstructionEncoder, instance_norm
 from lerobot_policy_cnn.processor_cnn import make_cnn_pre_post_processors
+from lerobot_wmrl.common.images import random_shift
 from tests.hub_server import Hub
 
 IMAGE = "observation.images.third_view"

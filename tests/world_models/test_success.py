@@ -17,7 +17,7 @@ from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 from lerobot_wmrl.world_models.losses import feature_loss
 from lerobot_wmrl.world_models.modeling_frame_tokenizer import FrameTokenizerRewardModel
-from lerobot_wmrl.world_models.success import SuccessClassifier, augment, coordinates, soft_positions
+from lerobot_wmrl.world_models.success import SuccessClassifier, augment
 from lerobot_wmrl.world_models.training import make_sampler
 from tests.relabelled import UNLABELLED, relabelled
 from tests.trained import action_config, run_training, text_config, tokenizer_config
@@ -88,14 +88,6 @@ def bright_column(image: Tensor) -> float:
     grey = image.mean((0, 1))
     bright = (grey > (grey.min() + grey.max()) / 2).float()
     return float((bright.sum(0) * torch.arange(bright.shape[1])).sum() / bright.sum())
-
-
-def test_soft_positions_are_where_a_map_is_high():
-    maps = torch.full((1, 2, 5, 9), -20.0)
-    maps[0, 0, 1, 8] = maps[0, 1, 4, 0] = 20.0
-    rows, columns = coordinates(maps)
-    expected = [rows[1, 8], columns[1, 8], rows[4, 0], columns[4, 0]]
-    torch.testing.assert_close(soft_positions(maps)[0], torch.stack(expected))
 
 
 def test_a_frame_is_labelled_by_the_action_before_it(small_dataset):
