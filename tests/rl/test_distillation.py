@@ -21,6 +21,7 @@ from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
 from lerobot_wmrl.rl.labels import Labels, Part, action_chunks, recorded_successes
 from lerobot_wmrl.scripts.train import main
 from lerobot_wmrl.world_models.configuration_planner import PlannerSettings
+from lerobot_wmrl.world_models.planning import Planner
 from tests.rl.act_checkpoint import save_small_act
 from tests.rl.checkpoints import save_untrained_policy
 
@@ -75,6 +76,31 @@ def test_it_trains_on_the_planners_successes_and_resumes_as_if_nothing_had_happe
         shutil.rmtree(output_dir / "checkpoints" / step)
     train(monkeypatch, *flags)
     assert all(torch.equal(value, after[name]) for name, value in weights(output_dir).items())
+
+
+def test_the_planners_search_begins_at_what_the_policy_would_do(
+    imagined: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With one sample and a knot a step, the plan is the proposal."""
+    look_ahead, plan, proposals, plans = WorldModelVectorEnv.look_ahead, Planner.plan, [], []
+
+    def spied_look_ahead(*args: Any) -> Tensor:
+        proposals.append(look_ahead(*args))
+        return proposals[-1]
+
+    def spied_plan(*args: Any) -> Tensor:
+        plans.append(plan(*args))
+        return plans[-1]
+
+    monkeypatch.setattr(WorldModelVectorEnv, "look_ahead", spied_look_ahead)
+    monkeypatch.setattr(Planner, "plan", spied_plan)
+    policy = save_untrained_policy(tmp_path / "policy", actions=7)
+    single = ["samples=1", "elites=1", "iterations=1", "knots=6", "execute=2"]
+    flags = [f"--policy.path={policy}", *FAST, *(f"--algorithm.planner.{each}" for each in single)]
+    train(monkeypatch, *flags, "--iterations=1", *imagined, f"--output_dir={tmp_path / 'rl'}")
+    assert len(plans) == 2
+    assert plans[0].shape == (3, 6, 7)
+    assert all(torch.allclose(*pair) for pair in zip(plans, proposals, strict=True))
 
 
 def test_nothing_is_labelled_after_an_episode_has_ended(
