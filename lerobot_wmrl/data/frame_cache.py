@@ -78,8 +78,7 @@ def cached_tokens(dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer
     """
     frames = cached_frames(dataset, camera_keys)
     device = next(tokenizer.parameters()).device
-    episodes = dataset.meta.episodes
-    starts = np.repeat(np.asarray(episodes["dataset_from_index"]), np.asarray(episodes["length"]))
+    starts = first_rows(dataset)
 
     def fill(target: np.ndarray) -> None:
         for begin in tqdm(range(0, len(frames), ENCODE_BATCH), desc="Encoding tokens", unit="batch"):
@@ -125,8 +124,7 @@ def cached_features(
     float32 (rows, F), encoded on the first call.
     """
     frames, device = cached_frames(dataset, camera_keys), next(tokenizer.parameters()).device
-    episodes = dataset.meta.episodes
-    starts = np.repeat(np.asarray(episodes["dataset_from_index"]), np.asarray(episodes["length"]))
+    starts = first_rows(dataset)
 
     def features(part: slice) -> np.ndarray:
         first, images = (frames_to_tensor(frames[rows]).to(device) for rows in (starts[part], part))
@@ -139,6 +137,12 @@ def cached_features(
 
     shape = (len(frames), *features(slice(0, 1)).shape[1:])
     return memory_map(encoded_path("features", dataset, camera_keys, tokenizer), shape, np.float32, fill)
+
+
+def first_rows(dataset: LeRobotDataset) -> np.ndarray:
+    """Return for each row the first row of its episode. (rows,)"""
+    episodes = dataset.meta.episodes
+    return np.repeat(np.asarray(episodes["dataset_from_index"]), np.asarray(episodes["length"]))
 
 
 def encoded_path(
