@@ -8,7 +8,9 @@ python -m experiments.choose_episodes outputs/attempts --every_success
 import argparse
 from pathlib import Path
 
-from lerobot_wmrl.demo.stages import optimal_episodes
+import numpy as np
+
+from lerobot_wmrl.common.constants import KINDS
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
 
@@ -22,6 +24,26 @@ def make_parser() -> argparse.ArgumentParser:
     chosen.add_argument("--successes", type=int, help="the first successes")
     chosen.add_argument("--every_success", action="store_true", help="all successes")
     return parser
+
+
+def optimal_episodes(root: Path, count: int) -> list[int]:
+    """Return the first `count` successful episodes of the kind `optimal`, taken from the scenes in turn.
+
+    Raises:
+        ValueError: there are not so many.
+    """
+    table = recorded_episodes(root)
+    chosen = (table["kind"] == KINDS.index("optimal")) & table["success"]
+    rank = np.zeros(len(chosen), dtype=np.int64)
+    for scene in np.unique(table["scene"]):
+        members = chosen & (table["scene"] == scene)
+        rank[members] = np.arange(members.sum())
+    order = sorted(np.flatnonzero(chosen), key=lambda row: (rank[row], table["scene"][row]))
+    if len(order) < count:
+        raise ValueError(
+            f"{root} holds {len(order)} successful optimal episodes, {count} are needed: record more"
+        )
+    return sorted(int(table["episode"][row]) for row in order[:count])
 
 
 def successes(root: Path, count: int | None) -> list[int]:

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 
 from lerobot_wmrl.common.checkpoints import LAST_CHECKPOINT, latest_checkpoint
 from lerobot_wmrl.common.command_line import RunConfig
-from lerobot_wmrl.common.constants import EVALUATION_SEED, KINDS
+from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import FieldError, require_at_least
 from lerobot_wmrl.common.presets import Flags, format_flags, preset_flags
 from lerobot_wmrl.demo.runner import Stage
@@ -20,43 +19,57 @@ from lerobot_wmrl.maniskill.recordings import recorded_episodes
 SEED_STRIDE = 100_000
 """Demo seed s records and trains with seeds from s·SEED_STRIDE on, below EVALUATION_SEED."""
 
-EXPLORATION_SEED = SEED_STRIDE // 2
-"""Offset of the seeds with which the SFT policy gathers experience for the world models."""
+ROLLOUTS_FROM = SEED_STRIDE // 2
+"""Offset of the seeds with which the cloned policy is rolled out."""
 
-ROLLOUT_SEED = EVALUATION_SEED + SEED_STRIDE
-"""First seed of the rollouts replayed in the world model: neither trained on nor used for a success rate."""
+CHECKED_SEED = EVALUATION_SEED + SEED_STRIDE
+"""First seed of the episodes replayed in the world model: neither trained on nor used for a success rate."""
 
 EXPLORATION = 0.4
-"""Largest noise on the SFT policy's actions while it gathers experience, as a share of the action box."""
+"""Largest noise on the cloned policy's actions in its rollouts, as a share of the action box."""
+
+MEASURED = {"cloned": "cloned policy", "filtered": "policy cloned with its own successes", "rl": "PPO policy"}
+"""Policies whose success is measured, in the order in which they are made."""
+
+WHERE: dict[str, Flags] = {
+    "known": {"env.split": "ind", "env.scenes": "[0,1,2]"},
+    "unseen": {"env.split": "ood"},
+}
+"""Scenes in which success is measured."""
 
 
 @dataclass
 class DemoConfig(RunConfig):
-    """Run the whole loop on one task: record, train, SFT, reinforce in imagination, measure, report.
+    """Is a world model worth it? Run the whole loop on one task, beside the best rival on the same data.
+
+    A few demonstrations, and labelled rollouts of the policy cloned from them, are all that is learnt from.
+    Two policies come of them: one cloned again, from the demonstrations and the successful rollouts, and that
+    one improved by PPO in a world model that has learnt from all of them. All three are measured in ManiSkill
+    on the same held-out starts, in known and in unseen scenes.
 
     Running the same command again continues after the last finished piece of work. `--preset=demo` (the
-    default) takes 40 minutes on one core, `--preset=tiny` a few and shows only that everything runs; flags
+    default) takes 40 minutes on two cores, `--preset=tiny` a few and shows only that everything runs; flags
     further right override the preset.
 
     Args:
         output_dir: folder of everything the demo makes; `report.html` is the page to read.
         seed: seed of recording, training and PPO. The evaluation seeds stay the same.
         stage_preset: `--preset` of each stage's command.
-        sft_episodes: optimal planned episodes that the SFT policy is cloned from.
-        explore_episodes: noisy rollouts of that policy, which the world models learn from beside the planned
-            episodes.
+        demonstrations: planned episodes with a human's pauses and detours that the first policy is cloned
+            from.
+        rollouts: noisy rollouts of that policy, labelled as successes and failures.
         eval_episodes: held-out episodes behind each success rate.
-        rollout_episodes: rollouts of each policy in ManiSkill that are replayed in the world model to measure
-            false positives and recall.
+        checked_episodes: held-out rollouts of a policy that are replayed in the world model, to measure false
+            positives and recall. Nothing learns from them.
     """
 
     output_dir: Path = Path("outputs/demo")
     seed: int = 0
     stage_preset: str = "demo"
-    sft_episodes: int = 8
-    explore_episodes: int = 300
+    demonstrations: int = 8
+    rollouts: int = 300
     eval_episodes: int = 100
-    rollout_episodes: int = 60
+    checked_episodes: int = 60
 
     def check(self) -> None:
         """Raise FieldError for a setting that cannot be."""
@@ -66,16 +79,17 @@ class DemoConfig(RunConfig):
             raise FieldError(
                 "seed", self.seed, f"must be from 0 to {last}, so that no evaluation seed is trained on"
             )
-        require_at_least(self, 1, "sft_episodes", "explore_episodes", "eval_episodes", "rollout_episodes")
+        require_at_least(self, 1, "demonstrations", "rollouts", "eval_episodes", "checked_episodes")
 
 
 def demo_stages(config: DemoConfig) -> list[Stage]:
     """List every stage in order. Paths are relative to where the demo runs, so each line can be copied."""
     return [
-        Stage("record", "Record planned trajectories in ManiSkill", partial(record, config)),
-        Stage("sft", "Clone an SFT policy from a few optimal episodes", partial(train_sft, config)),
-        Stage("explore", "Record noisy attempts of that policy", partial(explore, config)),
-        Stage("merge", "Merge both recordings", partial(merge, config)),
+        Stage("demonstrations", "Record demonstrations in ManiSkill", partial(record, config)),
+        Stage("cloned", "Clone a policy from them", partial(clone, config)),
+        Stage("rollouts", "Record noisy rollouts of that policy", partial(roll_out, config)),
+        Stage("merge", "Merge demonstrations and rollouts", partial(merge, config)),
+        Stage("filtered", "Clone it again, with its own successes", partial(clone_successes, config)),
         *(
             Stage(model, f"Train the {model.replace('_', ' ')}", partial(train_model, config, model))
             for model in ("frame_tokenizer", "action_world_model", "text_world_model")
@@ -85,24 +99,35 @@ def demo_stages(config: DemoConfig) -> list[Stage]:
             "Replay held-out recordings in it",
             partial(replay, config, "dataset", "held_out"),
         ),
-        *measurements(config, "sft", "SFT policy"),
-        Stage("rl", "Train it by PPO inside the world model", partial(reinforce, config)),
-        *measurements(config, "rl", "PPO policy"),
+        *checks(config, "filtered"),
+        Stage("rl", "Train that policy by PPO inside the world model", partial(reinforce, config)),
+        *checks(config, "rl"),
+        *(
+            Stage(
+                f"eval_{where}_{policy}",
+                f"Success of the {MEASURED[policy]} in ManiSkill, {where} scenes",
+                partial(evaluate, config, policy, where),
+            )
+            for where in WHERE
+            for policy in MEASURED
+        ),
+        *(
+            Stage(
+                f"imagine_{policy}",
+                f"Success of the {title} in imagination",
+                partial(imagine, config, policy),
+            )
+            for policy, title in MEASURED.items()
+        ),
     ]
 
 
-def measurements(config: DemoConfig, policy: str, title: str) -> list[Stage]:
-    """Measure a policy's success in ManiSkill and in imagination, and replay its ManiSkill episodes."""
-    rollouts = f"rollouts_{policy}"
+def checks(config: DemoConfig, policy: str) -> list[Stage]:
+    """Record a policy's ManiSkill episodes and replay them in the world model."""
+    title, folder = MEASURED[policy], f"checked_{policy}"
     return [
-        Stage(f"eval_{policy}", f"Success of the {title} in ManiSkill", partial(evaluate, config, policy)),
-        Stage(
-            f"imagine_{policy}", f"Success of the {title} in imagination", partial(imagine, config, policy)
-        ),
-        Stage(rollouts, f"Record ManiSkill episodes of the {title}", partial(record_policy, config, policy)),
-        Stage(
-            f"replay_{policy}", "Replay those in the world model", partial(replay, config, rollouts, policy)
-        ),
+        Stage(folder, f"Record held-out episodes of the {title}", partial(record_checked, config, policy)),
+        Stage(f"replay_{policy}", "Replay those in the world model", partial(replay, config, folder, policy)),
     ]
 
 
@@ -121,43 +146,41 @@ def preset_command(config: DemoConfig, program: str, flags: Flags) -> list[str]:
 
 
 def record(config: DemoConfig) -> list[str]:
-    flags: Flags = {"output_dir": str(config.output_dir / "planned"), "seed": first_seed(config)}
+    flags: Flags = {
+        "kinds": "{human_like: 1}",
+        "num_episodes": config.demonstrations,
+        "video": False,
+        "output_dir": str(config.output_dir / "demonstrations"),
+        "seed": first_seed(config),
+    }
     return preset_command(config, "lerobot-wmrl-record", flags)
 
 
-def train_sft(config: DemoConfig) -> list[str]:
-    dataset = config.output_dir / "planned"
-    flags: Flags = {"policy.type": "cnn", "dataset.repo_id": "local/demo", "seed": first_seed(config)}
-    return lerobot_train(
-        config.output_dir / "sft",
-        dataset,
-        optimal_episodes(dataset, config.sft_episodes),
-        [*preset_flags(config.stage_preset, "sft"), *format_flags(flags)],
-    )
+def clone(config: DemoConfig) -> list[str]:
+    dataset = config.output_dir / "demonstrations"
+    return lerobot_train(config, "cloned", dataset, preset_flags(config.stage_preset, "sft"))
 
 
-def optimal_episodes(root: Path, count: int) -> list[int]:
-    """Return the first `count` successful episodes of the kind `optimal`, taken from the scenes in turn."""
+def clone_successes(config: DemoConfig) -> list[str]:
+    """Clone from every success: of what needs no world model, the best use of the data that we know."""
+    dataset = config.output_dir / "dataset"
+    flags = preset_flags(config.stage_preset, "sft", ["filtered"])
+    return lerobot_train(config, "filtered", dataset, [*flags, f"--dataset.episodes={successful(dataset)}"])
+
+
+def successful(root: Path) -> str:
+    """Return the successful episodes of a recording, `[0,3,4]`."""
     table = recorded_episodes(root)
-    chosen = (table["kind"] == KINDS.index("optimal")) & table["success"]
-    rank = np.zeros(len(chosen), dtype=np.int64)
-    for scene in np.unique(table["scene"]):
-        members = chosen & (table["scene"] == scene)
-        rank[members] = np.arange(members.sum())
-    order = sorted(np.flatnonzero(chosen), key=lambda row: (rank[row], table["scene"][row]))
-    if len(order) < count:
-        raise ValueError(
-            f"{root} holds {len(order)} successful optimal episodes, {count} are needed: record more"
-        )
-    return sorted(int(table["episode"][row]) for row in order[:count])
+    return f"[{','.join(map(str, table['episode'][table['success']]))}]"
 
 
-def lerobot_train(folder: Path, dataset: Path, episodes: Sequence[int], flags: Sequence[str]) -> list[str]:
+def lerobot_train(config: DemoConfig, name: str, dataset: Path, flags: Sequence[str]) -> list[str]:
     """Return LeRobot's own training command, begun or continued.
 
     It continues by other flags, and refuses a folder without checkpoints, which is therefore removed. It
     points `last` at a checkpoint that is whole, but a kill can come between the two.
     """
+    folder = config.output_dir / name
     last = folder / LAST_CHECKPOINT
     newest = last if last.exists() else latest_checkpoint(folder)
     if newest is not None:
@@ -165,27 +188,34 @@ def lerobot_train(folder: Path, dataset: Path, episodes: Sequence[int], flags: S
         return ["lerobot-train", *format_flags({"config_path": str(trained), "resume": True})]
     shutil.rmtree(folder, ignore_errors=True)
     files: Flags = {
+        "policy.type": "cnn",
         "policy.push_to_hub": False,
+        "dataset.repo_id": f"local/{dataset.name}",
         "dataset.root": str(dataset),
-        "dataset.episodes": f"[{','.join(map(str, episodes))}]",
+        "seed": first_seed(config),
         "output_dir": str(folder),
     }
     return ["lerobot-train", *flags, *format_flags(files)]
 
 
-def explore(config: DemoConfig) -> list[str]:
-    """Record noisy episodes of the SFT policy: the world models must see how it fails, not planners only."""
-    seed = first_seed(config) + EXPLORATION_SEED
-    command = roll_out(config, "sft", config.output_dir / "explored", config.explore_episodes, seed)
+def roll_out(config: DemoConfig) -> list[str]:
+    """Record noisy episodes of the cloned policy: what it does right and wrong is all that is learnt from."""
+    command = record_policy(config, "cloned", "rollouts", config.rollouts, first_seed(config) + ROLLOUTS_FROM)
     return [*command, f"--exploration={EXPLORATION}"]
 
 
-def roll_out(config: DemoConfig, policy: str, folder: Path, episodes: int, seed: int) -> list[str]:
+def record_checked(config: DemoConfig, policy: str) -> list[str]:
+    """Record held-out episodes of a policy without exploration."""
+    return record_policy(config, policy, f"checked_{policy}", config.checked_episodes, CHECKED_SEED)
+
+
+def record_policy(config: DemoConfig, policy: str, name: str, episodes: int, seed: int) -> list[str]:
     flags: Flags = {
         "policy.path": str(checkpoint(config.output_dir / policy)),
         "env.type": "wmrl_maniskill",
         "num_episodes": episodes,
-        "output_dir": str(folder),
+        "video": False,
+        "output_dir": str(config.output_dir / name),
         "seed": seed,
     }
     return preset_command(config, "lerobot-wmrl-record", flags)
@@ -193,7 +223,7 @@ def roll_out(config: DemoConfig, policy: str, folder: Path, episodes: int, seed:
 
 def merge(config: DemoConfig) -> list[str]:
     """Merge with LeRobot's own tool, which refuses what an interrupted call left; that is removed first."""
-    target, names = config.output_dir / "dataset", ("planned", "explored")
+    target, names = config.output_dir / "dataset", ("demonstrations", "rollouts")
     shutil.rmtree(target, ignore_errors=True)
     flags: Flags = {
         "new_repo_id": "local/dataset",
@@ -201,7 +231,6 @@ def merge(config: DemoConfig) -> list[str]:
         "operation.type": "merge",
         "operation.repo_ids": str([f"local/{name}" for name in names]),
         "operation.roots": str([str(config.output_dir / name) for name in names]),
-        "operation.concatenate_videos": False,
         "operation.concatenate_data": False,
     }
     return ["lerobot-edit-dataset", *format_flags(flags)]
@@ -228,12 +257,12 @@ def imagination(config: DemoConfig) -> Flags:
 
 
 def reinforce(config: DemoConfig) -> list[str]:
-    """Train whatever the gate says of the SFT policy's rollouts; the report shows its warning."""
+    """Train whatever the gate says of the policy's rollouts; the report shows its warning."""
     out = config.output_dir
     flags: Flags = {
-        "policy.path": str(checkpoint(out / "sft")),
+        "policy.path": str(checkpoint(out / "filtered")),
         **imagination(config),
-        "gate.dataset.root": str(out / "rollouts_sft"),
+        "gate.dataset.root": str(out / "checked_filtered"),
         "algorithm.type": "ppo",
         "output_dir": str(out / "rl"),
         "seed": first_seed(config),
@@ -241,9 +270,9 @@ def reinforce(config: DemoConfig) -> list[str]:
     return preset_command(config, "lerobot-wmrl-train", flags)
 
 
-def evaluate(config: DemoConfig, policy: str) -> list[str]:
+def evaluate(config: DemoConfig, policy: str, where: str) -> list[str]:
     """Evaluate in ManiSkill, on the same held-out starts for every policy and every demo seed."""
-    return success_rate(config, policy, {}, preset="eval", folder=f"eval_{policy}")
+    return success_rate(config, policy, WHERE[where], preset="eval", folder=f"eval_{where}_{policy}")
 
 
 def imagine(config: DemoConfig, policy: str) -> list[str]:
@@ -263,12 +292,6 @@ def success_rate(config: DemoConfig, policy: str, env: Flags, preset: str, folde
         "output_dir": str(config.output_dir / folder),
     }
     return ["lerobot-eval", *preset_flags(config.stage_preset, preset), *format_flags(flags)]
-
-
-def record_policy(config: DemoConfig, policy: str) -> list[str]:
-    """Record held-out episodes of a policy without exploration."""
-    folder = config.output_dir / f"rollouts_{policy}"
-    return roll_out(config, policy, folder, config.rollout_episodes, ROLLOUT_SEED)
 
 
 def replay(config: DemoConfig, dataset: str, name: str) -> list[str]:

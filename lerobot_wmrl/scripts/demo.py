@@ -2,8 +2,9 @@
 
     lerobot-wmrl-demo --preset=demo --output_dir=outputs/demo
 
-It records a task in ManiSkill, clones an SFT policy from a few episodes, trains the world models, trains the
-policy by PPO inside them, and measures both policies on the same held-out starts in ManiSkill. Every stage is
+It records demonstrations of a task in ManiSkill, clones a policy, records that policy's rollouts, and learns
+from these alone: a policy cloned again with the successful rollouts, world models, and that policy trained by
+PPO inside them. All policies are measured on the same held-out starts in ManiSkill. Every stage is
 one console command, which it prints. Running the same command again continues an interrupted demo. It ends
 with a summary and `report.html`.
 """

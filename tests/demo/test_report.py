@@ -5,23 +5,24 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 
-from lerobot_wmrl.common.constants import KINDS
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.statistics import PairedChange, Proportion
 from lerobot_wmrl.common.tracking import append_metrics
 from lerobot_wmrl.demo.report import figures
 from lerobot_wmrl.demo.report.page import conclusion, verdict, write_report
 from lerobot_wmrl.demo.report.results import lerobot_train_curve, metric_curves, success_rate
-from lerobot_wmrl.demo.stages import DemoConfig, demo_stages, optimal_episodes
+from lerobot_wmrl.demo.stages import DemoConfig, demo_stages, successful
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
+from tests.recorded import write_recording
 
-SUCCESSES = {"eval_sft": 4, "imagine_sft": 5, "eval_rl": 6, "imagine_rl": 9}
+SUCCESSES = {
+    "eval_known_cloned": 2, "eval_known_filtered": 4, "eval_known_rl": 6,
+    "eval_unseen_cloned": 1, "eval_unseen_filtered": 3, "eval_unseen_rl": 3,
+    "imagine_cloned": 3, "imagine_filtered": 5, "imagine_rl": 9,
+}  # fmt: skip
 
 
 @pytest.fixture
@@ -29,7 +30,7 @@ def finished(tmp_path: Path) -> DemoConfig:
     """An output folder as ten episodes of evaluation and four recorded episodes would leave it."""
     tmp_path = tmp_path / "demo"
     config = DemoConfig(tmp_path)
-    write_dataset(tmp_path / "dataset")
+    write_recording(tmp_path / "dataset")
     for stage in demo_stages(config):
         record: dict[str, object] = {"name": stage.name, "title": stage.title, "command": f"run-{stage.name}"}
         record |= {"seconds": 3.0, "peak_memory_bytes": 2e9}
@@ -39,12 +40,13 @@ def finished(tmp_path: Path) -> DemoConfig:
     for folder, successes in SUCCESSES.items():
         outcomes = [i < successes for i in range(10)]
         write_json(tmp_path / folder / "eval_info.json", {"per_task": [{"metrics": {"successes": outcomes}}]})
-    for policy in ("sft", "rl", "held_out"):
+    for policy in ("filtered", "rl", "held_out"):
         replay = {"false_positives": 2, "failures": 5, "true_positives": 3, "successes": 4}
         write_json(tmp_path / f"replay_{policy}" / "metrics.json", replay)
         Image.new("RGB", (8, 8)).save(tmp_path / f"replay_{policy}" / "comparison_0.png")
     (tmp_path / "logs").mkdir()
-    (tmp_path / "logs" / "sft.log").write_text("INFO step:1 loss:2.0 \nINFO step:2 loss:1.0 \n")
+    for policy in ("cloned", "filtered"):
+        (tmp_path / "logs" / f"{policy}.log").write_text("INFO step:1 loss:2.0 \nINFO step:2 loss:1.0 \n")
     for folder in ("frame_tokenizer", "action_world_model", "text_world_model", "rl"):
         (tmp_path / folder).mkdir()
         append_metrics(tmp_path / folder, 1, {"loss": 1.0, "success_rate": 0.5})
@@ -57,33 +59,16 @@ def without_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(figures, "drawn", lambda figure: "data:image/png;base64,")
 
 
-def write_dataset(root: Path) -> None:
-    """Four episodes of three rows; the first and the last succeed, at their last row."""
-    kinds = [KINDS.index(kind) for kind in ("optimal", "optimal", "near_miss", "optimal")]
-    starts = {
-        "start.task": [0, 0, 0, 0],
-        "start.kind": kinds,
-        "start.seed": range(4),
-        "start.scene": [0, 0, 1, 1],
-        "episode_index": range(4),
-    }
-    success = np.zeros((4, 3), dtype=bool)
-    success[[0, 3], -1] = True
-    table = {name: np.repeat(values, 3) for name, values in starts.items()}
-    table["next.success"] = success.reshape(-1)
-    (root / "data" / "chunk-000").mkdir(parents=True)
-    pq.write_table(pa.table(table), root / "data" / "chunk-000" / "file-000.parquet")
-
-
 def test_page_is_self_contained_and_says_the_numbers(finished: DemoConfig) -> None:
     stages = [stage.name for stage in demo_stages(finished)]
     page = write_report(finished, stages).read_text()
     assert not re.findall(r"""(?:src|href)=["'](?!data:)""", page), "the page needs other files"
     assert "4 of 10; 95 %: 17–69 %" in page
     assert (
-        "Success in ManiSkill went from 40 % to 60 % (+20 points): of the same 10 starts, 2 were gained"
-        in page
+        "In known scenes PPO in the world model brought success in ManiSkill from 40 % to 60 % (+20 points): "
+        "of the same 10 starts, 2 were gained" in page
     )
+    assert "In unseen scenes PPO in the world model brought success in ManiSkill from 30 % to 30 %" in page
     assert "40 % (2 of 5; 12–77 %)" in page
     for name in stages:
         assert f"<pre>run-{name}</pre>" in page
@@ -92,7 +77,7 @@ def test_page_is_self_contained_and_says_the_numbers(finished: DemoConfig) -> No
 
 def test_the_demo_ends_by_saying_what_came_of_it(finished: DemoConfig) -> None:
     said = conclusion(finished, finished.output_dir / "report.html")
-    assert "Success in ManiSkill went from 40 % to 60 %" in said
+    assert "brought success in ManiSkill from 40 % to 60 %" in said
     assert "predicts 2 of 5 failures as successes (false positives) and 3 of 4 successes (recall)" in said
     assert f"Report: {finished.output_dir}/report.html" in said
 
@@ -112,10 +97,10 @@ def test_the_gates_last_warning_is_shown_in_red(finished: DemoConfig) -> None:
 def test_summary_holds_every_headline_number(finished: DemoConfig) -> None:
     write_report(finished, [stage.name for stage in demo_stages(finished)])
     summary = json.loads((finished.output_dir / "summary.json").read_text())
-    assert summary["policies"]["rl"]["maniskill"]["k"] == SUCCESSES["eval_rl"]
-    assert summary["policies"]["sft"]["false_positive_rate"]["share"] == 0.4
-    assert summary["change"] == {"gained": 2, "lost": 0, "p_value": 0.5}
-    assert sum(summary["outcomes"]["rl"]) == SUCCESSES["eval_rl"]
+    assert summary["policies"]["rl"]["known"]["k"] == SUCCESSES["eval_known_rl"]
+    assert summary["replayed"]["filtered"]["false_positive_rate"]["share"] == 0.4
+    assert summary["changes"]["known"] == {"gained": 2, "lost": 0, "p_value": 0.5}
+    assert sum(summary["outcomes"]["unseen"]["rl"]) == SUCCESSES["eval_unseen_rl"]
     assert summary["dataset"] == {"episodes": 4, "frames": 12}
     assert summary["seconds"] == 3.0 * len(demo_stages(finished))
 
@@ -128,7 +113,8 @@ def test_runs_with_other_seeds_stand_side_by_side(finished: DemoConfig) -> None:
     assert "Other seeds" not in write_report(config, stages).read_text()
     own = json.loads((config.output_dir / "summary.json").read_text())
     beside = config.output_dir.parent
-    other = {**own, "seed": 1, "outcomes": {"sft": [False] * 10, "rl": [True] * 4 + [False] * 6}}
+    changed = {**own["outcomes"]["known"], "filtered": [False] * 10, "rl": [True] * 4 + [False] * 6}
+    other = {**own, "seed": 1, "outcomes": {**own["outcomes"], "known": changed}}
     write_json(beside / "another" / "summary.json", other)
     write_json(beside / "copy" / "summary.json", own)
     write_json(beside / "tiny" / "summary.json", {**own, "preset": "tiny", "seed": 2})
@@ -139,25 +125,23 @@ def test_runs_with_other_seeds_stand_side_by_side(finished: DemoConfig) -> None:
 
 @pytest.mark.parametrize(
     ("gained", "lost", "words"),
-    [(20, 5, "made the policy better"), (5, 20, "made the policy worse"), (14, 9, "does not show")],
+    [(20, 5, "It is better than cloning"), (5, 20, "It is worse than"), (14, 9, "does not show")],
 )
 def test_verdict_claims_no_more_than_the_same_starts_show(gained: int, lost: int, words: str) -> None:
     before, after = Proportion(50, 100), Proportion(50 + gained - lost, 100)
-    assert words in verdict(before, after, PairedChange(gained, lost))
+    assert words in verdict("known", before, after, PairedChange(gained, lost))
 
 
 def test_episode_table_reads_outcomes_by_episode(tmp_path: Path) -> None:
-    write_dataset(tmp_path)
+    write_recording(tmp_path)
     table = recorded_episodes(tmp_path)
     assert table["length"].tolist() == [3, 3, 3, 3]
     assert table["success"].tolist() == [True, False, False, True]
 
 
-def test_cloning_takes_successful_optimal_episodes_only(tmp_path: Path) -> None:
-    write_dataset(tmp_path)
-    assert optimal_episodes(tmp_path, 2) == [0, 3]
-    with pytest.raises(ValueError, match="holds 2 successful optimal episodes, 3 are needed"):
-        optimal_episodes(tmp_path, 3)
+def test_cloning_with_successes_leaves_failures_out(tmp_path: Path) -> None:
+    write_recording(tmp_path)
+    assert successful(tmp_path) == "[0,3]"
 
 
 def test_success_rate_counts_every_episode_of_every_task(tmp_path: Path) -> None:
@@ -168,7 +152,7 @@ def test_success_rate_counts_every_episode_of_every_task(tmp_path: Path) -> None
 
 
 def test_curve_from_lerobots_log_lines(tmp_path: Path) -> None:
-    log = tmp_path / "sft.log"
+    log = tmp_path / "cloned.log"
     log.write_text(
         "INFO ot_train.py:1 step:200 smpl:2K ep:3 epch:0.10 loss:0.250 grdn:1.2 lr:1.0e-04\n"
         "Training:  10%|\rINFO step:1K smpl:9K ep:9 epch:0.20 loss:1.5e-02 grdn:1.1 lr:1.0e-04\n"

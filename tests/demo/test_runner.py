@@ -129,7 +129,7 @@ def test_two_runs_do_not_share_a_folder(tmp_path: Path) -> None:
         pass
 
 
-@pytest.mark.parametrize("flags", [{"seed": -1}, {"seed": 10}, {"eval_episodes": 0}, {"explore_episodes": 0}])
+@pytest.mark.parametrize("flags", [{"seed": -1}, {"seed": 10}, {"eval_episodes": 0}, {"rollouts": 0}])
 def test_impossible_settings_are_named(flags: dict[str, int]) -> None:
     with pytest.raises(ValueError, match=f"{next(iter(flags))}="):
         DemoConfig(**flags).check()
@@ -140,13 +140,11 @@ def test_training_and_evaluation_seeds_are_disjoint() -> None:
     trained, held_out = set(), set()
     for seed in range(10):
         for stage in demo_stages(DemoConfig(seed=seed)):
-            if stage.name not in ("sft", "merge"):  # the first one's command needs the dataset
+            if stage.name not in ("filtered", "merge"):  # the first one's command needs the dataset
                 seeds = {
                     int(flag.partition("=")[2]) for flag in stage.command() if flag.startswith("--seed=")
                 }
-                (held_out if stage.name.startswith(("eval", "imagine", "rollouts")) else trained).update(
-                    seeds
-                )
+                (held_out if stage.name.startswith(("eval", "imagine", "checked")) else trained).update(seeds)
     assert len(trained) == 20
     assert len(held_out) == 2
     assert min(held_out) - max(trained) >= 50_000

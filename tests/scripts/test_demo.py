@@ -14,13 +14,13 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.presets import preset_settings
 from lerobot_wmrl.common.tracking import read_metrics
-from lerobot_wmrl.demo.stages import DemoConfig, demo_stages
+from lerobot_wmrl.demo.stages import MEASURED, DemoConfig, demo_stages
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
-KILLED_STAGE = "explore"
+KILLED_STAGE = "rollouts"
 STAGES = [stage.name for stage in demo_stages(DemoConfig())]
 HEADINGS = (
-    "Success, before and after",
+    "Success on the same data",
     "Can the world model be trusted?",
     "Recorded beside imagined",
     "Goal frames",
@@ -77,7 +77,7 @@ def test_a_finished_run_does_nothing_again(outputs: tuple[Path, str]) -> None:
 
 def written(demo: Path) -> dict[Path, int]:
     """When each model and each part of the data was last written (ns)."""
-    kept = (".safetensors", ".parquet", ".mp4")
+    kept = (".safetensors", ".parquet")
     return {path: path.stat().st_mtime_ns for path in demo.rglob("*") if path.suffix in kept}
 
 
@@ -95,10 +95,10 @@ def test_the_dataset_reopens_and_holds_successes_and_failures(outputs: tuple[Pat
 
 def test_no_held_out_seed_is_trained_on(outputs: tuple[Path, str]) -> None:
     demo, _ = outputs
-    for dataset in ("planned", "explored", "dataset"):
+    for dataset in ("demonstrations", "rollouts", "dataset"):
         assert recorded_episodes(demo / dataset)["seed"].max() < EVALUATION_SEED
-    for policy in ("sft", "rl"):
-        rollouts = recorded_episodes(demo / f"rollouts_{policy}")["seed"]
+    for policy in ("filtered", "rl"):
+        rollouts = recorded_episodes(demo / f"checked_{policy}")["seed"]
         evaluated = range(
             EVALUATION_SEED, EVALUATION_SEED + int(preset_settings("tiny", "demo")["eval_episodes"])
         )
@@ -106,22 +106,35 @@ def test_no_held_out_seed_is_trained_on(outputs: tuple[Path, str]) -> None:
         assert not set(rollouts.tolist()) & set(evaluated)
 
 
-def test_both_policies_meet_the_same_held_out_starts(outputs: tuple[Path, str]) -> None:
+@pytest.mark.parametrize("where", ["known", "unseen"])
+def test_all_policies_meet_the_same_held_out_starts(outputs: tuple[Path, str], where: str) -> None:
     demo, _ = outputs
-    commands = [str(stage_record(demo, f"eval_{policy}")["command"]).split() for policy in ("sft", "rl")]
-    different = set(commands[0]) ^ set(commands[1])
-    assert {flag.partition("=")[0] for flag in different} == {"--policy.path", "--output_dir"}
+    commands = [
+        {*str(stage_record(demo, f"eval_{where}_{policy}")["command"]).split()} for policy in MEASURED
+    ]
+    for other in commands[1:]:
+        assert {flag.partition("=")[0] for flag in commands[0] ^ other} == {"--policy.path", "--output_dir"}
+
+
+def test_everything_learns_from_the_demonstrations_and_the_rollouts(outputs: tuple[Path, str]) -> None:
+    demo, _ = outputs
+    given = preset_settings("tiny", "demo")
+    table = recorded_episodes(demo / "dataset")
+    assert len(table["episode"]) == given["demonstrations"] + given["rollouts"]
+    for stage in ("filtered", "frame_tokenizer", "action_world_model", "text_world_model", "rl"):
+        assert "dataset.root=demo/dataset" in str(stage_record(demo, stage)["command"])
 
 
 def test_the_summary_counts_what_was_evaluated(outputs: tuple[Path, str]) -> None:
     demo, _ = outputs
     summary = json.loads((demo / "summary.json").read_text())
     n = preset_settings("tiny", "demo")["eval_episodes"]
-    for policy in ("sft", "rl"):
-        assert [summary["policies"][policy][key]["n"] for key in ("maniskill", "imagined")] == [n, n]
-        replayed = summary["policies"][policy]
+    for policy in MEASURED:
+        assert {row["n"] for row in summary["policies"][policy].values()} == {n}
+    for policy in ("filtered", "rl"):
+        replayed = summary["replayed"][policy]
         assert replayed["false_positive_rate"]["n"] + replayed["recall"]["n"] == len(
-            recorded_episodes(demo / f"rollouts_{policy}")["episode"]
+            recorded_episodes(demo / f"checked_{policy}")["episode"]
         )
     assert summary["peak_memory_bytes"] < 8e9
 
@@ -131,7 +144,7 @@ def test_training_left_metrics_and_whole_checkpoints(outputs: tuple[Path, str]) 
     for folder in ("frame_tokenizer", "action_world_model", "text_world_model", "rl"):
         assert read_metrics(demo / folder), f"{folder} has no metrics"
     whole = {"config.json", "model.safetensors", "train_config.json"}
-    for folder in ("frame_tokenizer", "action_world_model", "text_world_model", "sft", "rl"):
+    for folder in ("frame_tokenizer", "action_world_model", "text_world_model", *MEASURED):
         checkpoint = demo / folder / "checkpoints" / "last" / "pretrained_model"
         assert whole <= {path.name for path in checkpoint.iterdir()}
 

@@ -11,7 +11,6 @@ from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.demo.report.results import Curve
 
 COLOURS = ("#2b6cb0", "#dd6b20", "#2f855a", "#805ad5")
-MANISKILL, IMAGINED = COLOURS[:2]
 
 
 def data_url(content: bytes, kind: str) -> str:
@@ -29,21 +28,24 @@ def drawn(figure: Figure) -> str:
     return data_url(buffer.getvalue(), "png")
 
 
-def success_bars(rates: Mapping[str, tuple[Proportion, Proportion]]) -> str:
-    """Draw each policy's success in ManiSkill and in the world model, with 95 % intervals."""
-    figure = Figure(figsize=(6.4, 3.4))
+def success_bars(rates: Mapping[str, Mapping[str, Proportion]]) -> str:
+    """Draw each policy's success with 95 % intervals, a bar a place."""
+    figure = Figure(figsize=(8, 3.4))
     axes = figure.subplots()
-    for side, (label, colour) in enumerate((("in ManiSkill", MANISKILL), ("in the world model", IMAGINED))):
-        for place, pair in enumerate(rates.values()):
-            rate, x = pair[side], place + (side - 0.5) * 0.36
+    places = list(next(iter(rates.values())))
+    width = 0.8 / len(places)
+    for offset, place in enumerate(places):
+        for group, row in enumerate(rates.values()):
+            rate, x = row[place], group + (offset - (len(places) - 1) / 2) * width
             low, high = rate.interval
-            axes.bar(x, rate.share, width=0.33, color=colour, label=label if place == 0 else None)
+            label = place if group == 0 else None
+            axes.bar(x, rate.share, width=0.92 * width, color=COLOURS[offset], label=label)
             axes.errorbar(x, rate.share, [[rate.share - low], [high - rate.share]], color="#333", capsize=4)
             axes.annotate(
                 f"{100 * rate.share:.0f} %", (x, high), (0, 3), textcoords="offset points", ha="center"
             )
     axes.set_xticks(range(len(rates)), list(rates))
-    axes.set_ylim(0, 1.12)
+    axes.set_ylim(0, 1.3)
     axes.set_ylabel("success rate")
     return drawn(tidy(figure))
 

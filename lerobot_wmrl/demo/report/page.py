@@ -12,11 +12,21 @@ from lerobot_wmrl.common.constants import KINDS
 from lerobot_wmrl.common.files import write_json, write_text
 from lerobot_wmrl.common.statistics import PairedChange, Proportion
 from lerobot_wmrl.demo.report import figures, results
-from lerobot_wmrl.demo.report.results import EPISODES, POLICIES, Rates, Summary
-from lerobot_wmrl.demo.stages import DemoConfig
+from lerobot_wmrl.demo.report.results import EPISODES, OURS, RIVAL, Rates, Summary
+from lerobot_wmrl.demo.stages import MEASURED, WHERE, DemoConfig
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
 SIGNIFICANCE = 0.05
+
+POLICY_TITLES = {
+    "cloned": "cloned from the demonstrations",
+    "filtered": "cloned with its own successes",
+    "rl": "and then PPO in imagination",
+}
+"""What each policy learnt from, under its bars."""
+
+PLACES = {"known": "known scenes", "unseen": "unseen scenes", "imagined": "in the world model"}
+"""Where success is measured, as the figure says it."""
 
 PICTURE_SECTIONS = (
     (
@@ -74,9 +84,13 @@ def render(
         episodes=summary["dataset"],
         minutes=round(summary["seconds"] / 60, 1),
         peak_memory=f"{summary['peak_memory_bytes'] / 1e9:.1f}",
+        demonstrations=config.demonstrations,
+        rollouts=config.rollouts,
         cards=headline_cards(rates),
-        verdict=run_verdict(config.output_dir, rates),
-        bars=figures.success_bars({POLICIES[p]: (r["maniskill"], r["imagined"]) for p, r in rates.items()}),
+        verdicts=run_verdicts(config.output_dir, rates),
+        bars=figures.success_bars(
+            {POLICY_TITLES[policy]: {PLACES[p]: r for p, r in row.items()} for policy, row in rates.items()}
+        ),
         trust=trust_rows(config.output_dir),
         warning=results.gate_warning(config.output_dir / "rl"),
         pictures=picture_sections(config.output_dir),
@@ -90,36 +104,38 @@ def render(
     )
 
 
-def run_verdict(output_dir: Path, rates: Rates) -> str:
-    """State the verdict on the run in `output_dir`."""
-    before, after = (rates[policy]["maniskill"] for policy in POLICIES)
-    return verdict(before, after, results.paired_change(output_dir))
+def run_verdicts(output_dir: Path, rates: Rates) -> list[str]:
+    """State, for known and for unseen scenes, what PPO in imagination added to the best rival."""
+    return [
+        verdict(where, rates[RIVAL][where], rates[OURS][where], results.paired_change(output_dir, where))
+        for where in WHERE
+    ]
 
 
-def verdict(before: Proportion, after: Proportion, change: PairedChange) -> str:
+def verdict(where: str, before: Proportion, after: Proportion, change: PairedChange) -> str:
     """State whether success in ManiSkill changed, judged on the same starts; nothing more is claimed."""
-    shares = f"from {100 * before.share:.0f} % to {100 * after.share:.0f} %"
     said = (
-        f"Success in ManiSkill went {shares} ({100 * (after.share - before.share):+.0f} points): "
+        f"In {where} scenes PPO in the world model brought success in ManiSkill from "
+        f"{100 * before.share:.0f} % to {100 * after.share:.0f} % "
+        f"({100 * (after.share - before.share):+.0f} points): "
         f"of the same {before.n} starts, {change.gained} were gained and {change.lost} lost "
         f"(exact McNemar test: p = {change.p_value:.2g})."
     )
     if change.p_value >= SIGNIFICANCE:
         return f"{said} This run alone does not show a difference."
-    if change.gained > change.lost:
-        return f"{said} PPO in the world model made the policy better in ManiSkill."
-    return f"{said} PPO in the world model made the policy worse in ManiSkill."
+    better = "better" if change.gained > change.lost else "worse"
+    return f"{said} It is {better} than cloning the same data's successes."
 
 
 def conclusion(config: DemoConfig, page: Path) -> str:
     """Say in a few lines what the demo made, how good it is, and what comes next."""
     out = config.output_dir
-    rates = results.policy_rates(out)
-    false_positives, recall = (rates["sft"][key] for key in ("false_positive_rate", "recall"))
+    found = results.replayed(out, RIVAL)
+    false_positives, recall = found["false_positive_rate"], found["recall"]
     lines = [
-        f"Made: a dataset, a frame tokenizer, two world models and two policies in {out}.",
-        run_verdict(out, rates),
-        f"Of the SFT policy's ManiSkill episodes the world model predicts {false_positives.k} of "
+        f"Made: a dataset, a frame tokenizer, two world models and three policies in {out}.",
+        *run_verdicts(out, results.policy_rates(out)),
+        f"Of held-out episodes of the {MEASURED[RIVAL]}, the world model predicts {false_positives.k} of "
         f"{false_positives.n} failures as successes (false positives) and {recall.k} of {recall.n} successes "
         "(recall).",
         f"Report: {page}",
@@ -130,13 +146,13 @@ def conclusion(config: DemoConfig, page: Path) -> str:
 
 
 def headline_cards(rates: Rates) -> list[dict[str, Any]]:
-    """Return one card for each policy's success in ManiSkill and in the world model."""
+    """Return one card for each policy's success in ManiSkill, known scenes first."""
     cards = []
-    for policy, row in rates.items():
-        for key, where in (("maniskill", "in ManiSkill"), ("imagined", "in the world model")):
-            rate = row[key]
+    for where in WHERE:
+        for policy, row in rates.items():
+            rate = row[where]
             value = "–" if math.isnan(rate.share) else f"{100 * rate.share:.0f} %"
-            cards.append({"label": f"{POLICIES[policy]}, {where}", "value": value, "n": rate.n,
+            cards.append({"label": f"{PLACES[where]}: {POLICY_TITLES[policy]}", "value": value, "n": rate.n,
                           "note": f"{rate.k} of {rate.n}; 95 %: {100 * rate.interval[0]:.0f}–"
                                   f"{100 * rate.interval[1]:.0f} %"})  # fmt: skip
     return cards
@@ -146,7 +162,7 @@ def trust_rows(output_dir: Path) -> list[dict[str, str]]:
     """Return false positives and recall for each source of episodes."""
     rows = []
     for suffix, whose in EPISODES.items():
-        replayed = results.replayed(output_dir / f"replay_{suffix}")
+        replayed = results.replayed(output_dir, suffix)
         rows.append({"episodes": whose, **{key: str(rate) for key, rate in replayed.items()}})
     return rows
 

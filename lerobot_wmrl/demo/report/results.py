@@ -10,11 +10,12 @@ import numpy as np
 
 from lerobot_wmrl.common.statistics import MeanChange, PairedChange, Proportion
 from lerobot_wmrl.common.tracking import read_metrics
-from lerobot_wmrl.demo.stages import DemoConfig
+from lerobot_wmrl.demo.stages import MEASURED, WHERE, DemoConfig
 
-POLICIES = {"sft": "SFT policy", "rl": "PPO policy"}
+RIVAL, OURS = "filtered", "rl"
+"""The best policy without a world model, and the one that PPO made of it."""
 
-EPISODES = {"rl": "PPO policy", "sft": "SFT policy", "held_out": "recorded, held out from training"}
+EPISODES = {OURS: MEASURED[OURS], RIVAL: MEASURED[RIVAL], "held_out": "recorded, held out from training"}
 """Whose episodes were replayed, by the suffix of the folder."""
 
 MODELS = {
@@ -26,7 +27,7 @@ MODELS = {
 PPO_PANELS = {
     "success_rate": "PPO: imagined success",
     "reward": "PPO: reward a step",
-    "reference_kl": "PPO: KL to the SFT policy",
+    "reference_kl": "PPO: KL to the policy before",
 }
 """Columns of the PPO run's metrics that the report plots, and their titles."""
 
@@ -34,21 +35,20 @@ Curve = tuple[list[float], list[float]]
 """Steps and values."""
 
 Rates = dict[str, dict[str, Proportion]]
-"""For each policy: success in `maniskill` and `imagined`, `false_positive_rate` and `recall`."""
+"""For each policy: success in `known` and `unseen` scenes of ManiSkill, and `imagined`."""
 
 Summary = dict[str, Any]
 """Content of summary.json."""
 
 
 def policy_rates(output_dir: Path) -> Rates:
-    """Read the success of each policy, and what the world model makes of its ManiSkill episodes."""
+    """Read the success of each policy."""
     return {
         policy: {
-            "maniskill": success_rate(output_dir / f"eval_{policy}"),
+            **{where: success_rate(output_dir / f"eval_{where}_{policy}") for where in WHERE},
             "imagined": success_rate(output_dir / f"imagine_{policy}"),
-            **replayed(output_dir / f"replay_{policy}"),
         }
-        for policy in POLICIES
+        for policy in MEASURED
     }
 
 
@@ -64,18 +64,19 @@ def success_rate(eval_dir: Path) -> Proportion:
     return Proportion(sum(successes), len(successes))
 
 
-def replayed(replay_dir: Path) -> dict[str, Proportion]:
+def replayed(output_dir: Path, whose: str) -> dict[str, Proportion]:
     """Read false positives and recall from the world model's evaluation on recorded episodes."""
-    metrics = json.loads((replay_dir / "metrics.json").read_text())
+    metrics = json.loads((output_dir / f"replay_{whose}" / "metrics.json").read_text())
     return {
         "false_positive_rate": Proportion(metrics["false_positives"], metrics["failures"]),
         "recall": Proportion(metrics["true_positives"], metrics["successes"]),
     }
 
 
-def paired_change(output_dir: Path) -> PairedChange:
-    """Compare the SFT with the PPO policy on the same held-out starts in ManiSkill."""
-    return PairedChange.between(outcomes(output_dir / "eval_sft"), outcomes(output_dir / "eval_rl"))
+def paired_change(output_dir: Path, where: str) -> PairedChange:
+    """Compare PPO's policy with the one that it began with, on the same held-out starts in ManiSkill."""
+    before, after = (outcomes(output_dir / f"eval_{where}_{policy}") for policy in (RIVAL, OURS))
+    return PairedChange.between(before, after)
 
 
 def training_curves(output_dir: Path) -> dict[str, dict[str, Curve]]:
@@ -83,7 +84,9 @@ def training_curves(output_dir: Path) -> dict[str, dict[str, Curve]]:
     panels = {
         title: metric_curves(read_metrics(output_dir / folder), ["loss"]) for folder, title in MODELS.items()
     }
-    panels["SFT policy"] = {"loss": lerobot_train_curve(output_dir / "logs" / "sft.log")}
+    for folder in ("cloned", RIVAL):
+        log = output_dir / "logs" / f"{folder}.log"
+        panels[MEASURED[folder].capitalize()] = {"loss": lerobot_train_curve(log)}
     rows = read_metrics(output_dir / "rl")
     ppo = {title: metric_curves(rows, [name]) for name, title in PPO_PANELS.items()}
     return panels | {title: lines for title, lines in ppo.items() if lines}
@@ -129,8 +132,15 @@ def summarize(
         "preset": config.stage_preset,
         "seed": config.seed,
         "policies": {policy: {k: v.as_json() for k, v in row.items()} for policy, row in rates.items()},
-        "change": paired_change(config.output_dir).as_json(),
-        "outcomes": {policy: outcomes(config.output_dir / f"eval_{policy}") for policy in POLICIES},
+        "changes": {where: paired_change(config.output_dir, where).as_json() for where in WHERE},
+        "replayed": {
+            whose: {name: share.as_json() for name, share in replayed(config.output_dir, whose).items()}
+            for whose in EPISODES
+        },
+        "outcomes": {
+            where: {policy: outcomes(config.output_dir / f"eval_{where}_{policy}") for policy in MEASURED}
+            for where in WHERE
+        },
         "dataset": {"episodes": len(table["episode"]), "frames": int(table["length"].sum())},
         "seconds": sum(record["seconds"] for record in records),
         "peak_memory_bytes": max(record["peak_memory_bytes"] for record in records),
@@ -146,9 +156,11 @@ def other_seeds(config: DemoConfig) -> dict[str, Any] | None:
     runs = [
         run
         for run in finished_runs(config.output_dir, config.stage_preset)
-        if len(run["outcomes"]["sft"]) == config.eval_episodes
+        if len(run["outcomes"]["known"][OURS]) == config.eval_episodes
     ]
-    return {"rows": run_rows(runs), "change": str(mean_change(runs))} if len(runs) > 1 else None
+    if len(runs) < 2:
+        return None
+    return {"rows": run_rows(runs), "changes": {where: str(mean_change(runs, where)) for where in WHERE}}
 
 
 def finished_runs(output_dir: Path, preset: str) -> list[Summary]:
@@ -160,32 +172,28 @@ def finished_runs(output_dir: Path, preset: str) -> list[Summary]:
     folders = sorted(path.parent for path in output_dir.absolute().parent.glob("*/summary.json"))
     for folder in sorted(folders, key=lambda folder: folder != output_dir.absolute()):
         summary = json.loads((folder / "summary.json").read_text())
-        if summary.get("preset") == preset and "outcomes" in summary:
+        if summary.get("preset") == preset and "replayed" in summary:
             found.setdefault(summary["seed"], summary)
     return [found[seed] for seed in sorted(found)]
 
 
-def mean_change(runs: Sequence[Summary]) -> MeanChange:
+def mean_change(runs: Sequence[Summary], where: str) -> MeanChange:
     """Average the change of success in ManiSkill. Raises ValueError if the runs met different starts."""
-    both = [run["outcomes"] for run in runs]
-    return MeanChange.over_runs([each["sft"] for each in both], [each["rl"] for each in both])
-
-
-def rate(run: Summary, policy: str, key: str) -> Proportion:
-    """Return one of a run's measured shares."""
-    measured = run["policies"][policy][key]
-    return Proportion(measured["k"], measured["n"])
+    both = [run["outcomes"][where] for run in runs]
+    return MeanChange.over_runs([each[RIVAL] for each in both], [each[OURS] for each in both])
 
 
 def run_rows(runs: Sequence[Summary]) -> list[dict[str, str]]:
-    """Write a row of text for each run."""
+    """Write a row of text for each run: success of all policies, changes, and the gate's two shares."""
     rows = []
     for run in runs:
-        change = PairedChange(run["change"]["gained"], run["change"]["lost"])
-        row = {"seed": str(run["seed"]), "change": str(change)}
-        for key in ("maniskill", "imagined"):
-            row[key] = " → ".join(f"{100 * rate(run, policy, key).share:.0f} %" for policy in POLICIES)
-        for key in ("false_positive_rate", "recall"):
-            row[key] = f"{rate(run, 'sft', key).k} of {rate(run, 'sft', key).n}"
+        row = {"seed": str(run["seed"])}
+        for where in (*WHERE, "imagined"):
+            shares = [run["policies"][policy][where]["share"] for policy in MEASURED]
+            row[where] = " → ".join(f"{100 * share:.0f} %" for share in shares)
+        for where, change in run["changes"].items():
+            row[f"change_{where}"] = str(PairedChange(change["gained"], change["lost"]))
+        for name, share in run["replayed"][RIVAL].items():
+            row[name] = f"{share['k']} of {share['n']}"
         rows.append(row)
     return rows
