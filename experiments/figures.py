@@ -71,26 +71,6 @@ def draw_improvement(found: Mapping[str, Any], path: Path) -> None:
     tidy(figure).savefig(path, dpi=130)
 
 
-def draw_demo(results: Mapping[str, Any], path: Path) -> None:
-    """A panel a place: a line from the SFT to the PPO policy for each run of the demo."""
-    figure = Figure(figsize=(8, 3.4))
-    panels = figure.subplots(1, 2, sharey=True)
-    places = (("known", "in ManiSkill"), ("imagined", "in the world model"))
-    for axes, (place, title), colour in zip(panels, places, COLOURS, strict=False):
-        for offset, run in enumerate(results["runs"]):
-            rates = [run[place][kind] for kind in ("sft", "rl")]
-            errors = np.hstack([spread(rate) for rate in rates])
-            axes.errorbar(
-                [0.04 * offset, 1 + 0.04 * offset], [rate["share"] for rate in rates], errors, marker="o",
-                color=colour, alpha=1 - 0.2 * offset, capsize=3, label=f"seed {run['seed']}",
-            )  # fmt: skip
-        axes.set_title(title)
-        axes.set_xticks((0, 1), ("SFT", "PPO in imagination"))
-        axes.set_ylim(0, 1.05)
-    panels[0].set_ylabel("success rate")
-    tidy(figure).savefig(path, dpi=130, bbox_inches="tight")
-
-
 def draw_learning_curve(variants: Mapping[str, Mapping[str, Any]], path: Path) -> None:
     """A column each for data, time and size: delta-PSNR above, the AUC of the gate below."""
     figure = Figure(figsize=(9, 5), layout="constrained")

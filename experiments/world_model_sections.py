@@ -17,8 +17,7 @@ def policies(load: Load) -> str:
     return f"""Nearly, on these {len(rows)} checkpoints: Pearson's r is
 {found["pearson"]["value"]:.2f} ({low:.2f}–{high:.2f}, if they were independent), and the rates differ by
 {100 * gap / len(rows):.1f} points on average. Sampling 80 episodes in each alone would give 5.3 points, so
-part of this agreement is chance. The threshold was chosen on rollouts of one of these policies. Over the
-demo's six policies the difference is 12 points; imagined success is lower.
+part of this agreement is chance. The threshold was chosen on rollouts of one of these policies.
 
 {table(["checkpoint", "in the world model", "in ManiSkill"], rows)}
 
