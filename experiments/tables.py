@@ -15,7 +15,7 @@ from experiments import policy_sections as policies
 from experiments import value_sections as value
 from experiments import world_model_sections as world_models
 from experiments.cells import Load
-from experiments.study import ROOT, Study, read_cells
+from experiments.study import ROOT, read_cells
 from lerobot_wmrl.common.files import write_text
 
 DOCS: Final = ROOT / "docs"
@@ -85,9 +85,11 @@ def results_page(docs: Path = DOCS) -> str:
             chapter = title
             parts.append(f"## {chapter}\n")
         cells = read_cells(STUDIES / f"{name}.yaml")
+        results = [each for cell in cells for each in cell.results if each.endswith(".json")]
+        published = [result for result in results if (docs / result).exists()]
+        text = joined(section(load)) if published or not results else "Not run yet."
         parts.append(
-            f'### {cells[0].question}<a id="{name}"></a>\n\n{joined(section(load))}\n\n'
-            f"{origin(cells, load, docs)}\n"
+            f'### {cells[0].question}<a id="{name}"></a>\n\n{text}\n\n{origin(name, published, load)}\n'
         )
     return "\n".join(parts)
 
@@ -98,14 +100,8 @@ def joined(text: str) -> str:
     return "\n\n".join(block if block.startswith("|") else " ".join(block.split()) for block in blocks)
 
 
-def origin(cells: Sequence[Study], load: Load, docs: Path) -> str:
-    """Return the line that says where numbers come from and how to repeat them: of published cells alone."""
-    results = [
-        result
-        for study in cells
-        for result in study.results
-        if result.endswith(".json") and (len(cells) == 1 or (docs / result).exists())
-    ]
+def origin(study: str, results: Sequence[str], load: Load) -> str:
+    """Return the line that says where a study's published results come from and how to repeat them."""
     sources = [
         load(result.removeprefix("results/").removesuffix(".json"))["provenance"] for result in results
     ]
@@ -115,7 +111,7 @@ def origin(cells: Sequence[Study], load: Load, docs: Path) -> str:
     where += "".join(f". {source['note']}" for source in sources if "note" in source).removesuffix(".")
     parts = [f"Commit {commits}{where}"] if sources else []
     parts += [", ".join(f"[{Path(result).name}]({result})" for result in results)] if results else []
-    return f"*{'; '.join([*parts, f'`python -m experiments.run experiments/{cells[0].name}.yaml`'])}*"
+    return f"*{'; '.join([*parts, f'`python -m experiments.run experiments/{study}.yaml`'])}*"
 
 
 def make_parser() -> argparse.ArgumentParser:

@@ -65,8 +65,6 @@ def best(cells: Sequence[Cell], methods: Sequence[str], domain: str) -> str:
 def value_push(load: Load) -> str:
     """Return the section: for each budget the best with and without a world model, and a table."""
     found = groups(load, "value_push")
-    if not found:
-        return "No cell of this study has been run yet."
     answers, rows = [], []
     for (demonstrations, rollouts), cells in found.items():
         for domain in ("ind", "ood"):
