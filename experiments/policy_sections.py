@@ -44,8 +44,8 @@ def cloning_control(load: Load) -> str:
         for count, row in found.items()
     ]
     rows.append(["planning in a world model (`wm_mpc`)", share(plan["ind"]), share(plan["ood"])])
-    return f"""With 180 demonstrations without flaws it hardly fails. So neither the cameras nor the network limit
-what eight demonstrations reach.
+    return f"""With 180 demonstrations without flaws it hardly fails. So neither the cameras nor the network
+limit what eight demonstrations reach.
 
 {table(["policy", "known scenes", "unseen scenes"], rows)}
 
