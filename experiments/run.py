@@ -42,7 +42,8 @@ def run_study(study: Study, repeat: bool = False) -> None:
             episodes that are not in the study's budget.
     """
     for name in study.needs:
-        if not (study.folder_of(name) / RECORDS).is_dir():
+        folder = study.folder_of(name)
+        if not [*folder.glob(RECORDS), *folder.glob(f"*/{RECORDS}")]:
             raise StudyError(f"needs {name}: run experiments/{name}.yaml first, or give {name}=FOLDER")
     budget.begin(study)
     for number, step in enumerate(study.steps, start=1):

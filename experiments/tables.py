@@ -23,6 +23,8 @@ STUDIES: Final = ROOT / "experiments"
 
 SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     "value_push": ("Policies", value.value_push),
+    "value_iterated": ("Policies", value.value_iterated),
+    "value_controls": ("Policies", value.value_controls),
     "demo": ("Policies", policies.demo),
     "cloning_control": ("Policies", policies.cloning_control),
     "rl_comparison": ("Policies", policies.rl_comparison),
@@ -130,7 +132,7 @@ def main() -> None:
         if not target.exists() or target.read_text() != page:
             sys.exit("docs/results.md is not what the JSON says: run python -m experiments.tables")
         return
-    value.draw_value(loader(DOCS), "value_push", DOCS / "images" / "value_push.png")
+    value.draw_value(loader(DOCS), DOCS / "images" / "value_push.png")
     write_text(target, page)
     print(f"wrote {target.relative_to(ROOT)}")
 

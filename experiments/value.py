@@ -25,10 +25,20 @@ def cell(study: Study) -> Results:
     return {study.variables["cell"]: results}
 
 
+def controls(study: Study) -> Results:
+    """Return the success of PPO in imagination under each control, in one cell."""
+    found = {name: success(study, name) for name in study.variables["controls"]}
+    return {study.variables["cell"]: {"controls": found}}
+
+
 def method(study: Study, name: str, steps: Sequence[str]) -> dict[str, Any]:
     """Return a method's success in known and unseen scenes, and the minutes of its steps."""
-    success = {domain: rate(outcomes(study.folder / f"eval_{name}_{domain}")) for domain in ("ind", "ood")}
-    return {**success, "minutes": minutes(study, steps)}
+    return {**success(study, name), "minutes": minutes(study, steps)}
+
+
+def success(study: Study, name: str) -> dict[str, Any]:
+    """Return the success in known and in unseen scenes."""
+    return {domain: rate(outcomes(study.folder / f"eval_{name}_{domain}")) for domain in ("ind", "ood")}
 
 
 def minutes(study: Study, steps: Sequence[str]) -> float:

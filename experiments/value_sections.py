@@ -1,6 +1,6 @@
 """What imagination is worth: its section of docs/results.md, and the figure, from published cells."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
@@ -8,14 +8,15 @@ from typing import Any, Final
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from experiments.cells import DOMAINS, Load, points, table
+from experiments.cells import DOMAINS, Load, paired, points, table
 from experiments.study import ROOT, read_cells
-from lerobot_wmrl.common.statistics import RunsMean
+from lerobot_wmrl.common.statistics import PairedChange, RunsMean
 from lerobot_wmrl.demo.report.figures import COLOURS, tidy
 
 TITLES: Final = {
     "cloning": "cloning of the demonstrations",
     "filtered": "cloning of demonstrations and successful rollouts",
+    "iterated": "the same, with rollouts in three rounds",
     "weighted": "advantage-weighted cloning (RA-BC)",
     "conditioned": "advantage-conditioned cloning (RECAP)",
     "imagined_ppo": "PPO in imagination",
@@ -29,42 +30,70 @@ IMAGINED: Final = ("imagined_ppo", "distilled")
 RIVALS: Final = tuple(method for method in TITLES if method not in IMAGINED)
 """Methods that use none."""
 
+CONTROLS: Final = {
+    "labels": "labels of other episodes",
+    "actions": "actions of other episodes",
+    "constant": "no frame is rewarded",
+    "rollouts_only": "world model of the rollouts alone",
+    "demonstrations_only": "world model of the demonstrations alone",
+}
+
+STUDY: Final = "value_push"
+PARTS: Final = (STUDY, "value_iterated")
+"""Studies whose cells hold methods of the same table."""
+
 Cell = dict[str, Any]
 Groups = dict[tuple[int, int], list[Cell]]
 """Cells, one a seed, by demonstrations and rollouts."""
 
 
-def groups(load: Load, study: str) -> Groups:
-    """Return the published cells of a study."""
+def groups(load: Load) -> Groups:
+    """Return the published cells of the study, each with the methods of its other parts."""
     found: Groups = {}
-    for each in read_cells(ROOT / "experiments" / f"{study}.yaml"):
-        try:
-            cell = load(f"{study}/{each.variables['cell']}")
-        except FileNotFoundError:
-            continue
-        found.setdefault((cell["demonstrations"], cell["rollouts"]), []).append(cell)
+    for each in read_cells(ROOT / "experiments" / f"{STUDY}.yaml"):
+        parts = [part for study in PARTS if (part := published(load, study, each.variables["cell"]))]
+        if parts:
+            methods = {name: row for part in parts for name, row in part["methods"].items()}
+            cell = {**parts[0], "methods": methods}
+            found.setdefault((cell["demonstrations"], cell["rollouts"]), []).append(cell)
     return found
+
+
+def published(load: Load, study: str, cell: str) -> Cell | None:
+    """Return the results of a cell, None where they are not published."""
+    try:
+        return load(f"{study}/{cell}")
+    except FileNotFoundError:
+        return None
 
 
 def outcomes(cells: Sequence[Cell], method: str, domain: str) -> list[list[int]]:
     """Return the outcomes of a method's runs on the same starts, (R, E)."""
-    return [cell["methods"][method][domain]["outcomes"] for cell in cells]
+    return [cell["methods"][method][domain]["outcomes"] for cell in cells if method in cell["methods"]]
+
+
+def measured(cells: Sequence[Cell], methods: Iterable[str]) -> list[str]:
+    """Return the methods that have been run in any of the cells."""
+    return [method for method in methods if any(method in cell["methods"] for cell in cells)]
 
 
 def gain(cells: Sequence[Cell], method: str, rival: str, domain: str) -> RunsMean:
     """Return how much more often a method succeeds than a rival on the same data and starts."""
-    pairs = zip(outcomes(cells, method, domain), outcomes(cells, rival, domain), strict=True)
+    both = [cell for cell in cells if {method, rival} <= cell["methods"].keys()]
+    pairs = zip(outcomes(both, method, domain), outcomes(both, rival, domain), strict=True)
     return RunsMean.over([[a - b for a, b in zip(*pair, strict=True)] for pair in pairs])
 
 
 def best(cells: Sequence[Cell], methods: Sequence[str], domain: str) -> str:
     """Return the method with the highest mean success."""
-    return max(methods, key=lambda method: RunsMean.over(outcomes(cells, method, domain)).mean)
+    return max(
+        measured(cells, methods), key=lambda method: RunsMean.over(outcomes(cells, method, domain)).mean
+    )
 
 
 def value_push(load: Load) -> str:
     """Return the section: for each budget the best with and without a world model, and a table."""
-    found = groups(load, "value_push")
+    found = groups(load)
     answers, rows = [], []
     for (demonstrations, rollouts), cells in found.items():
         for domain in ("ind", "ood"):
@@ -73,8 +102,8 @@ def value_push(load: Load) -> str:
             answers.append([demonstrations, rollouts, DOMAINS[domain], TITLES[rival], TITLES[ours], gained])
         rows += [
             [demonstrations, rollouts, title, *(shares(cells, method, domain) for domain in ("ind", "ood")),
-             f"{sum(cell['methods'][method]['minutes'] for cell in cells) / len(cells):.0f}"]
-            for method, title in TITLES.items()
+             minutes(cells, method)]
+            for method, title in TITLES.items() if method in measured(cells, TITLES)
         ]  # fmt: skip
     budget = ["demonstrations", "rollouts"]
     starts = len(outcomes(next(iter(found.values())), "cloning", "ind")[0])
@@ -94,6 +123,42 @@ several methods is chosen on the starts that are reported, among four rivals and
 ![Success against real episodes](images/value_push.png)"""
 
 
+def value_iterated(load: Load) -> str:
+    """Return the section: its numbers are in the other one's table."""
+    return f'Its rows are in [the table above](#{STUDY}): "{TITLES["iterated"]}".'
+
+
+def value_controls(load: Load) -> str:
+    """Return the section: success under each control, against the policy before PPO on the same starts."""
+    rows = []
+    for each in read_cells(ROOT / "experiments" / "value_controls.yaml"):
+        cell, found = (published(load, name, each.variables["cell"]) for name in (STUDY, "value_controls"))
+        if cell and found:
+            before, ppo = cell["methods"]["filtered"], cell["methods"]["imagined_ppo"]
+            rows += [
+                [cell["seed"], title, *(against(row[domain], before[domain]) for domain in ("ind", "ood"))]
+                for title, row in [
+                    ("nothing: PPO in imagination", ppo),
+                    *((CONTROLS[name], row) for name, row in found["controls"].items()),
+                ]
+            ]
+    return f"""What is changed, and the success after PPO against the policy before it, on the same starts:
+
+{table(["seed", "changed", "known scenes", "unseen scenes"], rows)}"""
+
+
+def against(row: dict[str, Any], before: dict[str, Any]) -> str:
+    """`81 %: 25 gained, 3 lost (p = 1e-05)`."""
+    change = PairedChange.between(before["outcomes"], row["outcomes"])
+    return f"{100 * row['share']:.0f} %: {paired(change.as_json())}"
+
+
+def minutes(cells: Sequence[Cell], method: str) -> str:
+    """Return the minutes that a method's training took, the mean over its runs."""
+    found = [cell["methods"][method]["minutes"] for cell in cells if method in cell["methods"]]
+    return f"{sum(found) / len(found):.0f}"
+
+
 def shares(cells: Sequence[Cell], method: str, domain: str) -> str:
     """`62, 60 → 61 % (57–65)`, or `62 % (57–67)` of one seed."""
     found = outcomes(cells, method, domain)
@@ -103,18 +168,20 @@ def shares(cells: Sequence[Cell], method: str, domain: str) -> str:
     return f"{seeds}{100 * mean.mean:.0f} % ({100 * mean.low:.0f}–{100 * mean.high:.0f})"
 
 
-def draw_value(load: Load, study: str, path: Path) -> None:
+def draw_value(load: Load, path: Path) -> None:
     """Draw success against real episodes: a panel a domain, a line a method with its band.
 
     Nothing is drawn before a cell has been published.
     """
-    found = groups(load, study)
+    found = groups(load)
     if not found:
         return
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     panels = figure.subplots(1, 2, sharey=True)
     for axes, domain in zip(panels, ("ind", "ood"), strict=True):
-        for colour, (method, title) in zip((*COLOURS, "#b83280", "#333333"), TITLES.items(), strict=True):
+        for colour, (method, title) in zip(
+            (*COLOURS, "#b83280", "#333333", "#d69e2e"), TITLES.items(), strict=True
+        ):
             _draw_line(axes, found, method, domain, {"color": colour, "label": title})
         axes.set_title(f"{DOMAINS[domain]} scenes")
         axes.set_xlabel("real episodes: demonstrations + rollouts")
@@ -126,10 +193,14 @@ def draw_value(load: Load, study: str, path: Path) -> None:
 
 def _draw_line(axes: Axes, found: Groups, method: str, domain: str, style: Mapping[str, str]) -> None:
     """Draw a method's mean and band over the budgets, the smallest first."""
-    means = [RunsMean.over(outcomes(found[budget], method, domain)) for budget in sorted(found, key=sum)]
-    axes.plot([mean.mean for mean in means], marker="o", **style)
+    places, means = [], []
+    for place, budget in enumerate(sorted(found, key=sum)):
+        if runs := outcomes(found[budget], method, domain):
+            places.append(place)
+            means.append(RunsMean.over(runs))
+    axes.plot(places, [mean.mean for mean in means], marker="o", **style)
     axes.fill_between(
-        range(len(means)),
+        places,
         [mean.low for mean in means],
         [mean.high for mean in means],
         color=style["color"],

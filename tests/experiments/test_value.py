@@ -12,7 +12,16 @@ from experiments import value
 from experiments.run import record_path
 from experiments.study import ROOT, read_cells
 from experiments.tables import loader
-from experiments.value_sections import TITLES, best, draw_value, gain, groups, value_push
+from experiments.value_sections import (
+    CONTROLS,
+    TITLES,
+    best,
+    draw_value,
+    gain,
+    groups,
+    value_controls,
+    value_push,
+)
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.statistics import RunsMean
 
@@ -25,7 +34,7 @@ def made_up_cell(demonstrations: int, seed: int) -> dict[str, Any]:
     methods = {}
     for name, successes in SUCCESSES.items():
         k = successes + bool(seed)
-        rate = {"outcomes": [1] * k + [0] * (10 - k)}
+        rate = {"share": k / 10, "outcomes": [1] * k + [0] * (10 - k)}
         methods[name] = {"ind": rate, "ood": rate, "minutes": 2.0}
     return {"demonstrations": demonstrations, "rollouts": 300, "seed": seed, "methods": methods}
 
@@ -40,7 +49,7 @@ def docs(tmp_path: Path) -> Path:
 
 
 def test_the_section_compares_the_best_with_and_without_a_world_model(docs: Path) -> None:
-    cells = groups(loader(docs), "value_push")[8, 300]
+    cells = groups(loader(docs))[8, 300]
     assert len(cells) == 2
     assert best(cells, ["cloning", "filtered", "weighted"], "ind") == "filtered"
     change = gain(cells, "distilled", "filtered", "ood")
@@ -54,14 +63,35 @@ def test_the_section_compares_the_best_with_and_without_a_world_model(docs: Path
     assert "| 8 | 300 | cloning of the demonstrations | 50, 60 → 55 %" in text
 
 
+def test_rounds_stand_in_the_same_table_for_the_seeds_that_have_them(docs: Path) -> None:
+    (cell,) = read_cells(STUDY, ["demonstrations=8", "seed=0"])
+    content = made_up_cell(8, 0)
+    content["methods"] = {"iterated": content["methods"]["distilled"]}
+    write_json(docs / "results" / "value_iterated" / f"{cell.variables['cell']}.json", content)
+    cells = groups(loader(docs))[8, 300]
+    assert best(cells, TITLES, "ind") == "distilled", "a mean over two seeds above one of one seed"
+    assert gain(cells, "imagined_ppo", "iterated", "ind").mean == pytest.approx(-0.1)
+    assert f"| 8 | 300 | {TITLES['iterated']} | 90 %" in value_push(loader(docs))
+
+
+def test_controls_are_compared_on_the_same_starts(docs: Path) -> None:
+    (cell,) = read_cells(STUDY, ["demonstrations=8", "seed=0"])
+    rate = {"share": 0.4, "outcomes": [0] * 6 + [1] * 4}
+    controls = {"controls": {"labels": {"ind": rate, "ood": rate}}}
+    write_json(docs / "results" / "value_controls" / f"{cell.variables['cell']}.json", controls)
+    text = value_controls(loader(docs))
+    assert "| 0 | nothing: PPO in imagination | 80 %: 1 gained, 0 lost (p = 1)" in text
+    assert f"| 0 | {CONTROLS['labels']} | 40 %: 3 gained, 6 lost (p = 0.5)" in text
+
+
 def test_the_figure_has_a_line_for_every_method(docs: Path) -> None:
     path = docs / "images" / "value.png"
-    draw_value(loader(docs), "value_push", path)
+    draw_value(loader(docs), path)
     assert path.stat().st_size > 10_000
 
 
 def test_nothing_is_drawn_without_a_cell(tmp_path: Path) -> None:
-    draw_value(loader(tmp_path), "value_push", tmp_path / "value.png")
+    draw_value(loader(tmp_path), tmp_path / "value.png")
     assert not (tmp_path / "value.png").exists()
 
 
@@ -81,7 +111,7 @@ def test_a_cell_keeps_outcomes_and_minutes(tmp_path: Path, monkeypatch: pytest.M
     assert (content["real_episodes"], content["real_successes"]) == (308, 140)
     assert content["methods"]["distilled"]["minutes"] == 5
     assert content["methods"]["filtered"]["ind"]["outcomes"] == [1] * 7 + [0] * 3
-    assert content["methods"].keys() == TITLES.keys()
+    assert content["methods"].keys() == SUCCESSES.keys()
     json.dumps(content)
 
 
