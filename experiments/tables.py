@@ -8,6 +8,7 @@ import argparse
 import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,7 +24,8 @@ STUDIES: Final = ROOT / "experiments"
 
 SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     "value_push": ("Policies", value.value_push),
-    "value_iterated": ("Policies", value.value_iterated),
+    "value_iterated": ("Policies", partial(value.rounds, "iterated")),
+    "value_dyna": ("Policies", partial(value.rounds, "dyna")),
     "value_controls": ("Policies", value.value_controls),
     "demo": ("Policies", policies.demo),
     "cloning_control": ("Policies", policies.cloning_control),
