@@ -6,6 +6,7 @@ python -m experiments.choose_episodes outputs/attempts --every_success
 """
 
 import argparse
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -58,10 +59,13 @@ def successes(root: Path, count: int | None) -> list[int]:
 def main() -> None:
     """Entry point."""
     given = make_parser().parse_args()
-    if given.optimal:
-        chosen = optimal_episodes(given.root, given.optimal)
-    else:
-        chosen = successes(given.root, given.successes)
+    try:
+        if given.optimal:
+            chosen = optimal_episodes(given.root, given.optimal)
+        else:
+            chosen = successes(given.root, given.successes)
+    except ValueError as error:
+        sys.exit(f"error: {error}")
     print(",".join(map(str, chosen)))
 
 

@@ -13,9 +13,19 @@ from lerobot_wmrl.maniskill.scenes import scenes_of
 
 
 def recorded_episodes(root: Path) -> dict[str, np.ndarray]:
-    """Read columns (E,): episode, task, scene, seed, kind, length in frames, success at any frame."""
+    """Read columns (E,): episode, task, scene, seed, kind, length in frames, success at any frame.
+
+    Raises:
+        FieldError: the dataset lacks one of the columns.
+    """
     columns = ["episode_index", *START_COLUMNS, "next.success"]
-    rows = [pq.read_table(path, columns=columns).to_pydict() for path in parquet_files(root)]
+    files = parquet_files(root)
+    missing = [name for name in columns if name not in pq.read_schema(files[0]).names]
+    if missing:
+        raise FieldError(
+            "dataset.root", root, f"has no column {', '.join(missing)}", "record it with lerobot-wmrl-record"
+        )
+    rows = [pq.read_table(path, columns=columns).to_pydict() for path in files]
     stacked = {
         name: np.concatenate([np.asarray(part[name]).reshape(-1) for part in rows]) for name in columns
     }
