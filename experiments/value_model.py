@@ -5,6 +5,7 @@ dealt into folds, and each fold's values come from a model that was trained on t
 a model's values of its own training episodes would be memorised outcomes.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -13,10 +14,10 @@ import torch
 import torch.nn.functional as F
 from lerobot.utils.constants import OBS_STATE
 from scipy.stats import mannwhitneyu
-from torch import Tensor
+from torch import Tensor, nn
 
-from lerobot_policy_cnn.modeling_cnn import STATE_LIMIT, VALUE_WIDTH
-from lerobot_policy_cnn.networks import Trunk
+from lerobot_policy_cnn.modeling_cnn import STATE_LIMIT
+from lerobot_policy_cnn.networks import ObservationEncoder, Readout
 from lerobot_policy_cnn.processor_cnn import MIN_DATASET_STD
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.images import random_shift
@@ -24,6 +25,7 @@ from lerobot_wmrl.data.episodes import EpisodeTable
 from lerobot_wmrl.data.frame_cache import cached_frames, frames_to_tensor
 
 FOLDS: Final = 3
+WIDTH: Final = 8
 HIDDEN_SIZE: Final = 128
 BATCH_SIZE: Final = 64
 LEARNING_RATE: Final = 5e-4
@@ -73,6 +75,20 @@ class LabelledFrames:
         )
 
 
+class ValueNetwork(nn.Module):
+    """The encoder of the policy `cnn`, smaller, and a logit of success."""
+
+    def __init__(self, cameras: int, state_size: int) -> None:
+        super().__init__()
+        self.encoder = ObservationEncoder(cameras, state_size, WIDTH)
+        self.readout = Readout(self.encoder.size, HIDDEN_SIZE, outputs=1)
+
+    def forward(self, images: Sequence[Tensor], state: Tensor, instructions: Sequence[str]) -> Tensor:
+        """images: (B, 3, H, W) for each camera; state (B, P); B instructions → (B, 1)"""
+        logit: Tensor = self.readout(self.encoder(images, state, instructions))
+        return logit
+
+
 def cross_fitted_values(table: EpisodeTable, seed: int) -> np.ndarray:
     """Return each frame's probability of success, by the model that has not seen its episode. (N,)"""
     frames = LabelledFrames.read(table)
@@ -101,7 +117,7 @@ def fit_and_predict(
     Returns:
         Probabilities of success, one for each held-out row.
     """
-    network = Trunk(frames.images.shape[1], frames.state.shape[1], VALUE_WIDTH, HIDDEN_SIZE, outputs=1)
+    network = ValueNetwork(frames.images.shape[1], frames.state.shape[1])
     optimizer = torch.optim.AdamW(network.parameters(), LEARNING_RATE, weight_decay=WEIGHT_DECAY)
     best, values, waited = np.inf, np.empty(len(held_out)), 0
     for step in range(1, MAX_STEPS + 1):
@@ -122,14 +138,16 @@ def fit_and_predict(
 
 
 @torch.no_grad()
-def predict(network: Trunk, frames: LabelledFrames, rows: np.ndarray) -> np.ndarray:
+def predict(network: ValueNetwork, frames: LabelledFrames, rows: np.ndarray) -> np.ndarray:
     """Return the probability of success at each of the rows."""
     batches = np.array_split(rows, range(BATCH_SIZE, len(rows), BATCH_SIZE))
     logits = [value_logits(network, frames, batch) for batch in batches]
     return torch.cat(logits).sigmoid().double().numpy()
 
 
-def value_logits(network: Trunk, frames: LabelledFrames, rows: np.ndarray, max_shift: int = 0) -> Tensor:
+def value_logits(
+    network: ValueNetwork, frames: LabelledFrames, rows: np.ndarray, max_shift: int = 0
+) -> Tensor:
     """Return logits of success (B,) at B rows, whose images are shifted at random by up to `max_shift`."""
     images = frames_to_tensor(frames.images[rows]).unbind(1)
     if max_shift:

@@ -16,6 +16,7 @@ from lerobot_wmrl.common.policies import load_trained_weights
 from lerobot_wmrl.common.precision import require_exact_updates
 from lerobot_wmrl.rl.configuration_algorithms import PolicyGradientConfig
 from lerobot_wmrl.rl.policy_adapters import as_stochastic
+from lerobot_wmrl.rl.protocol import EncodingPolicy
 
 RATIO_ERROR, LOSS, NORM = "ratio_error", "_loss", "_grad_norm"
 
@@ -49,6 +50,13 @@ class Algorithm(RLAlgorithm):
                 )  # fmt: skip
             with within("algorithm"):
                 self.policy.set_std(config.initial_std)
+        if not config.train_encoder:
+            if not isinstance(self.policy, EncodingPolicy):
+                raise FieldError(
+                    "algorithm.train_encoder", config.train_encoder,
+                    "this policy has no encoder that can be kept", "leave the flag out, or take cnn",
+                )  # fmt: skip
+            self.policy.freeze_encoder()
         self.policy.eval()
         self.reference = frozen_copy(self.policy)
         self.value_parameters = list(self.policy.value_parameters())

@@ -25,6 +25,8 @@ class PolicyGradientConfig(RLAlgorithmConfig):
             this iteration end early.
         max_reference_kl: KL to the SFT policy, in nats per decision. Above it, the training stops.
         initial_std: standard deviation of exploration in normalised actions; by default the policy's own.
+        train_encoder: whether what encodes the policy's observations learns too. `false` keeps it as it was
+            cloned: every frame is then encoded once, and an update takes a small part of the time.
     """
 
     epochs: int = 3
@@ -36,6 +38,7 @@ class PolicyGradientConfig(RLAlgorithmConfig):
     target_kl: float = 0.015
     max_reference_kl: float = 20.0
     initial_std: float | None = None
+    train_encoder: bool = True
 
     def __post_init__(self) -> None:
         require_positive(self, "epochs", "minibatch_size", "policy_lr", "target_kl", "max_reference_kl")

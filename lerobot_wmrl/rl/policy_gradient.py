@@ -8,6 +8,7 @@ import math
 import time
 from abc import abstractmethod
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -27,7 +28,8 @@ from lerobot_wmrl.common.distributed import (
 )
 from lerobot_wmrl.rl.algorithm import NORM, RATIO_ERROR, Algorithm, training_stats
 from lerobot_wmrl.rl.configuration_algorithms import PolicyGradientConfig
-from lerobot_wmrl.rl.protocol import Pipeline
+from lerobot_wmrl.rl.observations import as_read_back
+from lerobot_wmrl.rl.protocol import Observation, Pipeline, unchanged
 from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
 
 GRAD_CLIP_NORM = 1.0
@@ -158,6 +160,7 @@ class PolicyGradient(Algorithm):
     ) -> dict[str, float]:
         """Collect one rollout with the seeds from `seed` on, update the policy on it, and return metrics."""
         started = time.perf_counter()
+        pipeline = self.encoding(pipeline)
         collected = collect(env, self.policy, pipeline, rollout, seed, self.group_size)
         rollout_end = time.perf_counter()
         minibatches, targets = self.prepare(rollout, pipeline)
@@ -171,6 +174,17 @@ class PolicyGradient(Algorithm):
             "rollout_s": rollout_end - started,
             "update_s": time.perf_counter() - rollout_end,
         }
+
+    def encoding(self, pipeline: Pipeline) -> Pipeline:
+        """Return a pipeline that stores what the encoder makes of observations, where it does not learn."""
+        if self.config.train_encoder:
+            return pipeline
+
+        def store(observation: Observation) -> Observation:
+            encoded: Observation = self.policy.encode(pipeline.prepare(as_read_back(observation)))
+            return encoded
+
+        return replace(pipeline, prepare=unchanged, store=store)
 
     def prepare(self, rollout: RolloutBuffer, pipeline: Pipeline) -> tuple[Minibatches, dict[str, float]]:
         """Compute advantages and the reference's log-probabilities; return minibatches for `update`, and

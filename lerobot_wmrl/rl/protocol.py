@@ -48,14 +48,31 @@ class StochasticPolicy(Protocol):
         """Return the parameters that only the value depends on."""
 
 
+@runtime_checkable
+class EncodingPolicy(Protocol):
+    """A stochastic policy that can keep its encoder as it is, so that a rollout encodes every frame once."""
+
+    def freeze_encoder(self) -> None:
+        """Leave the encoder out of all later training."""
+
+    def encode(self, observation: Observation) -> Observation:
+        """Return what the encoder makes of an observation; the policy's methods take it in its place."""
+
+
+def unchanged(observation: Observation) -> Observation:
+    return observation
+
+
 @dataclass(frozen=True)
 class Pipeline:
     """A policy's processors as functions.
 
     Args:
-        prepare: from the environment's observation to the policy's.
+        prepare: from a stored observation to the policy's.
         to_action: from raw actions to the environment's actions.
+        store: from the environment's observation to the stored one.
     """
 
     prepare: Callable[[Observation], Observation]
     to_action: Callable[[Tensor], Tensor]
+    store: Callable[[Observation], Observation] = unchanged

@@ -178,7 +178,7 @@ def collect(
     actor, logged = Actor(policy, pipeline, buffer), dict[str, list[Tensor]]()
     with seeded_noise(seed, buffer.device):
         for step in tqdm(range(buffer.steps), "rollout", leave=False, unit="step", disable=hidden_progress()):
-            buffer.observations.write(step, observation)
+            buffer.observations.write(step, pipeline.store(observation))
             raw_action, age = actor.act(step), actor.age  # (B, K), (B,)
             action = pipeline.to_action(raw_action).to(buffer.device)
             observation, reward, terminated, truncated, info = env.step(action)
@@ -187,9 +187,9 @@ def collect(
             for name, part in info.get("reward_parts", {}).items():
                 logged.setdefault(name, []).append(part.float().mean())
             if "final_obs" in info:
-                final = pipeline.prepare(as_read_back(info["final_obs"]))
+                final = pipeline.prepare(as_read_back(pipeline.store(info["final_obs"])))
                 buffer.write_end(step, info["final_info"]["is_success"], policy.value(final))
-        last_value = policy.value(pipeline.prepare(as_read_back(observation)))
+        last_value = policy.value(pipeline.prepare(as_read_back(pipeline.store(observation))))
     buffer.fill_next_value(last_value)
     parts = {name: torch.stack(values).mean().item() for name, values in logged.items()}
     return mean_over_processes({**buffer.statistics(), **parts}, buffer.device)

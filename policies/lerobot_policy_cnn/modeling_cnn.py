@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.distributions import Normal
 
 from lerobot_policy_cnn.configuration_cnn import MAX_STD, MIN_STD, CnnConfig, check_std
-from lerobot_policy_cnn.networks import Trunk
+from lerobot_policy_cnn.networks import ObservationEncoder, Readout
 from lerobot_wmrl.common.images import random_shift
 
 STATE_LIMIT = 10.0
@@ -29,8 +29,8 @@ At a bound its gradient vanishes."""
 STD_LR_FACTOR = 20.0
 """Learning rate of the standard deviation relative to the rest, in supervised training."""
 
-VALUE_WIDTH = 8
-"""Channels of the first convolution of the critic's encoder."""
+FEATURES = "observation.features"
+"""Name of the features of an encoded observation."""
 
 UNKNOWN_POLICY = "This is a **cnn** policy trained with [LeRobot](https://github.com/huggingface/lerobot)."
 """The sentence on LeRobot's card of policies that are not its own, which SUMMARY replaces."""
@@ -74,8 +74,9 @@ class CnnPolicy(PreTrainedPolicy):
         state = config.state_feature
         inputs = (len(self.cameras), state.shape[0] if state else 0)
         actions = config.action_feature.shape[0]
-        self.actor = Trunk(*inputs, config.width, config.hidden_size, outputs=actions)
-        self.critic = Trunk(*inputs, VALUE_WIDTH, config.hidden_size, outputs=1)
+        self.encoder = ObservationEncoder(*inputs, config.width)
+        self.actor = Readout(self.encoder.size, config.hidden_size, outputs=actions)
+        self.critic = Readout(self.encoder.size, config.hidden_size, outputs=1)
         self.std_logit = nn.Parameter(torch.zeros(actions))
         self.set_std(config.initial_std)
         self.register_buffer("target_low", torch.full((actions,), torch.inf))
@@ -85,13 +86,21 @@ class CnnPolicy(PreTrainedPolicy):
         """Return the parameters that lerobot-train trains: all but the critic's."""
         rate = self.config.optimizer_lr * STD_LR_FACTOR
         return [
-            {"params": list(self.actor.parameters())},
+            {"params": [*self.encoder.parameters(), *self.actor.parameters()]},
             {"params": [self.std_logit], "lr": rate, "weight_decay": 0.0},
         ]
 
     def value_parameters(self) -> Iterator[nn.Parameter]:
         """Return the critic's parameters, none of which the actor shares."""
         return self.critic.parameters()
+
+    def freeze_encoder(self) -> None:
+        """Train actor and critic alone from now on, on what `encode` returns."""
+        self.encoder.requires_grad_(False)
+
+    def encode(self, observation: Observation) -> Observation:
+        """Return an observation that all methods take in place of a preprocessed one: its features (B, F)."""
+        return {FEATURES: self._features(observation)}
 
     def reset(self) -> None:
         """Do nothing: the policy has no state."""
@@ -112,7 +121,7 @@ class CnnPolicy(PreTrainedPolicy):
         target = batch[ACTION].reshape(len(batch[ACTION]), -1)
         if self.training:
             self._widen_range(target)
-        mean = self._mean(batch, augment=self.training)
+        mean = self._mean(self._features(batch, augment=self.training))
         fit = F.huber_loss(mean, target, reduction="none").mean(dim=1)
         likelihood = Normal(mean.detach(), self.std(), validate_args=False).log_prob(target)
         loss = fit - (likelihood * self.varies()).mean(dim=1)
@@ -128,25 +137,27 @@ class CnnPolicy(PreTrainedPolicy):
     def select_action(self, batch: Observation, **_: Any) -> Tensor:
         """Return the mean action. → (B, K)"""
         self.eval()
-        return self._mean(batch)
+        return self._mean(self._features(batch))
 
     def sample(self, observation: Observation) -> GaussianSample:
         """Sample actions from the distribution that `evaluate` measures."""
-        mean = self._mean(observation)
+        features = self._features(observation)
+        mean = self._mean(features)
         raw_action = torch.where(
             self.varies(), Normal(mean, self.std(), validate_args=False).sample(), mean
         ).detach()
-        return GaussianSample(raw_action, self._log_prob(mean, raw_action), self.value(observation))
+        return GaussianSample(raw_action, self._log_prob(mean, raw_action), self._value(features))
 
     def evaluate(self, observation: Observation, raw_action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return log-probabilities (B, K) of actions (B, K), entropies (B,) and values (B,)."""
-        mean = self._mean(observation)
+        features = self._features(observation)
+        mean = self._mean(features)
         entropy = (Normal(mean, self.std(), validate_args=False).entropy() * self.varies()).sum(dim=1)
-        return self._log_prob(mean, raw_action), entropy, self.value(observation)
+        return self._log_prob(mean, raw_action), entropy, self._value(features)
 
     def value(self, observation: Observation) -> Tensor:
         """Return V(o). → (B,)"""
-        return self.critic(*self._inputs(observation)).squeeze(1)
+        return self._value(self._features(observation))
 
     def std(self) -> Tensor:
         """Return the standard deviation in normalised actions, within its bounds by a sigmoid. → (K,)"""
@@ -170,11 +181,22 @@ class CnnPolicy(PreTrainedPolicy):
         self.target_low.copy_(torch.minimum(self.target_low, target.amin(dim=0)))
         self.target_high.copy_(torch.maximum(self.target_high, target.amax(dim=0)))
 
-    def _mean(self, observation: Observation, augment: bool = False) -> Tensor:
+    def _features(self, observation: Observation, augment: bool = False) -> Tensor:
+        """Return the features of a preprocessed or encoded observation. → (B, F)"""
+        if FEATURES in observation:
+            encoded: Tensor = observation[FEATURES]
+            return encoded
         images, state, instructions = self._inputs(observation)
         if augment and self.config.max_shift:
             images = [random_shift(image, self.config.max_shift) for image in images]
-        return torch.where(self.varies(), self.actor(images, state, instructions), self.target_low)
+        return self.encoder(images, state, instructions)
+
+    def _mean(self, features: Tensor) -> Tensor:
+        return torch.where(self.varies(), self.actor(features), self.target_low)
+
+    def _value(self, features: Tensor) -> Tensor:
+        """Return the critic's value. The encoder does not learn from it. (B, F) → (B,)"""
+        return self.critic(features.detach()).squeeze(1)
 
     def _log_prob(self, mean: Tensor, raw_action: Tensor) -> Tensor:
         return Normal(mean, self.std(), validate_args=False).log_prob(raw_action) * self.varies()

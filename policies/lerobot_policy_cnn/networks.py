@@ -92,24 +92,36 @@ class InstructionEncoder(nn.Module):
         return self.project(counts).tanh()[rows]
 
 
-class Trunk(nn.Module):
-    """Map images, state and instruction to `outputs` values: the mean action, or the critic's value."""
+class ObservationEncoder(nn.Module):
+    """Encode images, state and instruction as one vector of `size` features."""
 
-    def __init__(self, cameras: int, state_size: int, width: int, hidden: int, outputs: int) -> None:
+    def __init__(self, cameras: int, state_size: int, width: int) -> None:
         super().__init__()
         self.encoders = nn.ModuleList(ImageEncoder(width) for _ in range(cameras))
         self.instruction = InstructionEncoder()
-        image_size = sum(encoder.size for encoder in self.encoders)  # type: ignore[misc]
-        self.mix = nn.Sequential(
-            nn.Linear(image_size + state_size + LANGUAGE_SIZE, hidden), nn.LayerNorm(hidden), nn.SiLU(),
-            nn.Linear(hidden, hidden), nn.SiLU(),
-        )  # fmt: skip
-        self.head = nn.Linear(hidden, outputs)
-        nn.init.orthogonal_(self.head.weight, 0.01)
-        nn.init.zeros_(self.head.bias)
+        images: int = sum(encoder.size for encoder in self.encoders)  # type: ignore[misc]
+        self.size = images + state_size + LANGUAGE_SIZE
 
     def forward(self, images: Sequence[Tensor], state: Tensor | None, instructions: Sequence[str]) -> Tensor:
-        """images: (B, 3, H, W) for each camera; state (B, P) or None; B instructions → (B, outputs)"""
+        """images: (B, 3, H, W) for each camera; state (B, P) or None; B instructions → (B, size)"""
         features = [encoder(image) for encoder, image in zip(self.encoders, images, strict=True)]
-        parts = [*features, *([] if state is None else [state]), self.instruction(instructions)]
-        return self.head(self.mix(torch.cat(parts, dim=1)))
+        return torch.cat(
+            [*features, *([] if state is None else [state]), self.instruction(instructions)], dim=1
+        )
+
+
+class Readout(nn.Sequential):
+    """Map features (B, size) to `outputs` values (B, outputs): the mean action, or the critic's value."""
+
+    def __init__(self, size: int, hidden: int, outputs: int) -> None:
+        head = nn.Linear(hidden, outputs)
+        nn.init.orthogonal_(head.weight, 0.01)
+        nn.init.zeros_(head.bias)
+        super().__init__(
+            nn.Linear(size, hidden),
+            nn.LayerNorm(hidden),
+            nn.SiLU(),
+            nn.Linear(hidden, hidden),
+            nn.SiLU(),
+            head,
+        )

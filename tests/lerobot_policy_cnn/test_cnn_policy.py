@@ -39,7 +39,7 @@ def build(
     outputs = {"action": PolicyFeature(type=FeatureType.ACTION, shape=(actions,))}
     config = CnnConfig(device="cpu", input_features=inputs, output_features=outputs, width=8, **settings)
     policy = CnnPolicy(config).eval()
-    nn.init.normal_(policy.actor.head.weight, std=0.3)
+    nn.init.normal_(policy.actor[-1].weight, std=0.3)
     return policy
 
 
@@ -161,9 +161,9 @@ def test_constant_components_are_neither_sampled_nor_blown_up(
     assert prepared["action"].abs().max() < 10
     assert prepared["observation.state"].abs().max() < 10
     with torch.no_grad():
-        policy.actor.head.bias += 1.0
+        policy.actor[-1].bias += 1.0
         sample = policy.sample(prepared)
-        policy.actor.head.bias -= 1.0
+        policy.actor[-1].bias -= 1.0
     assert torch.allclose(post(sample.raw_action)[:, 2:], batch["action"][:, 2:], atol=1e-6)
     assert (sample.log_prob[:, 2:] == 0).all()
     assert (sample.log_prob[:, :2] != 0).all()

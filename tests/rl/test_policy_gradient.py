@@ -46,7 +46,7 @@ def test_passes_of_a_minibatch_give_its_gradient(
     for name, value in whole.policy.state_dict().items():
         torch.testing.assert_close(in_passes.policy.state_dict()[name], value, rtol=1e-4, atol=1e-6)
     assert logged_in_passes == pytest.approx(logged, rel=1e-3, abs=1e-5)
-    assert not torch.equal(whole.policy.actor.head.weight, initial.actor.head.weight)
+    assert not torch.equal(whole.policy.actor[-1].weight, initial.actor[-1].weight)
 
 
 def test_clip_fraction_and_norms_are_logged(make_policy: MakePolicy, pipeline: Pipeline) -> None:
@@ -61,11 +61,11 @@ def test_clip_fraction_and_norms_are_logged(make_policy: MakePolicy, pipeline: P
 def test_the_reference_shares_what_is_not_trained(make_policy: MakePolicy) -> None:
     """A large frozen network under LoRA is in memory once."""
     policy = make_policy()
-    policy.actor.mix.requires_grad_(False)
+    policy.actor[0].requires_grad_(False)
     algorithm = PPO(policy, PPOConfig())
-    assert algorithm.reference.actor.mix[0].weight is policy.actor.mix[0].weight
-    assert algorithm.reference.actor.head.weight is not policy.actor.head.weight
-    assert policy.actor.head.weight.requires_grad
+    assert algorithm.reference.actor[0].weight is policy.actor[0].weight
+    assert algorithm.reference.actor[-1].weight is not policy.actor[-1].weight
+    assert policy.actor[-1].weight.requires_grad
     assert not any(parameter.requires_grad for parameter in algorithm.reference.parameters())
 
 

@@ -101,9 +101,33 @@ def test_value_iterations_leave_the_policy_alone(make_policy: MakePolicy, pipeli
     }
     assert changed == {"critic"}
     update(algorithm, buffer, pipeline)
-    assert not torch.equal(policy.actor.head.weight, before["actor.head.weight"])
+    assert not torch.equal(policy.actor[-1].weight, before["actor.5.weight"])
     reference = algorithm.reference.state_dict()
     assert all(torch.equal(reference[name], value) for name, value in before.items())
+
+
+def test_a_kept_encoder_encodes_each_frame_once_and_changes_nothing_else(
+    make_policy: MakePolicy, pipeline: Pipeline
+) -> None:
+    """Before the first update the losses are those of an encoder that learns; afterwards it is as it was."""
+    policies = [make_policy(32) for _ in range(2)]
+    policies[1].load_state_dict(policies[0].state_dict())
+    losses, seen = [], []
+    for policy, train_encoder in zip(policies, (True, False), strict=True):
+        encoded: list[int] = []
+        policy.encoder.register_forward_hook(lambda *call, counts=encoded: counts.append(len(call[2])))
+        config = PPOConfig(value_iterations=0, train_encoder=train_encoder, policy_lr=1e-3)
+        algorithm, buffer = PPO(policy, config), RolloutBuffer(12, 16, "cpu")
+        env = PointEnv(16, horizon=6, image_size=32)
+        before = copy.deepcopy(policy.encoder.state_dict())
+        stats = algorithm.iterate(env, pipeline, buffer, seed=0, last=False)
+        losses.append(stats["first_ratio_error"])
+        seen.append(sum(encoded))
+        same = [torch.equal(value, before[name]) for name, value in policy.encoder.state_dict().items()]
+        assert all(same) is not train_encoder
+    assert max(losses) < 1e-3
+    steps_and_ends = 12 * 16 + 2 * 16 + 16
+    assert seen[1] == steps_and_ends < seen[0] / 3
 
 
 def test_updates_stop_at_the_target_kl(make_policy: MakePolicy, pipeline: Pipeline) -> None:

@@ -61,7 +61,7 @@ def test_the_next_value_is_that_of_the_observation_before_the_reset(
     make_policy: Callable[..., CnnPolicy], pipeline: Pipeline
 ) -> None:
     policy = make_policy()
-    torch.nn.init.normal_(policy.critic.head.weight)
+    torch.nn.init.normal_(policy.critic[-1].weight)
     world, buffer, _ = filled(policy, pipeline)
     with torch.no_grad():
         expected = torch.stack([policy.value(seen["next"]) for seen in world.log])
