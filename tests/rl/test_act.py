@@ -89,6 +89,11 @@ def test_the_first_ratio_is_one_and_the_value_leaves_act_alone(pipeline: Pipelin
     assert all(parameter.grad is not None for parameter in algorithm.policy.critic.parameters())
 
 
+def test_it_has_no_encoder_to_keep() -> None:
+    with pytest.raises(FieldError, match=r"algorithm\.train_encoder=False: this policy has no encoder"):
+        PPO(small_act(), PPOConfig(train_encoder=False))
+
+
 def test_act_is_saved_as_act_and_what_was_added_with_the_algorithm(
     pipeline: Pipeline, tmp_path: Path
 ) -> None:
