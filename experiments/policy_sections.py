@@ -29,8 +29,8 @@ successes, on the same starts. {changes}.
 
 {table(["seed", "policy", "known scenes", "unseen scenes", "in the world model"], rows)}
 
-Each rate is over {found[0]["policies"]["rl"]["known"]["n"]} starts. One training a row; the section above
-compares more methods on more data."""
+Each rate is over {found[0]["policies"]["rl"]["known"]["n"]} starts. One training a row; [a
+study](#value_push) compares more methods on more data."""
 
 
 def cloning_control(load: Load) -> str:

@@ -49,11 +49,11 @@ Groups = dict[tuple[int, int], list[Cell]]
 
 
 def groups(load: Load) -> Groups:
-    """Return the published cells of the study, each with the methods of its other parts."""
+    """Return the published cells of the study, each with the methods of the other studies' same cell."""
     found: Groups = {}
     for each in read_cells(ROOT / "experiments" / f"{STUDY}.yaml"):
         parts = [part for study in PARTS if (part := published(load, study, each.variables["cell"]))]
-        if parts:
+        if published(load, STUDY, each.variables["cell"]):
             methods = {name: row for part in parts for name, row in part["methods"].items()}
             cell = {**parts[0], "methods": methods}
             found.setdefault((cell["demonstrations"], cell["rollouts"]), []).append(cell)
@@ -86,10 +86,9 @@ def gain(cells: Sequence[Cell], method: str, rival: str, domain: str) -> RunsMea
 
 
 def best(cells: Sequence[Cell], methods: Sequence[str], domain: str) -> str:
-    """Return the method with the highest mean success."""
-    return max(
-        measured(cells, methods), key=lambda method: RunsMean.over(outcomes(cells, method, domain)).mean
-    )
+    """Return the method with the highest mean success, of those that have been run in all cells."""
+    complete = [method for method in methods if all(method in cell["methods"] for cell in cells)]
+    return max(complete, key=lambda method: RunsMean.over(outcomes(cells, method, domain)).mean)
 
 
 def value_push(load: Load) -> str:
@@ -119,7 +118,7 @@ All methods:
 
 Success of each seed over {starts} starts; with more than one seed, their mean. Intervals count starts, and
 seeds where there are several. Minutes are those of training on one core, without recording. The better of
-several methods is chosen on the starts that are reported. Methods below PPO in imagination, and itself, have
+several methods is chosen on the starts that are reported. PPO in imagination and the methods below it use
 a world model.
 
 ![Success against real episodes](images/value_push.png)"""

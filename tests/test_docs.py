@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from experiments.value_sections import RIVALS
 from lerobot_wmrl.common.stored_help import FOLDER
 from tests.experiments.typed import ROOT, check
 
@@ -67,6 +68,26 @@ def test_the_readme_is_short() -> None:
 
 def test_the_readme_says_what_was_measured() -> None:
     text, results = (ROOT / "README.md").read_text(), ROOT / "docs" / "results"
+    cells = [
+        json.loads((results / "value_push" / f"demonstrations{d}_rollouts300_seed0.json").read_text())[
+            "methods"
+        ]
+        for d in (8, 25)
+    ]
+    rows = {
+        "cloned from the demonstrations": ("cloning",),
+        "best rival": RIVALS,
+        "PPO in imagination": ("imagined_ppo",),
+    }
+    for title, methods in rows.items():
+        shares = [
+            [
+                round(100 * max(cell[method][domain]["share"] for method in methods if method in cell))
+                for domain in ("ind", "ood")
+            ]
+            for cell in cells
+        ]
+        assert f"| {title} | " + " | ".join(f"{known} / {unseen} %" for known, unseen in shares) in text
     best = json.loads((results / "cloning_control.json").read_text())["cloned_from"]["180"]
     known, unseen = (round(100 * best[domain]["share"]) for domain in ("ind", "ood"))
     assert f"{known} % in known and {unseen} % in unseen scenes" in text

@@ -3,7 +3,7 @@
 A study that compares methods at equal real data gives each the same limits. The ledger is one JSON file:
 
     {"limits": {"demonstrations": 8, "rollouts": 300, "play": 0},
-     "episodes": {"<digest>": {"spent": "rollouts", "dataset": "explored"}, …},
+     "episodes": {"<digest>": {"spent": "rollouts", "dataset": "rollouts_1"}, …},
      "trainings": {"rl": 120}}
 
 An episode is known by a digest of its start and actions, which stays the same when a dataset is merged, split

@@ -19,7 +19,7 @@ from lerobot_wmrl.maniskill.recordings import recorded_episodes
 SEED_STRIDE = 100_000
 """Demo seed s records and trains with seeds from s·SEED_STRIDE on, below EVALUATION_SEED."""
 
-ROLLOUTS_FROM = SEED_STRIDE // 2
+ROLLOUT_SEED_OFFSET = SEED_STRIDE // 2
 """Offset of the seeds with which the cloned policy is rolled out."""
 
 CHECKED_SEED = EVALUATION_SEED + SEED_STRIDE
@@ -28,7 +28,11 @@ CHECKED_SEED = EVALUATION_SEED + SEED_STRIDE
 EXPLORATION = 0.4
 """Largest noise on the cloned policy's actions in its rollouts, as a share of the action box."""
 
-MEASURED = {"cloned": "cloned policy", "filtered": "policy cloned with its own successes", "rl": "PPO policy"}
+MEASURED = {
+    "cloned": "cloned policy",
+    "filtered": "policy cloned with successful rollouts",
+    "rl": "PPO policy",
+}
 """Policies whose success is measured, in the order in which they are made."""
 
 WHERE: dict[str, Flags] = {
@@ -40,7 +44,7 @@ WHERE: dict[str, Flags] = {
 
 @dataclass
 class DemoConfig(RunConfig):
-    """Is a world model worth it? Run the whole loop on one task, beside the best rival on the same data.
+    """Run the whole loop on one task, beside a rival without a world model on the same data.
 
     A few demonstrations, and labelled rollouts of the policy cloned from them, are all that is learnt from.
     Two policies come of them: one cloned again, from the demonstrations and the successful rollouts, and that
@@ -89,7 +93,9 @@ def demo_stages(config: DemoConfig) -> list[Stage]:
         Stage("cloned", "Clone a policy from them", partial(clone, config)),
         Stage("rollouts", "Record noisy rollouts of that policy", partial(roll_out, config)),
         Stage("merge", "Merge demonstrations and rollouts", partial(merge, config)),
-        Stage("filtered", "Clone it again, with its own successes", partial(clone_successes, config)),
+        Stage(
+            "filtered", "Clone another one, with the successful rollouts", partial(clone_successes, config)
+        ),
         *(
             Stage(model, f"Train the {model.replace('_', ' ')}", partial(train_model, config, model))
             for model in ("frame_tokenizer", "action_world_model", "text_world_model")
@@ -162,15 +168,17 @@ def clone(config: DemoConfig) -> list[str]:
 
 
 def clone_successes(config: DemoConfig) -> list[str]:
-    """Clone from every success: of what needs no world model, the best use of the data that we know."""
+    """Clone from every success (filtered cloning): what can be had of the same data without a world model."""
     dataset = config.output_dir / "dataset"
     flags = preset_flags(config.stage_preset, "sft", ["filtered"])
     return lerobot_train(config, "filtered", dataset, [*flags, f"--dataset.episodes={successful(dataset)}"])
 
 
 def successful(root: Path) -> str:
-    """Return the successful episodes of a recording, `[0,3,4]`."""
+    """Return the successful episodes of a recording, `[0,3,4]`. ValueError if there are none."""
     table = recorded_episodes(root)
+    if not table["success"].any():
+        raise ValueError(f"{root}: no episode succeeds: record more with `--demonstrations`")
     return f"[{','.join(map(str, table['episode'][table['success']]))}]"
 
 
@@ -200,7 +208,9 @@ def lerobot_train(config: DemoConfig, name: str, dataset: Path, flags: Sequence[
 
 def roll_out(config: DemoConfig) -> list[str]:
     """Record noisy episodes of the cloned policy: what it does right and wrong is all that is learnt from."""
-    command = record_policy(config, "cloned", "rollouts", config.rollouts, first_seed(config) + ROLLOUTS_FROM)
+    command = record_policy(
+        config, "cloned", "rollouts", config.rollouts, first_seed(config) + ROLLOUT_SEED_OFFSET
+    )
     return [*command, f"--exploration={EXPLORATION}"]
 
 
@@ -246,13 +256,15 @@ def train_model(config: DemoConfig, model: str) -> list[str]:
 
 
 def imagination(config: DemoConfig) -> Flags:
-    """Return the environment that the two world models make."""
+    """Return the environment that the action world model makes. Its reward is success: goal frames that the
+    text world model learns from a few demonstrations are not good enough to be rewarded."""
     out = config.output_dir
     return {
         "env.type": "world_model",
         "env.world_model_path": str(checkpoint(out / "action_world_model")),
-        "env.text_world_model_path": str(checkpoint(out / "text_world_model")),
         "env.dataset.root": str(out / "dataset"),
+        "env.reward.type": "general",
+        "env.reward.alpha": 1,
     }
 
 
@@ -264,6 +276,7 @@ def reinforce(config: DemoConfig) -> list[str]:
         **imagination(config),
         "gate.dataset.root": str(out / "checked_filtered"),
         "algorithm.type": "ppo",
+        "algorithm.train_encoder": False,
         "output_dir": str(out / "rl"),
         "seed": first_seed(config),
     }

@@ -54,7 +54,7 @@ class Algorithm(RLAlgorithm):
             if not isinstance(self.policy, EncodingPolicy):
                 raise FieldError(
                     "algorithm.train_encoder", config.train_encoder,
-                    "this policy has no encoder that can be kept", "leave the flag out, or take cnn",
+                    "this policy has no encoder that can be kept", "set it to true, or take the policy cnn",
                 )  # fmt: skip
             self.policy.freeze_encoder()
         self.policy.eval()

@@ -25,8 +25,9 @@ class PolicyGradientConfig(RLAlgorithmConfig):
             this iteration end early.
         max_reference_kl: KL to the SFT policy, in nats per decision. Above it, the training stops.
         initial_std: standard deviation of exploration in normalised actions; by default the policy's own.
-        train_encoder: whether what encodes the policy's observations learns too. `false` keeps it as it was
-            cloned: every frame is then encoded once, and an update takes a small part of the time.
+        train_encoder: train the policy's encoder of observations too. `false` keeps it as it was cloned, so
+            that every frame is encoded once, and an update takes a small part of the time. For the policy
+            `cnn`.
     """
 
     epochs: int = 3

@@ -69,7 +69,9 @@ def test_rounds_stand_in_the_same_table_for_the_seeds_that_have_them(docs: Path)
     content["methods"] = {"iterated": content["methods"]["distilled"]}
     write_json(docs / "results" / "value_iterated" / f"{cell.variables['cell']}.json", content)
     cells = groups(loader(docs))[8, 300]
-    assert best(cells, TITLES, "ind") == "distilled", "a mean over two seeds above one of one seed"
+    content["methods"]["iterated"] = {**content["methods"]["iterated"], "ood": {"outcomes": [1] * 10}}
+    write_json(docs / "results" / "value_iterated" / f"{cell.variables['cell']}.json", content)
+    assert best(groups(loader(docs))[8, 300], list(TITLES), "ood") == "distilled", "the other has one seed"
     assert gain(cells, "imagined_ppo", "iterated", "ind").mean == pytest.approx(-0.1)
     assert f"| 8 | 300 | {TITLES['iterated']} | 90 %" in value_push(loader(docs))
 

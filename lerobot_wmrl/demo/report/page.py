@@ -12,7 +12,7 @@ from lerobot_wmrl.common.constants import KINDS
 from lerobot_wmrl.common.files import write_json, write_text
 from lerobot_wmrl.common.statistics import PairedChange, Proportion
 from lerobot_wmrl.demo.report import figures, results
-from lerobot_wmrl.demo.report.results import EPISODES, OURS, RIVAL, Rates, Summary
+from lerobot_wmrl.demo.report.results import BASELINE, EPISODES, PPO_POLICY, Rates, Summary
 from lerobot_wmrl.demo.stages import MEASURED, WHERE, DemoConfig
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
@@ -20,8 +20,8 @@ SIGNIFICANCE = 0.05
 
 POLICY_TITLES = {
     "cloned": "cloned from the demonstrations",
-    "filtered": "cloned with its own successes",
-    "rl": "and then PPO in imagination",
+    "filtered": "cloned with successful rollouts",
+    "rl": "PPO in imagination",
 }
 """What each policy learnt from, under its bars."""
 
@@ -105,9 +105,11 @@ def render(
 
 
 def run_verdicts(output_dir: Path, rates: Rates) -> list[str]:
-    """State, for known and for unseen scenes, what PPO in imagination added to the best rival."""
+    """State, for known and for unseen scenes, what PPO in imagination added."""
     return [
-        verdict(where, rates[RIVAL][where], rates[OURS][where], results.paired_change(output_dir, where))
+        verdict(
+            where, rates[BASELINE][where], rates[PPO_POLICY][where], results.paired_change(output_dir, where)
+        )
         for where in WHERE
     ]
 
@@ -130,12 +132,12 @@ def verdict(where: str, before: Proportion, after: Proportion, change: PairedCha
 def conclusion(config: DemoConfig, page: Path) -> str:
     """Say in a few lines what the demo made, how good it is, and what comes next."""
     out = config.output_dir
-    found = results.replayed(out, RIVAL)
+    found = results.replayed(out, BASELINE)
     false_positives, recall = found["false_positive_rate"], found["recall"]
     lines = [
         f"Made: a dataset, a frame tokenizer, two world models and three policies in {out}.",
         *run_verdicts(out, results.policy_rates(out)),
-        f"Of held-out episodes of the {MEASURED[RIVAL]}, the world model predicts {false_positives.k} of "
+        f"Of held-out episodes of the {MEASURED[BASELINE]}, the world model predicts {false_positives.k} of "
         f"{false_positives.n} failures as successes (false positives) and {recall.k} of {recall.n} successes "
         "(recall).",
         f"Report: {page}",

@@ -12,10 +12,14 @@ from lerobot_wmrl.common.statistics import MeanChange, PairedChange, Proportion
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.demo.stages import MEASURED, WHERE, DemoConfig
 
-RIVAL, OURS = "filtered", "rl"
-"""The best policy without a world model, and the one that PPO made of it."""
+BASELINE, PPO_POLICY = "filtered", "rl"
+"""The policy that PPO begins with, which has used the same data without a world model; and PPO's."""
 
-EPISODES = {OURS: MEASURED[OURS], RIVAL: MEASURED[RIVAL], "held_out": "recorded, held out from training"}
+EPISODES = {
+    PPO_POLICY: MEASURED[PPO_POLICY],
+    BASELINE: MEASURED[BASELINE],
+    "held_out": "recorded, held out from training",
+}
 """Whose episodes were replayed, by the suffix of the folder."""
 
 MODELS = {
@@ -27,7 +31,7 @@ MODELS = {
 PPO_PANELS = {
     "success_rate": "PPO: imagined success",
     "reward": "PPO: reward a step",
-    "reference_kl": "PPO: KL to the policy before",
+    "reference_kl": "PPO: KL to the reference policy",
 }
 """Columns of the PPO run's metrics that the report plots, and their titles."""
 
@@ -75,7 +79,7 @@ def replayed(output_dir: Path, whose: str) -> dict[str, Proportion]:
 
 def paired_change(output_dir: Path, where: str) -> PairedChange:
     """Compare PPO's policy with the one that it began with, on the same held-out starts in ManiSkill."""
-    before, after = (outcomes(output_dir / f"eval_{where}_{policy}") for policy in (RIVAL, OURS))
+    before, after = (outcomes(output_dir / f"eval_{where}_{policy}") for policy in (BASELINE, PPO_POLICY))
     return PairedChange.between(before, after)
 
 
@@ -84,7 +88,7 @@ def training_curves(output_dir: Path) -> dict[str, dict[str, Curve]]:
     panels = {
         title: metric_curves(read_metrics(output_dir / folder), ["loss"]) for folder, title in MODELS.items()
     }
-    for folder in ("cloned", RIVAL):
+    for folder in ("cloned", BASELINE):
         log = output_dir / "logs" / f"{folder}.log"
         panels[MEASURED[folder].capitalize()] = {"loss": lerobot_train_curve(log)}
     rows = read_metrics(output_dir / "rl")
@@ -156,7 +160,7 @@ def other_seeds(config: DemoConfig) -> dict[str, Any] | None:
     runs = [
         run
         for run in finished_runs(config.output_dir, config.stage_preset)
-        if len(run["outcomes"]["known"][OURS]) == config.eval_episodes
+        if len(run["outcomes"]["known"][PPO_POLICY]) == config.eval_episodes
     ]
     if len(runs) < 2:
         return None
@@ -180,7 +184,7 @@ def finished_runs(output_dir: Path, preset: str) -> list[Summary]:
 def mean_change(runs: Sequence[Summary], where: str) -> MeanChange:
     """Average the change of success in ManiSkill. Raises ValueError if the runs met different starts."""
     both = [run["outcomes"][where] for run in runs]
-    return MeanChange.over_runs([each[RIVAL] for each in both], [each[OURS] for each in both])
+    return MeanChange.over_runs([each[BASELINE] for each in both], [each[PPO_POLICY] for each in both])
 
 
 def run_rows(runs: Sequence[Summary]) -> list[dict[str, str]]:
@@ -193,7 +197,7 @@ def run_rows(runs: Sequence[Summary]) -> list[dict[str, str]]:
             row[where] = " → ".join(f"{100 * share:.0f} %" for share in shares)
         for where, change in run["changes"].items():
             row[f"change_{where}"] = str(PairedChange(change["gained"], change["lost"]))
-        for name, share in run["replayed"][RIVAL].items():
+        for name, share in run["replayed"][BASELINE].items():
             row[name] = f"{share['k']} of {share['n']}"
         rows.append(row)
     return rows
