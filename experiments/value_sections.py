@@ -40,8 +40,8 @@ CONTROLS: Final = {
 }
 
 STUDY: Final = "value_push"
-PARTS: Final = (STUDY, "value_iterated", "value_dyna")
-"""Studies whose cells hold methods of the same table."""
+PARTS: Final = ("value_iterated", "value_dyna")
+"""Studies whose cells add methods to its table."""
 
 Cell = dict[str, Any]
 Groups = dict[tuple[int, int], list[Cell]]
@@ -52,11 +52,11 @@ def groups(load: Load) -> Groups:
     """Return the published cells of the study, each with the methods of the other studies' same cell."""
     found: Groups = {}
     for each in read_cells(ROOT / "experiments" / f"{STUDY}.yaml"):
-        parts = [part for study in PARTS if (part := published(load, study, each.variables["cell"]))]
-        if published(load, STUDY, each.variables["cell"]):
-            methods = {name: row for part in parts for name, row in part["methods"].items()}
-            cell = {**parts[0], "methods": methods}
-            found.setdefault((cell["demonstrations"], cell["rollouts"]), []).append(cell)
+        cell, *others = (published(load, study, each.variables["cell"]) for study in (STUDY, *PARTS))
+        if cell:
+            methods = {name: row for part in others if part for name, row in part["methods"].items()}
+            whole = {**cell, "methods": {**cell["methods"], **methods}}
+            found.setdefault((cell["demonstrations"], cell["rollouts"]), []).append(whole)
     return found
 
 

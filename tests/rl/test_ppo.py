@@ -126,6 +126,8 @@ def test_a_kept_encoder_encodes_each_frame_once_and_changes_nothing_else(
         seen.append(sum(encoded))
         same = [torch.equal(value, before[name]) for name, value in policy.encoder.state_dict().items()]
         assert all(same) is not train_encoder
+        kept, trained = policy.encoder.parameters(), {id(each) for each in algorithm.policy_parameters}
+        assert trained.isdisjoint(map(id, kept)) is not train_encoder
     for name in ("raw_action", "log_prob", "value", "reward"):
         torch.testing.assert_close(*(getattr(buffer, name) for buffer in buffers))
     steps_and_ends = 12 * 16 + 2 * 16 + 16
