@@ -4,7 +4,8 @@ A file has these keys:
 
     question   what the study answers
     needs      studies whose folders its commands read; `$gate` is the folder of gate.yaml
-    extends    another study, whose keys hold where this one has none of its own
+    extends    another study, whose keys hold where this one has none of its own, and whose steps may be named
+               in place of being written again
     budget     real episodes that all its methods may learn from: demonstrations, rollouts, play. `$budget` is
                the ledger, $output_dir/budget.json, which commands are given as --budget=$budget
     variables  names for commands; a later one may use an earlier one
@@ -163,17 +164,27 @@ def read_limits(budget: Mapping[str, Any], variables: Mapping[str, Any]) -> dict
 
 
 def read_keys(path: Path) -> dict[str, Any]:
-    """Return the keys of a study file, those of the file that it extends below its own."""
+    """Return the keys of a study file, those of the study that it extends below its own.
+
+    Raises:
+        ValueError: a key is unknown, or a step that is only named is not one of the extended study.
+    """
     content: dict[str, Any] = yaml.safe_load(path.read_text())
     if unknown := content.keys() - KEYS:
         raise ValueError(
             f"{path}: unknown key {', '.join(sorted(unknown))}; there are {', '.join(sorted(KEYS))}"
         )
-    if "extends" not in content:
-        return content
-    base = read_keys(path.parent / content["extends"])
+    base = read_keys(path.parent / content["extends"]) if "extends" in content else {}
+    written = {entry["name"]: entry for entry in base.get("steps", ())}
+    steps = content.get("steps", tuple(written))
+    if unknown := [entry for entry in steps if isinstance(entry, str) and entry not in written]:
+        raise ValueError(
+            f"{path}: step {', '.join(unknown)}: write its name and command; only a step of a study that this "
+            f"one extends may be named alone ({', '.join(written) or 'it extends none'})"
+        )
     variables = {**base.get("variables", {}), **content.get("variables", {})}
-    return {**base, "results": (), "collect": None, **content, "variables": variables}
+    steps = [written[entry] if isinstance(entry, str) else entry for entry in steps]
+    return {**base, "results": (), "collect": None, **content, "variables": variables, "steps": steps}
 
 
 def resolve(variables: Mapping[str, Any], given: Sequence[str], cell: str = "") -> dict[str, Any]:

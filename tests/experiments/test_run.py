@@ -124,6 +124,7 @@ def test_only_what_the_step_itself_writes_is_deleted(tmp_path: Path) -> None:
     (COUNT + "colour: red\n", "unknown key colour"),
     (COUNT.replace("$word", "$wrd"), r"\$wrd in .* there is no such variable"),
     (COUNT.replace("say_$seed", "say"), "steps with the same name: say"),
+    ("question: x\nsteps: [say]\n", r"step say: write its name and command; .* \(it extends none\)"),
 ])  # fmt: skip
 def test_mistakes_are_named(study_file: Path, text: str, message: str) -> None:
     study_file.write_text(text)
@@ -142,6 +143,20 @@ def test_a_study_may_extend_another(study_file: Path) -> None:
     study = read(other)
     assert "hello three" in study.steps[0].command
     assert (study.name, study.results) == ("other", ())
+
+
+def test_a_step_of_the_extended_study_may_be_named_alone(study_file: Path) -> None:
+    other = study_file.with_name("other.yaml")
+    other.write_text(
+        "question: Again?\nextends: count.yaml\nvariables: {word: three}\n"
+        "steps:\n  - {name: first, command: echo $word}\n  - say_$seed\n"
+    )
+    names, commands = zip(*((step.name, step.command) for step in read(other).steps), strict=True)
+    assert names == ("first", "say_0", "say_1")
+    assert "hello three" in commands[1]
+    other.write_text("question: x\nextends: count.yaml\nsteps: [say]\n")
+    with pytest.raises(ValueError, match=r"step say: .* \(say_\$seed, result\)"):
+        read(other)
 
 
 CELLS = """
