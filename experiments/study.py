@@ -179,8 +179,8 @@ def read_keys(path: Path) -> dict[str, Any]:
     steps = content.get("steps", tuple(written))
     if unknown := [entry for entry in steps if isinstance(entry, str) and entry not in written]:
         raise ValueError(
-            f"{path}: step {', '.join(unknown)}: write its name and command; only a step of a study that this "
-            f"one extends may be named alone ({', '.join(written) or 'it extends none'})"
+            f"{path}: step {', '.join(unknown)}: write its name and command; only a step of a study that "
+            f"this one extends may be named alone ({', '.join(written) or 'it extends none'})"
         )
     variables = {**base.get("variables", {}), **content.get("variables", {})}
     steps = [written[entry] if isinstance(entry, str) else entry for entry in steps]
