@@ -108,6 +108,22 @@ def test_the_value_is_not_touched(make_policy: MakePolicy, pipeline: Pipeline) -
     assert changed == {"encoder", "actor", "std_logit"}
 
 
+def test_a_kept_encoder_is_not_touched_either(make_policy: MakePolicy, pipeline: Pipeline) -> None:
+    policy = make_policy(32)
+    before = copy.deepcopy(policy.state_dict())
+    algorithm = GRPO(policy, GRPOConfig(group_size=GROUP, train_encoder=False, policy_lr=1e-3))
+    env, buffer = PointEnv(16, horizon=6, image_size=32), RolloutBuffer(12, 16, "cpu")
+    stats = algorithm.iterate(env, pipeline, buffer, seed=0, last=False)
+    assert stats["updates"] > 0
+    assert stats["first_ratio_error"] < 1e-3
+    changed = {
+        name.split(".")[0]
+        for name, value in policy.state_dict().items()
+        if not torch.equal(value, before[name])
+    }
+    assert changed == {"actor", "std_logit"}
+
+
 def test_the_clip_is_asymmetric(make_policy: MakePolicy, pipeline: Pipeline) -> None:
     """Ratios at 1.25 are still free, those at 0.75 are not."""
     policy = make_policy()

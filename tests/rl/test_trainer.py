@@ -28,8 +28,10 @@ class Killed(Exception):
 class FailingEnv(PointEnv):
     """Dies, or answers nonsense, from its `resets`-th reset on."""
 
-    def __init__(self, num_envs: int, horizon: int, resets: int, nonsense: bool = False) -> None:
-        super().__init__(num_envs, horizon)
+    def __init__(
+        self, num_envs: int, horizon: int, image_size: int = 0, *, resets: int, nonsense: bool = False
+    ) -> None:
+        super().__init__(num_envs, horizon, image_size)
         self.left, self.nonsense = resets, nonsense
 
     def reset(self, **kwargs: object) -> tuple[dict, dict]:
@@ -42,31 +44,39 @@ class FailingEnv(PointEnv):
         return observation, info
 
 
-def run(policy: CnnPolicy, pipeline: Pipeline, output_dir: Path, env: PointEnv, iterations: int = 4) -> PPO:
+def run(
+    policy: CnnPolicy, pipeline: Pipeline, output_dir: Path, env: PointEnv, train_encoder: bool = True
+) -> PPO:
     """The trainer as the command calls it, from a fixed seed and the same initial policy."""
     output_dir.mkdir(exist_ok=True)
     torch.manual_seed(7)
-    algorithm = PPO(policy, PPOConfig(value_iterations=1, value_normalisation=True, minibatch_size=32))
+    config = PPOConfig(
+        value_iterations=1, value_normalisation=True, minibatch_size=32, train_encoder=train_encoder
+    )
+    algorithm = PPO(policy, config)
     buffer = RolloutBuffer(6, env.num_envs, "cpu")
-    train(env, algorithm, pipeline, buffer, Schedule(iterations, 1, 0), output_dir, policy.save_pretrained)
+    train(env, algorithm, pipeline, buffer, Schedule(4, 1, 0), output_dir, policy.save_pretrained)
     return algorithm
 
 
+@pytest.mark.parametrize(("image_size", "train_encoder"), [(0, True), (32, False)])
 def test_an_interrupted_training_ends_bit_by_bit_where_the_other_does(
-    make_policy: MakePolicy, pipeline: Pipeline, tmp_path: Path
+    make_policy: MakePolicy, pipeline: Pipeline, tmp_path: Path, image_size: int, train_encoder: bool
 ) -> None:
-    initial = make_policy().state_dict()
+    initial = make_policy(image_size).state_dict()
 
     def fresh() -> CnnPolicy:
-        policy = make_policy()
+        policy = make_policy(image_size)
         policy.load_state_dict(initial)
         return policy
 
-    whole = run(fresh(), pipeline, tmp_path / "whole", PointEnv(8, 6))
+    env = PointEnv(8, 6, image_size)
+    whole = run(fresh(), pipeline, tmp_path / "whole", env, train_encoder)
+    failing = FailingEnv(8, 6, image_size, resets=2)
     with pytest.raises(Killed):
-        run(fresh(), pipeline, tmp_path / "cut", FailingEnv(8, 6, resets=2))
+        run(fresh(), pipeline, tmp_path / "cut", failing, train_encoder)
     torch.rand(5)
-    resumed = run(fresh(), pipeline, tmp_path / "cut", PointEnv(8, 6))
+    resumed = run(fresh(), pipeline, tmp_path / "cut", env, train_encoder)
     for name, value in whole.policy.state_dict().items():
         assert torch.equal(resumed.policy.state_dict()[name], value), name
     for name, value in whole.reference.state_dict().items():
