@@ -141,16 +141,13 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         Returns:
             (R, steps, A), clipped to the box.
         """
-        frames = self.newest_frames()[rows]
         instructions = [self._instructions[row] for row in rows.tolist()]
-        imagination, tokens, state, actions = self.model.start(frames), frames.tokens, frames.state, []
-        for _ in range(steps):
-            images = self.model.decode(tokens, frames.context).images
+
+        def bounded(images: Tensor, state: Tensor) -> Tensor:
             action = act(self._observe(images, state, instructions)).to(self.device)
-            actions.append(action.clamp(self.action_low, self.action_high))
-            imagined = self.model.step(imagination, actions[-1])
-            tokens, state = imagined.tokens, imagined.state
-        return torch.stack(actions, 1)
+            return action.clamp(self.action_low, self.action_high)
+
+        return self.model.look_ahead(self.newest_frames()[rows], bounded, steps)
 
     def adopt(self, model: ActionWorldModelRewardModel) -> None:
         """Imagine with a refreshed model from the next reset on.

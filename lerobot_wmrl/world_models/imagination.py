@@ -1,6 +1,6 @@
 """Imagination with a trained world model, in the dataset's units: start, step, open-loop prediction."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -102,6 +102,25 @@ class ImaginationMixin:
         """Imagine the frame after each of the actions (B, T, A)."""
         imagination = self.start(frames)
         return [self.step(imagination, action) for action in actions.unbind(1)]
+
+    @torch.no_grad()
+    def look_ahead(self, frames: Frames, act: Callable[[Tensor, Tensor], Tensor], steps: int) -> Tensor:
+        """Return what a policy would do from these frames on, in its own imagination of what follows.
+
+        Args:
+            frames: B of them.
+            act: images (B, N, 3, H, W) of N cameras, states (B, P) → actions (B, A), in the dataset's units.
+            steps: T.
+
+        Returns:
+            (B, T, A)
+        """
+        imagination, tokens, state, actions = self.start(frames), frames.tokens, frames.state, []
+        for _ in range(steps):
+            actions.append(act(self.decode(tokens, frames.context).images, state))
+            imagined = self.step(imagination, actions[-1])
+            tokens, state = imagined.tokens, imagined.state
+        return torch.stack(actions, 1)
 
     @torch.no_grad()
     def open_loop(self, frames: Frames, actions: Tensor, with_tokens: bool = True) -> OpenLoopPrediction:

@@ -9,6 +9,8 @@ from torch import Tensor
 
 from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
 from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW
+from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.policies import check_fit, load_policy, load_processors, read_policy_config
 from lerobot_wmrl.data.frames import Context, Frames
 from lerobot_wmrl.world_models.checkpoint import check_same_tokenizer, load_model
 from lerobot_wmrl.world_models.modeling_frame_tokenizer import stack_cameras
@@ -45,6 +47,7 @@ class WmMpcPolicy(PreTrainedPolicy):
             high=high,
             seed=config.seed,
         )
+        self.proposal = Proposal(config.proposal_path, model, low, high) if config.proposal_path else None
         self.reset()
 
     def get_optim_params(self) -> dict[str, Any]:
@@ -79,4 +82,45 @@ class WmMpcPolicy(PreTrainedPolicy):
             self._context = model.tokenizer.context(images)
         tokens = model.tokenizer.encode(images, self._context)
         state = batch.get(OBS_STATE, tokens.new_zeros(len(tokens), 0, dtype=torch.float32))
-        return self.planner.plan(Frames(tokens, state, self._context), list(batch.get("task", [])))
+        frames, instructions = Frames(tokens, state, self._context), list(batch.get("task", []))
+        proposed = self.proposal and self.proposal.actions(frames, instructions, self.config.horizon)
+        return self.planner.plan(frames, instructions, proposed)
+
+
+class Proposal:
+    """What a policy would do, in the world model's imagination of what follows.
+
+    Args:
+        path: checkpoint of the policy, or the output folder of its training.
+        model: the world model.
+        low, high: bounds of actions (A,).
+
+    Raises:
+        FieldError: there is no policy, or it looks at something that the world model does not imagine.
+    """
+
+    def __init__(self, path: str, model: Any, low: Tensor, high: Tensor) -> None:
+        self.model, self.low, self.high = model, low, high
+        tokenizer = model.config.tokenizer
+        image = (3, tokenizer.image_size, tokenizer.image_size)
+        shown = {**dict.fromkeys(tokenizer.camera_keys, image), OBS_STATE: (model.config.state_size,)}
+        try:
+            config = read_policy_config(path, [f"--device={low.device}"])
+            check_fit(config, shown, len(low))
+            self.policy = load_policy(config)
+        except FieldError as error:
+            raise FieldError("proposal_path", path, error.problem, error.remedy) from error
+        self.preprocess, self.postprocess = load_processors(config)
+
+    def actions(self, frames: Frames, instructions: list[str], steps: int) -> Tensor:
+        """Return the policy's next `steps` actions from B frames on. → (B, T, A)"""
+        self.policy.reset()
+
+        def act(images: Tensor, state: Tensor) -> Tensor:
+            cameras = self.model.config.tokenizer.camera_keys
+            seen = {name: images[:, index] for index, name in enumerate(cameras)}
+            batch = self.preprocess({**seen, OBS_STATE: state, "task": instructions})
+            action: Tensor = self.postprocess(self.policy.select_action(batch))
+            return action.to(self.low.device).clamp(self.low, self.high)
+
+        return self.model.look_ahead(frames, act, steps)

@@ -15,6 +15,7 @@ from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.configuration_planner import PlannerSettings
 from lerobot_wmrl.world_models.planning import Planner, interpolate_knots, plan_knots, success_logit
+from tests.rl.checkpoints import save_untrained_policy
 
 SMALL = {"horizon": 8, "execute": 3, "samples": 6, "elites": 2, "iterations": 2, "knots": 3, "device": "cpu"}
 IMAGE = "observation.images.third_view"
@@ -162,3 +163,20 @@ def test_bad_settings_name_the_field_and_the_remedy(trained_models):
         WmMpcConfig(device="cpu", elites=9, samples=4)
     with pytest.raises(ValueError, match=r"^knots=1: must be from 2"):
         WmMpcConfig(device="cpu", knots=1)
+
+
+def test_the_search_begins_at_what_another_policy_would_do(config, small_dataset, tmp_path):
+    """The first sample is the beginning itself."""
+    config.samples = config.elites = config.iterations = 1
+    config.proposal_path = str(save_untrained_policy(tmp_path, actions=7, constant=0.02))
+    plan = WmMpcPolicy(config).predict_action_chunk(observation(small_dataset, [0, 20]))
+    torch.testing.assert_close(plan, torch.full((2, SMALL["horizon"], 7), 0.02))
+
+
+def test_a_policy_that_looks_at_something_else_proposes_nothing(config, tmp_path):
+    config.proposal_path = str(save_untrained_policy(tmp_path, camera="wrist", actions=7))
+    with pytest.raises(ValueError, match=r"^proposal_path=.*needs observation\.images\.wrist"):
+        WmMpcPolicy(config)
+    config.proposal_path = str(tmp_path / "nothing")
+    with pytest.raises(ValueError, match=r"^proposal_path=.*no checkpoint there"):
+        WmMpcPolicy(config)
