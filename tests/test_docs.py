@@ -88,6 +88,12 @@ def test_the_readme_says_what_was_measured() -> None:
             for cell in cells
         ]
         assert f"| {title} | " + " | ".join(f"{known} / {unseen} %" for known, unseen in shares) in text
+    policies = json.loads((results / "demo.json").read_text())["runs"][0]["policies"].values()
+    unseen, known = (
+        "{}, {} and {} %".format(*(round(100 * policy[where]["share"]) for policy in policies))
+        for where in ("unseen", "known")
+    )
+    assert f"{unseen} in unseen scenes, {known} in known ones" in text
     best = json.loads((results / "cloning_control.json").read_text())["cloned_from"]["180"]
     known, unseen = (round(100 * best[domain]["share"]) for domain in ("ind", "ood"))
     assert f"{known} % in known and {unseen} % in unseen scenes" in text

@@ -52,8 +52,8 @@ class DemoConfig(RunConfig):
     on the same held-out starts, in known and in unseen scenes.
 
     Running the same command again continues after the last finished piece of work. `--preset=demo` (the
-    default) takes an estimated 40 minutes on two cores, `--preset=tiny` a few and shows only that everything
-    runs; flags further right override the preset.
+    default) takes about half an hour on two cores, `--preset=tiny` a few minutes and shows only that
+    everything runs; flags further right override the preset.
 
     Args:
         output_dir: folder of everything the demo makes; `report.html` is the page to read.
