@@ -134,7 +134,7 @@ def _read_cell(
     folders = {"output_dir": str(OUTPUTS / path.stem), **{need: str(OUTPUTS / need) for need in needs}}
     if BUDGET in content:
         folders[BUDGET] = "$output_dir/budget.json"
-    known = {**folders, **({"cell": name, **cell} if cell else {}), **content.get("variables", {})}
+    known = {**({"cell": name, **cell} if cell else {}), **folders, **content.get("variables", {})}
     variables = resolve(known, given, name)
     steps = tuple(step for entry in content["steps"] for step in repeated(entry, variables))
     names = [step.name for step in steps]

@@ -24,8 +24,9 @@ STUDIES: Final = ROOT / "experiments"
 
 SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     "value_push": ("Policies", value.value_push),
-    "value_iterated": ("Policies", partial(value.rounds, "iterated")),
-    "value_dyna": ("Policies", partial(value.rounds, "dyna")),
+    "value_others": ("Policies", partial(value.rows_above, ["conditioned", "distilled"])),
+    "value_iterated": ("Policies", partial(value.rows_above, ["iterated"])),
+    "value_dyna": ("Policies", partial(value.rows_above, ["dyna"])),
     "value_controls": ("Policies", value.value_controls),
     "demo": ("Policies", policies.demo),
     "cloning_control": ("Policies", policies.cloning_control),

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, Final
 
 from experiments.run import read_record
@@ -23,7 +24,7 @@ def cell(study: Study) -> Results:
     results = {
         **{name: study.variables[name] for name in CELL},
         "real_episodes": len(json.loads(study.budget.read_text())["episodes"]),
-        "real_successes": int(recorded_episodes(study.folder / "dataset")["success"].sum()),
+        "real_successes": int(recorded_episodes(Path(study.variables["run"]) / "dataset")["success"].sum()),
         "methods": {name: method(study, name, steps) for name, steps in methods.items()},
     }
     return {study.variables["cell"]: results}

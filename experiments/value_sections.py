@@ -22,10 +22,11 @@ TITLES: Final = {
     "imagined_ppo": "PPO in imagination",
     "dyna": "PPO in imagination, with rollouts in three rounds (Dyna)",
     "distilled": "planner distilled in imagination",
+    "planned": "planning in imagination at test time",
 }
 """Methods in the order of the table."""
 
-IMAGINED: Final = ("imagined_ppo", "dyna", "distilled")
+IMAGINED: Final = ("imagined_ppo", "dyna", "distilled", "planned")
 """Methods that use a world model."""
 
 RIVALS: Final = tuple(method for method in TITLES if method not in IMAGINED)
@@ -33,14 +34,18 @@ RIVALS: Final = tuple(method for method in TITLES if method not in IMAGINED)
 
 CONTROLS: Final = {
     "labels": "labels of other episodes",
+    "planned_labels": "the same, planning",
     "actions": "actions of other episodes",
+    "planned_actions": "the same, planning",
     "constant": "no frame is rewarded",
     "rollouts_only": "world model of the rollouts alone",
     "demonstrations_only": "world model of the demonstrations alone",
 }
 
+MORE_COLOURS: Final = ("#b83280", "#333333", "#d69e2e", "#319795", "#718096")
+
 STUDY: Final = "value_push"
-PARTS: Final = ("value_iterated", "value_dyna")
+PARTS: Final = ("value_others", "value_iterated", "value_dyna")
 """Studies whose cells add methods to its table."""
 
 Cell = dict[str, Any]
@@ -119,14 +124,16 @@ All methods:
 Success of each seed over {starts} starts; with more than one seed, their mean. Intervals count starts, and
 seeds where there are several. Minutes are those of training on one core, without recording. The better of
 several methods is chosen on the starts that are reported. PPO in imagination and the methods below it use
-a world model.
+a world model. Planning trains no policy: it improves on what the one of demonstrations and successful
+rollouts would do, and plans anew after eight actions.
 
 ![Success against real episodes](images/value_push.png)"""
 
 
-def rounds(method: str, load: Load) -> str:
+def rows_above(methods: Sequence[str], load: Load) -> str:
     """Return the section of a study whose numbers are in the other one's table."""
-    return f'Its rows are in [the table above](#{STUDY}): "{TITLES[method]}".'
+    titles = ", ".join(f'"{TITLES[method]}"' for method in methods)
+    return f"Its rows are in [the table above](#{STUDY}): {titles}."
 
 
 def value_controls(load: Load) -> str:
@@ -180,9 +187,7 @@ def draw_value(load: Load, path: Path) -> None:
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     panels = figure.subplots(1, 2, sharey=True)
     for axes, domain in zip(panels, ("ind", "ood"), strict=True):
-        for colour, (method, title) in zip(
-            (*COLOURS, "#b83280", "#333333", "#d69e2e", "#319795"), TITLES.items(), strict=True
-        ):
+        for colour, (method, title) in zip((*COLOURS, *MORE_COLOURS), TITLES.items(), strict=True):
             _draw_line(axes, found, method, domain, {"color": colour, "label": title})
         axes.set_title(f"{DOMAINS[domain]} scenes")
         axes.set_xlabel("real episodes: demonstrations + rollouts")

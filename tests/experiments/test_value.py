@@ -26,7 +26,7 @@ from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.statistics import RunsMean
 
 STUDY = ROOT / "experiments" / "value_push.yaml"
-SUCCESSES = {"cloning": 5, "filtered": 7, "weighted": 6, "conditioned": 6, "imagined_ppo": 8, "distilled": 9}
+SUCCESSES = {"cloning": 5, "filtered": 7, "weighted": 6, "imagined_ppo": 8, "planned": 9}
 
 
 def made_up_cell(demonstrations: int, seed: int) -> dict[str, Any]:
@@ -52,13 +52,13 @@ def test_the_section_compares_the_best_with_and_without_a_world_model(docs: Path
     cells = groups(loader(docs))[8, 300]
     assert len(cells) == 2
     assert best(cells, ["cloning", "filtered", "weighted"], "ind") == "filtered"
-    change = gain(cells, "distilled", "filtered", "ood")
+    change = gain(cells, "planned", "filtered", "ood")
     assert change.mean == pytest.approx(0.2)
     assert change.low < 0.2 < change.high
     text = value_push(loader(docs))
     assert (
-        "| 8 | 300 | known | cloning of demonstrations and successful rollouts | planner distilled in "
-        "imagination | +20.0 points" in text
+        "| 8 | 300 | known | cloning of demonstrations and successful rollouts | planning in "
+        "imagination at test time | +20.0 points" in text
     )
     assert "| 8 | 300 | cloning of the demonstrations | 50, 60 → 55 %" in text
 
@@ -66,12 +66,12 @@ def test_the_section_compares_the_best_with_and_without_a_world_model(docs: Path
 def test_rounds_stand_in_the_same_table_for_the_seeds_that_have_them(docs: Path) -> None:
     (cell,) = read_cells(STUDY, ["demonstrations=8", "seed=0"])
     content = made_up_cell(8, 0)
-    content["methods"] = {"iterated": content["methods"]["distilled"]}
+    content["methods"] = {"iterated": content["methods"]["planned"]}
     write_json(docs / "results" / "value_iterated" / f"{cell.variables['cell']}.json", content)
     cells = groups(loader(docs))[8, 300]
     content["methods"]["iterated"] = {**content["methods"]["iterated"], "ood": {"outcomes": [1] * 10}}
     write_json(docs / "results" / "value_iterated" / f"{cell.variables['cell']}.json", content)
-    assert best(groups(loader(docs))[8, 300], list(TITLES), "ood") == "distilled", "the other has one seed"
+    assert best(groups(loader(docs))[8, 300], list(TITLES), "ood") == "planned", "the other has one seed"
     assert gain(cells, "imagined_ppo", "iterated", "ind").mean == pytest.approx(-0.1)
     assert f"| 8 | 300 | {TITLES['iterated']} | 90 %" in value_push(loader(docs))
 
@@ -112,7 +112,7 @@ def test_a_cell_keeps_outcomes_and_minutes(tmp_path: Path, monkeypatch: pytest.M
         write_json(record_path(study, SimpleNamespace(name=step.name)), {"seconds": 60.0})
     (content,) = value.cell(study).values()
     assert (content["real_episodes"], content["real_successes"]) == (308, 140)
-    assert content["methods"]["distilled"]["minutes"] == 5
+    assert content["methods"]["planned"]["minutes"] == 4
     assert content["methods"]["filtered"]["ind"]["outcomes"] == [1] * 7 + [0] * 3
     assert content["methods"].keys() == SUCCESSES.keys()
     json.dumps(content)
