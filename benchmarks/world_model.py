@@ -127,16 +127,21 @@ def preset_config(preset: str, kind: str, flags: Sequence[str]) -> Any:
     return draccus.parse(TrainWorldModelConfig, args=given).model
 
 
-def make_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def add_model(parser: argparse.ArgumentParser) -> None:
+    """Add the flags that `make_model` reads."""
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("--world_model", help="output folder of an action world model's training")
     sizes = list(presets_of("train-world-model"))
     source.add_argument("--sizes", choices=sizes, help="random weights of this preset's sizes")
-    parser.add_argument("--batches", type=int, nargs="+", default=BATCHES, help="batch sizes")
     parser.add_argument("--device", help="cpu or cuda; by default CUDA if there is any")
+
+
+def make_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add_model(parser)
+    parser.add_argument("--batches", type=int, nargs="+", default=BATCHES, help="batch sizes")
     parser.add_argument("--no_maniskill", action="store_true", help="leave the simulator out")
     parser.add_argument("--output", type=Path, default=RESULTS / "world_model_speed.json", help="JSON file")
     return parser
