@@ -177,9 +177,9 @@ def read_keys(path: Path) -> dict[str, Any]:
     base = read_keys(path.parent / content["extends"]) if "extends" in content else {}
     written = {entry["name"]: entry for entry in base.get("steps", ())}
     steps = content.get("steps", tuple(written))
-    if unknown := [entry for entry in steps if isinstance(entry, str) and entry not in written]:
+    if missing := [entry for entry in steps if isinstance(entry, str) and entry not in written]:
         raise ValueError(
-            f"{path}: step {', '.join(unknown)}: write its name and command; only a step of a study that "
+            f"{path}: step {', '.join(missing)}: write its name and command; only a step of a study that "
             f"this one extends may be named alone ({', '.join(written) or 'it extends none'})"
         )
     variables = {**base.get("variables", {}), **content.get("variables", {})}

@@ -83,7 +83,9 @@ class WmMpcPolicy(PreTrainedPolicy):
         tokens = model.tokenizer.encode(images, self._context)
         state = batch.get(OBS_STATE, tokens.new_zeros(len(tokens), 0, dtype=torch.float32))
         frames, instructions = Frames(tokens, state, self._context), list(batch.get("task", []))
-        proposed = self.proposal and self.proposal.actions(frames, instructions, self.config.horizon)
+        proposed = None
+        if self.proposal is not None:
+            proposed = self.proposal.actions(frames, instructions, self.config.horizon)
         return self.planner.plan(frames, instructions, proposed)
 
 
