@@ -7,7 +7,7 @@ At each number of searches at once, measured in turns: plans of three settings (
 those of `distillation`, and a few samples around a policy's actions), the frames that such a policy is shown
 to look ahead (the policy itself is not counted), and the last setting's sequences in one pass and frame by
 frame, as one would without `open_loop`. The floor of a predicted frame is its arithmetic at the measured rate
-of matrix products. Episodes a second are those of a few samples around a policy's actions, looked ahead, with
+of matrix products. Episodes a second are those of a few samples around a policy's actions, with what the policy would do, with
 `PLANS_AN_EPISODE`. Beyond a clip's length all is frame by frame. Writes docs/results/planning_speed.json.
 """
 
@@ -68,15 +68,15 @@ def measure(model: ActionWorldModelRewardModel, searches: int, matmul: float) ->
             len(sequences) * near.horizon, lambda: model.open_loop(frames, sequences, with_tokens=False)
         ),
         "frame_by_frame": (len(sequences) * near.horizon, lambda: model.imagine(each, sequences)),
-        "looked_ahead": (searches, lambda: model.look_ahead(frames, lambda *seen: action, near.horizon)),
+        "policy_actions": (searches, lambda: model.policy_actions(frames, lambda *seen: action, near.horizon)),
     }  # fmt: skip
     for name, settings in SETTINGS.items():
         planner = Planner(model, None, settings, 2, averaged=False, low=low, high=high, seed=0)
         works[name] = (searches, partial(planner.plan, frames, tasks))
     found = rates(works, device)
     arithmetic = flop(works["open_loop"][1]) / works["open_loop"][0]
-    plans = {name: found[name] for name in (*SETTINGS, "looked_ahead")}
-    both = 1 / (1 / plans["near_a_policy"] + 1 / plans["looked_ahead"])
+    plans = {name: found[name] for name in (*SETTINGS, "policy_actions")}
+    both = 1 / (1 / plans["near_a_policy"] + 1 / plans["policy_actions"])
     return {
         "searches": searches,
         "frames_per_s": {name: round(found[name], 1) for name in ("open_loop", "frame_by_frame")},

@@ -133,7 +133,7 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         return self.model.newest(self._imagination)
 
     @torch.no_grad()
-    def look_ahead(self, act: Callable[[Observation], Tensor], rows: Tensor, steps: int) -> Tensor:
+    def policy_actions(self, act: Callable[[Observation], Tensor], rows: Tensor, steps: int) -> Tensor:
         """Return what a policy would do from the newest frames of the environments `rows` (R,) on.
 
         Their episodes do not go on. act: observations of the R environments → actions (R, A).
@@ -147,7 +147,7 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
             action = act(self._observe(images, state, instructions)).to(self.device)
             return action.clamp(self.action_low, self.action_high)
 
-        return self.model.look_ahead(self.newest_frames()[rows], bounded, steps)
+        return self.model.policy_actions(self.newest_frames()[rows], bounded, steps)
 
     def adopt(self, model: ActionWorldModelRewardModel) -> None:
         """Imagine with a refreshed model from the next reset on.

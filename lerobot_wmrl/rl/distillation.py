@@ -168,7 +168,7 @@ class Distillation(RLAlgorithm):
                         planned = planned[alive[planned]]
                         tasks = [observation[TASK][row] for row in planned.tolist()]
                         policy.reset()
-                        proposed = env.look_ahead(act, planned, horizon)
+                        proposed = env.policy_actions(act, planned, horizon)
                         chunk = planner.plan(env.newest_frames()[planned], tasks, proposed)
                     actions[step, planned] = chunk[:, ahead]
                     acting[step] = alive

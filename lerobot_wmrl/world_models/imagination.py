@@ -104,20 +104,29 @@ class ImaginationMixin:
         return [self.step(imagination, action) for action in actions.unbind(1)]
 
     @torch.no_grad()
-    def look_ahead(self, frames: Frames, act: Callable[[Tensor, Tensor], Tensor], steps: int) -> Tensor:
-        """Return what a policy would do from these frames on, in its own imagination of what follows.
+    def policy_actions(
+        self,
+        frames: Frames,
+        act: Callable[[Tensor, Tensor], Tensor],
+        steps: int,
+        images: Tensor | None = None,
+    ) -> Tensor:
+        """Return what a policy would do from these frames on, shown the frames that its actions lead to.
 
         Args:
             frames: B of them.
             act: images (B, N, 3, H, W) of N cameras, states (B, P) → actions (B, A), in the dataset's units.
             steps: T.
+            images: of the B frames; by default they are decoded.
 
         Returns:
             (B, T, A)
         """
         imagination, tokens, state, actions = self.start(frames), frames.tokens, frames.state, []
-        for _ in range(steps):
-            actions.append(act(self.decode(tokens, frames.context).images, state))
+        for step in range(steps):
+            if step or images is None:
+                images = self.decode(tokens, frames.context).images
+            actions.append(act(images, state))
             imagined = self.step(imagination, actions[-1])
             tokens, state = imagined.tokens, imagined.state
         return torch.stack(actions, 1)

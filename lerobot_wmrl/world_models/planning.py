@@ -103,31 +103,44 @@ class Planner:
         Args:
             frames: B of them.
             instructions: one a frame.
-            proposed: actions that the search begins at (B, T, A); by default what is left of the last plans.
+            proposed: actions (B, T, A) from which knots change something: the first sample is the proposal
+                itself. By default the search begins at what is left of the last plans.
 
         Returns:
             (B, T, A)
         """
         model, settings = self.model, self.settings
+        objective = self._objective(frames, instructions)
         # Statistics hold a std of 1 for components that never vary: these stay at their mean.
         std = settings.spread * torch.where(model.action_std == 1, 0.0, model.action_std)
-        mean = model.action_mean.expand(len(frames), settings.knots, -1)
+
+        def search(objective: Objective, mean: Tensor, low: Tensor, high: Tensor) -> Tensor:
+            best, average = plan_knots(
+                objective, mean, std, low, high, horizon=settings.horizon, samples=settings.samples,
+                elites=settings.elites, iterations=settings.iterations, generator=self.generator,
+            )  # fmt: skip
+            return average if self.averaged else best
+
         if proposed is not None:
-            mean = self._knots_of(proposed, 0)
-        elif self.knots is not None:
-            mean = self._knots_of(interpolate_knots(self.knots, settings.horizon), settings.execute)
-        best, average = plan_knots(
-            self._objective(frames, instructions), mean, std, self.low, self.high,
-            horizon=settings.horizon, samples=settings.samples, elites=settings.elites,
-            iterations=settings.iterations, generator=self.generator,
-        )  # fmt: skip
-        self.knots = average if self.averaged else best
+            spared = proposed.new_zeros(len(frames), settings.knots, proposed.shape[-1])
+            span = self.high - self.low
+            knots = search(lambda change: objective(self._changed(proposed, change)), spared, -span, span)
+            return self._changed(proposed, interpolate_knots(knots, settings.horizon))
+        mean = model.action_mean.expand(len(frames), settings.knots, -1)
+        if self.knots is not None:
+            mean = self._remaining_knots(interpolate_knots(self.knots, settings.horizon))
+        self.knots = search(objective, mean, self.low, self.high)
         return interpolate_knots(self.knots, settings.horizon)
 
-    def _knots_of(self, plans: Tensor, first: int) -> Tensor:
-        """Return the knots of plans from step `first` on, the last action held. (B, T, A) → (B, N, A)"""
+    def _changed(self, proposed: Tensor, change: Tensor) -> Tensor:
+        """Add changes (B·K, T, A), K for each proposal (B, T, A), within the bounds. → (B·K, T, A)"""
+        each = proposed.repeat_interleave(len(change) // len(proposed), 0)
+        return (each + change).clamp(self.low, self.high)
+
+    def _remaining_knots(self, plans: Tensor) -> Tensor:
+        """Return the knots of plans after the executed steps, the last action held. (B, T, A) → (B, N, A)"""
         settings = self.settings
-        steps = torch.linspace(first, first + settings.horizon - 1, settings.knots)
+        steps = torch.linspace(settings.execute, settings.execute + settings.horizon - 1, settings.knots)
         return plans[:, steps.round().long().clamp(max=settings.horizon - 1)]
 
     def _objective(self, frames: Frames, instructions: Sequence[str]) -> Objective:

@@ -47,7 +47,7 @@ class WmMpcPolicy(PreTrainedPolicy):
             high=high,
             seed=config.seed,
         )
-        self.proposal = Proposal(config.proposal_path, model, low, high) if config.proposal_path else None
+        self.proposal = Proposal(config, model, low, high) if config.proposal_path else None
         self.reset()
 
     def get_optim_params(self) -> dict[str, Any]:
@@ -85,44 +85,57 @@ class WmMpcPolicy(PreTrainedPolicy):
         frames, instructions = Frames(tokens, state, self._context), list(batch.get("task", []))
         proposed = None
         if self.proposal is not None:
-            proposed = self.proposal.actions(frames, instructions, self.config.horizon)
+            proposed = self.proposal.actions(frames, instructions, images, self.config.horizon)
         return self.planner.plan(frames, instructions, proposed)
 
 
 class Proposal:
-    """What a policy would do, in the world model's imagination of what follows.
+    """What a policy would do in the next steps, in the world model's imagination.
 
     Args:
-        path: checkpoint of the policy, or the output folder of its training.
+        config: of the planning policy, with the path of the other one.
         model: the world model.
         low, high: bounds of actions (A,).
 
     Raises:
-        FieldError: there is no policy, or it looks at something that the world model does not imagine.
+        FieldError: there is no policy, it looks at something that the world model does not imagine, or at
+            more than one time.
     """
 
-    def __init__(self, path: str, model: Any, low: Tensor, high: Tensor) -> None:
+    def __init__(self, config: WmMpcConfig, model: Any, low: Tensor, high: Tensor) -> None:
         self.model, self.low, self.high = model, low, high
-        tokenizer = model.config.tokenizer
-        image = (3, tokenizer.image_size, tokenizer.image_size)
-        shown = {**dict.fromkeys(tokenizer.camera_keys, image), OBS_STATE: (model.config.state_size,)}
+        self.cameras = model.config.tokenizer.camera_keys
+        size, path = model.config.tokenizer.image_size, config.proposal_path
+        shown: dict[str, tuple[int, ...]] = dict.fromkeys(self.cameras, (3, size, size))
+        if model.config.state_size:
+            shown[OBS_STATE] = (model.config.state_size,)
         try:
-            config = read_policy_config(path, [f"--device={low.device}"])
-            check_fit(config, shown, len(low))
-            self.policy = load_policy(config)
-        except FieldError as error:
-            raise FieldError("proposal_path", path, error.problem, error.remedy) from error
-        self.preprocess, self.postprocess = load_processors(config)
+            policy = read_policy_config(path, [f"--device={config.device}"])
+            check_fit(policy, shown, len(low))
+            if getattr(policy, "n_obs_steps", 1) > 1:
+                raise FieldError("n_obs_steps", policy.n_obs_steps, "it looks at earlier frames too")
+            self.policy = load_policy(policy)
+            self.preprocess, self.postprocess = load_processors(policy)
+        except ValueError as error:
+            problem = error.problem if isinstance(error, FieldError) else str(error)
+            raise FieldError(
+                "proposal_path", path, problem,
+                "give a policy of one time step that was trained on what the world model imagines: "
+                f"{', '.join(shown)}",
+            ) from error  # fmt: skip
 
-    def actions(self, frames: Frames, instructions: list[str], steps: int) -> Tensor:
-        """Return the policy's next `steps` actions from B frames on. → (B, T, A)"""
+    def actions(self, frames: Frames, instructions: list[str], images: Tensor, steps: int) -> Tensor:
+        """Return the policy's next `steps` actions from B frames on, of which these are the images
+        (B, N, 3, H, W). → (B, T, A)"""
         self.policy.reset()
 
         def act(images: Tensor, state: Tensor) -> Tensor:
-            cameras = self.model.config.tokenizer.camera_keys
-            seen = {name: images[:, index] for index, name in enumerate(cameras)}
-            batch = self.preprocess({**seen, OBS_STATE: state, "task": instructions})
-            action: Tensor = self.postprocess(self.policy.select_action(batch))
+            seen: Observation = {name: images[:, index] for index, name in enumerate(self.cameras)}
+            if self.model.config.state_size:
+                seen[OBS_STATE] = state
+            action: Tensor = self.postprocess(
+                self.policy.select_action(self.preprocess({**seen, "task": instructions}))
+            )
             return action.to(self.low.device).clamp(self.low, self.high)
 
-        return self.model.look_ahead(frames, act, steps)
+        return self.model.policy_actions(frames, act, steps, images)

@@ -82,17 +82,17 @@ def test_the_planners_search_begins_at_what_the_policy_would_do(
     imagined: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With one sample and a knot a step, the plan is the proposal."""
-    look_ahead, plan, proposals, plans = WorldModelVectorEnv.look_ahead, Planner.plan, [], []
+    policy_actions, plan, proposals, plans = WorldModelVectorEnv.policy_actions, Planner.plan, [], []
 
-    def spied_look_ahead(*args: Any) -> Tensor:
-        proposals.append(look_ahead(*args))
+    def spied_policy_actions(*args: Any) -> Tensor:
+        proposals.append(policy_actions(*args))
         return proposals[-1]
 
     def spied_plan(*args: Any) -> Tensor:
         plans.append(plan(*args))
         return plans[-1]
 
-    monkeypatch.setattr(WorldModelVectorEnv, "look_ahead", spied_look_ahead)
+    monkeypatch.setattr(WorldModelVectorEnv, "policy_actions", spied_policy_actions)
     monkeypatch.setattr(Planner, "plan", spied_plan)
     policy = save_untrained_policy(tmp_path / "policy", actions=7)
     single = ["samples=1", "elites=1", "iterations=1", "knots=6", "execute=2"]
