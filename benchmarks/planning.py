@@ -4,11 +4,11 @@
     python benchmarks/planning.py --world_model=outputs/demo/action_world_model --searches 1 64
 
 At each number of searches at once, measured in turns: plans of three settings (those of `wm_mpc` by default,
-those of `distillation`, and a few samples around a policy's actions), the frames that such a policy is shown
-to look ahead (the policy itself is not counted), and the last setting's sequences in one pass and frame by
-frame, as one would without `open_loop`. The floor of a predicted frame is its arithmetic at the measured rate
-of matrix products. Episodes a second are those of a few samples around a policy's actions, with what the policy would do, with
-`PLANS_AN_EPISODE`. Beyond a clip's length all is frame by frame. Writes docs/results/planning_speed.json.
+those of `distillation`, and a few changes of a policy's actions), what the policy would do (the frames that
+it is shown, without the policy itself), and the last setting's sequences in one pass and frame by frame, as
+one would without `open_loop`. The floor of a predicted frame is its arithmetic at the measured rate of matrix
+products. Episodes a second are those of the last setting, with `PLANS_AN_EPISODE`. Beyond a clip's length
+everything is frame by frame. Writes docs/results/planning_speed.json.
 """
 
 import argparse
@@ -68,7 +68,9 @@ def measure(model: ActionWorldModelRewardModel, searches: int, matmul: float) ->
             len(sequences) * near.horizon, lambda: model.open_loop(frames, sequences, with_tokens=False)
         ),
         "frame_by_frame": (len(sequences) * near.horizon, lambda: model.imagine(each, sequences)),
-        "policy_actions": (searches, lambda: model.policy_actions(frames, lambda *seen: action, near.horizon)),
+        "policy_actions": (
+            searches, lambda: model.policy_actions(frames, lambda *seen: action, near.horizon)
+        ),
     }  # fmt: skip
     for name, settings in SETTINGS.items():
         planner = Planner(model, None, settings, 2, averaged=False, low=low, high=high, seed=0)

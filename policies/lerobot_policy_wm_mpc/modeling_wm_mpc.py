@@ -98,8 +98,7 @@ class Proposal:
         low, high: bounds of actions (A,).
 
     Raises:
-        FieldError: there is no policy, it looks at something that the world model does not imagine, or at
-            more than one time.
+        FieldError: there is no policy, or it looks at something that the world model does not imagine.
     """
 
     def __init__(self, config: WmMpcConfig, model: Any, low: Tensor, high: Tensor) -> None:
@@ -112,16 +111,13 @@ class Proposal:
         try:
             policy = read_policy_config(path, [f"--device={config.device}"])
             check_fit(policy, shown, len(low))
-            if getattr(policy, "n_obs_steps", 1) > 1:
-                raise FieldError("n_obs_steps", policy.n_obs_steps, "it looks at earlier frames too")
             self.policy = load_policy(policy)
             self.preprocess, self.postprocess = load_processors(policy)
         except ValueError as error:
             problem = error.problem if isinstance(error, FieldError) else str(error)
             raise FieldError(
                 "proposal_path", path, problem,
-                "give a policy of one time step that was trained on what the world model imagines: "
-                f"{', '.join(shown)}",
+                f"give a policy that was trained on what the world model imagines ({', '.join(shown)})",
             ) from error  # fmt: skip
 
     def actions(self, frames: Frames, instructions: list[str], images: Tensor, steps: int) -> Tensor:

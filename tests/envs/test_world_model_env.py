@@ -84,7 +84,9 @@ def test_looking_ahead_shows_what_a_policy_would_do_and_moves_no_episode(config)
         observation, *_ = other.step(taken[-1])
     env.reset(seed=3)
     rows = torch.tensor([2, 0])
-    torch.testing.assert_close(env.policy_actions(act, rows, 4), torch.stack(taken, 1)[rows], atol=1e-4, rtol=0)
+    torch.testing.assert_close(
+        env.policy_actions(act, rows, 4), torch.stack(taken, 1)[rows], atol=1e-4, rtol=0
+    )
     for step in range(4):
         seen, *_ = env.step(taken[step])
     torch.testing.assert_close(seen[IMAGE], observation[IMAGE])

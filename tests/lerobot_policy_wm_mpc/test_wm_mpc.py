@@ -8,9 +8,11 @@ import pytest
 import torch
 from lerobot.scripts import lerobot_eval
 
+from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
 from lerobot_policy_wm_mpc.modeling_wm_mpc import WmMpcPolicy
 from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW
+from lerobot_wmrl.common.policies import load_processors, read_policy_config
 from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.configuration_planner import PlannerSettings
@@ -70,10 +72,10 @@ def test_the_planner_keeps_to_the_box_and_never_returns_worse_than_it_was_given(
     assert torch.cat(asked).max() <= high + 1e-6
 
 
-def test_a_search_begins_at_the_proposed_actions_and_stays_near_them(trained_models):
-    """One sample is the proposal itself; others leave it by no more than a few of the given deviations."""
+def test_a_search_changes_the_proposed_actions_by_a_few_deviations(trained_models):
+    """One sample is the proposal itself, at every step, not at knots alone."""
     model = load_model(trained_models["action_world_model"], "action_world_model").eval()
-    proposed = interpolate_knots(0.02 * torch.rand(2, 3, 7, generator=torch.Generator().manual_seed(0)), 9)
+    proposed = 0.02 * torch.rand(2, 9, 7, generator=torch.Generator().manual_seed(0))
     frames = Frames(torch.zeros(2, model.tokenizer.tokens_per_frame, dtype=torch.long), torch.zeros(2, 8))
     low, high = torch.tensor(ACTION_LOW), torch.tensor(ACTION_HIGH)
 
@@ -165,12 +167,26 @@ def test_bad_settings_name_the_field_and_the_remedy(trained_models):
         WmMpcConfig(device="cpu", knots=1)
 
 
-def test_the_search_begins_at_what_another_policy_would_do(config, small_dataset, tmp_path):
-    """The first sample is the beginning itself."""
+def test_without_a_search_it_does_what_the_other_policy_does_in_imagination(config, small_dataset, tmp_path):
+    """There are fewer knots than steps, and still every action is the policy's."""
     config.samples = config.elites = config.iterations = 1
-    config.proposal_path = str(save_untrained_policy(tmp_path, actions=7, constant=0.02))
-    plan = WmMpcPolicy(config).predict_action_chunk(observation(small_dataset, [0, 20]))
-    torch.testing.assert_close(plan, torch.full((2, SMALL["horizon"], 7), 0.02))
+    config.proposal_path = str(save_untrained_policy(tmp_path, actions=7))
+    planning, seen = WmMpcPolicy(config), observation(small_dataset, [0, 20])
+    plan = planning.predict_action_chunk(seen)
+
+    policy, model = CnnPolicy.from_pretrained(tmp_path).eval(), planning.planner.model
+    before, after = load_processors(read_policy_config(str(tmp_path), ["--device=cpu"]))
+    low, high = torch.tensor(ACTION_LOW), torch.tensor(ACTION_HIGH)
+    images, state, actions = seen[IMAGE][:, None], seen["observation.state"], []
+    context = model.tokenizer.context(images)
+    imagination = model.start(Frames(model.tokenizer.encode(images, context), state, context))
+    for _ in range(config.horizon):
+        batch = before({IMAGE: images[:, 0], "observation.state": state, "task": seen["task"]})
+        actions.append(after(policy.select_action(batch)).clamp(low, high))
+        imagined = model.step(imagination, actions[-1])
+        images, state = model.decode(imagined.tokens, context).images, imagined.state
+    torch.testing.assert_close(plan, torch.stack(actions, 1), atol=1e-4, rtol=0)
+    assert not torch.allclose(plan[0], plan[1])
 
 
 def test_a_policy_that_looks_at_something_else_proposes_nothing(config, tmp_path):

@@ -81,7 +81,7 @@ def test_it_trains_on_the_planners_successes_and_resumes_as_if_nothing_had_happe
 def test_the_planners_search_begins_at_what_the_policy_would_do(
     imagined: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With one sample and a knot a step, the plan is the proposal."""
+    """With one sample the plan is the proposal."""
     policy_actions, plan, proposals, plans = WorldModelVectorEnv.policy_actions, Planner.plan, [], []
 
     def spied_policy_actions(*args: Any) -> Tensor:
@@ -95,7 +95,7 @@ def test_the_planners_search_begins_at_what_the_policy_would_do(
     monkeypatch.setattr(WorldModelVectorEnv, "policy_actions", spied_policy_actions)
     monkeypatch.setattr(Planner, "plan", spied_plan)
     policy = save_untrained_policy(tmp_path / "policy", actions=7)
-    single = ["samples=1", "elites=1", "iterations=1", "knots=6", "execute=2"]
+    single = ["samples=1", "elites=1", "iterations=1", "knots=3", "execute=2"]
     flags = [f"--policy.path={policy}", *FAST, *(f"--algorithm.planner.{each}" for each in single)]
     train(monkeypatch, *flags, "--iterations=1", *imagined, f"--output_dir={tmp_path / 'rl'}")
     assert len(plans) == 2
