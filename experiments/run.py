@@ -41,10 +41,12 @@ def run_study(study: Study, repeat: bool = False) -> None:
         StudyError: a needed study is not finished, a command has changed, a command fails, or learns from
             episodes that are not in the study's budget.
     """
-    for name in study.needs:
-        folder = study.folder_of(name)
-        if not [*folder.glob(RECORDS), *folder.glob(f"*/{RECORDS}")]:
-            raise StudyError(f"needs {name}: run experiments/{name}.yaml first, or give {name}=FOLDER")
+    for name, folder in study.needs.items():
+        if not (folder / RECORDS).exists():
+            raise StudyError(
+                f"needs {name}, of which {folder} holds nothing: run experiments/{name}.yaml first, or give "
+                f"{name}=FOLDER"
+            )
     budget.begin(study)
     for number, step in enumerate(study.steps, start=1):
         heading = f"[{number}/{len(study.steps)}] {step.name}"
@@ -200,7 +202,7 @@ def main() -> None:
                 run_study(study, given.repeat)
                 for path in publish(study, given.docs):
                     print(f"wrote {path}")
-    except (ValueError, StudyError) as error:
+    except (OSError, ValueError, StudyError) as error:
         sys.exit(f"error: {error}")
     if not given.dry_run:
         print("Next: python -m experiments.tables, which writes docs/results.md")

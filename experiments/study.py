@@ -3,14 +3,16 @@
 A file has these keys:
 
     question   what the study answers
-    needs      studies whose folders its commands read; `$gate` is the folder of gate.yaml
+    needs      studies whose folders its commands read; `$gate` is the folder of gate.yaml. Of a study with
+               cells, the cell with the values that this study's variables have
     extends    another study, whose keys hold where this one has none of its own, and whose steps may be named
                in place of being written again
     budget     real episodes that all its methods may learn from: demonstrations, rollouts, play. `$budget` is
                the ledger, $output_dir/budget.json, which commands are given as --budget=$budget
     variables  names for commands; a later one may use an earlier one
     cells      variables with a list of values each: the study is run once for every combination, in a folder
-               `$cell` of its own, and publishes each one's results as soon as it is finished
+               `$cell` of its own, and publishes each one's results as soon as it is finished. In place of a
+               list, a mapping from each value to more variables, which hold in its cells
     steps      name, command; `for`: repeat the step for every combination; `fresh: true`: delete first what
                an interrupted run of it has left, since the command refuses that
     collect    a function of this package, `module.function(study)`, that returns results by their stem
@@ -22,7 +24,7 @@ A file has these keys:
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -63,7 +65,8 @@ class Study:
 
     name: str
     question: str
-    needs: tuple[str, ...]
+    needs: Mapping[str, Path]
+    """Studies that must be finished: name → folder, that of a cell where the study has cells."""
     variables: Mapping[str, Any]
     steps: tuple[Step, ...]
     collect: str | None
@@ -81,10 +84,6 @@ class Study:
     def budget(self) -> Path:
         """The ledger of a study with a budget."""
         return Path(self.variables[BUDGET])
-
-    def folder_of(self, study: str) -> Path:
-        """The folder of a study that this one needs."""
-        return Path(self.variables[study])
 
 
 def read_study(path: Path, given: Sequence[str] = ()) -> Study:
@@ -107,7 +106,8 @@ def read_cells(path: Path, given: Sequence[str] = ()) -> list[Study]:
     Raises:
         ValueError: a key, variable or value is not known.
     """
-    content, cells = read_keys(path), dict(cells_of(path))
+    content = read_keys(path)
+    cells = {name: list(values) for name, values in cells_of(path).items()}
     rest = []
     for assignment in given:
         name, _, value = assignment.partition("=")
@@ -120,22 +120,32 @@ def read_cells(path: Path, given: Sequence[str] = ()) -> list[Study]:
     return [_read_cell(path, content, cell, rest) for cell in combinations]
 
 
-def cells_of(path: Path) -> Mapping[str, list[Any]]:
-    """Return the variables that make a study's cells, with their values."""
+def cells_of(path: Path) -> Mapping[str, Any]:
+    """Return the variables that make a study's cells, with their values (and what each value brings)."""
     return read_keys(path).get("cells", {})
+
+
+def cell_name(cell: Mapping[str, Any]) -> str:
+    """Return the folder of a cell: `demonstrations8_seed0_labels`, the values of words by themselves."""
+    return "_".join(value if isinstance(value, str) else f"{key}{value}" for key, value in cell.items())
 
 
 def _read_cell(
     path: Path, content: Mapping[str, Any], cell: Mapping[str, Any], given: Sequence[str]
 ) -> Study:
     """Return a study with the variables of one cell, in that cell's folder."""
-    needs = tuple(content.get("needs", ()))
-    name = "_".join(f"{key}{value}" for key, value in cell.items())
+    needs, name = content.get("needs", ()), cell_name(cell)
+    more = {}
+    for key, value in cell.items():
+        if isinstance(values := content["cells"][key], Mapping):
+            if value not in values:
+                raise ValueError(f"{path}: {key}={value}: there are {', '.join(map(str, values))}")
+            more.update(values[value])
     folders = {"output_dir": str(OUTPUTS / path.stem), **{need: str(OUTPUTS / need) for need in needs}}
     if BUDGET in content:
         folders[BUDGET] = "$output_dir/budget.json"
-    known = {**({"cell": name, **cell} if cell else {}), **folders, **content.get("variables", {})}
-    variables = resolve(known, given, name)
+    own = {"cell": name, **cell} if cell else {}
+    variables = resolve({**own, **folders, **content.get("variables", {}), **more}, given, folders, name)
     steps = tuple(step for entry in content["steps"] for step in repeated(entry, variables))
     names = [step.name for step in steps]
     if twice := {name for name in names if names.count(name) > 1}:
@@ -145,13 +155,21 @@ def _read_cell(
     return Study(
         path.stem,
         " ".join(content["question"].split()),
-        needs,
+        {
+            need: Path(variables[need]) / _cell_needed(path.parent / f"{need}.yaml", variables)
+            for need in needs
+        },
         variables,
         steps,
         content.get("collect"),
         tuple(fill(result, variables) for result in content.get("results", ())),
         read_limits(content[BUDGET], variables) if BUDGET in content else None,
     )
+
+
+def _cell_needed(path: Path, variables: Mapping[str, Any]) -> str:
+    """Return the folder of the cell that a needed study has for these variables; `.` if it has no cells."""
+    return cell_name({key: variables[key] for key in cells_of(path)}) or "."
 
 
 def read_limits(budget: Mapping[str, Any], variables: Mapping[str, Any]) -> dict[str, int]:
@@ -187,10 +205,13 @@ def read_keys(path: Path) -> dict[str, Any]:
     return {**base, "results": (), "collect": None, **content, "variables": variables, "steps": steps}
 
 
-def resolve(variables: Mapping[str, Any], given: Sequence[str], cell: str = "") -> dict[str, Any]:
+def resolve(
+    variables: Mapping[str, Any], given: Sequence[str], folders: Iterable[str], cell: str
+) -> dict[str, Any]:
     """Return the variables, with those `given` as `name=value` in their place and all `$name` filled in.
 
-    The output folder is that of the cell, if there is one.
+    Variables that are `folders` are written without a slash at the end; the output folder is that of the
+    cell, if there is one.
     """
     chosen = dict(variables)
     for assignment in given:
@@ -198,6 +219,8 @@ def resolve(variables: Mapping[str, Any], given: Sequence[str], cell: str = "") 
         if not equals or name not in chosen:
             raise ValueError(f"{assignment}: give name=value, with one of {', '.join(chosen)}")
         chosen[name] = yaml.safe_load(value)
+    for name in folders:
+        chosen[name] = str(Path(chosen[name]))
     if cell:
         chosen["output_dir"] = str(Path(chosen["output_dir"]) / cell)
     filled: dict[str, Any] = {}

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from experiments.run import read_record
+from experiments.run import RECORDS
 from experiments.study import Study
 from experiments.success import Results, outcomes, rate
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
@@ -15,7 +15,7 @@ CELL: Final = ("task", "kind", "demonstrations", "rollouts", "seed", "starts")
 
 
 def cell(study: Study) -> Results:
-    """Return the success of every method in one cell, with the minutes that its own steps took.
+    """Return the success of every method in one cell, with the minutes that the steps it needs took.
 
     `real_episodes` is what the ledger says was spent, `real_successes` counts those that were merged before
     training: rollouts of Dyna rounds are not among them.
@@ -30,15 +30,24 @@ def cell(study: Study) -> Results:
     return {study.variables["cell"]: results}
 
 
-def controls(study: Study) -> Results:
-    """Return the success of PPO in imagination under each control, in one cell."""
-    found = {name: success(study, name) for name in study.variables["controls"]}
-    return {study.variables["cell"]: {"controls": found}}
+def control(study: Study) -> Results:
+    """Return the success of PPO and of planning in a world model that learnt from changed data."""
+    found = {name: success(study, name) for name in ("imagined_ppo", "planned")}
+    settings = {name: study.variables[name] for name in ("control", "seed", "starts")}
+    return {study.variables["cell"]: {**settings, "methods": found}}
 
 
 def method(study: Study, name: str, steps: Sequence[str]) -> dict[str, Any]:
-    """Return a method's success in known and unseen scenes, and the minutes of its steps."""
-    return {**success(study, name), "minutes": minutes(study, steps)}
+    """Return a method's success, the minutes of its steps, and the seconds that it takes for an episode."""
+    minutes = sum(seconds(study, step) for step in steps) / 60
+    found = success(study, name)
+    evaluated = sum(seconds(study, f"eval_{name}_{domain}") for domain in found)
+    episodes = sum(each["n"] for each in found.values())
+    return {
+        **found,
+        "minutes": round(minutes, 1),
+        "seconds_an_episode": round(evaluated / episodes, 2),
+    }
 
 
 def success(study: Study, name: str) -> dict[str, Any]:
@@ -46,13 +55,14 @@ def success(study: Study, name: str) -> dict[str, Any]:
     return {domain: rate(outcomes(study.folder / f"eval_{name}_{domain}")) for domain in ("ind", "ood")}
 
 
-def minutes(study: Study, steps: Sequence[str]) -> float:
-    """Return the minutes that finished steps took. ValueError names one that is not finished."""
-    seconds = 0.0
-    for step in study.steps:
-        record = read_record(study, step)
-        if step.name in steps:
-            if record is None:
-                raise ValueError(f"{study.name}: step {step.name} is not finished")
-            seconds += record["seconds"]
-    return round(seconds / 60, 1)
+def seconds(study: Study, step: str) -> float:
+    """Return the seconds of a finished step, of the study or of the run that it continues.
+
+    Raises:
+        ValueError: it is not finished.
+    """
+    for folder in (study.folder, Path(study.variables["run"])):
+        path = folder / RECORDS / f"{step}.json"
+        if path.exists():
+            return float(json.loads(path.read_text())["seconds"])
+    raise ValueError(f"{study.name}: step {step} is not finished")

@@ -21,13 +21,13 @@ class WmMpcConfig(PlannerSettings, SingleStepConfig):
     The cross-entropy method (Rubinstein 1999) searches the sequences. It samples them around a mean and moves
     the mean to the best of them, several times. Nothing is trained.
 
-    With `proposal_path` it improves on a policy: each search begins at what that policy would do, because
-    near its actions, which the dataset resembles, the world model is most often right.
+    With `proposal_path` it improves on a policy: it imagines what that policy would do and searches changes
+    of these actions. The policy's own actions are returned if no change is predicted to do better.
 
     Args:
         world_model_path: the action world model, a checkpoint or the output folder of its training.
-        proposal_path: the policy at whose actions each search begins; by default what is left of the last
-            plan. A smaller `spread` keeps the search near them.
+        proposal_path: the policy whose actions are changed; by default the search begins at what is left of
+            the last plan. `spread` is the size of the changes.
         text_world_model_path: the text world model, for goal frames; only the objective `goal` needs it.
         objective: what is maximised: `success`, the smallest done logit of `done_frames` consecutive frames;
             `goal`, the similarity of the last frame to the goal frame.

@@ -98,10 +98,28 @@ def test_a_result_that_no_step_wrote_is_named(study_file: Path) -> None:
         publish(study, study_file.parent / "docs")
 
 
-def test_what_is_needed_must_be_finished(study_file: Path) -> None:
-    study_file.write_text("needs: [gate]\n" + COUNT)
-    with pytest.raises(StudyError, match=r"needs gate: run experiments/gate\.yaml first"):
-        run_study(read(study_file, f"gate={study_file.parent / 'nothing'}"))
+def test_what_is_needed_must_be_there(study_file: Path) -> None:
+    """Of a study with cells, the cell with the same values."""
+    study_file.write_text("needs: [needed]\ncells: {letter: [a, b], seed: [0, 1]}\n" + COUNT)
+    needed = study_file.with_name("needed.yaml")
+    needed.write_text("cells: {seed: [0, 1]}\n" + COUNT)
+    folder = study_file.parent / "made"
+    run_study(read_study(needed, ["seed=1", f"output_dir={folder}"]))
+    both = read_cells(
+        study_file, ["letter=b", f"output_dir={study_file.parent / 'out'}/", f"needed={folder}/"]
+    )
+    assert [str(study.folder) for study in both] == [f"{study_file.parent}/out/b_seed{k}" for k in (0, 1)]
+    with pytest.raises(StudyError, match=rf"needs needed, of which {folder}/seed0 holds nothing: run"):
+        run_study(both[0])
+    run_study(both[1])
+
+
+def test_a_value_that_makes_a_cell_may_bring_more_variables(study_file: Path) -> None:
+    study_file.write_text("cells: {letter: {a: {word: $output_dir/x}, b: {word: why}}}\n" + COUNT)
+    words = [study.variables["word"] for study in read_cells(study_file, ["output_dir=out"])]
+    assert words == ["out/a/x", "why"]
+    with pytest.raises(ValueError, match="letter=c: there are a, b"):
+        read_cells(study_file, ["letter=c"])
 
 
 def test_only_what_the_step_itself_writes_is_deleted(tmp_path: Path) -> None:
@@ -173,14 +191,14 @@ def test_every_cell_has_a_folder_and_results_of_its_own(tmp_path: Path) -> None:
     path = tmp_path / "sizes.yaml"
     path.write_text(CELLS)
     cells = read_cells(path, [f"output_dir={tmp_path / 'out'}", "word=b"])
-    assert [cell.variables["cell"] for cell in cells] == ["size1_wordb", "size2_wordb"]
+    assert [cell.variables["cell"] for cell in cells] == ["size1_b", "size2_b"]
     for cell in cells:
         run_study(cell)
         assert publish(cell, tmp_path / "docs") == [
             tmp_path / "docs/results/sizes" / f"{cell.variables['cell']}.json"
         ]
         assert (cell.folder / "steps" / "say.json").exists()
-    assert json.loads((tmp_path / "docs/results/sizes/size2_wordb.json").read_text())["n"] == 2
+    assert json.loads((tmp_path / "docs/results/sizes/size2_b.json").read_text())["n"] == 2
 
 
 def test_a_cell_whose_results_are_published_is_left_out(
@@ -200,4 +218,4 @@ def test_one_cell_must_be_chosen_where_one_is_wanted(tmp_path: Path) -> None:
     path.write_text(CELLS)
     with pytest.raises(ValueError, match="4 cells; choose one by name=value for size, word"):
         read_study(path)
-    assert read_study(path, ["size=2", "word=a"]).variables["cell"] == "size2_worda"
+    assert read_study(path, ["size=2", "word=a"]).variables["cell"] == "size2_a"

@@ -1,8 +1,8 @@
 """What imagination is worth: a cell is collected, and the section says what the cells hold."""
 
 import json
+import re
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,8 +13,11 @@ from experiments.run import record_path
 from experiments.study import ROOT, read_cells
 from experiments.tables import loader
 from experiments.value_sections import (
+    CONTROLLED,
     CONTROLS,
     TITLES,
+    UNCHANGED,
+    UNREWARDED,
     best,
     draw_value,
     gain,
@@ -35,7 +38,7 @@ def made_up_cell(demonstrations: int, seed: int) -> dict[str, Any]:
     for name, successes in SUCCESSES.items():
         k = successes + bool(seed)
         rate = {"share": k / 10, "outcomes": [1] * k + [0] * (10 - k)}
-        methods[name] = {"ind": rate, "ood": rate, "minutes": 2.0}
+        methods[name] = {"ind": rate, "ood": rate, "minutes": 2.0, "seconds_an_episode": 0.5}
     return {"demonstrations": demonstrations, "rollouts": 300, "seed": seed, "methods": methods}
 
 
@@ -76,14 +79,39 @@ def test_rounds_stand_in_the_same_table_for_the_seeds_that_have_them(docs: Path)
     assert f"| 8 | 300 | {TITLES['iterated']} | 90 %" in value_push(loader(docs))
 
 
-def test_controls_are_compared_on_the_same_starts(docs: Path) -> None:
-    (cell,) = read_cells(STUDY, ["demonstrations=8", "seed=0"])
+def test_controls_are_compared_with_the_policy_that_they_begin_from(docs: Path) -> None:
     rate = {"share": 0.4, "outcomes": [0] * 6 + [1] * 4}
-    controls = {"controls": {"labels": {"ind": rate, "ood": rate}}}
-    write_json(docs / "results" / "value_controls" / f"{cell.variables['cell']}.json", controls)
-    text = value_controls(loader(docs))
-    assert "| 0 | nothing: PPO in imagination | 80 %: 1 gained, 0 lost (p = 1)" in text
-    assert f"| 0 | {CONTROLS['labels']} | 40 %: 3 gained, 6 lost (p = 0.5)" in text
+    row = {"ind": rate, "ood": rate}
+    made = read_cells(ROOT / "experiments" / "value_controls.yaml", ["demonstrations=8", "seed=0"])
+    for cell in made:
+        write_json(docs / cell.results[0], {"methods": {"imagined_ppo": row, "planned": row}})
+    (cell,) = read_cells(STUDY, ["demonstrations=8", "seed=0"])
+    others = {"methods": {"unrewarded": row}}
+    write_json(docs / "results" / "value_others" / f"{cell.variables['cell']}.json", others)
+    lines = value_controls(loader(docs)).splitlines()
+    unchanged, changed = "80 %: 1 gained, 0 lost (p = 1)", "40 %: 3 gained, 6 lost (p = 0.5)"
+    assert f"| 8 | 300 | 0 | {UNCHANGED} | {TITLES['imagined_ppo']} | {unchanged} | {unchanged} |" in lines
+    assert f"| 8 | 300 | 0 | {UNCHANGED} | {UNREWARDED} | {changed} | {changed} |" in lines
+    assert [cell.variables["control"] for cell in made] == list(CONTROLS)
+    for title in CONTROLS.values():
+        for method in CONTROLLED:
+            assert f"| 8 | 300 | 0 | {title} | {TITLES[method]} | {changed} | {changed} |" in lines
+    assert not any("| 100000 |" in line for line in lines), "that seed has no controls"
+
+
+def test_a_control_differs_from_the_study_in_nothing_but_the_world_model() -> None:
+    """Its PPO and its planner have the settings of the rows that they are compared with."""
+    (cell,) = read_cells(STUDY, ["demonstrations=8", "seed=0"])
+    control, *_ = read_cells(ROOT / "experiments" / "value_controls.yaml", ["demonstrations=8", "seed=0"])
+    run = control.variables["run"]
+    assert run == str(cell.folder)
+    steps = {step.name: set(step.command.split()) for step in control.steps}
+    compared = [step for step in cell.steps if step.name in steps and step.name != "dataset"]
+    assert len(compared) == 7
+    for step in compared:
+        words, budget = set(step.command.split()), {f"--budget={cell.budget}"}
+        for word in steps[step.name] ^ words - budget:
+            assert re.match(r"--(output_dir|dataset\.root|[\w.]+path)=", word), (step.name, word)
 
 
 def test_the_figure_has_a_line_for_every_method(docs: Path) -> None:
@@ -109,10 +137,11 @@ def test_a_cell_keeps_outcomes_and_minutes(tmp_path: Path, monkeypatch: pytest.M
     with pytest.raises(ValueError, match="step cloning is not finished"):
         value.cell(study)
     for step in study.steps:
-        write_json(record_path(study, SimpleNamespace(name=step.name)), {"seconds": 60.0})
+        write_json(record_path(study, step), {"seconds": 60.0})
     (content,) = value.cell(study).values()
     assert (content["real_episodes"], content["real_successes"]) == (308, 140)
     assert content["methods"]["planned"]["minutes"] == 4
+    assert content["methods"]["planned"]["seconds_an_episode"] == 6
     assert content["methods"]["filtered"]["ind"]["outcomes"] == [1] * 7 + [0] * 3
     assert content["methods"].keys() == SUCCESSES.keys()
     json.dumps(content)
