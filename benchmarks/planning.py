@@ -23,13 +23,12 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.precision import imagination_dtype, keep_freed_memory
-from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.rl.configuration_distillation import fast_planner
 from lerobot_wmrl.world_models.configuration_planner import PlannerSettings
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 from lerobot_wmrl.world_models.planning import Planner
 from machine import matmul_rate, rates
-from workloads import Work, black_context
+from workloads import Work, start_frames
 from world_model import add_model, flop, make_model
 
 RESULTS: Final = Path(__file__).parents[1] / "docs" / "results" / "planning_speed.json"
@@ -44,20 +43,10 @@ SETTINGS: Final = {
 }
 
 
-def start_frames(model: ActionWorldModelRewardModel, number: int) -> Frames:
-    """Return frames to plan from; what they show does not matter."""
-    device = model.state_mean.device
-    tokens = torch.zeros(number, model.tokenizer.tokens_per_frame, dtype=torch.long, device=device)
-    context = black_context(model, number, device)
-    return Frames(
-        tokens, model.state_mean.expand(number, -1), context, torch.ones(tokens.shape, device=device)
-    )
-
-
 def measure(model: ActionWorldModelRewardModel, searches: int, matmul: float) -> dict[str, Any]:
     """Return all rates at one number of searches at once."""
     device = model.state_mean.device
-    frames, tasks = start_frames(model, searches), [""] * searches
+    frames, tasks = start_frames(model, searches, device), [""] * searches
     low, high = (torch.tensor(bound, device=device) for bound in (ACTION_LOW, ACTION_HIGH))
     near = SETTINGS["near_a_policy"]
     action = model.action_mean.expand(searches, -1)

@@ -35,14 +35,7 @@ class Imagination:
         self.state = self._running()
 
     def _running(self) -> RunningImagination:
-        tokens = torch.zeros(
-            self.batch, self.model.tokenizer.tokens_per_frame, dtype=torch.long, device=self.device
-        )
-        frames = Frames(
-            tokens, self.model.state_mean.expand(self.batch, -1),
-            black_context(self.model, self.batch, self.device), torch.ones(tokens.shape, device=self.device),
-        )  # fmt: skip
-        state = self.model.start(frames, dtype=self.dtype)
+        state = self.model.start(start_frames(self.model, self.batch, self.device), dtype=self.dtype)
         for _ in range(self.frames):
             self.model.step(state, self.action)
         return state
@@ -110,6 +103,13 @@ def repeated(work: Work, graphed: bool) -> Work:
             replay()
 
     return repeat
+
+
+def start_frames(model: ActionWorldModelRewardModel, batch: int, device: torch.device) -> Frames:
+    """Return black first frames, (B,): what they show does not matter to the speed."""
+    tokens = torch.zeros(batch, model.tokenizer.tokens_per_frame, dtype=torch.long, device=device)
+    state = model.state_mean.expand(batch, -1)
+    return Frames(tokens, state, black_context(model, batch, device), torch.ones(tokens.shape, device=device))
 
 
 def black_context(model: ActionWorldModelRewardModel, batch: int, device: torch.device) -> Context:
