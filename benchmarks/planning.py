@@ -63,7 +63,8 @@ def measure(model: ActionWorldModelRewardModel, searches: int, matmul: float) ->
     }  # fmt: skip
     for name, settings in SETTINGS.items():
         planner = Planner(model, None, settings, 2, averaged=False, low=low, high=high, seed=0)
-        works[name] = (searches, partial(planner.plan, frames, tasks))
+        proposed = None if name == "wm_mpc" else action[:, None].expand(-1, settings.horizon, -1)
+        works[name] = (searches, partial(planner.plan, frames, tasks, proposed))
     found = rates(works, device)
     arithmetic = flop(works["open_loop"][1]) / works["open_loop"][0]
     plans = {name: found[name] for name in (*SETTINGS, "policy_actions")}

@@ -38,7 +38,7 @@ def run_study(study: Study, repeat: bool = False) -> None:
     """Run every step that is not finished.
 
     Raises:
-        StudyError: a needed study is not finished, a command has changed, a command fails, or learns from
+        StudyError: a needed study has not been run, a command has changed, a command fails, or learns from
             episodes that are not in the study's budget.
     """
     for name, folder in study.needs.items():

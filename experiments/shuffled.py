@@ -3,9 +3,11 @@
     python -m experiments.shuffled outputs/dataset outputs/shuffled --what=labels
     python -m experiments.shuffled outputs/dataset outputs/shuffled --what=actions
 
-Every episode keeps its pictures and takes the labels (or the actions) of another, chosen at random. Labels
-are aligned at the ends of the episodes, where success is, actions at their beginnings. Where the other
-episode is shorter, its first label or its last action is repeated.
+Every episode keeps its pictures and takes the labels (or the actions) of another, chosen at random, from its
+beginning on. Where the other episode is shorter, its last label or action is repeated.
+
+Labels are not aligned at the ends: recordings stop at success, so that the last frames would often keep the
+right label.
 """
 
 import argparse
@@ -25,14 +27,15 @@ from lerobot_wmrl.data.episodes import EpisodeTable, open_dataset, parquet_files
 COLUMNS: Final = {"labels": ("next.success", DONE, REWARD), "actions": (ACTION,)}
 
 
-def donor_rows(table: EpisodeTable, what: str, seed: int) -> np.ndarray:
-    """Return for each row the row whose labels or actions it takes. (N,)"""
-    donor = np.random.default_rng(seed).permutation(len(table.start))
+def donor_rows(table: EpisodeTable, seed: int) -> np.ndarray:
+    """Return for each row the row of another episode whose labels or actions it takes. (N,)"""
+    order = np.random.default_rng(seed).permutation(len(table.start))
     rows = np.empty(int(table.length.sum()), int)
-    for episode, other in enumerate(donor):
+    for episode, other in zip(order, np.roll(order, 1), strict=True):
         start, length = table.start[episode], table.length[episode]
-        offset = np.arange(length) + (table.length[other] - length if what == "labels" else 0)
-        rows[start : start + length] = table.start[other] + offset.clip(0, table.length[other] - 1)
+        rows[start : start + length] = table.start[other] + np.arange(length).clip(
+            max=table.length[other] - 1
+        )
     return rows
 
 
@@ -40,7 +43,7 @@ def shuffle(root: Path, folder: Path, what: str, seed: int) -> LeRobotDataset:
     """Copy the dataset at `root` to `folder`, shuffled. FieldError if `folder` exists."""
     if folder.exists():
         raise FieldError("folder", folder, "exists", "remove it or choose another")
-    rows = donor_rows(read_episodes(open_dataset(root)), what, seed)
+    rows = donor_rows(read_episodes(open_dataset(root)), seed)
     partial = folder.with_name(f"{folder.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     shutil.copytree(root, partial)

@@ -4,7 +4,7 @@ A file has these keys:
 
     question   what the study answers
     needs      studies whose folders its commands read; `$gate` is the folder of gate.yaml. Of a study with
-               cells, the cell with the values that this study's variables have
+               cells it is the folder of the cell that has this cell's values
     extends    another study, whose keys hold where this one has none of its own, and whose steps may be named
                in place of being written again
     budget     real episodes that all its methods may learn from: demonstrations, rollouts, play. `$budget` is
@@ -66,7 +66,7 @@ class Study:
     name: str
     question: str
     needs: Mapping[str, Path]
-    """Studies that must be finished: name → folder, that of a cell where the study has cells."""
+    """Studies that must have been run: name → folder, that of a cell where the study has cells."""
     variables: Mapping[str, Any]
     steps: tuple[Step, ...]
     collect: str | None
@@ -145,7 +145,8 @@ def _read_cell(
     if BUDGET in content:
         folders[BUDGET] = "$output_dir/budget.json"
     own = {"cell": name, **cell} if cell else {}
-    variables = resolve({**own, **folders, **content.get("variables", {}), **more}, given, folders, name)
+    cells = {"output_dir": name, **{need: _cell_needed(path, need, cell) for need in needs}}
+    variables = resolve({**own, **folders, **content.get("variables", {}), **more}, given, folders, cells)
     steps = tuple(step for entry in content["steps"] for step in repeated(entry, variables))
     names = [step.name for step in steps]
     if twice := {name for name in names if names.count(name) > 1}:
@@ -155,10 +156,7 @@ def _read_cell(
     return Study(
         path.stem,
         " ".join(content["question"].split()),
-        {
-            need: Path(variables[need]) / _cell_needed(path.parent / f"{need}.yaml", variables)
-            for need in needs
-        },
+        {need: Path(variables[need]) for need in needs},
         variables,
         steps,
         content.get("collect"),
@@ -167,9 +165,17 @@ def _read_cell(
     )
 
 
-def _cell_needed(path: Path, variables: Mapping[str, Any]) -> str:
-    """Return the folder of the cell that a needed study has for these variables; `.` if it has no cells."""
-    return cell_name({key: variables[key] for key in cells_of(path)}) or "."
+def _cell_needed(path: Path, need: str, cell: Mapping[str, Any]) -> str:
+    """Return the cell of a needed study that has the values of `cell`; nothing if it has no cells.
+
+    Raises:
+        ValueError: a variable that makes its cells makes none of this study's.
+    """
+    needed = cells_of(path.parent / f"{need}.yaml")
+    if missing := needed.keys() - cell.keys():
+        names = ", ".join(sorted(missing))
+        raise ValueError(f"{path}: `cells` lacks {names}, which makes the cells of {need}, which it needs")
+    return cell_name({key: cell[key] for key in needed})
 
 
 def read_limits(budget: Mapping[str, Any], variables: Mapping[str, Any]) -> dict[str, int]:
@@ -206,12 +212,12 @@ def read_keys(path: Path) -> dict[str, Any]:
 
 
 def resolve(
-    variables: Mapping[str, Any], given: Sequence[str], folders: Iterable[str], cell: str
+    variables: Mapping[str, Any], given: Sequence[str], folders: Iterable[str], cells: Mapping[str, str]
 ) -> dict[str, Any]:
     """Return the variables, with those `given` as `name=value` in their place and all `$name` filled in.
 
-    Variables that are `folders` are written without a slash at the end; the output folder is that of the
-    cell, if there is one.
+    Variables that are `folders` are written without a slash at the end, and those with `cells` go on to the
+    cell.
     """
     chosen = dict(variables)
     for assignment in given:
@@ -220,9 +226,7 @@ def resolve(
             raise ValueError(f"{assignment}: give name=value, with one of {', '.join(chosen)}")
         chosen[name] = yaml.safe_load(value)
     for name in folders:
-        chosen[name] = str(Path(chosen[name]))
-    if cell:
-        chosen["output_dir"] = str(Path(chosen["output_dir"]) / cell)
+        chosen[name] = str(Path(chosen[name]) / cells.get(name, ""))
     filled: dict[str, Any] = {}
     for name, value in chosen.items():
         filled[name] = fill(value, filled) if isinstance(value, str) else value

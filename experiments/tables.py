@@ -24,7 +24,7 @@ STUDIES: Final = ROOT / "experiments"
 
 SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     "value_push": ("Policies", value.value_push),
-    "value_others": ("Policies", partial(value.rows_above, ["conditioned", "distilled"])),
+    "value_others": ("Policies", value.value_others),
     "value_iterated": ("Policies", partial(value.rows_above, ["iterated"])),
     "value_dyna": ("Policies", partial(value.rows_above, ["dyna"])),
     "value_controls": ("Policies", value.value_controls),

@@ -33,7 +33,9 @@ def cell(study: Study) -> Results:
 def control(study: Study) -> Results:
     """Return the success of PPO and of planning in a world model that learnt from changed data."""
     found = {name: success(study, name) for name in ("imagined_ppo", "planned")}
-    settings = {name: study.variables[name] for name in ("control", "seed", "starts")}
+    settings = {
+        name: study.variables[name] for name in ("control", "demonstrations", "rollouts", "seed", "starts")
+    }
     return {study.variables["cell"]: {**settings, "methods": found}}
 
 

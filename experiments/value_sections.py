@@ -1,6 +1,6 @@
 """What imagination is worth: its section of docs/results.md, and the figure, from published cells."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
@@ -44,8 +44,7 @@ CONTROLS: Final = {
 }
 """What a control's world model learnt from."""
 
-UNREWARDED: Final = "PPO in imagination, no frame rewarded"
-
+BUDGET: Final = ("demonstrations", "rollouts", "seed")
 MORE_COLOURS: Final = ("#b83280", "#333333", "#d69e2e", "#319795", "#718096")
 
 STUDY: Final = "value_push"
@@ -135,12 +134,12 @@ All methods:
 {table([*budget, "method", "known scenes", "unseen scenes", "minutes"], rows)}
 
 Success of each seed over {starts} starts; with more than one seed, their mean. Intervals count starts, and
-seeds where there are several. Minutes are those of training on one core, without recording. The best method
-of each kind is chosen on the starts that are reported. PPO in imagination and the methods below it use a
-world model. {planning}
+seeds where there are several. Minutes are those of training on one core, without recording (Dyna records
+while it trains, and that is counted). The best method of each kind is chosen on the starts that are reported.
+PPO in imagination and the methods below it use a world model. {planning}
 
-RECAP and the distilled planner were moved into a [study of their own](#value_others) after two cells, in
-which others of their kind did better.
+RECAP and the distilled planner were moved into a [study of their own](#value_others) after a first run of two
+cells, in which others of their kind did better.
 
 ![Success against real episodes](images/value_push.png)"""
 
@@ -151,36 +150,56 @@ def rows_above(methods: Sequence[str], load: Load) -> str:
     return f"Its rows are in [the table above](#{STUDY}): {titles}."
 
 
+def value_others(load: Load) -> str:
+    """Return the section: where its methods are, and success after PPO without a reward."""
+    rows = [
+        [
+            *budget,
+            *(against(others["methods"]["unrewarded"][domain], before[domain]) for domain in ("ind", "ood")),
+        ]
+        for cell, budget, before in improved(load)
+        if (others := published(load, "value_others", cell))
+    ]
+    return f"""{rows_above(["conditioned", "distilled"], load)}
+
+PPO in which an episode is rewarded only if all its frames are done, against the policy before it:
+
+{table([*BUDGET, "known scenes", "unseen scenes"], rows)}"""
+
+
 def value_controls(load: Load) -> str:
     """Return the section: success under each control, against the policy before it on the same starts."""
-    rows = []
-    for each in read_cells(ROOT / "experiments" / f"{STUDY}.yaml"):
-        cell, others = (published(load, study, each.variables["cell"]) for study in (STUDY, "value_others"))
-        if cell is None:
-            continue
-        controls = [
-            (title, TITLES[method], control["methods"][method])
-            for name, title in CONTROLS.items()
-            if (control := published(load, "value_controls", f"{each.variables['cell']}_{name}"))
-            for method in CONTROLLED
+    rows = [
+        [
+            *budget,
+            learnt,
+            TITLES[method],
+            *(against(found[method][domain], before[domain]) for domain in ("ind", "ood")),
         ]
-        if others and "unrewarded" in others["methods"]:
-            controls.insert(0, (UNCHANGED, UNREWARDED, others["methods"]["unrewarded"]))
-        if controls:
-            before = cell["methods"]["filtered"]
-            budget = [cell["demonstrations"], cell["rollouts"], cell["seed"]]
-            rows += [
-                [*budget, learnt, title, *(against(row[domain], before[domain]) for domain in ("ind", "ood"))]
-                for learnt, title, row in (
-                    *((UNCHANGED, TITLES[name], cell["methods"][name]) for name in CONTROLLED), *controls
-                )
-            ]  # fmt: skip
-    head = ["demonstrations", "rollouts", "seed", "the world model learnt from", "method"]
+        for cell, budget, before in improved(load)
+        for learnt, found in controls(load, cell)
+        for method in CONTROLLED
+    ]
     return f"""Success against that of the policy which each method improves on, cloned from demonstrations
-and successful rollouts, on the same starts. With wrong labels, wrong actions or no reward nothing may be
-gained:
+and successful rollouts, on the same starts:
 
-{table([*head, "known scenes", "unseen scenes"], rows)}"""
+{table([*BUDGET, "the world model learnt from", "method", "known scenes", "unseen scenes"], rows)}"""
+
+
+def improved(load: Load) -> Iterator[tuple[str, list[Any], Cell]]:
+    """Yield the published cells of the study: name, budget and seed, success of the policy improved on."""
+    for each in read_cells(ROOT / "experiments" / f"{STUDY}.yaml"):
+        name = each.variables["cell"]
+        if cell := published(load, STUDY, name):
+            budget = [cell["demonstrations"], cell["rollouts"], cell["seed"]]
+            yield name, budget, cell["methods"]["filtered"]
+
+
+def controls(load: Load, cell: str) -> list[tuple[str, Cell]]:
+    """Return what a cell's world models learnt from and the methods in them; none without a control."""
+    found = [(title, published(load, "value_controls", f"{cell}_{name}")) for name, title in CONTROLS.items()]
+    changed = [(title, control["methods"]) for title, control in found if control]
+    return changed and [(UNCHANGED, load(f"{STUDY}/{cell}")["methods"]), *changed]
 
 
 def against(row: dict[str, Any], before: dict[str, Any]) -> str:

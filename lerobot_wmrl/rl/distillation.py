@@ -137,8 +137,7 @@ class Distillation(RLAlgorithm):
     ) -> Demonstrated:
         """Let the policy act for some steps, and then the planner, until every first episode has ended.
 
-        The planner's search begins at what the policy would do: near the policy's actions, which the dataset
-        resembles, the world model is most often right.
+        The planner changes what the policy would do.
         """
         policy, steps, count = self.lerobot_policy.eval(), rollout.steps, env.num_envs
         horizon = self.config.planner.horizon

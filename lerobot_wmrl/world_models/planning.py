@@ -103,15 +103,15 @@ class Planner:
         Args:
             frames: B of them.
             instructions: one a frame.
-            proposed: actions (B, T, A) from which knots change something: the first sample is the proposal
-                itself. By default the search begins at what is left of the last plans.
+            proposed: actions (B, T, A) to change. The search samples changes at the knots; its first sample
+                changes nothing. By default the search begins at what is left of the last plans.
 
         Returns:
             (B, T, A)
         """
         model, settings = self.model, self.settings
-        objective = self._objective(frames, instructions)
-        # Statistics hold a std of 1 for components that never vary: these stay at their mean.
+        value = self._objective(frames, instructions)
+        # Statistics hold a std of 1 for components that never vary: these are not searched.
         std = settings.spread * torch.where(model.action_std == 1, 0.0, model.action_std)
 
         def search(objective: Objective, mean: Tensor, low: Tensor, high: Tensor) -> Tensor:
@@ -122,14 +122,14 @@ class Planner:
             return average if self.averaged else best
 
         if proposed is not None:
-            spared = proposed.new_zeros(len(frames), settings.knots, proposed.shape[-1])
+            no_change = proposed.new_zeros(len(frames), settings.knots, proposed.shape[-1])
             span = self.high - self.low
-            knots = search(lambda change: objective(self._changed(proposed, change)), spared, -span, span)
+            knots = search(lambda change: value(self._changed(proposed, change)), no_change, -span, span)
             return self._changed(proposed, interpolate_knots(knots, settings.horizon))
         mean = model.action_mean.expand(len(frames), settings.knots, -1)
         if self.knots is not None:
             mean = self._remaining_knots(interpolate_knots(self.knots, settings.horizon))
-        self.knots = search(objective, mean, self.low, self.high)
+        self.knots = search(value, mean, self.low, self.high)
         return interpolate_knots(self.knots, settings.horizon)
 
     def _changed(self, proposed: Tensor, change: Tensor) -> Tensor:

@@ -27,7 +27,7 @@ class WmMpcConfig(PlannerSettings, SingleStepConfig):
     Args:
         world_model_path: the action world model, a checkpoint or the output folder of its training.
         proposal_path: the policy whose actions are changed; by default the search begins at what is left of
-            the last plan. `spread` is the size of the changes.
+            the last plan. `spread` is then the standard deviation of the changes.
         text_world_model_path: the text world model, for goal frames; only the objective `goal` needs it.
         objective: what is maximised: `success`, the smallest done logit of `done_frames` consecutive frames;
             `goal`, the similarity of the last frame to the goal frame.

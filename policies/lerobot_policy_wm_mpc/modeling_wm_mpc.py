@@ -109,16 +109,12 @@ class Proposal:
         if model.config.state_size:
             shown[OBS_STATE] = (model.config.state_size,)
         try:
-            policy = read_policy_config(path, [f"--device={config.device}"])
-            check_fit(policy, shown, len(low))
-            self.policy = load_policy(policy)
-            self.preprocess, self.postprocess = load_processors(policy)
-        except ValueError as error:
-            problem = error.problem if isinstance(error, FieldError) else str(error)
-            raise FieldError(
-                "proposal_path", path, problem,
-                f"give a policy that was trained on what the world model imagines ({', '.join(shown)})",
-            ) from error  # fmt: skip
+            policy_config = read_policy_config(path, [f"--device={config.device}"])
+            check_fit(policy_config, shown, len(low))
+            self.policy = load_policy(policy_config)
+        except FieldError as error:
+            raise FieldError("proposal_path", path, error.problem, error.remedy) from error
+        self.preprocess, self.postprocess = load_processors(policy_config)
 
     def actions(self, frames: Frames, instructions: list[str], images: Tensor, steps: int) -> Tensor:
         """Return the policy's next `steps` actions from B frames on, of which these are the images

@@ -67,7 +67,7 @@ def test_the_same_seed_and_actions_give_the_same_episode(env):
         assert torch.equal(a, b)
 
 
-def test_looking_ahead_shows_what_a_policy_would_do_and_moves_no_episode(config):
+def test_policy_actions_are_what_the_policy_would_do_and_no_episode_moves(config):
     """From a start on, imagination is the same whether the episode goes on or not."""
     env, other = config.create_tensor_env(B), config.create_tensor_env(B)
 

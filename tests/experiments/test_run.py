@@ -112,6 +112,9 @@ def test_what_is_needed_must_be_there(study_file: Path) -> None:
     with pytest.raises(StudyError, match=rf"needs needed, of which {folder}/seed0 holds nothing: run"):
         run_study(both[0])
     run_study(both[1])
+    study_file.write_text("needs: [needed]\n" + COUNT)
+    with pytest.raises(ValueError, match="`cells` lacks seed, which makes the cells of needed"):
+        read_study(study_file)
 
 
 def test_a_value_that_makes_a_cell_may_bring_more_variables(study_file: Path) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from experiments.shuffled import shuffle
+from experiments.shuffled import donor_rows, shuffle
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.episodes import EpisodeTable, open_dataset, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames
@@ -39,12 +39,14 @@ def test_episodes_take_each_others_labels_or_actions_and_nothing_else(
         assert firsts[0] == firsts[1]
 
 
-def test_labels_are_aligned_at_the_ends_of_episodes(small_dataset: LeRobotDataset, tmp_path: Path):
-    """An episode still ends in success, if it has any."""
-    table = read_episodes(shuffle(Path(small_dataset.root), tmp_path / "copy", "labels", seed=1))
-    ends = [done[-1] for done in per_episode(table, table.done)]
-    assert np.array_equal(ends, table.success)
-    assert any(ends)
+@pytest.mark.parametrize("seed", range(5))
+def test_every_episode_takes_from_the_beginning_of_another(small_dataset: LeRobotDataset, seed: int):
+    table = read_episodes(small_dataset)
+    episode = np.repeat(np.arange(len(table.start)), table.length)
+    rows = donor_rows(table, seed)
+    assert (episode[rows] != episode).all()
+    assert np.array_equal(rows[table.start], table.start[episode[rows[table.start]]])
+    assert sorted(episode[rows[table.start]]) == list(range(len(table.start)))
 
 
 def test_a_seed_gives_one_shuffle_and_nothing_is_overwritten(small_dataset: LeRobotDataset, tmp_path: Path):

@@ -191,8 +191,11 @@ def test_without_a_search_it_does_what_the_other_policy_does_in_imagination(conf
 
 def test_a_policy_that_looks_at_something_else_proposes_nothing(config, tmp_path):
     config.proposal_path = str(save_untrained_policy(tmp_path, camera="wrist", actions=7))
-    with pytest.raises(ValueError, match=r"^proposal_path=.*needs observation\.images\.wrist"):
+    with pytest.raises(
+        ValueError,
+        match=r"^proposal_path=.*needs observation\.images\.wrist.*train the policy on what this one shows",
+    ):
         WmMpcPolicy(config)
     config.proposal_path = str(tmp_path / "nothing")
-    with pytest.raises(ValueError, match=r"^proposal_path=.*no checkpoint there"):
+    with pytest.raises(ValueError, match=r"^proposal_path=.*no checkpoint there.*give the output folder"):
         WmMpcPolicy(config)
