@@ -78,6 +78,7 @@ def test_the_readme_says_what_was_measured() -> None:
         "cloned from the demonstrations": ("cloning",),
         "best rival": RIVALS,
         "PPO in imagination": ("imagined_ppo",),
+        "planning in imagination": ("planned",),
     }
     for title, methods in rows.items():
         shares = [
