@@ -26,6 +26,7 @@ SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     "value_push": ("Policies", value.value_push),
     "value_others": ("Policies", value.value_others),
     "value_iterated": ("Policies", partial(value.rows_above, ["iterated"])),
+    "value_simulator": ("Policies", partial(value.rows_above, ["simulated_ppo"])),
     "value_dyna": ("Policies", partial(value.rows_above, ["dyna"])),
     "value_controls": ("Policies", value.value_controls),
     "demo": ("Policies", policies.demo),

@@ -19,6 +19,7 @@ TITLES: Final = {
     "iterated": "the same, with rollouts in three rounds",
     "weighted": "advantage-weighted cloning (RA-BC)",
     "conditioned": "advantage-conditioned cloning (RECAP)",
+    "simulated_ppo": "PPO in ManiSkill, as many steps as the rollouts",
     "imagined_ppo": "PPO in imagination",
     "dyna": "PPO in imagination, with rollouts in three rounds (Dyna)",
     "distilled": "planner distilled in imagination",
@@ -45,10 +46,10 @@ CONTROLS: Final = {
 """What a control's world model learnt from."""
 
 BUDGET: Final = ("demonstrations", "rollouts", "seed")
-MORE_COLOURS: Final = ("#b83280", "#333333", "#d69e2e", "#319795", "#718096")
+MORE_COLOURS: Final = ("#b83280", "#333333", "#d69e2e", "#319795", "#718096", "#9c4221")
 
 STUDY: Final = "value_push"
-PARTS: Final = ("value_others", "value_iterated", "value_dyna")
+PARTS: Final = ("value_others", "value_iterated", "value_simulator", "value_dyna")
 """Studies whose cells add methods to its table."""
 
 Cell = dict[str, Any]
