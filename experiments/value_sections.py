@@ -57,11 +57,11 @@ Groups = dict[tuple[int, int], list[Cell]]
 """Cells, one a seed, by demonstrations and rollouts."""
 
 
-def groups(load: Load) -> Groups:
-    """Return the published cells of the study, each with the methods of the other studies' same cell."""
+def groups(load: Load, study: str = STUDY, parts: Sequence[str] = PARTS) -> Groups:
+    """Return the published cells of a study, each with the methods of the same cell of its parts."""
     found: Groups = {}
-    for each in read_cells(ROOT / "experiments" / f"{STUDY}.yaml"):
-        cell, *others = (published(load, study, each.variables["cell"]) for study in (STUDY, *PARTS))
+    for each in read_cells(ROOT / "experiments" / f"{study}.yaml"):
+        cell, *others = (published(load, name, each.variables["cell"]) for name in (study, *parts))
         if cell:
             methods = {name: row for part in others if part for name, row in part["methods"].items()}
             whole = {**cell, "methods": {**cell["methods"], **methods}}
@@ -101,8 +101,22 @@ def best(cells: Sequence[Cell], methods: Sequence[str], domain: str) -> str:
 
 
 def value_push(load: Load) -> str:
-    """Return the section: for each budget the best with and without a world model, and a table."""
-    found = groups(load)
+    """Return the section, with the methods of all studies on the same data, and the figure."""
+    return f"""{comparison(groups(load))}
+
+RECAP and the distilled planner were moved into a [study of their own](#value_others) after a first run of two
+cells, in which others of their kind did better.
+
+![Success against real episodes](images/value_push.png)"""
+
+
+def value_pick_place(load: Load) -> str:
+    """Return the section."""
+    return comparison(groups(load, "value_pick_place", ()))
+
+
+def comparison(found: Groups) -> str:
+    """Return for each budget the best with and without a world model, and a table of all methods."""
     answers, rows = [], []
     for (demonstrations, rollouts), cells in found.items():
         for domain in ("ind", "ood"):
@@ -115,14 +129,7 @@ def value_push(load: Load) -> str:
             for method, title in TITLES.items() if method in measured(cells, TITLES)
         ]  # fmt: skip
     every = [cell for cells in found.values() for cell in cells]
-    planning = ""
-    if measured(every, ["planned"]):
-        policy, planned = (seconds_an_episode(every, method) for method in ("filtered", "planned"))
-        planning = (
-            "Planning trains no policy. It improves on what the policy of demonstrations and successful\n"
-            f"rollouts would do and plans anew after eight actions: {planned:.1f} s an episode on one core, "
-            f"simulator included, in place\nof {policy:.1f} s."
-        )
+    policy, planned = (mean_of(every, method, "seconds_an_episode") for method in ("filtered", "planned"))
     budget = ["demonstrations", "rollouts"]
     starts = len(outcomes(next(iter(found.values())), "cloning", "ind")[0])
     return f"""The best method with a world model against the best without one, on the same real episodes and
@@ -137,12 +144,9 @@ All methods:
 Success of each seed over {starts} starts; with more than one seed, their mean. Intervals count starts, and
 seeds where there are several. Minutes are those of training on one core, without recording (Dyna records
 while it trains, and that is counted). The best method of each kind is chosen on the starts that are reported.
-PPO in imagination and the methods below it use a world model. {planning}
-
-RECAP and the distilled planner were moved into a [study of their own](#value_others) after a first run of two
-cells, in which others of their kind did better.
-
-![Success against real episodes](images/value_push.png)"""
+PPO in imagination and the methods below it use a world model. Planning trains no policy: it improves on what
+the policy of demonstrations and successful rollouts would do, and plans anew after eight actions. An episode
+of it takes {planned:.1f} s on one core, simulator included, one of that policy {policy:.1f} s."""
 
 
 def rows_above(methods: Sequence[str], load: Load) -> str:
@@ -212,11 +216,6 @@ def against(row: dict[str, Any], before: dict[str, Any]) -> str:
 def minutes(cells: Sequence[Cell], method: str) -> str:
     """Return the minutes that a method's training took, the mean over its runs."""
     return f"{mean_of(cells, method, 'minutes'):.0f}"
-
-
-def seconds_an_episode(cells: Sequence[Cell], method: str) -> float:
-    """Return the seconds that an episode of the evaluation took, the mean over a method's runs."""
-    return mean_of(cells, method, "seconds_an_episode")
 
 
 def mean_of(cells: Sequence[Cell], method: str, number: str) -> float:
