@@ -102,7 +102,14 @@ def best(cells: Sequence[Cell], methods: Sequence[str], domain: str) -> str:
 
 def value_push(load: Load) -> str:
     """Return the section, with the methods of all studies on the same data, and the figure."""
-    return f"""{comparison(groups(load))}
+    found = groups(load)
+    cells = [cell for each in found.values() for cell in each]
+    policy, planned = (mean_of(cells, method, "seconds_an_episode") for method in ("filtered", "planned"))
+    return f"""{comparison(found)}
+
+Planning trains no policy: it improves on what the policy of demonstrations and successful rollouts would do,
+and plans anew after eight actions. An episode of it takes {planned:.1f} s on one core, simulator included,
+one of that policy {policy:.1f} s.
 
 RECAP and the distilled planner were moved into a [study of their own](#value_others) after a first run of two
 cells, in which others of their kind did better.
@@ -128,8 +135,6 @@ def comparison(found: Groups) -> str:
              minutes(cells, method)]
             for method, title in TITLES.items() if method in measured(cells, TITLES)
         ]  # fmt: skip
-    every = [cell for cells in found.values() for cell in cells]
-    policy, planned = (mean_of(every, method, "seconds_an_episode") for method in ("filtered", "planned"))
     budget = ["demonstrations", "rollouts"]
     starts = len(outcomes(next(iter(found.values())), "cloning", "ind")[0])
     return f"""The best method with a world model against the best without one, on the same real episodes and
@@ -144,9 +149,7 @@ All methods:
 Success of each seed over {starts} starts; with more than one seed, their mean. Intervals count starts, and
 seeds where there are several. Minutes are those of training on one core, without recording (Dyna records
 while it trains, and that is counted). The best method of each kind is chosen on the starts that are reported.
-PPO in imagination and the methods below it use a world model. Planning trains no policy: it improves on what
-the policy of demonstrations and successful rollouts would do, and plans anew after eight actions. An episode
-of it takes {planned:.1f} s on one core, simulator included, one of that policy {policy:.1f} s."""
+PPO in imagination and the methods below it use a world model."""
 
 
 def rows_above(methods: Sequence[str], load: Load) -> str:
