@@ -299,7 +299,10 @@ def speed(load: Load) -> str:
     head = ["parallel episodes", "frames/s without decoding", "frames/s with decoding",
             "frames/s without decoding or cache", "with decoding, share of the roofline"]  # fmt: skip
     recording, rate, ppo = load("recording_speed"), load("recording_rate"), load("ppo_speed")
-    environment = load("environment_speed")["by_number"][-1]
+    environment, planning = (
+        load("environment_speed")["by_number"][-1],
+        load("planning_speed")["by_searches"][-1],
+    )
     return f"""On two CPU cores 64 imaginations are {faster["stock meshes"]["64"]:.0f} times as fast as one
 process of ManiSkill with its own robot meshes, {faster["light meshes"]["64"]:.0f} times as fast as with our
 light ones.
@@ -316,4 +319,11 @@ environments rewards add {100 * min(environment["costs_more"].values()):.0f} to
 {100 * max(environment["costs_more"].values()):.0f} % to imagination. Recording a step takes
 {1000 * recording["cpu_s_per_step"]["light meshes"]:.0f} ms of CPU, ManiSkill's own table
 {1000 * recording["cpu_s_per_step"]["ManiSkill's own"]:.0f} ms; two processes record
-{rate["episodes_per_minute"]["two processes"]:.0f} episodes a minute."""
+{rate["episodes_per_minute"]["two processes"]:.0f} episodes a minute.
+
+Planning for {planning["searches"]} imaginations at once, on one core and in the preset `demo`, predicts
+{planning["frames_per_s"]["open_loop"]:,.0f} frames a second,
+{planning["times_faster_than_frame_by_frame"]:.0f} times as many as frame by frame and
+{100 * planning["share_of_floor"]:.0f} % of what the core's matrix products allow. From what a policy would do
+it plans {planning["episodes_per_s"]:.1f} episodes a second, without the policy itself and the episodes' own
+frames."""
