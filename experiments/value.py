@@ -8,6 +8,7 @@ from typing import Any, Final
 from experiments.run import RECORDS
 from experiments.study import Study
 from experiments.success import Results, outcomes, rate
+from lerobot_wmrl.data.budget import Ledger
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
 CELL: Final = ("task", "kind", "demonstrations", "rollouts", "seed", "starts")
@@ -24,7 +25,7 @@ def cell(study: Study) -> Results:
     dataset = Path(study.variables["run"]) / "dataset"
     results = {
         **{name: study.variables[name] for name in CELL},
-        "real_episodes": len(json.loads(study.budget.read_text())["episodes"]),
+        "real_episodes": Ledger(study.budget).read().spent().total(),
         "real_successes": int(recorded_episodes(dataset)["success"].sum()) if dataset.exists() else None,
         "methods": {name: method(study, name, steps) for name, steps in methods.items()},
     }

@@ -68,10 +68,15 @@ class Entries:
     episodes: dict[str, dict[str, str]] = field(default_factory=dict)
     trainings: dict[str, int] = field(default_factory=dict)
 
-    def require_left(self, path: Path, wanted: Mapping[str, int]) -> None:
-        """Raise FieldError unless the limits allow the `wanted` episodes too."""
+    def spent(self) -> Counter[str]:
+        """Return how many episodes have been spent on each of the limits."""
         spent = Counter(entry["spent"] for entry in self.episodes.values())
         spent[ROLLOUTS] += sum(self.trainings.values())
+        return spent
+
+    def require_left(self, path: Path, wanted: Mapping[str, int]) -> None:
+        """Raise FieldError unless the limits allow the `wanted` episodes too."""
+        spent = self.spent()
         for name, limit in asdict(self.limits).items():
             count, left = wanted.get(name, 0), limit - spent[name]
             if count > left:

@@ -145,7 +145,8 @@ def test_a_cell_keeps_outcomes_and_minutes(tmp_path: Path, monkeypatch: pytest.M
         for domain in ("ind", "ood"):
             task = {"metrics": {"successes": [True] * k + [False] * (10 - k)}}
             write_json(study.folder / f"eval_{name}_{domain}" / "eval_info.json", {"per_task": [task]})
-    write_json(study.budget, {"episodes": {str(episode): {} for episode in range(308)}})
+    episodes = {str(episode): {"spent": "rollouts"} for episode in range(208)}
+    write_json(study.budget, {"limits": {}, "episodes": episodes, "trainings": {"dyna": 100}})
     (study.folder / "dataset").mkdir()
     table = {"success": np.arange(308) < 140}
     monkeypatch.setattr(value, "recorded_episodes", lambda root: table)
