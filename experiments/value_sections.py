@@ -112,7 +112,8 @@ and plans anew after eight actions. An episode of it takes {planned:.1f} s on on
 one of that policy {policy:.1f} s.
 
 With 50 demonstrations, cloning these alone succeeds more often than cloning them and successful rollouts,
-whose actions are noisy. PPO and planning begin from the latter policy in all cells.
+whose actions are noisy. PPO in imagination and planning begin from the latter policy in all
+cells, PPO in ManiSkill from the former.
 
 RECAP and the distilled planner were moved into a [study of their own](#value_others) after a first run of two
 cells, in which others of their kind did better.
