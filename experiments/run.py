@@ -50,7 +50,7 @@ def run_study(study: Study, repeat: bool = False) -> None:
     budget.begin(study)
     for number, step in enumerate(study.steps, start=1):
         heading = f"[{number}/{len(study.steps)}] {step.name}"
-        record = read_record(study, step)
+        record = read_record(study.folder, step.name)
         if record is None:
             run_step(study, step, heading)
         elif record["command"] == step.command:
@@ -58,7 +58,7 @@ def run_study(study: Study, repeat: bool = False) -> None:
         elif repeat:
             print(f"{heading}: its command has changed, so it and what follows is repeated", flush=True)
             for later in study.steps[number - 1 :]:
-                record_path(study, later).unlink(missing_ok=True)
+                record_path(study.folder, later.name).unlink(missing_ok=True)
                 delete_output(study, later)
             run_step(study, step, heading)
         else:
@@ -84,16 +84,17 @@ def run_step(study: Study, step: Step, heading: str) -> None:
     budget.check_datasets(study, step, checked)
     seconds = round(time.monotonic() - began, 1)
     finished = {"command": step.command, "seconds": seconds, "commit": commit(), "machine": machine()}
-    write_json(record_path(study, step), finished)
+    write_json(record_path(study.folder, step.name), finished)
 
 
-def record_path(study: Study, step: Step) -> Path:
-    return study.folder / RECORDS / f"{step.name}.json"
+def record_path(folder: Path, step: str) -> Path:
+    """Return where a step of the study in this folder is recorded."""
+    return folder / RECORDS / f"{step}.json"
 
 
-def read_record(study: Study, step: Step) -> dict[str, Any] | None:
+def read_record(folder: Path, step: str) -> dict[str, Any] | None:
     """Return what was recorded of a finished step, None if it is not finished."""
-    path = record_path(study, step)
+    path = record_path(folder, step)
     return json.loads(path.read_text()) if path.exists() else None
 
 
@@ -133,7 +134,7 @@ def publish(study: Study, docs: Path) -> list[Path]:
 
 def provenance(study: Study) -> dict[str, Any]:
     """Return what the results of a finished study come from: commits, machines, commands."""
-    records = [record for step in study.steps if (record := read_record(study, step))]
+    records = [record for step in study.steps if (record := read_record(study.folder, step.name))]
     return {
         "study": study.name,
         "commit": ", ".join(dict.fromkeys(record["commit"] for record in records)),

@@ -5,8 +5,8 @@ A file has these keys:
     question   what the study answers
     needs      studies whose folders its commands read; `$gate` is the folder of gate.yaml. Of a study with
                cells it is the folder of the cell that has this cell's values
-    extends    another study, whose keys hold where this one has none of its own, and whose steps may be named
-               in place of being written again
+    extends    another study, whose keys hold where this one has none of its own (an empty `budget:` is none),
+               and whose steps may be named in place of being written again
     budget     real episodes that all its methods may learn from: demonstrations, rollouts, play. `$budget` is
                the ledger, $output_dir/budget.json, which commands are given as --budget=$budget
     variables  names for commands; a later one may use an earlier one
@@ -24,7 +24,7 @@ A file has these keys:
 
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -142,11 +142,11 @@ def _read_cell(
                 raise ValueError(f"{path}: {key}={value}: there are {', '.join(map(str, values))}")
             more.update(values[value])
     folders = {"output_dir": str(OUTPUTS / path.stem), **{need: str(OUTPUTS / need) for need in needs}}
-    if BUDGET in content:
+    if content.get(BUDGET):
         folders[BUDGET] = "$output_dir/budget.json"
     own = {"cell": name, **cell} if cell else {}
     cells = {"output_dir": name, **{need: _cell_needed(path, need, cell) for need in needs}}
-    variables = resolve({**own, **folders, **content.get("variables", {}), **more}, given, folders, cells)
+    variables = resolve({**own, **folders, **content.get("variables", {}), **more}, given, cells)
     steps = tuple(step for entry in content["steps"] for step in repeated(entry, variables))
     names = [step.name for step in steps]
     if twice := {name for name in names if names.count(name) > 1}:
@@ -161,7 +161,7 @@ def _read_cell(
         steps,
         content.get("collect"),
         tuple(fill(result, variables) for result in content.get("results", ())),
-        read_limits(content[BUDGET], variables) if BUDGET in content else None,
+        read_limits(content[BUDGET], variables) if content.get(BUDGET) else None,
     )
 
 
@@ -211,13 +211,10 @@ def read_keys(path: Path) -> dict[str, Any]:
     return {**base, "results": (), "collect": None, **content, "variables": variables, "steps": steps}
 
 
-def resolve(
-    variables: Mapping[str, Any], given: Sequence[str], folders: Iterable[str], cells: Mapping[str, str]
-) -> dict[str, Any]:
+def resolve(variables: Mapping[str, Any], given: Sequence[str], cells: Mapping[str, str]) -> dict[str, Any]:
     """Return the variables, with those `given` as `name=value` in their place and all `$name` filled in.
 
-    Variables that are `folders` are written without a slash at the end, and those with `cells` go on to the
-    cell.
+    Those that name a study's folder are in `cells`: they go on to the cell there, or to nothing.
     """
     chosen = dict(variables)
     for assignment in given:
@@ -225,8 +222,8 @@ def resolve(
         if not equals or name not in chosen:
             raise ValueError(f"{assignment}: give name=value, with one of {', '.join(chosen)}")
         chosen[name] = yaml.safe_load(value)
-    for name in folders:
-        chosen[name] = str(Path(chosen[name]) / cells.get(name, ""))
+    for name, cell in cells.items():
+        chosen[name] = str(Path(chosen[name]) / cell)
     filled: dict[str, Any] = {}
     for name, value in chosen.items():
         filled[name] = fill(value, filled) if isinstance(value, str) else value

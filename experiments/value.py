@@ -1,11 +1,10 @@
 """Collect one cell of the study of what imagination is worth: every method on the same real episodes."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from experiments.run import RECORDS
+from experiments.run import read_record
 from experiments.study import Study
 from experiments.success import Results, outcomes, rate
 from lerobot_wmrl.data.budget import Ledger
@@ -66,7 +65,6 @@ def seconds(study: Study, step: str) -> float:
         ValueError: it is not finished.
     """
     for folder in (study.folder, Path(study.variables["run"])):
-        path = folder / RECORDS / f"{step}.json"
-        if path.exists():
-            return float(json.loads(path.read_text())["seconds"])
+        if record := read_record(folder, step):
+            return float(record["seconds"])
     raise ValueError(f"{study.name}: step {step} is not finished")

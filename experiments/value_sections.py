@@ -1,12 +1,13 @@
 """What imagination is worth: its section of docs/results.md, and the figure, from published cells."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from experiments.cells import DOMAINS, Load, paired, points, table
 from experiments.study import ROOT, read_cells
@@ -253,33 +254,25 @@ def draw_value(load: Load, path: Path) -> None:
     methods = measured([cell for cells in found.values() for cell in cells], TITLES)
     colours = dict(zip(TITLES, (*COLOURS, *MORE_COLOURS), strict=True))
     for axes, domain in zip(panels, ("ind", "ood"), strict=True):
-        for method in methods:
-            _draw_line(axes, found, method, domain, {"color": colours[method], "label": TITLES[method]})
+        lines = [_draw_line(axes, found, method, domain, colours[method]) for method in methods]
         axes.set_title(f"{DOMAINS[domain]} scenes")
         axes.set_xlabel("real episodes: demonstrations + rollouts")
         axes.set_xticks(range(len(found)), [f"{d} + {r}" for d, r in sorted(found, key=sum)])
     panels[0].set_ylabel("success in ManiSkill")
-    handles, titles = panels[0].get_legend_handles_labels()
-    tidy(figure)
-    for axes in panels:
-        axes.get_legend().remove()
-    figure.legend(handles, titles, loc="outside lower center", ncols=2, frameon=False, fontsize=9)
+    titles = [TITLES[method] for method in methods]
+    figure.legend(lines, titles, loc="outside lower center", ncols=2, frameon=False, fontsize=9)
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=130)
+    tidy(figure).savefig(path, dpi=130)
 
 
-def _draw_line(axes: Axes, found: Groups, method: str, domain: str, style: Mapping[str, str]) -> None:
-    """Draw a method's mean and band over the budgets, the smallest first."""
+def _draw_line(axes: Axes, found: Groups, method: str, domain: str, color: str) -> Line2D:
+    """Draw a method's mean and band over the budgets, the smallest first, and return the line."""
     places, means = [], []
     for place, budget in enumerate(sorted(found, key=sum)):
         if runs := outcomes(found[budget], method, domain):
             places.append(place)
             means.append(RunsMean.over(runs))
-    axes.plot(places, [mean.mean for mean in means], marker="o", **style)
-    axes.fill_between(
-        places,
-        [mean.low for mean in means],
-        [mean.high for mean in means],
-        color=style["color"],
-        alpha=0.15,
-    )
+    low, high = [mean.low for mean in means], [mean.high for mean in means]
+    axes.fill_between(places, low, high, color=color, alpha=0.15)
+    (line,) = axes.plot(places, [mean.mean for mean in means], marker="o", color=color)
+    return line

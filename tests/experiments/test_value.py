@@ -153,7 +153,7 @@ def test_a_cell_keeps_outcomes_and_minutes(tmp_path: Path, monkeypatch: pytest.M
     with pytest.raises(ValueError, match="step cloning is not finished"):
         value.cell(study)
     for step in study.steps:
-        write_json(record_path(study, step), {"seconds": 60.0})
+        write_json(record_path(study.folder, step.name), {"seconds": 60.0})
     (content,) = value.cell(study).values()
     assert (content["real_episodes"], content["real_successes"]) == (308, 140)
     assert content["methods"]["planned"]["minutes"] == 4
