@@ -18,14 +18,17 @@ def cell(study: Study) -> Results:
     """Return the success of every method in one cell, with the minutes that the steps it needs took.
 
     `real_episodes` is what the ledger says was spent, `real_successes` counts those that were merged before
-    training: rollouts of Dyna rounds are not among them, and PPO in ManiSkill has none.
+    training: rollouts of Dyna rounds are not among them, and PPO in ManiSkill has none. `start` is the
+    policy that PPO in imagination begins from.
     """
     methods: dict[str, Sequence[str]] = study.variables["methods"]
-    dataset = Path(study.variables["run"]) / "dataset"
+    run = Path(study.variables["run"])
+    dataset, start = run / "dataset", run / "start"
     results = {
         **{name: study.variables[name] for name in CELL},
         "real_episodes": Ledger(study.budget).read().spent().total(),
         "real_successes": int(recorded_episodes(dataset)["success"].sum()) if dataset.exists() else None,
+        "start": start.resolve().parents[1].name if start.exists() else None,
         "methods": {name: method(study, name, steps) for name, steps in methods.items()},
     }
     return {study.variables["cell"]: results}

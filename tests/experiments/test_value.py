@@ -40,7 +40,8 @@ def made_up_cell(demonstrations: int, seed: int) -> dict[str, Any]:
         k = successes + bool(seed)
         rate = {"share": k / 10, "outcomes": [1] * k + [0] * (10 - k)}
         methods[name] = {"ind": rate, "ood": rate, "minutes": 2.0, "seconds_an_episode": 0.5}
-    return {"demonstrations": demonstrations, "rollouts": 300, "seed": seed, "methods": methods}
+    budget = {"demonstrations": demonstrations, "rollouts": 300, "seed": seed}
+    return {**budget, "start": "filtered", "methods": methods}
 
 
 @pytest.fixture
@@ -61,9 +62,10 @@ def test_the_section_compares_the_best_with_and_without_a_world_model(docs: Path
     assert change.low < 0.2 < change.high
     text = value_push(loader(docs))
     assert (
-        "| 8 | 300 | known | cloning of demonstrations and successful rollouts | planning in "
-        "imagination at test time | +20.0 points" in text
+        "| 8 | 300 | known | cloning of demonstrations and successful rollouts | "
+        f"{TITLES['planned']} | +20.0 points" in text
     )
+    assert "from the demonstrations alone in 0 of 2 cells" in text
     assert "| 8 | 300 | cloning of the demonstrations | 50, 60 → 55 %" in text
 
 
@@ -107,6 +109,7 @@ def test_ppo_without_a_reward_is_compared_with_the_policy_before_it(docs: Path) 
 
 MAY_DIFFER = {
     "output_dir", "dataset.root", "model.tokenizer_path", "env.world_model_path", "policy.world_model_path",
+    "policy.proposal_path",
 }  # fmt: skip
 """Flags of a control that name its own dataset and models."""
 
@@ -120,6 +123,7 @@ def test_a_control_differs_from_the_study_in_nothing_but_the_world_model() -> No
     steps = {step.name: set(step.command.split()) for step in control.steps}
     compared = [step for step in cell.steps if step.name in steps and step.name != "dataset"]
     assert len(compared) == 7
+    assert "start" not in steps, "the policy that PPO begins from is the study's"
     for step in compared:
         words, budget = set(step.command.split()), {f"--budget={cell.budget}"}
         for word in steps[step.name] ^ words - budget:
@@ -148,6 +152,9 @@ def test_a_cell_keeps_outcomes_and_minutes(tmp_path: Path, monkeypatch: pytest.M
     episodes = {str(episode): {"spent": "rollouts"} for episode in range(208)}
     write_json(study.budget, {"limits": {}, "episodes": episodes, "trainings": {"dyna": 100}})
     (study.folder / "dataset").mkdir()
+    chosen = study.folder / "filtered" / "checkpoints" / "003000"
+    chosen.mkdir(parents=True)
+    (study.folder / "start").symlink_to(chosen)
     table = {"success": np.arange(308) < 140}
     monkeypatch.setattr(value, "recorded_episodes", lambda root: table)
     with pytest.raises(ValueError, match="step cloning is not finished"):
@@ -156,7 +163,8 @@ def test_a_cell_keeps_outcomes_and_minutes(tmp_path: Path, monkeypatch: pytest.M
         write_json(record_path(study.folder, step.name), {"seconds": 60.0})
     (content,) = value.cell(study).values()
     assert (content["real_episodes"], content["real_successes"]) == (308, 140)
-    assert content["methods"]["planned"]["minutes"] == 4
+    assert content["start"] == "filtered"
+    assert content["methods"]["planned"]["minutes"] == 6
     assert content["methods"]["planned"]["seconds_an_episode"] == 6
     assert content["methods"]["filtered"]["ind"]["outcomes"] == [1] * 7 + [0] * 3
     assert content["methods"].keys() == SUCCESSES.keys()

@@ -28,7 +28,7 @@ LEROBOT: dict[str, type[Any]] = {
     "lerobot-eval": EvalPipelineConfig,
     "lerobot-edit-dataset": EditDatasetConfig,
 }
-SHELL = {"cp", "source", "pip", "make", "hf", "apt", "lerobot-record", ".uv/bin/uv"}
+SHELL = {"cp", "ln", "source", "pip", "make", "hf", "apt", "lerobot-record", ".uv/bin/uv"}
 
 
 class Stopped(BaseException):
