@@ -29,6 +29,7 @@ SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     "value_iterated": ("Policies", partial(value.rows_above, ["iterated"])),
     "value_simulator": ("Policies", partial(value.rows_above, ["simulated_ppo"])),
     "value_dyna": ("Policies", partial(value.rows_above, ["dyna"])),
+    "value_imagined": ("Policies", partial(value.rows_above, ["imagined_cloning"])),
     "value_controls": ("Policies", value.value_controls),
     "demo": ("Policies", policies.demo),
     "cloning_control": ("Policies", policies.cloning_control),

@@ -24,11 +24,13 @@ TITLES: Final = {
     "imagined_ppo": "PPO in imagination",
     "planned": "PPO in imagination, then planning in it at test time",
     "dyna": "PPO in imagination, with rollouts in three rounds (Dyna)",
+    "imagined_cloning": "cloning of recorded and imagined successes",
     "distilled": "planner distilled in imagination",
+    "distilled_ppo": "planner distilled, then PPO in imagination",
 }
 """Methods in the order of the table."""
 
-IMAGINED: Final = ("imagined_ppo", "planned", "dyna", "distilled")
+IMAGINED: Final = ("imagined_ppo", "planned", "dyna", "imagined_cloning", "distilled", "distilled_ppo")
 """Methods that use a world model."""
 
 CONTROLLED: Final = ("imagined_ppo", "planned")
@@ -47,10 +49,10 @@ CONTROLS: Final = {
 """What a control's world model learnt from."""
 
 BUDGET: Final = ("demonstrations", "rollouts", "seed")
-MORE_COLOURS: Final = ("#b83280", "#333333", "#d69e2e", "#319795", "#718096", "#9c4221")
+MORE_COLOURS: Final = ("#b83280", "#333333", "#d69e2e", "#319795", "#718096", "#9c4221", "#d53f8c", "#553c9a")
 
 STUDY: Final = "value_push"
-PARTS: Final = ("value_others", "value_iterated", "value_simulator", "value_dyna")
+PARTS: Final = ("value_others", "value_iterated", "value_simulator", "value_dyna", "value_imagined")
 """Studies whose cells add methods to its table."""
 
 Cell = dict[str, Any]
@@ -164,7 +166,8 @@ PPO in imagination and the methods below it use a world model."""
 
 def rows_above(methods: Sequence[str], load: Load) -> str:
     """Return the section of a study whose numbers are in the other one's table."""
-    titles = ", ".join(f'"{TITLES[method]}"' for method in methods)
+    cells = [cell for each in groups(load).values() for cell in each]
+    titles = ", ".join(f'"{TITLES[method]}"' for method in measured(cells, methods))
     return f"Its rows are in [the table above](#{STUDY}): {titles}."
 
 
@@ -178,7 +181,7 @@ def value_others(load: Load) -> str:
         for cell, budget, before in improved(load)
         if (others := published(load, "value_others", cell))
     ]
-    return f"""{rows_above(["conditioned", "distilled"], load)}
+    return f"""{rows_above(["conditioned", "distilled", "distilled_ppo"], load)}
 
 PPO in which an episode is rewarded only if all its frames are done, against the policy before it:
 
