@@ -22,6 +22,11 @@ TYPES: Final = {
         ["--model.type=action_world_model", "--model.dynamics.type=autoregressive"],
         ["--model.type=text_world_model"],
     ),
+    "lerobot-wmrl-label": (
+        ["--success.type=first_frames"],
+        ["--success.type=column"],
+        ["--success.type=reward_model"],
+    ),
     "lerobot-wmrl-train": (["--env.type=world_model"], ["--algorithm.type=grpo"]),
 }
 """Flags that choose types, whose own flags a page shows beside `--help` alone."""

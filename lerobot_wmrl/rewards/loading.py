@@ -1,5 +1,6 @@
 """Load an environment's reward: ours, or one of LeRobot's own reward models with its preprocessor."""
 
+from pathlib import Path
 from typing import Any, Final, Protocol
 
 import torch
@@ -76,20 +77,29 @@ def load_lerobot_reward(config: RewardModelConfig, cameras: list[str], device: s
     Raises:
         FieldError: the reward needs what an imagined episode does not have.
     """
-    config.device, saved = device, []
+    config.device = device
     if config.pretrained_path:
         folder = resolve_checkpoint(config.pretrained_path)
-        config, saved = read_config(folder, config.type, device), sorted(folder.glob(PREPROCESSORS))
+        config = read_config(folder, config.type, device)
         config.pretrained_path = str(folder)
     check_observation(config, cameras)
-    if saved:
-        overrides = {"device_processor": {"device": device}}
-        preprocessor = PolicyProcessorPipeline.from_pretrained(
-            saved[0].parent, config_filename=saved[0].name, overrides=overrides
-        )
-    else:
-        preprocessor = make_reward_pre_post_processors(config)[0]
-    return LeRobotReward(make_reward_model(config), preprocessor)
+    return LeRobotReward(make_reward_model(config), load_preprocessor(config))
+
+
+def load_preprocessor(config: RewardModelConfig, **about: Any) -> PolicyProcessorPipeline:
+    """Return the preprocessor in a reward's checkpoint, or a new one where there is none.
+
+    Args:
+        config: with the folder of the checkpoint and the device.
+        about: what new processors are made from, `dataset_stats` and `dataset_meta`.
+    """
+    saved = sorted(Path(config.pretrained_path).glob(PREPROCESSORS)) if config.pretrained_path else []
+    if not saved:
+        return make_reward_pre_post_processors(config, **about)[0]
+    overrides = {"device_processor": {"device": config.device}}
+    return PolicyProcessorPipeline.from_pretrained(
+        saved[0].parent, config_filename=saved[0].name, overrides=overrides
+    )
 
 
 def check_observation(config: RewardModelConfig, cameras: list[str]) -> None:

@@ -10,7 +10,15 @@ from lerobot_dataset_maniskill import record
 from lerobot_wmrl.common.command_line import help_of
 from lerobot_wmrl.common.settings import settings_of
 from lerobot_wmrl.common.stored_help import FOLDER
-from lerobot_wmrl.scripts import compare, convert_openvla, demo, eval_world_model, train, train_world_model
+from lerobot_wmrl.scripts import (
+    compare,
+    convert_openvla,
+    demo,
+    eval_world_model,
+    label,
+    train,
+    train_world_model,
+)
 
 COMMANDS = {
     "lerobot-wmrl-record": (record.run, record.RecordConfig),
@@ -23,6 +31,7 @@ COMMANDS = {
         train_world_model.train_world_model, train_world_model.TrainWorldModelConfig,
     ),
     "lerobot-wmrl-compare": (compare.compare, compare.CompareConfig),
+    "lerobot-wmrl-label": (label.label, label.LabelConfig),
     "lerobot-wmrl-convert-openvla": (convert_openvla.convert, convert_openvla.ConvertOpenVLAConfig),
 }  # fmt: skip
 
@@ -34,7 +43,7 @@ def test_help_explains_and_shows_no_source_code(command: str, monkeypatch: pytes
     text = help_of(function, config_class)
     assert text.startswith(f"{command}: ")
     assert f"    {command} --" in text  # an example
-    assert "--preset=" in text or command.endswith(("compare", "openvla"))
+    assert "--preset=" in text or command.endswith(("compare", "label", "openvla"))
     assert "def " not in text
     assert "default_factory" not in text
     settings = list(settings_of(config_class))

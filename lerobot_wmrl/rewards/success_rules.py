@@ -1,0 +1,210 @@
+"""What counts as success in a dataset that does not say so. N frames, E episodes."""
+
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from draccus import ChoiceRegistry
+
+from lerobot_wmrl.common.errors import FieldError, require_at_least
+
+if TYPE_CHECKING:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+BATCH: Final = 32
+"""Frames that a reward model looks at together."""
+
+
+@dataclass
+class SuccessRule(ChoiceRegistry):
+    """What counts as success."""
+
+    def frames(self, dataset: "LeRobotDataset") -> np.ndarray:
+        """Mark the frames in which the task is solved. (N,)
+
+        Raises:
+            FieldError: the rule does not fit the dataset.
+        """
+        raise NotImplementedError
+
+
+@SuccessRule.register_subclass("ends")
+@dataclass
+class EndsRule(SuccessRule):
+    """The last frames of episodes that are known to succeed, such as demonstrations.
+
+    Args:
+        episodes: the episodes that succeed, by their indices; by default all. The others fail.
+        last: how many of their last frames count. World models ask for `done_frames` (3) in a row. Frames in
+            which the task is not solved yet would teach a wrong success.
+    """
+
+    episodes: list[int] | None = None
+    last: int = 3
+
+    def __post_init__(self) -> None:
+        require_at_least(self, 1, "last")
+
+    def frames(self, dataset: "LeRobotDataset") -> np.ndarray:
+        episode, frame, length = rows_of(dataset)
+        if self.episodes is None:
+            return np.asarray(frame >= length - self.last)
+        require_episodes("episodes", self.episodes, dataset)
+        return np.asarray((frame >= length - self.last) & np.isin(episode, self.episodes))
+
+
+@SuccessRule.register_subclass("first_frames")
+@dataclass
+class FirstFramesRule(SuccessRule):
+    """All frames from a given one on, in the episodes that succeed.
+
+    Args:
+        first: episode → the first frame in which the task is solved, both from 0 on: `{0: 120, 3: 95}`.
+            Episodes that are not named fail.
+    """
+
+    first: dict[int, int] = field(default_factory=dict)
+
+    def frames(self, dataset: "LeRobotDataset") -> np.ndarray:
+        episode, frame, length = rows_of(dataset)
+        require_episodes("first", self.first, dataset)
+        solved = np.zeros(len(episode), bool)
+        for index, first in self.first.items():
+            own = episode == index
+            if not 0 <= first < length[own][0]:
+                raise FieldError(
+                    "first", self.first, f"episode {index} has no frame {first}",
+                    f"its frames are 0 to {length[own][0] - 1}",
+                )  # fmt: skip
+            solved |= own & (frame >= first)
+        return solved
+
+
+@SuccessRule.register_subclass("column")
+@dataclass
+class ColumnRule(SuccessRule):
+    """Frames in which a column of the dataset reaches a threshold, such as a reward or a label.
+
+    Args:
+        column: its name.
+        threshold: the value from which a frame counts.
+    """
+
+    column: str = "next.reward"
+    threshold: float = 0.5
+
+    def frames(self, dataset: "LeRobotDataset") -> np.ndarray:
+        feature = dataset.features.get(self.column)
+        if feature is None or tuple(feature["shape"]) != (1,) or feature["dtype"] == "string":
+            single = [name for name, each in dataset.features.items() if tuple(each["shape"]) == (1,)]
+            raise FieldError(
+                "column", self.column, f"is no column of one number in {dataset.root}",
+                f"choose one of {', '.join(single)}",
+            )  # fmt: skip
+        rows = dataset.hf_dataset.with_format("numpy", columns=[self.column])[:]
+        return reach(np.asarray(rows[self.column], np.float64).reshape(-1), self.threshold)
+
+
+@SuccessRule.register_subclass("reward_model")
+@dataclass
+class RewardModelRule(SuccessRule):
+    """Frames in which one of LeRobot's reward models reaches a threshold: a classifier, SARM, Robometer.
+
+    Args:
+        path: its checkpoint, a folder or a hub id.
+        threshold: the reward from which a frame counts. A classifier gives 0 or 1, SARM the progress from 0
+            to 1.
+        device: where it runs; by default the best device of this machine.
+    """
+
+    path: str = ""
+    threshold: float = 0.5
+    device: str | None = None
+
+    def frames(self, dataset: "LeRobotDataset") -> np.ndarray:
+        return reach(rewards_of(self, dataset), self.threshold)
+
+
+def rows_of(dataset: "LeRobotDataset") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return each frame's episode, its place in it, and the episode's length, (N,) each."""
+    rows = dataset.hf_dataset.with_format("numpy", columns=["episode_index", "frame_index"])[:]
+    _, index, count = np.unique(rows["episode_index"], return_inverse=True, return_counts=True)
+    return rows["episode_index"], rows["frame_index"], count[index]
+
+
+def require_episodes(name: str, episodes: Collection[int], dataset: "LeRobotDataset") -> None:
+    """Raise FieldError unless there are some, and the dataset has them."""
+    value = episodes if isinstance(episodes, dict) else list(episodes)
+    if not episodes:
+        raise FieldError(name, value, "names no episode that succeeds", "name those that do")
+    wrong = [each for each in episodes if not 0 <= each < dataset.meta.total_episodes]
+    if wrong:
+        raise FieldError(
+            name, value, f"there is no episode {wrong[0]} in {dataset.root}",
+            f"it has episodes 0 to {dataset.meta.total_episodes - 1}",
+        )  # fmt: skip
+
+
+def reach(values: np.ndarray, threshold: float) -> np.ndarray:
+    """Mark the values (N,) from `threshold` on. FieldError if one is not a number, or none is so high."""
+    if not np.isfinite(values).all():
+        frame = int(np.argmin(np.isfinite(values)))
+        raise FieldError("threshold", threshold, f"cannot be compared with frame {frame}: {values[frame]}")
+    if not (values >= threshold).any():
+        raise FieldError(
+            "threshold", threshold, f"no frame reaches it: the values go from {values.min():.3g} to "
+            f"{values.max():.3g}", "lower it",
+        )  # fmt: skip
+    return np.asarray(values >= threshold)
+
+
+def rewards_of(rule: RewardModelRule, dataset: "LeRobotDataset") -> np.ndarray:
+    """Return what a reward model gives for every frame. (N,)
+
+    The model is shown what its configuration asks for, frames before and after included, as in lerobot-train.
+    """
+    import torch
+    from huggingface_hub import snapshot_download
+    from lerobot.configs.rewards import RewardModelConfig
+    from lerobot.datasets.factory import resolve_delta_timestamps
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from lerobot.rewards.factory import make_reward_model
+    from lerobot.utils.collate import lerobot_collate_fn
+    from tqdm import tqdm
+
+    from lerobot_wmrl.common.checkpoints import resolve_checkpoint
+    from lerobot_wmrl.data.episodes import VIDEO_BACKEND
+    from lerobot_wmrl.rewards.loading import load_preprocessor
+
+    try:
+        folder = resolve_checkpoint(rule.path if Path(rule.path).is_dir() else snapshot_download(rule.path))
+        config = RewardModelConfig.from_pretrained(folder)
+    except Exception as error:  # a missing file, a type that nobody registered, or what the hub answers
+        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        raise FieldError(
+            "path", rule.path, f"no reward model of LeRobot there ({reason})",
+            "give the checkpoint of one, as lerobot-train --reward_model.type=… makes it",
+        ) from error  # fmt: skip
+    config.pretrained_path, config.device = str(folder), rule.device or config.device
+    missing = [name for name in config.input_features or () if name not in dataset.features]
+    if missing:
+        raise FieldError(
+            "path", rule.path, f"looks at {', '.join(missing)}, which {dataset.root} has not",
+            "give a reward model that was trained on datasets like this",
+        )  # fmt: skip
+    shown = LeRobotDataset(
+        dataset.repo_id, root=dataset.root, delta_timestamps=resolve_delta_timestamps(config, dataset.meta),
+        video_backend=VIDEO_BACKEND,
+    )  # fmt: skip
+    about: dict[str, Any] = {"dataset_stats": dataset.meta.stats, "dataset_meta": dataset.meta}
+    model = make_reward_model(config, **about).eval()
+    prepare = load_preprocessor(config, **about)
+    batches = torch.utils.data.DataLoader(shown, BATCH, collate_fn=lerobot_collate_fn)
+    with torch.no_grad():
+        found = [
+            model.compute_reward(prepare(batch)).float().cpu()
+            for batch in tqdm(batches, "label", unit="batch")
+        ]
+    return torch.cat(found).numpy().reshape(-1)

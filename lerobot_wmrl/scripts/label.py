@@ -1,0 +1,132 @@
+"""lerobot-wmrl-label: copy a dataset with a column `next.success`, which says where the task is solved.
+
+    lerobot-wmrl-label --dataset.root=data/demonstrations --success.type=ends --output_dir=data/labelled
+    lerobot-wmrl-label --dataset.root=data/rollouts --success.type=ends --success.episodes=[0,3,7] \\
+        --output_dir=data/labelled
+    lerobot-wmrl-label --dataset.root=data/rollouts --success.type=first_frames \\
+        --success.first='{0: 120, 3: 95}' --output_dir=data/labelled
+    lerobot-wmrl-label --dataset.root=data/rollouts --success.type=column --success.column=next.reward \\
+        --success.threshold=0.95 --output_dir=data/labelled
+    lerobot-wmrl-label --dataset.root=data/rollouts --success.type=reward_model \\
+        --success.path=user/classifier --output_dir=data/labelled
+
+World models learn from this column when an imagined episode succeeds. The dataset itself stays as it is. The
+command says how many episodes succeed and for how long, and what cannot be learnt from such labels.
+"""
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from lerobot_wmrl.common.command_line import RunConfig, run_command
+from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.files import writing
+from lerobot_wmrl.data.episodes import DatasetSource
+from lerobot_wmrl.rewards.success_rules import EndsRule, SuccessRule
+
+if TYPE_CHECKING:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+SUCCESS: Final = "next.success"
+DONE_FRAMES: Final = 3
+"""Frames in a row that make a success where nothing else is asked for."""
+
+
+@dataclass
+class LabelConfig(RunConfig):
+    """Copy a dataset with a column that says where the task is solved.
+
+    Args:
+        dataset: the dataset to label.
+        success: what counts as success.
+        output_dir: folder of the labelled dataset.
+        repo_id: its name, for the hub; by default `local/` and the folder's.
+    """
+
+    dataset: DatasetSource = field(default_factory=DatasetSource)
+    success: SuccessRule = field(default_factory=EndsRule)
+    output_dir: Path = Path("outputs/labelled")
+    repo_id: str | None = None
+
+
+def label(cfg: LabelConfig) -> None:
+    """Write the labelled dataset and say what is in it."""
+    from lerobot_wmrl.data.episodes import open_dataset
+
+    dataset = open_dataset(cfg.dataset.root, cfg.dataset.repo_id)
+    check(cfg, dataset)
+    solved = cfg.success.frames(dataset)
+    with writing("output_dir", cfg.output_dir):
+        write_labelled(dataset, solved, cfg.output_dir, cfg.repo_id or f"local/{cfg.output_dir.name}")
+    episode = dataset.hf_dataset.with_format("numpy", columns=["episode_index"])[:]["episode_index"]
+    print("\n".join(report(np.bincount(episode, solved).astype(int), cfg)))
+
+
+def check(cfg: LabelConfig, dataset: "LeRobotDataset") -> None:
+    """Raise FieldError if the dataset is labelled already, or there is something at `output_dir`."""
+    if SUCCESS in dataset.features:
+        raise FieldError(
+            "dataset.root", cfg.dataset.root, f"has a column {SUCCESS} already",
+            "train with it, or remove it first: lerobot-edit-dataset --operation.type=remove_feature "
+            f"--operation.feature_names=[{SUCCESS}]",
+        )  # fmt: skip
+    if cfg.output_dir.exists():
+        raise FieldError("output_dir", cfg.output_dir, "there is something already", "choose a new folder")
+
+
+def write_labelled(dataset: "LeRobotDataset", solved: np.ndarray, output_dir: Path, repo_id: str) -> None:
+    """Copy a dataset with `next.success` (N,) by LeRobot's own function; the folder is whole or absent."""
+    from lerobot.datasets.dataset_tools import add_features
+
+    partial = output_dir.with_name(f".{output_dir.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.parent.mkdir(parents=True, exist_ok=True)
+    column = {SUCCESS: (solved[:, None], {"dtype": "bool", "shape": (1,), "names": None})}
+    add_features(dataset, column, output_dir=partial, repo_id=repo_id)
+    partial.rename(output_dir)
+
+
+def report(frames: Sequence[int] | np.ndarray, cfg: LabelConfig) -> list[str]:
+    """Return what the labels say, and what cannot be learnt from them.
+
+    Args:
+        frames: in which the task is solved, of each episode (E,).
+        cfg: the command's settings.
+    """
+    held = np.array([count for count in frames if count])
+    failures = len(frames) - len(held)
+    said = [f"{cfg.output_dir}: {len(frames)} episodes, of which {len(held)} succeed and {failures} fail."]
+    if len(held):
+        said.append(f"Success holds for {held.min()} to {held.max()} frames (median {np.median(held):.0f}).")
+    if len(held) > 0 and held.min() < DONE_FRAMES:
+        short = int((held < DONE_FRAMES).sum())
+        said.append(
+            f"{short} of them for fewer than {DONE_FRAMES}: these count with --env.done_frames={held.min()} "
+            f"in lerobot-wmrl-train and --done_frames={held.min()} in lerobot-wmrl-eval-world-model."
+        )
+    if not failures:
+        said.append(
+            "There is no failure: a world model cannot learn to predict one from this dataset alone, and "
+            "nothing measured on it says how many failures are taken for successes. Record rollouts of the "
+            "policy, and label them too."
+        )
+    if not len(held):
+        said.append("There is no success: a world model learns no reward from this dataset alone.")
+    said.append(
+        f"Next: lerobot-wmrl-train-world-model --preset=cpu --model.type=frame_tokenizer "
+        f"--dataset.root={cfg.output_dir} …"
+    )
+    return said
+
+
+def main() -> None:
+    """Run the console command."""
+    run_command(label, LabelConfig, list)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,148 @@
+"""lerobot-wmrl-label: the copy has `next.success` as the rule says, everything else as it was."""
+
+import re
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lerobot.datasets.dataset_tools import remove_feature
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.rewards.factory import make_reward_pre_post_processors
+
+from lerobot_wmrl.data.episodes import open_dataset, read_episodes
+from lerobot_wmrl.rewards.configuration_rewards import ProxyConfig
+from lerobot_wmrl.rewards.modeling_rewards import ProxyRewardModel
+from lerobot_wmrl.scripts.label import main
+
+IMAGE = "observation.images.third_view"
+
+
+@pytest.fixture(scope="module")
+def unlabelled(small_dataset: LeRobotDataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The six synthetic episodes, of which every third fails, without what says so."""
+    root = tmp_path_factory.mktemp("label") / "unlabelled"
+    remove_feature(small_dataset, ["next.success", "next.done"], output_dir=root, repo_id="local/unlabelled")
+    return root
+
+
+def label(monkeypatch: pytest.MonkeyPatch, root: Path, target: Path, *flags: str) -> list[list[bool]]:
+    """Run the command; return the labels of each episode of the copy."""
+    monkeypatch.setattr("sys.argv", ["label", f"--dataset.root={root}", f"--output_dir={target}", *flags])
+    main()
+    table = read_episodes(open_dataset(target))
+    return [table.done[a : a + n].tolist() for a, n in zip(table.start, table.length, strict=True)]
+
+
+def lengths(root: Path) -> list[int]:
+    return [int(n) for n in read_episodes(open_dataset(root)).length]
+
+
+def test_demonstrations_succeed_at_their_ends(
+    unlabelled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = label(monkeypatch, unlabelled, tmp_path / "labelled", "--success.type=ends")
+    assert found == [[False] * (n - 3) + [True] * 3 for n in lengths(unlabelled)]
+    said = capsys.readouterr().out
+    assert "6 episodes, of which 6 succeed and 0 fail" in said
+    assert "There is no failure" in said
+    before, after = LeRobotDataset("a", unlabelled), LeRobotDataset("b", tmp_path / "labelled")
+    assert {*after.features} == {*before.features, "next.success"}
+    for row in (0, len(before) - 1):
+        np.testing.assert_array_equal(before[row][IMAGE], after[row][IMAGE])
+        np.testing.assert_array_equal(before[row]["action"], after[row]["action"])
+
+
+def test_the_others_fail_where_successes_are_named(
+    unlabelled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flags = ["--success.episodes=[0,4]", "--success.last=1"]
+    found = label(monkeypatch, unlabelled, tmp_path / "labelled", "--success.type=ends", *flags)
+    assert [sum(episode) for episode in found] == [1, 0, 0, 0, 1, 0]
+    said = capsys.readouterr().out
+    assert "2 of them for fewer than 3: these count with --env.done_frames=1" in said
+    assert "There is no failure" not in said
+
+
+def test_success_may_begin_at_a_frame(
+    unlabelled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flags = ["--success.type=first_frames", "--success.first={0: 5, 3: 2}"]
+    found = label(monkeypatch, unlabelled, tmp_path / "labelled", *flags)
+    expected = [
+        [frame >= {0: 5, 3: 2}.get(e, n) for frame in range(n)] for e, n in enumerate(lengths(unlabelled))
+    ]
+    assert found == expected
+
+
+def test_a_reward_may_say_it(
+    small_dataset: LeRobotDataset, unlabelled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The synthetic reward is 1 where the task is solved."""
+    flags = ["--success.type=column", "--success.column=next.reward", "--success.threshold=1"]
+    found = label(monkeypatch, unlabelled, tmp_path / "labelled", *flags)
+    assert [*chain(*found)] == read_episodes(small_dataset).done.tolist()
+
+
+def test_a_reward_model_may_say_it(unlabelled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An untrained network stands for a trained one: it is asked about the frame after every action."""
+    config = ProxyConfig(device="cpu", cameras=["third_view"], image_size=32)
+    model = ProxyRewardModel(config)
+    model.save_pretrained(tmp_path / "reward")
+    dataset = open_dataset(unlabelled)
+    prepare = make_reward_pre_post_processors(config, dataset_stats=dataset.meta.stats)[0]
+    prepare.save_pretrained(tmp_path / "reward")
+    table = read_episodes(dataset)
+    ends = np.repeat(table.start + table.length - 1, table.length)
+    after = np.minimum(np.arange(len(ends)) + 1, ends)  # of these frames its training makes the reward
+    rewards = [float(model.compute_reward(prepare({IMAGE: dataset[row][IMAGE][None]}))) for row in after]
+    ordered = np.sort(rewards)
+    widest = int(np.argmax(np.diff(ordered)))
+    threshold = float(ordered[widest : widest + 2].mean())
+    flags = ["--success.type=reward_model", f"--success.path={tmp_path / 'reward'}", "--success.device=cpu"]
+    found = label(monkeypatch, unlabelled, tmp_path / "labelled", *flags, f"--success.threshold={threshold}")
+    assert [*chain(*found)] == pytest.approx([reward >= threshold for reward in rewards])
+    assert 0 < np.sum([*chain(*found)]) < len(dataset)
+
+
+@pytest.mark.parametrize(("flags", "message"), [
+    (["--success.type=ends", "--success.episodes=[6]"], "no episode 6 in .*; it has episodes 0 to 5"),
+    (["--success.type=ends", "--success.episodes=[]"], "names no episode that succeeds"),
+    (["--success.type=ends", "--success.last=0"], "--success.last=0: must be at least 1"),
+    (["--success.type=first_frames"], "--success.first={}: names no episode"),
+    (["--success.type=first_frames", "--success.first={1: 99}"], "episode 1 has no frame 99; its frames are"),
+    (["--success.type=column", "--success.column=score"], "no column of one number .*next.reward"),
+    (["--success.type=column", "--success.threshold=7"], "--success.threshold=7.0: no frame reaches it"),
+    (["--success.type=reward_model"], "--success.path.*: no reward model of LeRobot there"),
+])  # fmt: skip
+def test_mistakes_are_named_and_nothing_is_written(
+    flags: list[str], message: str, unlabelled: Path, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    with pytest.raises(SystemExit):
+        label(monkeypatch, unlabelled, tmp_path / "labelled", *flags)
+    assert list(tmp_path.iterdir()) == []
+    assert re.search(message, capsys.readouterr().err)
+
+
+def test_labels_are_not_replaced(
+    small_dataset: LeRobotDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    with pytest.raises(SystemExit):
+        label(monkeypatch, Path(small_dataset.root), tmp_path / "labelled")
+    assert "has a column next.success already; train with it, or remove it first" in capsys.readouterr().err
+
+
+def test_a_copy_that_was_cut_off_is_made_again(
+    unlabelled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    torn = tmp_path / ".labelled.partial"
+    torn.mkdir()
+    (torn / "half").write_text("")
+    label(monkeypatch, unlabelled, tmp_path / "labelled")
+    assert not torn.exists()
+    assert not (tmp_path / "labelled" / "half").exists()
+    with pytest.raises(SystemExit):
+        label(monkeypatch, unlabelled, tmp_path / "labelled")
+    assert "labelled: there is something already; choose a new folder" in capsys.readouterr().err
