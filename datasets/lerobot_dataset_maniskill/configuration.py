@@ -1,10 +1,11 @@
 """What to record: the flags of `lerobot-wmrl-record`."""
 
 import re
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, ClassVar
 
+import draccus
 from huggingface_hub import get_token
 from huggingface_hub.errors import HFValidationError
 from huggingface_hub.utils import validate_repo_id
@@ -16,7 +17,7 @@ from lerobot_dataset_maniskill.planners import MOTIONS
 from lerobot_wmrl.common.command_line import RunConfig
 from lerobot_wmrl.common.constants import EVALUATION_SEED, KINDS, POLICY
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
-from lerobot_wmrl.common.policies import read_policy_config
+from lerobot_wmrl.common.policies import read_policy_config, require_trained
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.maniskill.tasks import task_of
@@ -91,8 +92,8 @@ class RecordConfig(RunConfig):
     """Folders of all shards: merge them into output_dir, and stop."""
 
     policy: PreTrainedConfig | None = None
-    """LeRobot policy to roll out: --policy.path=FOLDER. A policy without a checkpoint (--policy.type=wm_mpc)
-    cannot be recorded."""
+    """Policy to roll out: --policy.path=FOLDER of a checkpoint, or a planner, which has none:
+    --policy.type=wm_mpc --policy.world_model_path=…"""
 
     exploration: float = 0.0
     """Noise on the translations of a policy's actions: the largest standard deviation, as a share of the
@@ -138,6 +139,8 @@ class RecordConfig(RunConfig):
         if self.shard_of[1] > -(-self.num_episodes // self.part_episodes):
             raise FieldError("shard", self.shard, "there are fewer sub-datasets than shards")
         require_choice(self, "planner", MOTIONS)
+        if self.policy is not None:
+            require_trained(self.policy)
         self._validate_kinds()
         if self.push_to_hub:
             self._validate_publishing()
@@ -251,9 +254,17 @@ class RecordConfig(RunConfig):
             "seed": self.seed,
             "kinds": self.kinds if self.policy is None else {POLICY: 1.0},
             "planner": self.planner if self.policy is None else None,
-            "policy": None if self.policy is None else str(self.policy.pretrained_path),
+            **self._policy_content(),
             "exploration": self.exploration,
         }
+
+    def _policy_content(self) -> dict[str, Any]:
+        """Return what decides a policy's actions: its checkpoint, or its own settings if it has none."""
+        if self.policy is None or self.policy.pretrained_path:
+            return {"policy": None if self.policy is None else str(self.policy.pretrained_path)}
+        own = {each.name for each in fields(self.policy)} - {each.name for each in fields(PreTrainedConfig)}
+        settings = draccus.encode(self.policy)
+        return {"policy": self.policy.type, **{f"policy.{name}": settings[name] for name in sorted(own)}}
 
     def _simulated_content(self) -> dict[str, Any]:
         env = self.maniskill

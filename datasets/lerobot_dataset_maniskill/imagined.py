@@ -15,7 +15,7 @@ from lerobot_dataset_maniskill.worker import EpisodeResult, ExplorationNoise, Re
 from lerobot_dataset_maniskill.writer import Outcome, StartColumns, add_step
 from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW, ACTION_NAMES, STATE_NAMES
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.policies import check_fit, load_policy, load_processors
+from lerobot_wmrl.common.policies import fit_to_environment, load_policy, load_processors
 from lerobot_wmrl.envs.evaluation_adapter import images_to_numpy
 from lerobot_wmrl.maniskill.episode import Frame
 from lerobot_wmrl.maniskill.tasks import task_of
@@ -40,7 +40,7 @@ class ImaginedPartRecorder:
                 f"does not imagine the recorder's state ({len(STATE_NAMES)} values)",
                 "train it on a dataset that lerobot-wmrl-record recorded",
             )
-        check_fit(config.policy, shown, len(ACTION_NAMES))
+        fit_to_environment(config.policy, shown, len(ACTION_NAMES))
         self.policy: Any = load_policy(config.policy).eval()
         self.processors = load_processors(config.policy)
         self.pipeline = make_pipeline(config.policy, *self.processors)

@@ -22,7 +22,7 @@ from lerobot_dataset_maniskill.writer import find_damage
 from lerobot_wmrl.common.constants import ACTION_NAMES, EVALUATION_SEED, GATE_SEED, KINDS
 from lerobot_wmrl.common.errors import FieldError, within
 from lerobot_wmrl.common.files import foreign_files, write_json, writing
-from lerobot_wmrl.common.policies import check_fit, check_weights
+from lerobot_wmrl.common.policies import check_weights, fit_to_environment
 from lerobot_wmrl.data.budget import Ledger, spending
 from lerobot_wmrl.data.episodes import open_dataset, read_episodes
 from lerobot_wmrl.maniskill.backend import render_backend, simulating_context
@@ -86,7 +86,7 @@ def check_simulation(config: RecordConfig) -> None:
     """Raise ValueError unless there is a renderer, and the cameras show what the policy needs."""
     render_backend()
     if config.policy is not None:
-        check_fit(config.policy, config.maniskill.observation_shapes(), len(ACTION_NAMES))
+        fit_to_environment(config.policy, config.maniskill.observation_shapes(), len(ACTION_NAMES))
 
 
 def discard(work: Path, content: Mapping[str, Any]) -> None:
@@ -98,7 +98,10 @@ def discard(work: Path, content: Mapping[str, Any]) -> None:
 
 @contextmanager
 def claimed(work: Path, content: Mapping[str, Any]) -> Iterator[None]:
-    """Lock the folder of unfinished work, which belongs to one configuration and one running command."""
+    """Lock the folder of unfinished work, which belongs to one configuration and one running command.
+
+    A command that fails before a part is recorded leaves no folder behind.
+    """
     work.mkdir(parents=True, exist_ok=True)
     with (work / "lock").open("w") as lock:
         try:
@@ -106,13 +109,23 @@ def claimed(work: Path, content: Mapping[str, Any]) -> Iterator[None]:
         except BlockingIOError as error:
             raise ValueError(f"{work}: another command is recording into this folder; wait for it") from error
         stored = work / CONTENT_FILE
-        if stored.is_file():
+        if stored.is_file() and has_parts(work):
             require_same(json.loads(stored.read_text()), content, work)
-        elif foreign_files(work, "lock", CONTENT_FILE):
+        elif not stored.is_file() and foreign_files(work, "lock", CONTENT_FILE):
             raise ValueError(f"{work} holds something else; move it away to record here")
         else:
             write_json(stored, dict(content))
-        yield
+        try:
+            yield
+        except BaseException:
+            if not has_parts(work):
+                shutil.rmtree(work, ignore_errors=True)
+            raise
+
+
+def has_parts(work: Path) -> bool:
+    """Return whether a part has been recorded in the folder of unfinished work."""
+    return any(work.glob("part-*"))
 
 
 def missing_parts(work: Path, parts: list[Part]) -> list[Part]:

@@ -9,7 +9,7 @@ from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.default import PeftConfig as AdapterSettings
 from lerobot.configs.types import FeatureType, PolicyFeature
-from lerobot.utils.constants import OBS_IMAGES
+from lerobot.utils.constants import ACTION, OBS_IMAGES
 from safetensors import SafetensorError, safe_open
 
 from lerobot_wmrl.common.checkpoints import ADAPTERS_FILE, resolve_checkpoint
@@ -52,9 +52,15 @@ def weights_file(config: PreTrainedConfig) -> str:
 
 
 def load_policy(config: PreTrainedConfig) -> Any:
-    """Load a policy with its weights, in evaluation mode. Raises FieldError if they do not fit."""
+    """Load a policy with its weights, in evaluation mode; one without a checkpoint has none to load.
+
+    Raises:
+        FieldError: the weights do not fit.
+    """
     from lerobot.policies.factory import get_policy_class
 
+    if config.pretrained_path is None:
+        return get_policy_class(config.type)(config).eval()
     try:
         if config.use_peft:
             return load_with_adapters(config).eval()
@@ -65,9 +71,11 @@ def load_policy(config: PreTrainedConfig) -> Any:
 
 
 def load_processors(config: PreTrainedConfig) -> tuple[Any, Any]:
-    """Load the checkpoint's pre- and postprocessor, on the policy's device."""
+    """Load the checkpoint's pre- and postprocessor, on the policy's device; new ones without a checkpoint."""
     from lerobot.policies.factory import make_pre_post_processors
 
+    if config.pretrained_path is None:
+        return make_pre_post_processors(config)
     overrides = {"device_processor": {"device": config.device}}
     return make_pre_post_processors(config, str(config.pretrained_path), preprocessor_overrides=overrides)
 
@@ -81,6 +89,24 @@ def adopt_features(config: PreTrainedConfig, shown: Mapping[str, tuple[int, ...]
         name: PolicyFeature(type=kinds[name], shape=shape) for name, shape in shown.items()
     }
     config.validate_features()
+
+
+def require_trained(config: PreTrainedConfig) -> None:
+    """Raise FieldError for a policy without a checkpoint, unless it has nothing to train (a planner)."""
+    if config.pretrained_path is None and config.get_optimizer_preset() is not None:
+        raise FieldError(
+            "policy.type", config.type, "would act with random weights", "give a checkpoint: `policy.path`"
+        )
+
+
+def fit_to_environment(
+    config: PreTrainedConfig, shown: Mapping[str, tuple[int, ...]], action_size: int
+) -> None:
+    """Let a policy without features take the environment's; `check_fit` for all others."""
+    adopt_features(config, shown)
+    action = PolicyFeature(type=FeatureType.ACTION, shape=(action_size,))
+    config.output_features = config.output_features or {ACTION: action}
+    check_fit(config, shown, action_size)
 
 
 def check_fit(config: PreTrainedConfig, shown: Mapping[str, tuple[int, ...]], action_size: int) -> None:

@@ -19,9 +19,8 @@ from lerobot.utils.random_utils import set_seed
 from lerobot_wmrl.common.checkpoints import resolve_checkpoint
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.policies import (
-    adopt_features,
-    check_fit,
     check_weights,
+    fit_to_environment,
     load_policy,
     load_processors,
     read_policy_config,
@@ -90,9 +89,7 @@ def _check_environment(config: PreTrainedConfig, env: EnvConfig) -> None:
     features = env_to_policy_features(env)
     action = features.pop(ACTION)
     shown = {name: tuple(feature.shape) for name, feature in features.items()}
-    adopt_features(config, shown)
-    config.output_features = config.output_features or {ACTION: action}
-    check_fit(config, shown, action.shape[0])
+    fit_to_environment(config, shown, action.shape[0])
 
 
 def load_policies(configs: Mapping[str, PreTrainedConfig]) -> list[LoadedPolicy]:

@@ -1,5 +1,6 @@
 """Imagined episodes, recorded as a LeRobotDataset: no simulator."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.recorder import record
+from lerobot_policy_cnn.configuration_cnn import CnnConfig
+from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
 from lerobot_wmrl.common.constants import KINDS
 from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
@@ -75,6 +78,42 @@ def test_the_same_command_again_finds_it_complete_and_other_settings_are_refused
     config.env.done_frames = 1
     with pytest.raises(ValueError, match=r"other settings \(done_frames 2 → 1\)"):
         record(config)
+
+
+def test_a_planner_acts_as_a_policy(config, trained_models):
+    """It has no checkpoint; its settings decide which recording the same command continues."""
+    search = {"horizon": 4, "execute": 2, "samples": 4, "elites": 2, "iterations": 1, "knots": 2}
+    config.num_episodes = 3
+    config.policy = WmMpcConfig(
+        world_model_path=str(trained_models["action_world_model"]), device="cpu", done_frames=2, **search
+    )
+    record(config)
+    dataset = LeRobotDataset("local/imagined", root=config.root)
+    actions = dataset.hf_dataset.with_format("numpy")["action"][:].reshape(3, LENGTH, 7)
+    assert len({episode.tobytes() for episode in actions}) == 3
+    assert (np.abs(actions[..., :2]) > 0).any()
+    config.policy = replace(config.policy, samples=5)
+    with pytest.raises(ValueError, match=r"other settings \(policy\.samples 4 → 5\)"):
+        record(config)
+
+
+def test_a_policy_without_weights_is_refused(config):
+    config.policy = CnnConfig(device="cpu")
+    with pytest.raises(
+        ValueError, match=r"policy\.type=cnn: would act with random weights; give a checkpoint"
+    ):
+        record(config)
+
+
+def test_a_command_that_fails_at_once_leaves_nothing_behind(config, tmp_path):
+    fits = config.policy
+    config.policy = read_policy_config(str(save_untrained_policy(tmp_path / "other", actions=3)), [])
+    before = sorted(tmp_path.iterdir())
+    with pytest.raises(ValueError, match="has 3 action components, the environment 7"):
+        record(config)
+    assert sorted(tmp_path.iterdir()) == before
+    config.policy = fits
+    record(config)
 
 
 def test_what_a_world_model_cannot_do_is_refused(config, make_synthetic_dataset, tmp_path):
