@@ -25,6 +25,10 @@ STUDIES: Final = ROOT / "experiments"
 SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     "value_push": ("Policies", value.value_push),
     "value_pick_place": ("Policies", value.value_pick_place),
+    "value_pick_place_simulator": (
+        "Policies",
+        partial(value.rows_above, ["simulated_ppo"], study=value.SECOND_STUDY, parts=value.SECOND_PARTS),
+    ),
     "value_others": ("Policies", value.value_others),
     "value_iterated": ("Policies", partial(value.rows_above, ["iterated"])),
     "value_simulator": ("Policies", partial(value.rows_above, ["simulated_ppo"])),

@@ -49,11 +49,15 @@ CONTROLS: Final = {
 """What a control's world model learnt from."""
 
 BUDGET: Final = ("demonstrations", "rollouts", "seed")
-MORE_COLOURS: Final = ("#b83280", "#333333", "#d69e2e", "#319795", "#718096", "#9c4221", "#d53f8c", "#553c9a")
+MORE_COLOURS: Final = ("#b83280", "#333333", "#d69e2e", "#319795", "#718096", "#9c4221", "#63b3ed", "#553c9a")
 
 STUDY: Final = "value_push"
 PARTS: Final = ("value_others", "value_iterated", "value_simulator", "value_dyna", "value_imagined")
 """Studies whose cells add methods to its table."""
+
+SECOND_STUDY: Final = "value_pick_place"
+SECOND_PARTS: Final = ("value_pick_place_simulator",)
+"""The same of the second task."""
 
 Cell = dict[str, Any]
 Groups = dict[tuple[int, int], list[Cell]]
@@ -134,7 +138,7 @@ def begun(cells: Sequence[Cell]) -> str:
 
 def value_pick_place(load: Load) -> str:
     """Return the section."""
-    return f"""{comparison(groups(load, "value_pick_place", ()))}
+    return f"""{comparison(groups(load, SECOND_STUDY, SECOND_PARTS))}
 
 The gain is in known scenes. In unseen ones all methods mostly fail: 50 demonstrations in three scenes teach
 grasping in these. PPO in ManiSkill has not been run here, and planning at test time failed in a
@@ -172,11 +176,11 @@ while it trains, and that is counted). The best method of each kind is chosen on
 PPO in imagination and the methods below it use a world model."""
 
 
-def rows_above(methods: Sequence[str], load: Load) -> str:
-    """Return the section of a study whose numbers are in the other one's table."""
-    cells = [cell for each in groups(load).values() for cell in each]
+def rows_above(methods: Sequence[str], load: Load, study: str = STUDY, parts: Sequence[str] = PARTS) -> str:
+    """Return the section of a study whose numbers are in the table of another one, `study`."""
+    cells = [cell for each in groups(load, study, parts).values() for cell in each]
     titles = ", ".join(f'"{TITLES[method]}"' for method in measured(cells, methods))
-    return f"Its rows are in [the table above](#{STUDY}): {titles}."
+    return f"Its rows are in [the table above](#{study}): {titles}."
 
 
 def value_others(load: Load) -> str:
