@@ -30,7 +30,8 @@ def chosen_policy(results: Mapping[str, Any]) -> str:
     if not results["finished"]:
         raise ValueError("the comparison is not finished: run its command again")
     first, *_ = policies = results["policies"]
-    better = [pair["better"] for pair in results["pairs"] if pair["better"] not in (None, first)]
+    against = [pair for pair in results["pairs"] if pair["before"] == first]
+    better = [pair["after"] for pair in against if pair["better"] == pair["after"]]
     return str(max(better, key=lambda name: policies[name]["share"], default=first))
 
 

@@ -34,6 +34,7 @@ SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     "value_simulator": ("Policies", partial(value.rows_above, ["simulated_ppo"])),
     "value_dyna": ("Policies", partial(value.rows_above, ["dyna"])),
     "value_imagined": ("Policies", partial(value.rows_above, ["imagined_cloning"])),
+    "value_distilled_ppo": ("Policies", partial(value.rows_above, ["distilled_ppo"])),
     "value_controls": ("Policies", value.value_controls),
     "demo": ("Policies", policies.demo),
     "cloning_control": ("Policies", policies.cloning_control),

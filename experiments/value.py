@@ -62,12 +62,12 @@ def success(study: Study, name: str) -> dict[str, Any]:
 
 
 def seconds(study: Study, step: str) -> float:
-    """Return the seconds of a finished step, of the study or of the run that it continues.
+    """Return the seconds of a finished step, of the study, of the run that it continues or of what it needs.
 
     Raises:
         ValueError: it is not finished.
     """
-    for folder in (study.folder, Path(study.variables["run"])):
+    for folder in (study.folder, Path(study.variables["run"]), *study.needs.values()):
         if record := read_record(folder, step):
             return float(record["seconds"])
     raise ValueError(f"{study.name}: step {step} is not finished")

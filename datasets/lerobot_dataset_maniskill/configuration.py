@@ -154,7 +154,7 @@ class RecordConfig(RunConfig):
     def _validate_imagination(self) -> None:
         """Raise FieldError for a setting that needs the simulator, or for a missing policy."""
         if self.policy is None:
-            raise FieldError("env.type", "world_model", "needs a policy", "give `policy.path`")
+            raise FieldError("env.type", "world_model", "needs a policy", "give `policy.path`, or a planner")
         for name in ("depth", "tasks"):
             if getattr(self, name):
                 raise FieldError(

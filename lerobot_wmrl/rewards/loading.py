@@ -86,16 +86,11 @@ def load_lerobot_reward(config: RewardModelConfig, cameras: list[str], device: s
     return LeRobotReward(make_reward_model(config), load_preprocessor(config))
 
 
-def load_preprocessor(config: RewardModelConfig, **about: Any) -> PolicyProcessorPipeline:
-    """Return the preprocessor in a reward's checkpoint, or a new one where there is none.
-
-    Args:
-        config: with the folder of the checkpoint and the device.
-        about: what new processors are made from, `dataset_stats` and `dataset_meta`.
-    """
+def load_preprocessor(config: RewardModelConfig) -> PolicyProcessorPipeline:
+    """Return the preprocessor in a reward's checkpoint, or a new one where there is none."""
     saved = sorted(Path(config.pretrained_path).glob(PREPROCESSORS)) if config.pretrained_path else []
     if not saved:
-        return make_reward_pre_post_processors(config, **about)[0]
+        return make_reward_pre_post_processors(config)[0]
     overrides = {"device_processor": {"device": config.device}}
     return PolicyProcessorPipeline.from_pretrained(
         saved[0].parent, config_filename=saved[0].name, overrides=overrides

@@ -3,7 +3,7 @@
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from draccus import ChoiceRegistry
@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 
 BATCH: Final = 32
 """Frames that a reward model looks at together."""
+
+FRAME_REWARDS: Final = ("reward_classifier", "proxy", "embedding")
+"""Types of reward models that judge a frame without the episode around it."""
 
 
 @dataclass
@@ -110,13 +113,15 @@ class ColumnRule(SuccessRule):
 @SuccessRule.register_subclass("reward_model")
 @dataclass
 class RewardModelRule(SuccessRule):
-    """Frames in which one of LeRobot's reward models reaches a threshold: a classifier, SARM, Robometer.
+    """Frames in which a reward model reaches a threshold: LeRobot's classifier, or one of this package.
+
+    LeRobot's other reward models look at whole episodes, one instruction at a time. Let them write a column,
+    and use the type `column`.
 
     Args:
         path: its checkpoint, a folder or a hub id.
-        threshold: the reward from which a frame counts. A classifier gives 0 or 1, SARM the progress from 0
-            to 1.
-        device: where it runs; by default the best device of this machine.
+        threshold: the reward from which a frame counts. A classifier gives 0 or 1.
+        device: where it runs; by default where the checkpoint says.
     """
 
     path: str = ""
@@ -187,6 +192,12 @@ def rewards_of(rule: RewardModelRule, dataset: "LeRobotDataset") -> np.ndarray:
             "path", rule.path, f"no reward model of LeRobot there ({reason})",
             "give the checkpoint of one, as lerobot-train --reward_model.type=… makes it",
         ) from error  # fmt: skip
+    if config.type not in FRAME_REWARDS:
+        raise FieldError(
+            "path", rule.path, f"a reward model of type {config.type} does not judge frames one by one",
+            f"give one of type {', '.join(FRAME_REWARDS)}, or write its rewards into a column and set "
+            "`success.type` to column",
+        )  # fmt: skip
     config.pretrained_path, config.device = str(folder), rule.device or config.device
     missing = [name for name in config.input_features or () if name not in dataset.features]
     if missing:
@@ -198,9 +209,7 @@ def rewards_of(rule: RewardModelRule, dataset: "LeRobotDataset") -> np.ndarray:
         dataset.repo_id, root=dataset.root, delta_timestamps=resolve_delta_timestamps(config, dataset.meta),
         video_backend=VIDEO_BACKEND,
     )  # fmt: skip
-    about: dict[str, Any] = {"dataset_stats": dataset.meta.stats, "dataset_meta": dataset.meta}
-    model = make_reward_model(config, **about).eval()
-    prepare = load_preprocessor(config, **about)
+    model, prepare = make_reward_model(config).eval(), load_preprocessor(config)
     batches = torch.utils.data.DataLoader(shown, BATCH, collate_fn=lerobot_collate_fn)
     with torch.no_grad():
         found = [

@@ -26,7 +26,7 @@ from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.files import writing
 from lerobot_wmrl.data.episodes import DatasetSource
-from lerobot_wmrl.rewards.success_rules import EndsRule, SuccessRule
+from lerobot_wmrl.rewards.success_rules import EndsRule, SuccessRule, rows_of
 
 if TYPE_CHECKING:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -62,8 +62,9 @@ def label(cfg: LabelConfig) -> None:
     solved = cfg.success.frames(dataset)
     with writing("output_dir", cfg.output_dir):
         write_labelled(dataset, solved, cfg.output_dir, cfg.repo_id or f"local/{cfg.output_dir.name}")
-    episode = dataset.hf_dataset.with_format("numpy", columns=["episode_index"])[:]["episode_index"]
-    print("\n".join(report(np.bincount(episode, solved).astype(int), cfg)))
+    episode, *_ = rows_of(dataset)
+    runs = [longest_run(solved[episode == index]) for index in np.unique(episode)]
+    print("\n".join(report(runs, cfg)))
 
 
 def check(cfg: LabelConfig, dataset: "LeRobotDataset") -> None:
@@ -90,18 +91,26 @@ def write_labelled(dataset: "LeRobotDataset", solved: np.ndarray, output_dir: Pa
     partial.rename(output_dir)
 
 
-def report(frames: Sequence[int] | np.ndarray, cfg: LabelConfig) -> list[str]:
+def longest_run(solved: np.ndarray) -> int:
+    """Return the largest number of solved frames in a row. (T,)"""
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], solved, [False]])))
+    return int(np.diff(ends)[::2].max(initial=0))
+
+
+def report(runs: Sequence[int], cfg: LabelConfig) -> list[str]:
     """Return what the labels say, and what cannot be learnt from them.
 
     Args:
-        frames: in which the task is solved, of each episode (E,).
+        runs: the most frames in a row in which the task is solved, of each episode.
         cfg: the command's settings.
     """
-    held = np.array([count for count in frames if count])
-    failures = len(frames) - len(held)
-    said = [f"{cfg.output_dir}: {len(frames)} episodes, of which {len(held)} succeed and {failures} fail."]
+    held = np.array([count for count in runs if count])
+    failures = len(runs) - len(held)
+    said = [f"{cfg.output_dir}: {len(runs)} episodes, of which {len(held)} succeed and {failures} fail."]
     if len(held):
-        said.append(f"Success holds for {held.min()} to {held.max()} frames (median {np.median(held):.0f}).")
+        said.append(
+            f"Success holds for {held.min()} to {held.max()} frames in a row (median {np.median(held):.0f})."
+        )
     if len(held) > 0 and held.min() < DONE_FRAMES:
         short = int((held < DONE_FRAMES).sum())
         said.append(

@@ -31,6 +31,12 @@ def test_the_first_is_kept_unless_another_is_better(better: dict[str, str | None
     assert chosen_policy(results(better)) == chosen
 
 
+def test_being_better_than_another_one_is_not_enough() -> None:
+    found = results({"second": None, "third": None})
+    found["pairs"].append({"before": "second", "after": "third", "better": "third"})
+    assert chosen_policy(found) == "first"
+
+
 def test_an_interrupted_comparison_chooses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "comparison.json").write_text(json.dumps(results({"second": None}, finished=False)))
     monkeypatch.setattr("sys.argv", ["choose_policy", str(tmp_path)])

@@ -121,6 +121,8 @@ def test_what_a_world_model_cannot_do_is_refused(config, make_synthetic_dataset,
     with pytest.raises(ValueError, match="depth=True: cannot be chosen in a world model"):
         record(config)
     config.depth, config.policy = False, None
-    with pytest.raises(ValueError, match=r"env\.type=world_model: needs a policy; give `policy\.path`"):
+    with pytest.raises(
+        ValueError, match=r"env\.type=world_model: needs a policy; give `policy\.path`, or a planner"
+    ):
         record(config)
     assert not config.root.exists()

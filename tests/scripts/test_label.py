@@ -9,11 +9,12 @@ import pytest
 from lerobot.datasets.dataset_tools import remove_feature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.rewards.factory import make_reward_pre_post_processors
+from lerobot.rewards.sarm.configuration_sarm import SARMConfig
 
 from lerobot_wmrl.data.episodes import open_dataset, read_episodes
 from lerobot_wmrl.rewards.configuration_rewards import ProxyConfig
 from lerobot_wmrl.rewards.modeling_rewards import ProxyRewardModel
-from lerobot_wmrl.scripts.label import main
+from lerobot_wmrl.scripts.label import longest_run, main
 
 IMAGE = "observation.images.third_view"
 
@@ -82,6 +83,22 @@ def test_a_reward_may_say_it(
     flags = ["--success.type=column", "--success.column=next.reward", "--success.threshold=1"]
     found = label(monkeypatch, unlabelled, tmp_path / "labelled", *flags)
     assert [*chain(*found)] == read_episodes(small_dataset).done.tolist()
+
+
+def test_frames_in_a_row_are_what_counts() -> None:
+    assert [longest_run(np.array(frames, bool)) for frames in ([1, 0, 1, 0, 1], [0, 1, 1, 0, 1], [0, 0])] == [
+        1, 2, 0,
+    ]  # fmt: skip
+
+
+def test_a_reward_model_of_whole_episodes_is_refused(
+    unlabelled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    SARMConfig(device="cpu").save_pretrained(tmp_path / "reward")
+    with pytest.raises(SystemExit):
+        label(monkeypatch, unlabelled, tmp_path / "labelled", "--success.type=reward_model",
+              f"--success.path={tmp_path / 'reward'}")  # fmt: skip
+    assert "a reward model of type sarm does not judge frames one by one" in capsys.readouterr().err
 
 
 def test_a_reward_model_may_say_it(unlabelled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
