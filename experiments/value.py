@@ -1,14 +1,17 @@
 """Collect one cell of the study of what imagination is worth: every method on the same real episodes."""
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from experiments.choose_policy import chosen_policy
 from experiments.run import read_record
 from experiments.study import Study
 from experiments.success import Results, outcomes, rate
 from lerobot_wmrl.data.budget import Ledger
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
+from lerobot_wmrl.scripts.compare import RESULTS
 
 CELL: Final = ("task", "kind", "demonstrations", "rollouts", "seed", "starts")
 """Variables of the study that say which cell it is."""
@@ -19,19 +22,35 @@ def cell(study: Study) -> Results:
 
     `real_episodes` is what the ledger says was spent, `real_successes` counts those that were merged before
     training: rollouts of Dyna rounds are not among them, and PPO in ManiSkill has none. `start` is the
-    policy that PPO in imagination begins from.
+    policy that PPO in imagination begins from, `imagined` the share of starts from which the policies it is
+    chosen from succeed in imagination.
     """
     methods: dict[str, Sequence[str]] = study.variables["methods"]
     run = Path(study.variables["run"])
-    dataset, start = run / "dataset", run / "start"
+    dataset = run / "dataset"
     results = {
         **{name: study.variables[name] for name in CELL},
         "real_episodes": Ledger(study.budget).read().spent().total(),
         "real_successes": int(recorded_episodes(dataset)["success"].sum()) if dataset.exists() else None,
-        "start": start.resolve().parents[1].name if start.exists() else None,
+        **begun(run),
         "methods": {name: method(study, name, steps) for name, steps in methods.items()},
     }
     return {study.variables["cell"]: results}
+
+
+def begun(run: Path) -> dict[str, Any]:
+    """Return which policy imagination has chosen to begin from, and how often each succeeded in it."""
+    results = run / "comparison" / RESULTS
+    if not results.exists():
+        return {"start": None}
+    found = json.loads(results.read_text())
+    shares = {policy_name(path): rate["share"] for path, rate in found["policies"].items()}
+    return {"start": policy_name(chosen_policy(found)), "imagined": shares}
+
+
+def policy_name(checkpoint: str) -> str:
+    """Return the folder of the training that made a checkpoint: `…/filtered/checkpoints/003000`."""
+    return Path(checkpoint).parents[1].name
 
 
 def control(study: Study) -> Results:

@@ -152,9 +152,13 @@ def test_a_cell_keeps_outcomes_and_minutes(tmp_path: Path, monkeypatch: pytest.M
     episodes = {str(episode): {"spent": "rollouts"} for episode in range(208)}
     write_json(study.budget, {"limits": {}, "episodes": episodes, "trainings": {"dyna": 100}})
     (study.folder / "dataset").mkdir()
-    chosen = study.folder / "filtered" / "checkpoints" / "003000"
-    chosen.mkdir(parents=True)
-    (study.folder / "start").symlink_to(chosen)
+    first, second = (f"runs/{name}/checkpoints/003000" for name in ("filtered", "cloning"))
+    comparison = {
+        "policies": {first: {"share": 0.5}, second: {"share": 0.7}},
+        "finished": True,
+        "pairs": [{"before": first, "after": second, "better": second}],
+    }
+    write_json(study.folder / "comparison" / "comparison.json", comparison)
     table = {"success": np.arange(308) < 140}
     monkeypatch.setattr(value, "recorded_episodes", lambda root: table)
     with pytest.raises(ValueError, match="step cloning is not finished"):
@@ -163,7 +167,8 @@ def test_a_cell_keeps_outcomes_and_minutes(tmp_path: Path, monkeypatch: pytest.M
         write_json(record_path(study.folder, step.name), {"seconds": 60.0})
     (content,) = value.cell(study).values()
     assert (content["real_episodes"], content["real_successes"]) == (308, 140)
-    assert content["start"] == "filtered"
+    assert content["start"] == "cloning"
+    assert content["imagined"] == {"filtered": 0.5, "cloning": 0.7}
     assert content["methods"]["planned"]["minutes"] == 6
     assert content["methods"]["planned"]["seconds_an_episode"] == 6
     assert content["methods"]["filtered"]["ind"]["outcomes"] == [1] * 7 + [0] * 3
