@@ -176,7 +176,6 @@ def rewards_of(rule: RewardModelRule, dataset: "LeRobotDataset") -> np.ndarray:
     from lerobot.datasets.factory import resolve_delta_timestamps
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
     from lerobot.rewards.factory import make_reward_model
-    from lerobot.utils.collate import lerobot_collate_fn
     from tqdm import tqdm
 
     from lerobot_wmrl.common.checkpoints import resolve_checkpoint
@@ -210,7 +209,7 @@ def rewards_of(rule: RewardModelRule, dataset: "LeRobotDataset") -> np.ndarray:
         video_backend=VIDEO_BACKEND,
     )  # fmt: skip
     model, prepare = make_reward_model(config).eval(), load_preprocessor(config)
-    batches = torch.utils.data.DataLoader(shown, BATCH, collate_fn=lerobot_collate_fn)
+    batches = torch.utils.data.DataLoader(shown, BATCH)
     with torch.no_grad():
         found = [
             model.compute_reward(prepare(batch)).float().cpu()

@@ -146,10 +146,11 @@ def test_other_settings_and_foreign_folders_are_refused(recorded: Path, tmp_path
 
 def test_unfinished_work_of_other_settings_is_refused(tmp_path: Path) -> None:
     work = tmp_path / ".dataset.recording"
-    work.mkdir()
+    (work / "part-00000").mkdir(parents=True)
     (work / "recording.json").write_text(json.dumps(config(tmp_path, seed=5).recorded_content()))
     with pytest.raises(ValueError, match="other settings"):
         record(config(tmp_path))
+    assert (work / "part-00000").exists()
 
 
 def test_a_corrupted_finished_dataset_is_reported(recorded: Path, tmp_path: Path) -> None:
