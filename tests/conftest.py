@@ -38,7 +38,12 @@ def dataset_features(cameras: tuple[str, ...], size: int, depth: bool = False) -
         **{f"observation.images.{camera}": image for camera in cameras},
         **{f"observation.images.{camera}_depth": depth_map for camera in cameras if depth},
         "observation.state": {"dtype": "float32", "shape": (8,), "names": list(STATE_NAMES)},
-        "action": {"dtype": "float32", "shape": (7,), "names": list(ACTION_NAMES)},
+        "action": {
+            "dtype": "float32",
+            "shape": (7,),
+            "names": list(ACTION_NAMES),
+            "info": {"low": list(ACTION_LOW), "high": list(ACTION_HIGH)},
+        },
         "next.reward": {"dtype": "float32", "shape": (1,), "names": None},
         **{f"next.{name}": flag for name in ("done", "success", "truncated")},
         **{f"start.{name}": number for name in ("task", "scene", "seed", "kind")},

@@ -26,6 +26,7 @@ from lerobot_wmrl.common.constants import (
     TASKS,
 )
 from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.data.embodiment import HIGH, LOW
 from lerobot_wmrl.data.episodes import parquet_files
 from lerobot_wmrl.maniskill.episode import Frame
 from lerobot_wmrl.maniskill.scenes import SCENES
@@ -70,7 +71,12 @@ def dataset_features(
     return {
         **camera_columns,
         "observation.state": {"dtype": "float32", "shape": (len(STATE_NAMES),), "names": list(STATE_NAMES)},
-        "action": {"dtype": "float32", "shape": (len(ACTION_NAMES),), "names": list(ACTION_NAMES)},
+        "action": {
+            "dtype": "float32",
+            "shape": (len(ACTION_NAMES),),
+            "names": list(ACTION_NAMES),
+            "info": {LOW: list(ACTION_LOW), HIGH: list(ACTION_HIGH)},
+        },
         **{name: {"dtype": dtype, "shape": (1,), "names": None} for name, dtype in scalars.items()},
     }
 

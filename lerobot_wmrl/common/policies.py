@@ -1,16 +1,18 @@
 """Checkpoints of policies, with adapters (PEFT) or without, loaded to act in an environment."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import torch
 from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.default import PeftConfig as AdapterSettings
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.utils.constants import ACTION, OBS_IMAGES
 from safetensors import SafetensorError, safe_open
+from torch import Tensor
 
 from lerobot_wmrl.common.checkpoints import ADAPTERS_FILE, resolve_checkpoint
 from lerobot_wmrl.common.errors import FieldError
@@ -144,6 +146,35 @@ def check_fit(config: PreTrainedConfig, shown: Mapping[str, tuple[int, ...]], ac
             "policy.path", path, f"the policy has {wanted} action components, the environment {action_size}",
             "train it on a dataset with the environment's actions",
         )  # fmt: skip
+
+
+def check_units(
+    config: PreTrainedConfig, postprocessor: Any, names: Sequence[str], low: Tensor, high: Tensor
+) -> None:
+    """Raise FieldError if a policy's actions are in other units than an environment's.
+
+    This is seen from the mean of the actions that the policy was trained on: it must not lie farther outside
+    of the environment's range than this is wide.
+
+    Args:
+        config: the policy's.
+        postprocessor: the policy's, which knows that mean, if actions are normalised.
+        names: one for each component of an action.
+        low, high: the range of the environment's actions. (A,), (A,)
+    """
+    for step in postprocessor.steps:
+        known = (getattr(step, "stats", None) or {}).get(ACTION, {}).get("mean")
+        if known is None:
+            continue
+        mean, least, most = (torch.as_tensor(each).flatten().double().cpu() for each in (known, low, high))
+        strange = (mean < 2 * least - most) | (mean > 2 * most - least)
+        for component in strange.nonzero().flatten().tolist()[:1]:
+            raise FieldError(
+                "policy.path", config.pretrained_path,
+                f"was trained on actions whose {names[component]} is {mean[component]:.4g} on average, the "
+                f"environment's is between {least[component]:.4g} and {most[component]:.4g}",
+                "use a policy with the same actions in the same units",
+            )  # fmt: skip
 
 
 def with_new_adapters(policy: Any, settings: AdapterSettings) -> Any:

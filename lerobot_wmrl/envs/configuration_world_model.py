@@ -10,7 +10,7 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
-from lerobot_wmrl.common.constants import FPS, TASKS
+from lerobot_wmrl.common.constants import TASKS
 from lerobot_wmrl.common.errors import FieldError, require_at_least
 from lerobot_wmrl.data.episodes import DatasetSource
 from lerobot_wmrl.envs.uncertainty import Uncertainty
@@ -86,11 +86,12 @@ class WorldModelEnv(EnvConfig):
         done_threshold: predicted success probability θ at which a frame counts as done (eq. 7).
         done_frames: consecutive done frames k that make a success.
         uncertainty: what happens to episodes about which the world model is uncertain.
+        fps: frames a second, those of the world model's dataset.
         device: device of the models; by default the best one of this machine.
     """
 
     task: str | None = "imagination"
-    fps: int = FPS
+    fps: int = 0
     world_model_path: str = ""
     text_world_model_path: str = ""
     dataset: StartFrames = field(default_factory=StartFrames)
@@ -100,9 +101,7 @@ class WorldModelEnv(EnvConfig):
     done_frames: int = 3
     uncertainty: Uncertainty = field(default_factory=Uncertainty)
     device: str | None = None
-    features: dict[str, PolicyFeature] = field(
-        default_factory=lambda: {ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(7,))}
-    )
+    features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(default_factory=lambda: {ACTION: ACTION, "agent_pos": OBS_STATE})
 
     def __post_init__(self) -> None:
@@ -118,6 +117,12 @@ class WorldModelEnv(EnvConfig):
         from lerobot_wmrl.world_models.checkpoint import read_config
 
         model: Any = read_config(self.world_model_path, "action_world_model")
+        if self.fps not in (0, model.embodiment.fps):
+            raise FieldError(
+                "fps", self.fps, f"the world model has learnt {model.embodiment.fps} frames a second",
+                "leave it out",
+            )  # fmt: skip
+        self.fps = model.embodiment.fps
         self.features[ACTION] = PolicyFeature(type=FeatureType.ACTION, shape=(model.action_size,))
         if model.state_size:
             self.features["agent_pos"] = PolicyFeature(type=FeatureType.STATE, shape=(model.state_size,))

@@ -1,5 +1,6 @@
 """Adapters for lerobot-eval: a tensor environment in numpy, and a counter of steps."""
 
+import logging
 from typing import Any
 
 import gymnasium as gym
@@ -26,6 +27,7 @@ class EvaluationAdapter(gym.vector.VectorEnv):
         self.single_observation_space = numpy_space(env.single_observation_space)
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, env.num_envs)
         self._max_episode_steps = self.env.max_episode_steps
+        self._clipped: list[float] = []
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
@@ -43,6 +45,7 @@ class EvaluationAdapter(gym.vector.VectorEnv):
         observation, reward, terminated, truncated, info = self.env.step(
             torch.from_numpy(np.asarray(actions))
         )
+        self._count_clipped(info.get("reward_parts", {}).get("clipped"))
         ended = (terminated | truncated) & ~self._frozen
         self._last = self._hold(self._last, info.get("final_obs", observation))
         if "final_info" in info:
@@ -54,6 +57,11 @@ class EvaluationAdapter(gym.vector.VectorEnv):
         )
         flags = (terminated & ended).cpu().numpy(), (truncated & ended).cpu().numpy()
         return self._to_numpy(self._last), reward.cpu().numpy(), *flags, result
+
+    def _count_clipped(self, shares: Tensor | None) -> None:
+        """Keep the share of action components (B,) that were out of range, of environments that go on."""
+        if shares is not None:
+            self._clipped.extend(shares[~self._frozen].tolist())
 
     def _hold(self, held: Observation, new: Observation) -> Observation:
         """Return `held` in the rows of frozen sub-environments and `new` in the others."""
@@ -90,6 +98,13 @@ class EvaluationAdapter(gym.vector.VectorEnv):
         return self.call(name)
 
     def close(self, **kwargs: Any) -> None:
+        """Close the environment, and say how many actions it could not take as they were."""
+        if any(self._clipped):
+            logging.warning(
+                "%.1f %% of the components of the policy's actions were out of range, and clipped to it",
+                100 * np.mean(self._clipped),
+            )
+        self._clipped = []
         self.env.close(**kwargs)
 
 

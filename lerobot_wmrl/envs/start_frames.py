@@ -16,7 +16,7 @@ import torch
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from lerobot_wmrl.common.constants import ACTION_LOW, START_SCENE, START_TASK, TASKS
+from lerobot_wmrl.common.constants import START_SCENE, START_TASK, TASKS
 from lerobot_wmrl.common.errors import FieldError, within
 from lerobot_wmrl.data.budget import Ledger
 from lerobot_wmrl.data.episodes import (
@@ -172,7 +172,7 @@ def read_dataset_frames(source: StartFrames, config: WorldModelConfig) -> FirstF
     """Read the first frames of a LeRobotDataset's episodes."""
     assert config.tokenizer is not None, "a trained world model knows its tokenizer"
     table = read_episodes(open_dataset(source.root, source.repo_id))
-    check_dataset(config, table.dataset.features)
+    check_dataset(config, table.dataset.meta)
     episodes = chosen_episodes(table, source)
     if source.past >= config.memory:
         raise FieldError(
@@ -182,7 +182,7 @@ def read_dataset_frames(source: StartFrames, config: WorldModelConfig) -> FirstF
     rows = table.start[episodes, None] + np.arange(source.past + 1)
 
     def depth(model: WorldModelRewardModel) -> Tensor | None:
-        check_dataset(model.config, table.dataset.features)
+        check_dataset(model.config, table.dataset.meta)
         every = model.recorded_depth(table.dataset, rows.reshape(-1))
         return every if every is None else every.unflatten(0, rows.shape)
 
@@ -227,7 +227,7 @@ def read_saved_frames(path: Path, max_starts: int, config: WorldModelConfig) -> 
     rows = evenly_spread(count, max_starts)
     instructions = [str(text) for text in found[INSTRUCTION][rows]]
     state = found[OBS_STATE][rows].astype(np.float32)
-    return _without_past(images[rows], state, instructions, np.full(len(rows), -1))
+    return _without_past(images[rows], state, instructions, np.full(len(rows), -1), config)
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
@@ -264,14 +264,15 @@ def simulate_first_frames(source: StartFrames, config: WorldModelConfig) -> Firs
     simulation.close()
     images = np.stack([np.stack([frame.images[camera] for camera in sizes.cameras]) for frame in frames])
     state = np.stack([frame.state for frame in frames])
-    return _without_past(images, state, instructions, np.array(indices))
+    return _without_past(images, state, instructions, np.array(indices), config)
 
 
 def _without_past(
-    images: np.ndarray, state: np.ndarray, instructions: list[str], tasks: np.ndarray
-) -> FirstFrames:
+    images: np.ndarray, state: np.ndarray, instructions: list[str], tasks: np.ndarray,
+    config: WorldModelConfig,
+) -> FirstFrames:  # fmt: skip
     """Return starts of a single frame each, without depth. images (K, N, H, W, 3), state (K, P)"""
-    actions = np.zeros((len(images), 0, len(ACTION_LOW)), np.float32)
+    actions = np.zeros((len(images), 0, getattr(config, "action_size", 0)), np.float32)
     return FirstFrames(images[:, None], state[:, None], actions, instructions, tasks, _no_depth)
 
 

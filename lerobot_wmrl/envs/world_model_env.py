@@ -1,7 +1,7 @@
 """The world model as a natively batched environment: many imagined episodes, one forward pass a step."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -11,8 +11,6 @@ from lerobot.rewards.factory import make_reward_model
 from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
-from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW, FPS
-from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.start_frames import FirstFrames, Goals, Starts, load_starts, read_first_frames
@@ -37,15 +35,13 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
     """B imagined episodes: tensors in, tensors out, SAME_STEP autoreset with `final_obs` and `final_info`.
 
     Observations: `observation.images.<camera>` (B, 3, H, W) in [0, 1], `observation.state` (B, P) if the
-    model predicts it, `task` (B strings). Actions (B, A) in metres, radians and gripper, clipped to the box;
-    NaN is refused.
+    model predicts it, `task` (B strings). Actions (B, A) in the dataset's units; NaN is refused, and what is
+    out of their range is clipped to it and counted: `reward_parts["clipped"]`, the share of components.
 
     A step synchronises with the device once, to learn whether an episode has ended and whether every action
     was a number. Resets are expensive, so they run only when an episode has ended, and only then the
     instructions of new episodes are fetched.
     """
-
-    metadata: ClassVar[dict[str, Any]] = {"render_fps": FPS, "autoreset_mode": AutoresetMode.SAME_STEP}
 
     def __init__(
         self, model: ActionWorldModelRewardModel, starts: Starts, goals: Goals | None,
@@ -55,9 +51,9 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         self.reward, self.config = reward, config
         self.num_envs, self.max_episode_steps = n_envs, config.episode_length
         self.device = starts.images.device
-        self.action_low, self.action_high = (
-            torch.tensor(bound, device=self.device) for bound in (ACTION_LOW, ACTION_HIGH)
-        )
+        embodiment = model.config.embodiment
+        self.metadata = {"render_fps": embodiment.fps, "autoreset_mode": AutoresetMode.SAME_STEP}
+        self.action_low, self.action_high = model.action_range()
         self.single_action_space = gym.spaces.Box(
             self.action_low.cpu().numpy(), self.action_high.cpu().numpy()
         )
@@ -106,7 +102,8 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         Raises:
             ValueError: the actions have another shape, or contain NaN; then reset before the next step.
         """
-        clipped = self._clip(actions)
+        given = self._checked(actions)
+        clipped = given.clamp(self.action_low, self.action_high)
         imagined = self.model.step(self._imagination, clipped)
         uncertainty = entropies(imagined)
         terminated, truncated = self._advance(imagined, uncertainty)
@@ -116,6 +113,7 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         reward = self.reward.compute_reward({**observation, **parts, "hidden": imagined.hidden})
         reward = self.config.uncertainty.weigh(reward, uncertainty)
         parts |= {**uncertainty, "done_probability": imagined.done_logit.sigmoid()}
+        parts["clipped"] = (given != clipped).float().mean(1)
         info: dict[str, Any] = {"reward_parts": parts}
         finished = terminated | truncated
         any_finished, any_nan = torch.stack([finished.any(), clipped.isnan().any()]).tolist()
@@ -139,7 +137,7 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         Their episodes do not go on. act: observations of the R environments → actions (R, A).
 
         Returns:
-            (R, steps, A), clipped to the box.
+            (R, steps, A), clipped to their range.
         """
         instructions = [self._instructions[row] for row in rows.tolist()]
 
@@ -189,15 +187,14 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         self._start_index = index
         self._instructions = [self.starts.instructions[row] for row in index.tolist()]
 
-    def _clip(self, actions: Tensor) -> Tensor:
-        """Clip actions to the box, float32 on the device. ValueError for another shape than (B, A)."""
+    def _checked(self, actions: Tensor) -> Tensor:
+        """Return actions in float32 on the device. ValueError for another shape than (B, A)."""
         if tuple(actions.shape) != self.action_space.shape:
             raise ValueError(
                 f"action: shape {tuple(actions.shape)}, but {self.num_envs} environments take "
                 f"{self.action_space.shape}"
             )
-        given = torch.as_tensor(actions, dtype=torch.float32, device=self.device)
-        return given.clamp(self.action_low, self.action_high)
+        return torch.as_tensor(actions, dtype=torch.float32, device=self.device)
 
     def _seeded_starts(self, seed: int | Sequence[int] | None) -> Tensor:
         """Seed the generator (by the first of several seeds) and return the starts. → (B,)"""
@@ -254,12 +251,6 @@ class WorldModels(NamedTuple):
 def load_world_models(config: WorldModelEnv, device: str | None) -> WorldModels:
     """Load the models that `config` names. ValueError if one is missing or does not fit the others."""
     model = load_model(config.world_model_path, "action_world_model", device)
-    if model.config.action_size != len(ACTION_LOW):
-        raise FieldError(
-            "world_model_path", config.world_model_path,
-            f"was trained on {model.config.action_size} action components, the action box has "
-            f"{len(ACTION_LOW)}", "train it on a dataset of lerobot-wmrl-record",
-        )  # fmt: skip
     text_model = None
     if config.text_world_model_path:
         text_model = load_model(config.text_world_model_path, "text_world_model", device)

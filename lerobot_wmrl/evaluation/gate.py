@@ -162,7 +162,7 @@ def labelled_recording(model: ActionWorldModelRewardModel, dataset_root: str | P
         FieldError: the dataset does not fit the model, or has no labels of success.
     """
     table = read_episodes(open_dataset(dataset_root))
-    check_dataset(model.config, table.dataset.features)
+    check_dataset(model.config, table.dataset.meta)
     if not table.done_known:
         raise FieldError(
             "dataset.root", dataset_root,

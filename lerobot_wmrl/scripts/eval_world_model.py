@@ -124,7 +124,7 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     cfg.check()
     model = load_model(cfg.model.path, "action_world_model", cfg.device, "model.path")
     table = read_episodes(open_dataset(cfg.dataset.root, cfg.dataset.repo_id))
-    check_dataset(model.config, table.dataset.features)
+    check_dataset(model.config, table.dataset.meta)
     text_model = load_text_model(cfg, model)
     scenes = scene_splits(table.column(START_SCENE), cfg.split)
     episodes = choose_episodes(table, cfg.split, cfg.max_episodes, scenes)

@@ -255,7 +255,7 @@ def train_in(
     processors: tuple[Any, Any],
 ) -> None:
     """Check that policy and environment fit, then train."""
-    from lerobot_wmrl.common.policies import adopt_features, check_fit, with_new_adapters
+    from lerobot_wmrl.common.policies import adopt_features, check_fit, check_units, with_new_adapters
     from lerobot_wmrl.rl.budget import charge_steps
     from lerobot_wmrl.rl.make_callbacks import Trained, make_callbacks
     from lerobot_wmrl.rl.policy_adapters import make_pipeline
@@ -267,6 +267,9 @@ def train_in(
     shown = {name: tuple(value.shape[1:]) for name, value in observation.items() if hasattr(value, "shape")}
     adopt_features(config, shown)
     check_fit(config, shown, env.single_action_space.shape[-1])
+    if isinstance(cfg.env, WorldModelEnv):
+        names = env.model.config.embodiment.action_names
+        check_units(config, processors[1], names, env.action_low, env.action_high)
     if cfg.simulator is not None:
         check_fit(config, cfg.simulator.observation_shapes(), len(ACTION_NAMES))
     if cfg.peft is not None:

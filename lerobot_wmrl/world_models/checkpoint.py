@@ -1,7 +1,7 @@
 """Loading trained models of this package, with errors that say what is wrong and what to do."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,6 +14,7 @@ from safetensors import SafetensorError
 
 from lerobot_wmrl.common.checkpoints import resolve_checkpoint
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.data.embodiment import check_same_robot
 from lerobot_wmrl.data.episodes import check_cameras, check_depth, check_widths
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig, WorldModelConfig
@@ -112,8 +113,12 @@ def load_model(
         ) from error
 
 
-def check_dataset(config: FrameTokenizerConfig | WorldModelConfig, features: Mapping[str, Any]) -> None:
-    """Raise ValueError unless a trained model can learn from, start in or replay a dataset's episodes."""
+def check_dataset(config: FrameTokenizerConfig | WorldModelConfig, meta: Any) -> None:
+    """Raise ValueError unless a trained model can learn from, start in or replay a dataset's episodes.
+
+    meta: the dataset's metadata, a LeRobotDatasetMetadata.
+    """
+    features = meta.features
     sizes = config.tokenizer
     assert sizes is not None, "a trained model knows its tokenizer"
     check_cameras(features, sizes.camera_keys, sizes.image_size)
@@ -123,6 +128,7 @@ def check_dataset(config: FrameTokenizerConfig | WorldModelConfig, features: Map
         check_widths(features, {OBS_STATE: config.state_size})
     if isinstance(config, ActionWorldModelConfig):
         check_widths(features, {ACTION: config.action_size})
+        check_same_robot(config.embodiment, meta)
 
 
 def check_tokenizer_source(config: WorldModelConfig) -> None:

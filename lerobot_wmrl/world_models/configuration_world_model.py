@@ -8,6 +8,7 @@ from lerobot.optim.optimizers import AdamWConfig
 from lerobot.optim.schedulers import LRSchedulerConfig
 
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_share
+from lerobot_wmrl.data.embodiment import Embodiment
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 
 
@@ -152,9 +153,11 @@ class ActionWorldModelConfig(WorldModelConfig):
 
     Args:
         action_size: width of `action`, filled in from the dataset.
+        embodiment: names, ranges and frame rate, filled in from the dataset; imagined episodes keep to them.
     """
 
     action_size: int = 7
+    embodiment: Embodiment = field(default_factory=Embodiment)
 
 
 @RewardModelConfig.register_subclass("text_world_model")

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.clips import Clip, clip_from_windows
+from lerobot_wmrl.data.embodiment import read_embodiment
 from lerobot_wmrl.data.episodes import (
     check_cameras,
     check_depth,
@@ -96,7 +97,7 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
             check_episode_lengths(dataset_meta)
         source = self._adopt_tokenizer() if config.tokenizer_path else None
         if dataset_meta is not None:
-            self._adopt_features(dataset_meta.features)
+            self._adopt_dataset(dataset_meta)
         sizes: Any = config.tokenizer  # given, or adopted above
         self.tokenizer = FrameTokenizer(sizes).requires_grad_(False)
         if source is not None:
@@ -123,11 +124,11 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
         self.config.tokenizer_path = None
         return source
 
-    def _adopt_features(self, features: dict[str, Any]) -> None:
+    def _adopt_dataset(self, meta: Any) -> None:
         """Take the sizes of features from the dataset, or check them against those of a trained model."""
         if self.config.pretrained_path:
-            check_dataset(self.config, features)
-        sizes = self.config.tokenizer
+            check_dataset(self.config, meta)
+        sizes, features = self.config.tokenizer, meta.features
         check_cameras(features, sizes.camera_keys, sizes.image_size)
         if self.config.depth:
             check_depth(features, sizes.camera_keys, sizes.image_size)
@@ -221,9 +222,27 @@ class ActionWorldModelRewardModel(WorldModelRewardModel):
             nn.Linear(config.action_size, width), nn.SiLU(), nn.Linear(width, CONDITION_TOKENS * width)
         )
 
-    def _adopt_features(self, features: dict[str, Any]) -> None:
-        super()._adopt_features(features)
-        self.config.action_size = features[ACTION]["shape"][0]
+    def _adopt_dataset(self, meta: Any) -> None:
+        super()._adopt_dataset(meta)
+        self.config.action_size = meta.features[ACTION]["shape"][0]
+        if not self.config.pretrained_path:
+            self.config.embodiment = read_embodiment(meta, self.config.embodiment)
+
+    def action_range(self) -> tuple[Tensor, Tensor]:
+        """Return the least and the greatest value of each component of an action. (A,), (A,)
+
+        Raises:
+            FieldError: the checkpoint does not say.
+        """
+        embodiment = self.config.embodiment
+        if not embodiment.action_low:
+            raise FieldError(
+                "world_model_path", self.config.pretrained_path, "does not say in which range actions are",
+                "train it with this version of the package",
+            )  # fmt: skip
+        ends = embodiment.action_low, embodiment.action_high
+        low, high = (torch.tensor(end, device=self.state_mean.device) for end in ends)
+        return low, high
 
     def encode_actions(self, actions: Tensor) -> Condition:
         if actions.shape[-1] != self.config.action_size:

@@ -74,7 +74,7 @@ def build_model(config: RewardModelConfig, table: EpisodeTable, output_dir: Path
     checkpoint, meta = latest_checkpoint(output_dir), table.dataset.meta
     if checkpoint is not None:
         model = load_model(checkpoint, config.type, config.device or "cpu")
-        check_dataset(model.config, meta.features)
+        check_dataset(model.config, meta)
         return model
     return make_reward_model(config, dataset_stats=meta.stats, dataset_meta=meta)
 
@@ -173,7 +173,7 @@ def make_joint_sampler(
     """
     more = [read_episodes(open_dataset(root)) for root in data.more]
     for other in more:
-        check_dataset(model.config, other.dataset.features)
+        check_dataset(model.config, other.dataset.meta)
     unlabelled = not any(each.done_known for each in (table, *more))
     first, *others = (
         make_sampler(model, each, chosen, batch_size, seed, unlabelled or each.done_known)

@@ -8,9 +8,14 @@ from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
 from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
-from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.policies import check_fit, load_policy, load_processors, read_policy_config
+from lerobot_wmrl.common.policies import (
+    check_fit,
+    check_units,
+    load_policy,
+    load_processors,
+    read_policy_config,
+)
 from lerobot_wmrl.data.frames import Context, Frames
 from lerobot_wmrl.world_models.checkpoint import check_same_tokenizer, load_model
 from lerobot_wmrl.world_models.modeling_frame_tokenizer import stack_cameras
@@ -36,7 +41,7 @@ class WmMpcPolicy(PreTrainedPolicy):
         if config.objective == "goal":
             text_model = load_model(config.text_world_model_path, "text_world_model", device)
             check_same_tokenizer(model, text_model, "text_world_model_path", config.text_world_model_path)
-        low, high = (torch.tensor(bound, device=device) for bound in (ACTION_LOW, ACTION_HIGH))
+        low, high = model.action_range()
         self.planner = Planner(
             model,
             text_model,
@@ -111,10 +116,12 @@ class Proposal:
         try:
             policy_config = read_policy_config(path, [f"--device={config.device}"])
             check_fit(policy_config, shown, len(low))
+            self.preprocess, self.postprocess = load_processors(policy_config)
+            names = model.config.embodiment.action_names
+            check_units(policy_config, self.postprocess, names, low, high)
             self.policy = load_policy(policy_config)
         except FieldError as error:
             raise FieldError("proposal_path", path, error.problem, error.remedy) from error
-        self.preprocess, self.postprocess = load_processors(policy_config)
 
     def actions(self, frames: Frames, instructions: list[str], images: Tensor, steps: int) -> Tensor:
         """Return the policy's next `steps` actions from B frames on, of which these are the images

@@ -4,9 +4,17 @@ from pathlib import Path
 
 import pytest
 import torch
+from lerobot.configs.types import FeatureType, NormalizationMode, PolicyFeature
+from lerobot.processor import PolicyProcessorPipeline, UnnormalizerProcessorStep
 
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
-from lerobot_wmrl.common.policies import check_fit, check_weights, load_policy, read_policy_config
+from lerobot_wmrl.common.policies import (
+    check_fit,
+    check_units,
+    check_weights,
+    load_policy,
+    read_policy_config,
+)
 from tests.rl.checkpoints import save_untrained_policy
 
 IMAGE = "observation.images.third_view"
@@ -53,3 +61,22 @@ def test_an_environment_that_does_not_fit_is_refused(
     config = read_policy_config(str(save_untrained_policy(tmp_path, camera, size, actions)), [])
     with pytest.raises(ValueError, match=message):
         check_fit(config, {IMAGE: (3, 32, 32)}, action_size=3)
+
+
+@pytest.mark.parametrize(
+    ("mean", "refused"), [((0.1, 0.0), False), ((-0.9, 1.9), False), ((0.0, 45.0), True)]
+)
+def test_a_policy_whose_actions_are_in_other_units_is_refused(
+    mean: tuple[float, float], refused: bool, tmp_path: Path
+) -> None:
+    config = read_policy_config(str(save_untrained_policy(tmp_path)), [])
+    stats = {"action": {"mean": torch.tensor(mean), "std": torch.ones(2)}}
+    feature, norm = PolicyFeature(FeatureType.ACTION, (2,)), {FeatureType.ACTION: NormalizationMode.MEAN_STD}
+    step = UnnormalizerProcessorStep({"action": feature}, norm, stats)
+    pipeline = PolicyProcessorPipeline(steps=[step], name="postprocessor")
+    names, low, high = ["shoulder", "elbow"], torch.zeros(2), torch.ones(2)
+    if not refused:
+        check_units(config, pipeline, names, low, high)
+        return
+    with pytest.raises(ValueError, match="elbow is 45 on average, the environment's is between 0 and 1"):
+        check_units(config, pipeline, names, low, high)

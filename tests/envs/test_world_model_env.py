@@ -201,12 +201,23 @@ def test_an_episode_that_restarts_forgets_what_came_before(env):
     assert not torch.allclose(alone[STATE][1], after[STATE][1], atol=1e-5)
 
 
-def test_actions_are_clipped_to_the_box(env):
+def test_actions_are_clipped_to_their_range_and_counted(env):
     env.reset(seed=1)
-    far = env.step(torch.full((B, 7), 9.0))[0][STATE]
+    far, *_, info = env.step(torch.tensor([*ACTION_HIGH[:-1], 9.0]).expand(B, 7))
+    assert info["reward_parts"]["clipped"].tolist() == pytest.approx([1 / 7] * B)
     env.reset(seed=1)
-    edge = env.step(torch.tensor(ACTION_HIGH).expand(B, 7))[0][STATE]
-    assert torch.equal(far, edge)
+    edge, *_, info = env.step(torch.tensor(ACTION_HIGH).expand(B, 7))
+    assert torch.equal(far[STATE], edge[STATE])
+    assert not info["reward_parts"]["clipped"].any()
+
+
+def test_lerobot_eval_says_how_many_actions_were_out_of_range(env, caplog):
+    adapter = EvaluationAdapter(env)
+    adapter.reset(seed=1)
+    adapter.step(np.zeros((B, 7), np.float32))
+    adapter.step(np.full((B, 7), 9.0, np.float32))
+    adapter.close()
+    assert "50.0 % of the components" in caplog.text
 
 
 def test_actions_that_are_none_are_refused(env):

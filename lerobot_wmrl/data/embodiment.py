@@ -1,0 +1,162 @@
+"""The robot that a dataset shows: names of its actions and states, the range of its actions, frames a second.
+
+A world model keeps this in its checkpoint. Environment, planner and evaluation take it from there.
+"""
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
+
+import numpy as np
+import pyarrow.dataset
+from lerobot.utils.constants import ACTION, OBS_STATE
+
+from lerobot_wmrl.common.errors import FieldError
+
+LOW, HIGH = "low", "high"
+"""Keys of the recorded range of a feature, lists of one number a component, in the feature's `info`."""
+
+QUANTILES: Final = (0.01, 0.99)
+"""Quantiles of the actions from which the range is guessed."""
+
+MARGIN: Final = 0.1
+"""How far the range may reach beyond these quantiles, as a share of the distance between them."""
+
+
+@dataclass
+class Embodiment:
+    """The robot that a world model learns from, filled in from the dataset.
+
+    Args:
+        fps: frames a second.
+        action_names: one name for each component of `action`.
+        action_low: least value of each component, in the dataset's units. By default what the dataset says
+            (`low` and `high` in the `info` of its feature `action`), else the least recorded one, but not
+            far below the 1 % quantile.
+        action_high: greatest value of each component, correspondingly.
+        state_names: one name for each component of `observation.state`.
+    """
+
+    fps: int = 0
+    action_names: list[str] = field(default_factory=list)
+    action_low: list[float] = field(default_factory=list)
+    action_high: list[float] = field(default_factory=list)
+    state_names: list[str] = field(default_factory=list)
+
+    def range_text(self) -> str:
+        """Return the names of the action's components with their ranges."""
+        parts = zip(self.action_names, self.action_low, self.action_high, strict=True)
+        return ", ".join(f"{name} {low:.4g} to {high:.4g}" for name, low, high in parts)
+
+
+def component_names(feature: Mapping[str, Any]) -> list[str]:
+    """Return one name for each component of a feature, their numbers where the dataset has no names.
+
+    LeRobot's datasets have a list of names, or a dictionary with such a list, such as {"motors": […]}.
+    """
+    size, names = int(np.prod(feature["shape"])), feature.get("names")
+    if isinstance(names, Mapping):
+        names = next(iter(names.values())) if len(names) == 1 else list(names)
+    if not isinstance(names, Sequence) or len(names) != size:
+        return [str(component) for component in range(size)]
+    return [str(name) for name in names]
+
+
+def read_embodiment(meta: Any, given: Embodiment) -> Embodiment:
+    """Read what a dataset says about its robot.
+
+    Args:
+        meta: the dataset's metadata, a LeRobotDatasetMetadata.
+        given: the user's settings; the action's range is taken from here where it is given.
+
+    Raises:
+        FieldError: the range that is given or recorded has another number of components, is not finite, or
+            has a lower end above the upper one.
+    """
+    names = component_names(meta.features[ACTION])
+    recorded = recorded_range(meta.features[ACTION])
+    low, high, source = given.action_low, given.action_high, "settings"
+    if bool(low) != bool(high):
+        raise FieldError(
+            "embodiment.action_low", low, f"is given without the other end (action_high={high})",
+            "give both, or neither",
+        )  # fmt: skip
+    if not low and recorded is not None:
+        (low, high), source = recorded, "dataset"
+    if not low:
+        (low, high), source = observed_range(meta), "recorded actions"
+    check_range(low, high, names)
+    found = replace(
+        given, fps=meta.fps, action_names=names, action_low=list(low), action_high=list(high),
+        state_names=component_names(meta.features[OBS_STATE]) if OBS_STATE in meta.features else [],
+    )  # fmt: skip
+    logging.info("range of the actions, from the %s: %s", source, found.range_text())
+    return found
+
+
+def recorded_range(feature: Mapping[str, Any]) -> tuple[list[float], list[float]] | None:
+    """Return the ends of a feature's range, None where the dataset does not say."""
+    info = feature.get("info") or {}
+    if LOW not in info or HIGH not in info:
+        return None
+    return list(map(float, info[LOW])), list(map(float, info[HIGH]))
+
+
+def observed_range(meta: Any) -> tuple[list[float], list[float]]:
+    """Guess the range of each component from the recorded actions.
+
+    It is that of the recorded values, but does not reach beyond the 1 % and 99 % quantiles by more than a
+    tenth of their distance: a single wrong value would widen it at will. A component whose quantiles are the
+    same, such as a gripper that hardly ever moves, keeps its extremes.
+    """
+    files = sorted((meta.root / "data").rglob("*.parquet"))
+    table = pyarrow.dataset.dataset(files, format="parquet").to_table(columns=[ACTION])
+    actions = np.stack(table[ACTION].to_pylist()).astype(np.float64).reshape(table.num_rows, -1)
+    finite = actions[np.isfinite(actions).all(1)]
+    if not len(finite):
+        raise FieldError("dataset.root", meta.root, "none of its actions is finite", "record it again")
+    least, most = finite.min(0), finite.max(0)
+    low, high = np.quantile(finite, QUANTILES, axis=0)
+    margin = np.where(high > low, MARGIN * (high - low), np.inf)
+    low, high = np.maximum(least, low - margin), np.minimum(most, high + margin)
+    outside = ((finite < low) | (finite > high)).any(1).mean()
+    if outside:
+        logging.info("%.1f %% of the recorded actions lie outside of the range below", 100 * outside)
+    return low.tolist(), high.tolist()
+
+
+def check_range(low: Sequence[float], high: Sequence[float], names: Sequence[str]) -> None:
+    """Raise FieldError unless the ends are finite, in order, and one for each component."""
+    for name, end in (("action_low", low), ("action_high", high)):
+        if len(end) != len(names):
+            raise FieldError(
+                f"embodiment.{name}", list(end), f"the dataset's action has {len(names)} components: "
+                f"{', '.join(names)}", "give one number for each",
+            )  # fmt: skip
+    for name, least, most in zip(names, low, high, strict=True):
+        if not (np.isfinite([least, most]).all() and least <= most):
+            raise FieldError(
+                "embodiment.action_low", list(low), f"{name} would range from {least} to {most}",
+                "give finite numbers, the lower end first",
+            )  # fmt: skip
+
+
+def check_same_robot(own: Embodiment, meta: Any) -> None:
+    """Raise FieldError if a dataset shows another robot, or another frame rate, than a world model learnt.
+
+    Names that are numbers say nothing and are not compared.
+    """
+    for column, names in ((ACTION, own.action_names), (OBS_STATE, own.state_names)):
+        found = component_names(meta.features[column]) if column in meta.features else []
+        unnamed = any(each and each[0].isdigit() for each in (*found[:1], *names[:1]))
+        if names and found and not unnamed and names != found:
+            raise FieldError(
+                "dataset.root", meta.root, f"its {column} has the components {', '.join(found)}, the world "
+                f"model has learnt {', '.join(names)}", "use a dataset of the same robot",
+            )  # fmt: skip
+    if own.fps and own.fps != meta.fps:
+        raise FieldError(
+            "dataset.root", meta.root, f"has {meta.fps} frames a second, the world model has learnt "
+            f"{own.fps}", "use a dataset of the same frame rate",
+        )  # fmt: skip

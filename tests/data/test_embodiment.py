@@ -1,0 +1,104 @@
+"""What a dataset says about its robot, and what is refused."""
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from lerobot_wmrl.data.embodiment import (
+    Embodiment,
+    check_same_robot,
+    component_names,
+    observed_range,
+    read_embodiment,
+)
+
+JOINTS = ["shoulder", "elbow", "gripper"]
+FPS = 50
+
+
+def record(
+    root: Path, actions: np.ndarray, names: object = None, info: dict[str, list[float]] | None = None
+) -> LeRobotDatasetMetadata:
+    """Record one episode of these actions (T, 3), without pictures, with LeRobot's own functions."""
+    action = {"dtype": "float32", "shape": (3,), "names": JOINTS if names is None else names}
+    state = {"dtype": "float32", "shape": (2,), "names": {"motors": ["a", "b"]}}
+    features = {"action": action | ({"info": info} if info else {}), "observation.state": state}
+    dataset = LeRobotDataset.create("local/joints", FPS, features, root=root)
+    for row in actions.astype(np.float32):
+        dataset.add_frame({"action": row, "observation.state": np.zeros(2, np.float32), "task": "reach"})
+    dataset.save_episode()
+    dataset.finalize()
+    return LeRobotDatasetMetadata("local/joints", root=root)
+
+
+def degrees(frames: int = 400) -> np.ndarray:
+    """Two joints that sweep their ranges, and a gripper that is opened in one frame alone."""
+    sweep = np.linspace(0, 1, frames)
+    actions = np.stack([-90 + 180 * sweep, 45 * sweep, np.zeros(frames)], 1)
+    actions[7, 2] = 30
+    return actions
+
+
+@pytest.mark.parametrize(("names", "found"), [
+    (["x", "y"], ["x", "y"]), ({"motors": ["x", "y"]}, ["x", "y"]), ({"x": 0, "y": 1}, ["x", "y"]),
+    (None, ["0", "1"]), (["x"], ["0", "1"]), ({"a": ["x"], "b": ["y"]}, ["a", "b"]),
+])  # fmt: skip
+def test_components_have_names(names: object, found: list[str]) -> None:
+    assert component_names({"shape": (2,), "names": names}) == found
+
+
+def test_names_range_and_rate_come_from_the_dataset(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    found = read_embodiment(record(tmp_path / "data", degrees()), Embodiment())
+    assert (found.fps, found.action_names, found.state_names) == (FPS, JOINTS, ["a", "b"])
+    assert found.action_low == pytest.approx([-90, 0, 0])
+    assert found.action_high == pytest.approx([90, 45, 30])
+    assert "shoulder -90 to 90" in caplog.text
+
+
+def test_one_wrong_value_does_not_widen_the_range(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    actions = degrees()
+    actions[3, 0] = 1e6
+    _, high = observed_range(record(tmp_path / "data", actions))
+    assert 90 <= high[0] < 110
+    assert "0.2 % of the recorded actions lie outside" in caplog.text
+
+
+def test_a_recorded_range_goes_before_a_guessed_one_and_a_given_one_before_both(tmp_path: Path) -> None:
+    info = {"low": [-180.0] * 3, "high": [180.0] * 3}
+    meta = record(tmp_path / "data", degrees(), info=info)
+    assert read_embodiment(meta, Embodiment()).action_high == [180.0] * 3
+    given = Embodiment(action_low=[-1.0] * 3, action_high=[1.0] * 3)
+    assert read_embodiment(meta, given).action_high == [1.0] * 3
+
+
+@pytest.mark.parametrize(("low", "high", "message"), [
+    ([0.0], [1.0], "action has 3 components: shoulder, elbow, gripper"),
+    ([0.0] * 3, [], "without the other end"),
+    ([0.0, 2.0, 0.0], [1.0] * 3, r"elbow would range from 2\.0 to 1\.0"),
+    ([0.0, np.nan, 0.0], [1.0] * 3, "elbow would range from nan"),
+])  # fmt: skip
+def test_a_range_that_is_none_is_refused(
+    low: list[float], high: list[float], message: str, tmp_path: Path
+) -> None:
+    meta = record(tmp_path / "data", degrees(10))
+    with pytest.raises(ValueError, match=message):
+        read_embodiment(meta, Embodiment(action_low=low, action_high=high))
+
+
+def test_a_dataset_of_another_robot_is_refused(tmp_path: Path) -> None:
+    meta = record(tmp_path / "data", degrees(10))
+    own = read_embodiment(meta, Embodiment())
+    check_same_robot(own, meta)
+    unnamed = record(tmp_path / "unnamed", degrees(10), names=["0", "1", "2"])
+    check_same_robot(own, unnamed)
+    other = record(tmp_path / "other", degrees(10), names=["dx", "dy", "dz"])
+    with pytest.raises(ValueError, match="dx, dy, dz, the world model has learnt shoulder, elbow, gripper"):
+        check_same_robot(own, other)
+    with pytest.raises(ValueError, match="has 50 frames a second, the world model has learnt 30"):
+        check_same_robot(Embodiment(fps=30), meta)
