@@ -1,6 +1,7 @@
 """A policy's imagined episodes: a part is imagined in one batch, and written like simulated episodes."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ class ImaginedPartRecorder:
     def __init__(self, config: RecordConfig, folder: Path) -> None:
         assert config.imagination is not None
         assert config.policy is not None
-        self.config, self.folder, self.threshold = config, folder, config.imagination.done_threshold
+        self.config, self.folder, self.done_frames = config, folder, config.imagination.done_frames
         self.env: Any = config.imagination.create_tensor_env(min(config.part_episodes, config.num_episodes))
         shown = {name: tuple(space.shape) for name, space in self.env.single_observation_space.items()}
         if shown.get(OBS_STATE) != (len(STATE_NAMES),):
@@ -67,20 +68,20 @@ class ImaginedPartRecorder:
         spare = [0] * (count - len(plans))
         observation, _ = self.env.reset(seed=[*(plan.start for plan in plans), *spare])
         instructions = list(observation["task"])
-        before = self._frames(observation, torch.zeros(count), torch.zeros(count))
+        before = self._frames(observation, torch.zeros(count))
         rows: list[list[Row]] = [[] for _ in plans]
         running = set(range(len(plans)))
         while running:
             action = self._act(observation, noises)
             observation, reward, terminated, truncated, info = self.env.step(torch.from_numpy(action))
-            fired = info["reward_parts"]["done_probability"] >= self.threshold
-            after = self._frames(info.get("final_obs", observation), reward, fired)
+            after = self._frames(info.get("final_obs", observation), reward)
             for index in running:
                 outcome = Outcome(after[index], bool(truncated[index]))
                 rows[index].append((before[index], action[index], outcome))
             running -= set((terminated | truncated).nonzero().flatten().tolist())
             before = after
-        return list(zip(instructions, rows, strict=False))
+        ended = [with_success(each, self.done_frames) for each in rows]
+        return list(zip(instructions, ended, strict=False))
 
     def _act(self, observation: dict[str, Any], noises: list[ExplorationNoise]) -> np.ndarray:
         """Return actions (B, 7) inside the action box."""
@@ -89,14 +90,29 @@ class ImaginedPartRecorder:
         action[: len(noises), :3] += np.stack([noise() for noise in noises])
         return np.clip(action, ACTION_LOW, ACTION_HIGH).astype(np.float32)
 
-    def _frames(self, observation: dict[str, Any], reward: Tensor, success: Tensor) -> list[Frame]:
-        """Return what each environment shows, in the simulator's form."""
+    def _frames(self, observation: dict[str, Any], reward: Tensor) -> list[Frame]:
+        """Return what each environment shows, in the simulator's form, as if it were no success."""
         images = images_to_numpy(observation)
         state = observation[OBS_STATE].cpu().numpy()
         return [
             Frame(
                 {camera: frames[index] for camera, frames in images.items()}, {}, state[index],
-                float(reward[index]), bool(success[index]),
+                float(reward[index]), False,
             )
             for index in range(len(state))
         ]  # fmt: skip
+
+
+def with_success(rows: list[Row], done_frames: int) -> list[Row]:
+    """Mark the frames that made an episode's success: its last `done_frames`, unless it was truncated.
+
+    Single frames that were done without being followed by as many others are no success, as in the
+    environment.
+    """
+    if rows[-1][-1].truncated:
+        return rows
+    solved = [
+        (before, action, replace(outcome, frame=replace(outcome.frame, success=True)))
+        for before, action, outcome in rows[-done_frames:]
+    ]
+    return [*rows[:-done_frames], *solved]

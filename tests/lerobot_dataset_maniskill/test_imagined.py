@@ -1,5 +1,6 @@
 """Imagined episodes, recorded as a LeRobotDataset: no simulator."""
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
+from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 from tests.rl.checkpoints import save_untrained_policy
 
 LENGTH = 4
@@ -69,6 +71,20 @@ def test_an_episode_ends_with_the_k_frame_done(config):
     found = recorded_episodes(config.root)
     assert found["length"].tolist() == [2] * 7
     assert found["success"].all()
+
+
+def test_a_single_done_frame_is_no_success(config, monkeypatch):
+    """Done in the second and in the fourth frame: two frames in a row are wanted."""
+    step, count = ActionWorldModelRewardModel.step, itertools.count(1)
+
+    def every_second(*args):
+        return step(*args)._replace(done_logit=torch.full((3,), 20.0 if next(count) % 2 == 0 else -20.0))
+
+    monkeypatch.setattr(ActionWorldModelRewardModel, "step", every_second)
+    record(config)
+    found = recorded_episodes(config.root)
+    assert found["length"].tolist() == [LENGTH] * 7
+    assert not found["success"].any()
 
 
 def test_the_same_command_again_finds_it_complete_and_other_settings_are_refused(config, capsys):
