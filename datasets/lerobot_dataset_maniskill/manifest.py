@@ -76,21 +76,21 @@ def imagined_episodes(config: RecordConfig) -> list[EpisodePlan]:
     Task, scene and seed are those of the recorded episodes that the frames are from, so that an imagined
     episode can be repeated in ManiSkill.
     """
-    from lerobot_wmrl.data.episodes import open_dataset, read_episodes
+    from lerobot_wmrl.data.episodes import read_episodes
     from lerobot_wmrl.envs.start_frames import chosen_episodes
 
     assert config.imagination is not None
     source = config.imagination.dataset
-    table = read_episodes(open_dataset(source.root, source.repo_id))
+    table = read_episodes(source.open())
     missing = [name for name in START_COLUMNS if name not in table.dataset.features]
     if missing:
         raise FieldError(
             "env.dataset.root",
-            source.root,
+            source.name,
             f"does not say how its episodes began ({', '.join(missing)})",
             "give a dataset that lerobot-wmrl-record recorded: imagined episodes start like its episodes",
         )
-    starts, real = chosen_episodes(table, source), recorded_episodes(Path(source.root))
+    starts, real = chosen_episodes(table, source), recorded_episodes(Path(table.dataset.root))
     plans = []
     for number in range(config.num_episodes):
         start = (config.seed + number) % len(starts)

@@ -28,15 +28,43 @@ OWN_COLUMNS: Final = ("index", "episode_index", "frame_index", "task_index")
 
 @dataclass
 class DatasetSource:
-    """A LeRobotDataset on disk.
+    """A LeRobotDataset, on disk or on the hub.
 
     Args:
         root: folder of the dataset on disk.
-        repo_id: name of the dataset on the hub, if it has one. It is not downloaded.
+        repo_id: name of the dataset on the hub. It is downloaded, into LeRobot's cache, if there is no
+            `root`.
+        revision: branch, tag or commit to download; by default the one of LeRobot's dataset version.
     """
 
     root: str = ""
     repo_id: str | None = None
+    revision: str | None = None
+
+    @property
+    def given(self) -> bool:
+        """Whether a dataset is named."""
+        return bool(self.root or self.repo_id)
+
+    @property
+    def name(self) -> str:
+        """The folder, or the name on the hub, for messages and file names."""
+        return self.root or self.repo_id or ""
+
+    def flags(self, prefix: str = "dataset") -> dict[str, str]:
+        """Return the flags that name the dataset on a command line."""
+        named = {"root": self.root} if self.root else {"repo_id": self.repo_id, "revision": self.revision}
+        return {f"{prefix}.{name}": value for name, value in named.items() if value}
+
+    def open(self) -> LeRobotDataset:
+        """Open the dataset; download it first if it is named by `repo_id` alone.
+
+        Raises:
+            FieldError: there is none, it is not whole, or it cannot be downloaded.
+        """
+        if self.root or not self.repo_id:
+            return open_dataset(self.root, self.repo_id)
+        return download_dataset(self.repo_id, self.revision)
 
 
 @dataclass
@@ -138,6 +166,19 @@ def open_dataset(root: str | Path, repo_id: str | None = None) -> LeRobotDataset
         "dataset.root", root, f"{len(missing)} files are missing, the first is {missing[0]}",
         "copy the dataset again, or remove it and record it again",
     )  # fmt: skip
+
+
+def download_dataset(repo_id: str, revision: str | None = None) -> LeRobotDataset:
+    """Download a dataset of the hub into LeRobot's cache and open it. FieldError if that fails."""
+    try:
+        return LeRobotDataset(repo_id, revision=revision, video_backend=VIDEO_BACKEND)
+    except Exception as error:  # the hub's client, parquet and JSON each raise their own
+        reason = str(error).strip().splitlines()[0]
+        raise FieldError(
+            "dataset.repo_id", repo_id, f"cannot be downloaded ({reason})",
+            "correct the name, log in with `hf auth login` if it is private, or give a folder on disk, "
+            "`dataset.root`",
+        ) from error  # fmt: skip
 
 
 def missing_files(meta: LeRobotDatasetMetadata) -> list[Path]:

@@ -19,6 +19,7 @@ from lerobot.configs.video import DEPTH_METER_UNIT, DepthEncoderConfig, infer_de
 from lerobot.datasets.depth_utils import MM_PER_METRE, dequantize_depth
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.video_utils import decode_video_frames
+from lerobot.utils.constants import HF_LEROBOT_HOME
 from torch import Tensor
 from torch.nn import functional as F
 from tqdm import tqdm
@@ -51,8 +52,10 @@ class FrameEncoder(Protocol):
 
 
 def cache_dir(dataset: LeRobotDataset) -> Path:
-    """Return the folder of a dataset's caches."""
+    """Return the folder of a dataset's caches: beside it, or, in the hub's cache, in LeRobot's folder."""
     root = Path(dataset.root)
+    if root.parent.name == "snapshots":  # the hub's cache has nothing else there
+        return HF_LEROBOT_HOME / "frames" / f"{root.parents[1].name}-{root.name}.cache"
     return root.with_name(root.name + ".cache")
 
 

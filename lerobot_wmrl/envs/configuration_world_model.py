@@ -19,8 +19,8 @@ from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 
 @dataclass
 class StartFrames(DatasetSource):
-    """Where imagined episodes begin: in the first frames of a LeRobotDataset's episodes (`root`), in saved
-    frames (`frames`) or in ManiSkill's resets (`resets`).
+    """Where imagined episodes begin: in the first frames of a dataset's episodes (`root` or `repo_id`), in
+    saved frames (`frames`) or in ManiSkill's resets (`resets`).
 
     Args:
         split: `train` (what the world model was trained on), `validation` (held out) or `all`; `ind` (scenes
@@ -46,16 +46,17 @@ class StartFrames(DatasetSource):
 
     def check(self) -> None:
         """Raise FieldError unless there is exactly one kind of starts, and it can be chosen as asked."""
-        given = [name for name in ("root", "frames", "resets") if getattr(self, name)]
+        given = [name for name in ("given", "frames", "resets") if getattr(self, name)]
         if len(given) != 1:
+            named = " and ".join(given).replace("given", "a dataset") or "nothing"
             raise FieldError(
-                "dataset.root", self.root, f"starts are given by {' and '.join(given) or 'nothing'}",
-                "give one of `dataset.root`, `dataset.frames` and `dataset.resets`",
+                "dataset.root", self.name, f"starts are given by {named}",
+                "give one of `dataset.root`, `dataset.repo_id`, `dataset.frames` and `dataset.resets`",
             )  # fmt: skip
-        if self.past < 0 or (self.past and not self.root):
+        if self.past < 0 or (self.past and not self.given):
             raise FieldError(
                 "dataset.past", self.past, "the frames before a start are those of a dataset, at least 0",
-                "give `dataset.root`; saved frames and resets have no past",
+                "give a dataset; saved frames and resets have no past",
             )  # fmt: skip
         if self.frames and (self.tasks or self.scenes or self.split != "all"):
             raise FieldError(

@@ -23,7 +23,6 @@ from lerobot_wmrl.data.episodes import (
     EpisodeTable,
     choose_episodes,
     evenly_spread,
-    open_dataset,
     read_episodes,
 )
 from lerobot_wmrl.data.frame_cache import cached_frames, frames_to_tensor
@@ -129,7 +128,7 @@ def chosen_episodes(table: EpisodeTable, source: StartFrames) -> np.ndarray:
     ):
         if values and not np.isin(column, values).any():
             raise FieldError(
-                f"dataset.{name}", getattr(source, name), f"no episode of {source.root} has one of them"
+                f"dataset.{name}", getattr(source, name), f"no episode of {source.name} has one of them"
             )
         wanted &= np.isin(column, values) if values else True
     if source.past:
@@ -142,7 +141,7 @@ def check_starts(source: StartFrames, ledger: Ledger | None) -> None:
 
     These are starts that results are reported on, and, if there is a ledger, starts that are not in it.
     """
-    if ledger is not None and not source.root:
+    if ledger is not None and not source.given:
         kind = "frames" if source.frames else "resets"
         raise FieldError(
             f"dataset.{kind}", getattr(source, kind), "under a budget, episodes start in recorded ones",
@@ -153,9 +152,9 @@ def check_starts(source: StartFrames, ledger: Ledger | None) -> None:
             "dataset.split", "ood", "results are reported on unseen scenes: nothing may be learnt in them",
             "choose ind",
         )  # fmt: skip
-    if not source.root:
+    if not source.given:
         return
-    table = read_episodes(open_dataset(source.root, source.repo_id))
+    table = read_episodes(source.open())
     episodes = chosen_episodes(table, source)
     require_unreported(table, episodes, "choose others with `dataset.split=ind` or `dataset.scenes`")
     if ledger is not None:
@@ -171,7 +170,7 @@ def undecided_after(table: EpisodeTable, frames: int) -> np.ndarray:
 def read_dataset_frames(source: StartFrames, config: WorldModelConfig) -> FirstFrames:
     """Read the first frames of a LeRobotDataset's episodes."""
     assert config.tokenizer is not None, "a trained world model knows its tokenizer"
-    table = read_episodes(open_dataset(source.root, source.repo_id))
+    table = read_episodes(source.open())
     check_dataset(config, table.dataset.meta)
     episodes = chosen_episodes(table, source)
     if source.past >= config.memory:

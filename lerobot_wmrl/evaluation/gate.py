@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from scipy.stats import mannwhitneyu
 from torch import Tensor
 
@@ -152,20 +153,21 @@ def success_gate(
     Raises:
         FieldError: the model cannot replay the dataset, or its episodes have no labels of success.
     """
-    return gate_at(predict_outcomes(model, labelled_recording(model, dataset_root)), threshold, frames)
+    recording = labelled_recording(model, open_dataset(dataset_root))
+    return gate_at(predict_outcomes(model, recording), threshold, frames)
 
 
-def labelled_recording(model: ActionWorldModelRewardModel, dataset_root: str | Path) -> Recording:
-    """Open a dataset of rollouts that the model can replay and whose success is recorded.
+def labelled_recording(model: ActionWorldModelRewardModel, dataset: LeRobotDataset) -> Recording:
+    """Read a dataset of rollouts that the model can replay and whose success is recorded.
 
     Raises:
         FieldError: the dataset does not fit the model, or has no labels of success.
     """
-    table = read_episodes(open_dataset(dataset_root))
+    table = read_episodes(dataset)
     check_dataset(model.config, table.dataset.meta)
     if not table.done_known:
         raise FieldError(
-            "dataset.root", dataset_root,
+            "dataset.root", dataset.root,
             "has neither next.success nor next.done, which say whether success holds",
             "use rollouts with labels",
         )  # fmt: skip

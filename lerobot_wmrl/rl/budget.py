@@ -7,7 +7,7 @@ from lerobot.envs.configs import EnvConfig
 
 from lerobot_wmrl.common.errors import within
 from lerobot_wmrl.data.budget import Ledger
-from lerobot_wmrl.data.episodes import open_dataset, read_episodes
+from lerobot_wmrl.data.episodes import DatasetSource, read_episodes
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.envs.start_frames import check_starts
 from lerobot_wmrl.rl.configuration_callbacks import CallbackSettings
@@ -26,14 +26,15 @@ def check_data(settings: CallbackSettings, env: EnvConfig) -> None:
     if ledger is None:
         return
     datasets = {
-        "gate.dataset.root": [settings.gate.dataset.root],
-        "selection.dataset.root": [settings.selection.dataset.root],
-        "dyna.learnt.root": [settings.learnt(env).root] if settings.dyna.rounds else [],
-        "dyna.dataset.roots": settings.dyna.dataset.roots or [],
+        "gate.dataset.root": [settings.gate.dataset],
+        "selection.dataset.root": [settings.selection.dataset],
+        "dyna.learnt.root": [settings.learnt(env)] if settings.dyna.rounds else [],
+        "dyna.dataset.roots": [DatasetSource(root) for root in settings.dyna.dataset.roots or []],
     }
-    for field, roots in datasets.items():
-        for root in filter(None, roots):
-            ledger.require_known(read_episodes(open_dataset(root)), field=field)
+    for field, sources in datasets.items():
+        for source in sources:
+            if source.given:
+                ledger.require_known(read_episodes(source.open()), field=field)
 
 
 def charge_steps(budget: Path, output_dir: Path, steps: int, episode_length: int) -> None:

@@ -127,7 +127,7 @@ class CallbackSettings:
     def learnt(self, env: EnvConfig) -> DatasetSource:
         """Return the dataset that the world model was trained on."""
         own = self.dyna.learnt
-        return own if own.root or not isinstance(env, WorldModelEnv) else env.dataset
+        return own if own.given or not isinstance(env, WorldModelEnv) else env.dataset
 
     def _check_selection_and_gate(self) -> None:
         with within("selection"):
@@ -149,7 +149,7 @@ class CallbackSettings:
             )  # fmt: skip
 
     def _check_gate_has_labels(self) -> None:
-        if not self.gate.dataset.root and self.simulator is None:
+        if not self.gate.dataset.given and self.simulator is None:
             raise FieldError(
                 "gate.action", self.gate.action,
                 "no episode says what success is outside the world model, so its false positives cannot be "
@@ -189,7 +189,7 @@ class CallbackSettings:
                 "give a simulator to record in (`real_env.type`, wmrl_maniskill), or datasets recorded "
                 "elsewhere (`dyna.dataset.roots`)"
             )
-        elif not self.learnt(env).root:
+        elif not self.learnt(env).given:
             problem = "the world model would forget what it was trained on"
             remedy = "give that dataset, `dyna.learnt.root`"
         if problem and remedy:

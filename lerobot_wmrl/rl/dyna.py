@@ -118,11 +118,10 @@ class DynaRounds:
         if number:
             initial = str(self._world_model(self.iterations[number - 1]))
         flags: Flags = {
-            "model.path": initial, "model.device": self.env.device.type, "dataset.root": self.learnt.root,
+            "model.path": initial, "model.device": self.env.device.type, **self.learnt.flags(),
             "dataset.more": str(more), "model.learning_rate": LEARNING_RATE,
             "steps": self.config.steps, "batch_size": self.config.batch_size,
             "save_freq": max(1, self.config.steps // 4), "seed": number, "output_dir": str(output_dir),
-            **({"dataset.repo_id": self.learnt.repo_id} if self.learnt.repo_id else {}),
             **budget_flags(self.budget),
         }  # fmt: skip
         run_subcommand(["lerobot-wmrl-train-world-model", *format_flags(flags)])

@@ -15,6 +15,7 @@ import numpy as np
 from termcolor import colored
 
 from lerobot_wmrl.common.constants import GATE_SEED
+from lerobot_wmrl.data.episodes import open_dataset
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.evaluation.gate import Gate, Outcomes, gate_at, labelled_recording, predict_outcomes
 from lerobot_wmrl.evaluation.pictures import save_strip, side_by_side
@@ -65,8 +66,8 @@ class SuccessGate:
     def run(self, iteration: int, checkpoint: Path, folder: Path) -> Record:
         """Return a verdict for each source of rollouts, and a warning if one is bad or there is none."""
         recordings: dict[str, Recording] = {}
-        if self.config.dataset.root and self._new_model(iteration):
-            recordings[LABELLED] = labelled_recording(self.env.model, self.config.dataset.root)
+        if self.config.dataset.given and self._new_model(iteration):
+            recordings[LABELLED] = labelled_recording(self.env.model, self.config.dataset.open())
         if self.recorder is not None:
             recordings[FRESH] = self._fresh(self.recorder, iteration, checkpoint, folder / "rollouts")
         verdicts = {}
@@ -99,7 +100,7 @@ class SuccessGate:
         episodes = self.config.n_episodes
         first = GATE_SEED + iteration * episodes % (SEEDS - episodes)
         recorder.record(checkpoint, episodes, first, folder)
-        return labelled_recording(self.env.model, folder)
+        return labelled_recording(self.env.model, open_dataset(folder))
 
     def _above(self, verdict: Gate) -> bool:
         return verdict.false_positives.share > self.config.limit

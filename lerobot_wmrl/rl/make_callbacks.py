@@ -72,8 +72,8 @@ def make_measures(settings: CallbackSettings, trained: Trained) -> dict[str, Mea
 
     def measure_in_training_env() -> Any:
         measured_env = env
-        if dataset.root and isinstance(env, WorldModelVectorEnv):
-            measured_env = make_success_env(env, StartFrames(dataset.root, dataset.repo_id))
+        if dataset.given and isinstance(env, WorldModelVectorEnv):
+            measured_env = make_success_env(env, StartFrames(dataset.root, dataset.repo_id, dataset.revision))
         return evaluate_within(measured_env, config, policy, processors, episodes, SELECTION_SEED)
 
     if isinstance(env, WorldModelVectorEnv):

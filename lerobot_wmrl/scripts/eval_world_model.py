@@ -113,7 +113,7 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     """Replay, measure, and write metrics.json, metrics.md and the pictures."""
     from lerobot_wmrl.common.constants import START_SCENE
     from lerobot_wmrl.common.files import write_json, write_text
-    from lerobot_wmrl.data.episodes import choose_episodes, open_dataset, read_episodes
+    from lerobot_wmrl.data.episodes import choose_episodes, read_episodes
     from lerobot_wmrl.data.frame_cache import cached_frames
     from lerobot_wmrl.evaluation.reconstruction import reconstruction_metrics
     from lerobot_wmrl.evaluation.replay import Recording
@@ -123,7 +123,7 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
 
     cfg.check()
     model = load_model(cfg.model.path, "action_world_model", cfg.device, "model.path")
-    table = read_episodes(open_dataset(cfg.dataset.root, cfg.dataset.repo_id))
+    table = read_episodes(cfg.dataset.open())
     check_dataset(model.config, table.dataset.meta)
     text_model = load_text_model(cfg, model)
     scenes = scene_splits(table.column(START_SCENE), cfg.split)
@@ -140,7 +140,7 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
         reports.append(report_agreement(policy_agreement(cfg), cfg.output_dir))
     metrics = {name: value for report in reports for name, value in report.metrics.items()}
     metrics["tokenizer"] = reconstruction_metrics(model, table, recording.frames, episodes)
-    metrics |= {"dataset": cfg.dataset.root, "split": cfg.split}
+    metrics |= {"dataset": cfg.dataset.name, "split": cfg.split}
     page = "\n\n".join(report.page for report in reports)
     write_json(cfg.output_dir / "metrics.json", metrics)
     write_text(cfg.output_dir / "metrics.md", f"{page}\n")
@@ -154,7 +154,7 @@ def conclusion(cfg: EvalWorldModelConfig, episodes: int, report: "Report") -> st
     metrics = report.metrics
     psnr, ceiling = (metrics["headline"][name]["value"] for name in ("psnr", "psnr_ceiling"))
     found = (
-        f"Replayed {episodes} recorded episodes of {cfg.dataset.root} open loop: PSNR {psnr:.1f} dB "
+        f"Replayed {episodes} recorded episodes of {cfg.dataset.name} open loop: PSNR {psnr:.1f} dB "
         f"(the tokenizer alone {ceiling:.1f} dB); false positives: {metrics['false_positives']} of "
         f"{metrics['failures']} failures; recall: {metrics['true_positives']} of {metrics['successes']} "
         "successes."
@@ -206,7 +206,7 @@ def policy_agreement(cfg: EvalWorldModelConfig) -> "Agreement":
     imagination = WorldModelEnv(
         world_model_path=cfg.model.path, reward=GeneralConfig(alpha=1.0), device=cfg.device,
         episode_length=longest or WorldModelEnv.episode_length,
-        dataset=StartFrames(cfg.dataset.root, cfg.dataset.repo_id, split=cfg.split),
+        dataset=StartFrames(cfg.dataset.root, cfg.dataset.repo_id, cfg.dataset.revision, split=cfg.split),
         done_threshold=cfg.done_threshold, done_frames=cfg.done_frames,
     )  # fmt: skip
     outcomes = {

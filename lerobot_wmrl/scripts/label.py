@@ -56,9 +56,8 @@ class LabelConfig(RunConfig):
 
 def label(cfg: LabelConfig) -> None:
     """Write the labelled dataset and say what is in it."""
-    from lerobot_wmrl.data.episodes import open_dataset
 
-    dataset = open_dataset(cfg.dataset.root, cfg.dataset.repo_id)
+    dataset = cfg.dataset.open()
     check(cfg, dataset)
     solved = cfg.success.frames(dataset)
     with writing("output_dir", cfg.output_dir):

@@ -10,6 +10,7 @@ Running the same command again continues from the last checkpoint. `--preset=dem
 new data.
 """
 
+import shlex
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -25,7 +26,7 @@ from lerobot_wmrl.common.command_line import RunConfig, claim_output_dir, requir
 from lerobot_wmrl.common.distributed import LONGEST_WAIT
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
 from lerobot_wmrl.common.precision import PRECISIONS, keep_freed_memory, training_dtype
-from lerobot_wmrl.common.presets import expand_preset
+from lerobot_wmrl.common.presets import expand_preset, format_flags
 from lerobot_wmrl.common.tracking import make_wandb
 from lerobot_wmrl.data.episodes import EpisodeTable, TrainingData
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
@@ -133,7 +134,7 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
     from lerobot.utils.random_utils import set_seed
 
     from lerobot_wmrl.common.checkpoints import latest_checkpoint, require_resumable
-    from lerobot_wmrl.data.episodes import open_dataset, read_episodes
+    from lerobot_wmrl.data.episodes import read_episodes
     from lerobot_wmrl.world_models.checkpoint import config_to_continue
     from lerobot_wmrl.world_models.training import build_model
 
@@ -144,7 +145,7 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
         require_resumable(cfg.output_dir)
     processes = PartialState(cpu=cfg.model.device == "cpu", timeout=LONGEST_WAIT)
     check_processes(cfg, processes.num_processes)
-    table = read_episodes(open_dataset(cfg.dataset.root, cfg.dataset.repo_id))
+    table = read_episodes(cfg.dataset.open())
     check_data(cfg, table)
     given = draccus.encode(cfg)
     checkpoint = latest_checkpoint(cfg.output_dir)
@@ -217,21 +218,20 @@ def quality(cfg: TrainWorldModelConfig, model: Any, table: EpisodeTable) -> str:
 
 def next_command(cfg: TrainWorldModelConfig) -> str:
     """Return the command that usually follows."""
-    root, folder = cfg.dataset.root, cfg.output_dir.parent
+    data, folder = shlex.join(format_flags(cfg.dataset.flags())), cfg.output_dir.parent
     if cfg.model.type == "frame_tokenizer":
         return (
             "lerobot-wmrl-train-world-model --model.type=action_world_model "
-            f"--model.tokenizer_path={cfg.output_dir} --dataset.root={root} "
+            f"--model.tokenizer_path={cfg.output_dir} {data} "
             f"--output_dir={folder / 'action_world_model'}"
         )
     if cfg.model.type == "text_world_model":
         return (
             f"lerobot-wmrl-eval-world-model --model.path={folder / 'action_world_model'} "
-            f"--text_model.path={cfg.output_dir} --dataset.root={root} --output_dir={folder / 'check'}"
+            f"--text_model.path={cfg.output_dir} {data} --output_dir={folder / 'check'}"
         )
     return (
-        f"lerobot-wmrl-eval-world-model --model.path={cfg.output_dir} --dataset.root={root} "
-        f"--output_dir={folder / 'check'}"
+        f"lerobot-wmrl-eval-world-model --model.path={cfg.output_dir} {data} --output_dir={folder / 'check'}"
     )
 
 

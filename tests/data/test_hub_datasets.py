@@ -1,0 +1,61 @@
+"""A dataset that is named by its name on the hub alone."""
+
+from pathlib import Path
+
+import pytest
+from lerobot.datasets import dataset_metadata, lerobot_dataset
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from lerobot_wmrl.data import frame_cache
+from lerobot_wmrl.data.episodes import DatasetSource, TrainingData, read_episodes
+from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig, train_world_model
+from tests.hub_server import Hub
+from tests.trained import tokenizer_config
+
+NAME = "somebody/episodes"
+
+
+@pytest.fixture
+def published(
+    hub: Hub, small_dataset: LeRobotDataset, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> LeRobotDataset:
+    """The small dataset on the hub, and an empty cache of LeRobot's."""
+    for module in (dataset_metadata, lerobot_dataset, frame_cache):
+        for name in ("HF_LEROBOT_HOME", "HF_LEROBOT_HUB_CACHE"):
+            if hasattr(module, name):
+                monkeypatch.setattr(module, name, tmp_path / "home" / ("hub" if "HUB" in name else ""))
+    own = LeRobotDataset(NAME, root=small_dataset.root)
+    own.push_to_hub()
+    return small_dataset
+
+
+def test_it_is_downloaded_once(published: LeRobotDataset, hub: Hub) -> None:
+    source = DatasetSource(repo_id=NAME)
+    assert (source.given, source.name, source.flags()) == (True, NAME, {"dataset.repo_id": NAME})
+    first, second = source.open(), source.open()
+    assert Path(first.root) == Path(second.root) != Path(published.root)
+    table, own = read_episodes(first), read_episodes(published)
+    assert (table.action == own.action).all()
+    assert table.success.tolist() == own.success.tolist()
+
+
+def test_a_tokenizer_trains_on_it(published: LeRobotDataset, tmp_path: Path) -> None:
+    train_world_model(
+        TrainWorldModelConfig(
+            model=tokenizer_config(),
+            dataset=TrainingData(repo_id=NAME),
+            output_dir=tmp_path / "run",
+            steps=1,
+            batch_size=2,
+        )
+    )
+    assert list((tmp_path / "home" / "frames").iterdir()), "the hub's cache holds nothing of ours"
+    snapshots = next((tmp_path / "home" / "hub").glob("datasets--*/snapshots"))
+    assert len(list(snapshots.iterdir())) == 1
+
+
+def test_a_name_that_is_not_there_is_refused(published: LeRobotDataset) -> None:
+    with pytest.raises(ValueError, match=r"dataset\.repo_id=somebody/other: cannot be downloaded"):
+        DatasetSource(repo_id="somebody/other").open()
+    with pytest.raises(ValueError, match=r"cannot be downloaded"):
+        DatasetSource(repo_id=NAME, revision="v9").open()
