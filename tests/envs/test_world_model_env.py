@@ -314,7 +314,7 @@ def test_episodes_begin_in_saved_frames_as_in_those_of_the_dataset(config, env, 
         path.write_bytes(content)
         with pytest.raises(ValueError, match=r"cannot be read.*numpy\.savez"):
             saved.create_tensor_env(2)
-    with pytest.raises(ValueError, match="starts are given by root and frames; give one"):
+    with pytest.raises(ValueError, match="starts are given by a dataset and frames; give one"):
         replace(config, dataset=replace(config.dataset, frames=path)).create_tensor_env(2)
 
 
