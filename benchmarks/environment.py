@@ -22,11 +22,11 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from torch import Tensor
 
 from imagined_env import add_world_models, world_model_env
-from lerobot_wmrl.common.constants import ACTION_LOW
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.envs.start_frames import read_first_frames
 from lerobot_wmrl.envs.world_model_env import WorldModels, WorldModelVectorEnv, load_world_models, make_env_at
+from lerobot_wmrl.maniskill.embodiment import ACTION_LOW
 from lerobot_wmrl.rewards.configuration_rewards import EmbeddingConfig, GeneralConfig, ProxyConfig
 from lerobot_wmrl.rewards.modeling_rewards import EmbeddingRewardModel, GeneralRewardModel, ProxyRewardModel
 from lerobot_wmrl.rewards.similarity import PixelSimilarity

@@ -20,9 +20,9 @@ from typing import Any, Final
 import torch
 from lerobot.utils.import_utils import register_third_party_plugins
 
-from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.precision import imagination_dtype, keep_freed_memory
+from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW
 from lerobot_wmrl.rl.configuration_distillation import fast_planner
 from lerobot_wmrl.world_models.configuration_planner import PlannerSettings
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel

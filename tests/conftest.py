@@ -9,15 +9,8 @@ import numpy as np
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_wmrl.common.constants import (
-    ACTION_HIGH,
-    ACTION_LOW,
-    ACTION_NAMES,
-    FPS,
-    KINDS,
-    STATE_NAMES,
-    TASKS,
-)
+from lerobot_wmrl.common.constants import KINDS, TASKS
+from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW, ACTION_NAMES, FPS, STATE_NAMES
 from tests.hub_client import hub as hub
 
 HOLD_FRAMES = 5

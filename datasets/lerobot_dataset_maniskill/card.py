@@ -13,10 +13,11 @@ import numpy as np
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_dataset_maniskill.writer import VOCABULARY_FILE
-from lerobot_wmrl.common.constants import FPS, KINDS, TASKS
+from lerobot_wmrl.common.constants import KINDS, TASKS
 from lerobot_wmrl.common.files import write_text
 from lerobot_wmrl.common.frame_strips import enlarged, evenly_spaced, in_a_row
 from lerobot_wmrl.common.statistics import Proportion
+from lerobot_wmrl.maniskill.embodiment import FPS
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
 CARD_FILE = Path("README.md")

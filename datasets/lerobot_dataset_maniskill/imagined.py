@@ -14,10 +14,10 @@ from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.manifest import EpisodePlan, Part
 from lerobot_dataset_maniskill.worker import EpisodeResult, ExplorationNoise, Report, whole_part
 from lerobot_dataset_maniskill.writer import Outcome, StartColumns, add_step
-from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW, ACTION_NAMES, STATE_NAMES
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.policies import fit_to_environment, load_policy, load_processors
 from lerobot_wmrl.envs.evaluation_adapter import images_to_numpy
+from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW, ACTION_NAMES, STATE_NAMES
 from lerobot_wmrl.maniskill.episode import Frame
 from lerobot_wmrl.maniskill.tasks import task_of
 from lerobot_wmrl.rl.policy_adapters import make_pipeline

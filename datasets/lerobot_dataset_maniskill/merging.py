@@ -11,8 +11,8 @@ from lerobot.datasets.aggregate import aggregate_datasets
 
 from lerobot_dataset_maniskill.card import CARD_FILE, success_by_kind, write_card
 from lerobot_dataset_maniskill.writer import VOCABULARY_FILE, find_damage, write_vocabulary
-from lerobot_wmrl.common.constants import FPS
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.maniskill.embodiment import FPS
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
 WHOLE: Final = [0, 1]

@@ -19,13 +19,14 @@ from lerobot_dataset_maniskill.manifest import Part, planned_parts
 from lerobot_dataset_maniskill.merging import already_recorded, finish, merge_folders, require_same
 from lerobot_dataset_maniskill.worker import EpisodeResult, PartRecorder, Report, serve_parts
 from lerobot_dataset_maniskill.writer import find_damage
-from lerobot_wmrl.common.constants import ACTION_NAMES, EVALUATION_SEED, GATE_SEED, KINDS
+from lerobot_wmrl.common.constants import EVALUATION_SEED, GATE_SEED, KINDS
 from lerobot_wmrl.common.errors import FieldError, within
 from lerobot_wmrl.common.files import foreign_files, write_json, writing
 from lerobot_wmrl.common.policies import check_weights, fit_to_environment
 from lerobot_wmrl.data.budget import Ledger, spending
 from lerobot_wmrl.data.episodes import open_dataset, read_episodes
 from lerobot_wmrl.maniskill.backend import render_backend, simulating_context
+from lerobot_wmrl.maniskill.embodiment import ACTION_NAMES
 
 CONTENT_FILE: Final = "recording.json"
 POLL_SECONDS: Final = 1.0

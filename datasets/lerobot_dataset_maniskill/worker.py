@@ -24,10 +24,11 @@ from lerobot_dataset_maniskill.manifest import EpisodePlan, Part
 from lerobot_dataset_maniskill.planners import MOTIONS, follow_plan
 from lerobot_dataset_maniskill.planners.kinds import PLAY_STEPS
 from lerobot_dataset_maniskill.writer import HOLD_FRAMES, Outcome, StartColumns, add_step, create_dataset
-from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW, KINDS, PLAY
+from lerobot_wmrl.common.constants import KINDS, PLAY
 from lerobot_wmrl.common.policies import load_policy, load_processors
 from lerobot_wmrl.common.processes import own_progress_lock
 from lerobot_wmrl.maniskill.backend import leave_with_command
+from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW
 from lerobot_wmrl.maniskill.episode import Frame
 from lerobot_wmrl.maniskill.tasks import task_of
 

@@ -15,19 +15,11 @@ from lerobot.configs.video import DepthEncoderConfig, RGBEncoderConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_dataset_maniskill.manifest import EpisodePlan
-from lerobot_wmrl.common.constants import (
-    ACTION_HIGH,
-    ACTION_LOW,
-    ACTION_NAMES,
-    FPS,
-    KINDS,
-    START_COLUMNS,
-    STATE_NAMES,
-    TASKS,
-)
+from lerobot_wmrl.common.constants import KINDS, START_COLUMNS, TASKS
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.data.embodiment import HIGH, LOW
 from lerobot_wmrl.data.episodes import parquet_files
+from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW, ACTION_NAMES, FPS, STATE_NAMES
 from lerobot_wmrl.maniskill.episode import Frame
 from lerobot_wmrl.maniskill.scenes import SCENES
 

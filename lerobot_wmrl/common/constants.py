@@ -2,20 +2,6 @@
 
 from typing import Final
 
-FPS: Final = 25
-"""Control and recording rate in Hz."""
-
-STATE_NAMES: Final = ("tcp_x", "tcp_y", "tcp_z", "tcp_qw", "tcp_qx", "tcp_qy", "tcp_qz", "gripper_opening")
-"""`observation.state`: TCP position (m), TCP quaternion wxyz, gripper opening in [0, 1]."""
-
-ACTION_NAMES: Final = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")
-"""`action`: commanded TCP delta (m), XYZ Euler angles of its rotation (rad), gripper in [-1, 1] (+1 opens).
-Deltas and angles are along and about the axes of the base."""
-
-ACTION_LOW: Final = (-0.05, -0.05, -0.05, -0.25, -0.25, -0.25, -1.0)
-ACTION_HIGH: Final = (0.05, 0.05, 0.05, 0.25, 0.25, 0.25, 1.0)
-"""The one action box: both environments clip to it, the recorder never exceeds it."""
-
 TASKS: Final = ("push", "pull", "pick_place", "move_to_aim")
 """Vocabulary of the column `start.task`."""
 

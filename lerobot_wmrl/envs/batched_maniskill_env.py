@@ -10,11 +10,12 @@ from gymnasium.vector import AutoresetMode
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW, EVALUATION_SEED, FPS
+from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.maniskill_env import image_observations, observation_space
 from lerobot_wmrl.envs.scene_results import SceneResults
 from lerobot_wmrl.maniskill.batched import BatchedFrame
+from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW, FPS
 from lerobot_wmrl.maniskill.scenes import scene_for_seed
 
 

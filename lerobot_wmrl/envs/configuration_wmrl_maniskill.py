@@ -11,10 +11,10 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
-from lerobot_wmrl.common.constants import ACTION_NAMES, FPS, STATE_NAMES
 from lerobot_wmrl.common.errors import FieldError, require_at_least
 from lerobot_wmrl.maniskill.backend import render_backend, require_simulator
 from lerobot_wmrl.maniskill.cameras import CAMERAS, IMAGE_SIZE, ROBOT_MESH_DETAIL, Rendering
+from lerobot_wmrl.maniskill.embodiment import ACTION_NAMES, FPS, STATE_NAMES
 from lerobot_wmrl.maniskill.objects import describe_assets, read_assets, use_assets
 from lerobot_wmrl.maniskill.scenes import Scene, scenes_of
 from lerobot_wmrl.maniskill.tasks import Task, task_of

@@ -12,10 +12,11 @@ from lerobot.envs.utils import FreezeAfterEpisodeEnd
 from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
-from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW, EVALUATION_SEED, FPS, STATE_NAMES
+from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.scene_results import CountingAsyncVectorEnv, CountingSyncVectorEnv
 from lerobot_wmrl.maniskill.backend import simulating_context
+from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW, FPS, STATE_NAMES
 from lerobot_wmrl.maniskill.episode import Frame
 from lerobot_wmrl.maniskill.scenes import scene_for_seed
 

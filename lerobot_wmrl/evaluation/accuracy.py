@@ -9,7 +9,6 @@ import torch
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from lerobot_wmrl.common.constants import STATE_NAMES
 from lerobot_wmrl.common.statistics import Estimate, Proportion, bootstrap_ratio
 from lerobot_wmrl.data.frames import Context
 from lerobot_wmrl.evaluation.gate import first_run
@@ -29,6 +28,7 @@ from lerobot_wmrl.evaluation.replay import (
     Recording,
     imagine_frames,
 )
+from lerobot_wmrl.maniskill.embodiment import STATE_NAMES
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer, feature_distance
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 

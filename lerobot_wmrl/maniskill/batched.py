@@ -13,9 +13,9 @@ import torch
 from mani_skill.utils.structs.pose import Pose
 from torch import Tensor
 
-from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW
 from lerobot_wmrl.maniskill.backend import render_backend
 from lerobot_wmrl.maniskill.cameras import Rendering
+from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW
 from lerobot_wmrl.maniskill.episode import WORKSPACE_FLOOR, Episode
 from lerobot_wmrl.maniskill.objects import OBJECTS
 from lerobot_wmrl.maniskill.robot import GRIPPER_OPEN
@@ -86,7 +86,7 @@ class BatchedFrame:
 
     Args:
         images: camera → (B, H, W, 3) uint8.
-        state: (B, 8) float32, `constants.STATE_NAMES`.
+        state: (B, 8) float32, `embodiment.STATE_NAMES`.
         reward: (B,) float32.
         success: (B,) bool.
     """

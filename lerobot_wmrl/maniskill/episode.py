@@ -5,7 +5,7 @@ from typing import Final
 
 import numpy as np
 
-from lerobot_wmrl.common.constants import FPS
+from lerobot_wmrl.maniskill.embodiment import FPS
 from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS
 from lerobot_wmrl.maniskill.scenes import Scene
 from lerobot_wmrl.maniskill.tasks import Situation, Task
@@ -23,7 +23,7 @@ class Frame:
         images: camera → (H, W, 3) uint8.
         depth: camera → (H, W, 1) uint16, millimetres along the camera's axis, 0 where nothing is; empty
             unless depth was asked for.
-        state: (8,) float32, `constants.STATE_NAMES`.
+        state: (8,) float32, `embodiment.STATE_NAMES`.
         reward: the task's dense reward at this frame.
         success: whether the task is solved at this frame.
     """

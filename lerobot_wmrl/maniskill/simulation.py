@@ -15,10 +15,10 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.structs.types import SimConfig
 from transforms3d.euler import euler2quat
 
-from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW, FPS
 from lerobot_wmrl.maniskill.actors import build_carpet, build_container, build_object, build_table
 from lerobot_wmrl.maniskill.backend import render_backend
 from lerobot_wmrl.maniskill.cameras import VIEWS, Rendering
+from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW, FPS
 from lerobot_wmrl.maniskill.episode import WORKSPACE_FLOOR, Episode, Frame
 from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS
 from lerobot_wmrl.maniskill.rendering import AMBIENT, SUN, SUN_DIRECTION, Variation, camera_config

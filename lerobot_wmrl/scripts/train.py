@@ -30,11 +30,11 @@ from lerobot.configs import PreTrainedConfig, parser
 from lerobot.configs.default import PeftConfig, WandBConfig
 from lerobot.envs.configs import EnvConfig
 from lerobot.rl.algorithms.configs import RLAlgorithmConfig
-from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
+from lerobot.utils.constants import ACTION, CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
 
 from lerobot_wmrl.common.checkpoints import BEST_CHECKPOINT_LINK
 from lerobot_wmrl.common.command_line import RunConfig, claim_output_dir, run_command
-from lerobot_wmrl.common.constants import ACTION_NAMES, EVALUATION_SEED
+from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.distributed import LONGEST_WAIT, rank_and_size, wait_for_all
 from lerobot_wmrl.common.errors import FieldError, require_at_least
 from lerobot_wmrl.common.precision import keep_freed_memory
@@ -271,7 +271,7 @@ def train_in(
         names = env.model.config.embodiment.action_names
         check_units(config, processors[1], names, env.action_low, env.action_high)
     if cfg.simulator is not None:
-        check_fit(config, cfg.simulator.observation_shapes(), len(ACTION_NAMES))
+        check_fit(config, cfg.simulator.observation_shapes(), cfg.simulator.features[ACTION].shape[0])
     if cfg.peft is not None:
         policy = with_new_adapters(policy, cfg.peft)
     algorithm = make_algorithm(policy, cfg.algorithm, cfg.output_dir)

@@ -7,11 +7,12 @@ import pytest
 import torch
 from gymnasium.vector import AutoresetMode
 
-from lerobot_wmrl.common.constants import ACTION_HIGH, TASKS
+from lerobot_wmrl.common.constants import TASKS
 from lerobot_wmrl.data.episodes import DatasetSource
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
 from lerobot_wmrl.envs.uncertainty import Uncertainty
+from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH
 from lerobot_wmrl.rewards.configuration_rewards import EmbeddingConfig, GeneralConfig, ProxyConfig
 from lerobot_wmrl.rewards.modeling_rewards import EmbeddingRewardModel, ProxyRewardModel
 from lerobot_wmrl.rewards.similarity import TokenizerSimilarity

@@ -7,7 +7,7 @@ import pytest
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.worker import ExplorationNoise
-from lerobot_wmrl.common.constants import ACTION_HIGH
+from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH
 
 STEPS = 400
 

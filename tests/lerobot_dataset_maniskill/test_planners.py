@@ -17,8 +17,9 @@ from lerobot_dataset_maniskill.planners.slide import (
     slide_partly,
     stop_short,
 )
-from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW, PLAY
+from lerobot_wmrl.common.constants import PLAY
 from lerobot_wmrl.maniskill.cameras import Rendering
+from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW
 from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS
 from lerobot_wmrl.maniskill.scenes import SCENES, Scene
 from lerobot_wmrl.maniskill.simulation import Simulation

@@ -5,9 +5,9 @@ import pytest
 import sapien
 from transforms3d.quaternions import qconjugate, qmult, quat2axangle
 
-from lerobot_wmrl.common.constants import ACTION_HIGH
 from lerobot_wmrl.maniskill import backend
 from lerobot_wmrl.maniskill.cameras import IMAGE_SIZE, ROBOT_MESH_DETAIL, VIEWS, Rendering
+from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH
 from lerobot_wmrl.maniskill.episode import WORKSPACE_FLOOR, Frame
 from lerobot_wmrl.maniskill.scenes import SCENES
 from lerobot_wmrl.maniskill.simulation import Simulation

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from lerobot_wmrl.common.constants import ACTION_HIGH, ACTION_LOW
+from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW
 from lerobot_wmrl.maniskill.episode import WORKSPACE_FLOOR
 
 GAIN: Final = 2.0
