@@ -1,8 +1,14 @@
 """Functions of images that policies and world models share. B batch, C channels, H height, W width."""
 
 import torch
+from lerobot.utils.constants import OBS_IMAGES
 from torch import Tensor
 from torch.nn import functional as F
+
+
+def camera_key(camera: str) -> str:
+    """Return a camera's key in a dataset: `observation.images.` and its name, or a name that is a key."""
+    return camera if camera.startswith("observation.") else f"{OBS_IMAGES}.{camera}"
 
 
 def coordinates(height: int, width: int, like: Tensor) -> tuple[Tensor, Tensor]:

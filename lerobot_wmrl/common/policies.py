@@ -10,7 +10,7 @@ from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.default import PeftConfig as AdapterSettings
 from lerobot.configs.types import FeatureType, PolicyFeature
-from lerobot.utils.constants import ACTION, OBS_IMAGES
+from lerobot.utils.constants import ACTION, OBS_IMAGE
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
@@ -86,7 +86,7 @@ def adopt_features(config: PreTrainedConfig, shown: Mapping[str, tuple[int, ...]
     """Let a policy that saw no dataset yet see what the environment shows, as lerobot-eval does."""
     if config.input_features:
         return
-    kinds = {name: FeatureType.VISUAL if name.startswith(OBS_IMAGES) else FeatureType.STATE for name in shown}
+    kinds = {name: FeatureType.VISUAL if name.startswith(OBS_IMAGE) else FeatureType.STATE for name in shown}
     config.input_features = {
         name: PolicyFeature(type=kinds[name], shape=shape) for name, shape in shown.items()
     }
@@ -119,7 +119,7 @@ def check_fit(config: PreTrainedConfig, shown: Mapping[str, tuple[int, ...]], ac
         shown: the environment's observations by LeRobot's names with their shapes, images (3, H, W).
         action_size: components of the environment's actions.
     """
-    cameras = ", ".join(name for name in shown if name.startswith(OBS_IMAGES)) or "none"
+    cameras = ", ".join(name for name in shown if name.startswith(OBS_IMAGE)) or "none"
     path = config.pretrained_path
     for name, feature in (config.input_features or {}).items():
         if name not in shown:

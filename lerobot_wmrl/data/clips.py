@@ -13,6 +13,7 @@ import torch
 from lerobot.utils.constants import ACTION, DONE, OBS_STATE
 from torch import Tensor
 
+from lerobot_wmrl.common.images import camera_key
 from lerobot_wmrl.data.episodes import EpisodeTable
 from lerobot_wmrl.data.frame_cache import frames_to_tensor
 from lerobot_wmrl.data.frames import NO_CONTEXT, Context, Frames
@@ -166,7 +167,7 @@ class FrameSampler:
         seen = (rows > start) & self.table.done[np.maximum(rows - 1, start)]
         batch = {"success": torch.from_numpy(seen).to(self.device)}
         for index, camera in enumerate(self.cameras):
-            batch[f"observation.images.{camera}"] = images[:, index]
+            batch[camera_key(camera)] = images[:, index]
             batch[f"reference.{camera}"] = reference[:, index]
         return batch
 

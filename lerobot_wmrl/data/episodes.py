@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.utils.constants import ACTION, DONE, OBS_IMAGES, OBS_STATE
+from lerobot.utils.constants import ACTION, DONE, OBS_IMAGE, OBS_IMAGES, OBS_STATE
 from numpy.typing import ArrayLike
 
 from lerobot_wmrl.common.errors import FieldError
@@ -304,7 +304,7 @@ def check_cameras(features: Mapping[str, Any], camera_keys: Sequence[str], image
     """Raise FieldError unless the dataset has these cameras at that image size."""
     for key in camera_keys:
         if key not in features:
-            cameras = ", ".join(name for name in features if name.startswith(OBS_IMAGES)) or "none"
+            cameras = ", ".join(name for name in features if name.startswith(OBS_IMAGE)) or "none"
             raise FieldError(
                 "tokenizer.cameras", camera_names(camera_keys),
                 f"the dataset has no {key} (its cameras: {cameras})",

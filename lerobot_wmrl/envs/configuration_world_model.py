@@ -8,10 +8,11 @@ import gymnasium as gym
 from lerobot.configs.rewards import RewardModelConfig
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
-from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 
 from lerobot_wmrl.common.constants import TASKS
 from lerobot_wmrl.common.errors import FieldError, require_at_least
+from lerobot_wmrl.common.images import camera_key
 from lerobot_wmrl.data.episodes import DatasetSource
 from lerobot_wmrl.envs.uncertainty import Uncertainty
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
@@ -129,8 +130,9 @@ class WorldModelEnv(EnvConfig):
             self.features["agent_pos"] = PolicyFeature(type=FeatureType.STATE, shape=(model.state_size,))
         for camera in model.tokenizer.cameras:
             shape = (model.tokenizer.image_size, model.tokenizer.image_size, 3)
-            self.features[f"pixels/{camera}"] = PolicyFeature(type=FeatureType.VISUAL, shape=shape)
-            self.features_map[f"pixels/{camera}"] = f"{OBS_IMAGES}.{camera}"
+            pixels = "pixels" if camera == OBS_IMAGE else f"pixels/{camera}"  # as LeRobot's environments do
+            self.features[pixels] = PolicyFeature(type=FeatureType.VISUAL, shape=shape)
+            self.features_map[pixels] = camera_key(camera)
 
     def _check(self) -> None:
         require_at_least(self, 1, "episode_length", "done_frames")

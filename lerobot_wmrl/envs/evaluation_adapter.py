@@ -6,7 +6,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch
-from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
+from lerobot.utils.constants import OBS_IMAGE, OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
 Observation = dict[str, Any]
@@ -77,7 +77,8 @@ class EvaluationAdapter(gym.vector.VectorEnv):
         return kept
 
     def _to_numpy(self, observation: Observation) -> Observation:
-        converted: Observation = {"pixels": images_to_numpy(observation)}
+        images = images_to_numpy(observation)
+        converted: Observation = {"pixels": images.get(OBS_IMAGE, images)}
         if OBS_STATE in observation:
             converted["agent_pos"] = observation[OBS_STATE].cpu().numpy()
         return converted
@@ -89,7 +90,7 @@ class EvaluationAdapter(gym.vector.VectorEnv):
             name: `task`, `task_description`, `render` or `_max_episode_steps`.
         """
         if name == "render":
-            return tuple(next(iter(self._to_numpy(self._last)["pixels"].values())))
+            return tuple(next(iter(images_to_numpy(self._last).values())))
         if name in ("task", "task_description"):
             return tuple(self._last["task"])
         return (getattr(self, name),) * self.num_envs
@@ -109,12 +110,15 @@ class EvaluationAdapter(gym.vector.VectorEnv):
 
 
 def images_to_numpy(observation: Observation) -> dict[str, np.ndarray]:
-    """Return each camera's images of a batch: (B, 3, H, W) float in [0, 1] → (B, H, W, 3) uint8."""
+    """Return each camera's images of a batch: (B, 3, H, W) float in [0, 1] → (B, H, W, 3) uint8.
+
+    Cameras are named without `observation.images.`; LeRobot's `observation.image` keeps its name.
+    """
     prefix = f"{OBS_IMAGES}."
     return {
         key.removeprefix(prefix): (value.permute(0, 2, 3, 1) * 255).round().byte().cpu().numpy()
         for key, value in observation.items()
-        if key.startswith(prefix)
+        if key.startswith(OBS_IMAGE)
     }
 
 
@@ -123,10 +127,11 @@ def numpy_space(space: Any) -> gym.spaces.Dict:
     cameras = {
         key.removeprefix(f"{OBS_IMAGES}."): gym.spaces.Box(0, 255, (*box.shape[1:], 3), np.uint8)
         for key, box in space.items()
-        if key.startswith(OBS_IMAGES)
+        if key.startswith(OBS_IMAGE)
     }
     state = {"agent_pos": space[OBS_STATE]} if OBS_STATE in space.spaces else {}
-    return gym.spaces.Dict({"pixels": gym.spaces.Dict(cameras), **state})
+    pixels = cameras.get(OBS_IMAGE) or gym.spaces.Dict(cameras)
+    return gym.spaces.Dict({"pixels": pixels, **state})
 
 
 class StepCounter:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode
 from lerobot.rewards.factory import make_reward_model
-from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
+from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
 from lerobot_wmrl.data.frames import Frames
@@ -67,8 +67,7 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         config = self.model.config
         size = config.tokenizer.image_size
         spaces: dict[str, gym.Space] = {
-            f"{OBS_IMAGES}.{camera}": gym.spaces.Box(0.0, 1.0, (3, size, size), np.float32)
-            for camera in config.tokenizer.cameras
+            key: gym.spaces.Box(0.0, 1.0, (3, size, size), np.float32) for key in config.tokenizer.camera_keys
         }
         if config.state_size:
             spaces[OBS_STATE] = gym.spaces.Box(-np.inf, np.inf, (config.state_size,), np.float32)
@@ -229,8 +228,7 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         self, images: Tensor, state: Tensor, instructions: Sequence[str] | None = None
     ) -> Observation:
         observation: Observation = {
-            f"{OBS_IMAGES}.{camera}": images[:, index]
-            for index, camera in enumerate(self.model.config.tokenizer.cameras)
+            key: images[:, index] for index, key in enumerate(self.model.config.tokenizer.camera_keys)
         }
         if self.model.config.state_size:
             observation[OBS_STATE] = state

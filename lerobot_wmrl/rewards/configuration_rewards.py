@@ -11,6 +11,7 @@ from lerobot.configs.rewards import RewardModelConfig
 from lerobot.optim.optimizers import AdamWConfig
 
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
+from lerobot_wmrl.common.images import camera_key
 from lerobot_wmrl.rewards.general import check_general_reward
 
 LPIPS_BACKBONES: Final = {"lpips_alex": "alex", "lpips_vgg": "vgg"}
@@ -92,7 +93,7 @@ class ProxyConfig(LearnedRewardConfig):
     @property
     def camera_keys(self) -> list[str]:
         """The cameras' keys in the dataset."""
-        return [f"observation.images.{camera}" for camera in self.cameras]
+        return [camera_key(camera) for camera in self.cameras]
 
     @property
     def observation_delta_indices(self) -> list[int]:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import torch
-from lerobot.utils.constants import OBS_IMAGES
+from lerobot.utils.constants import OBS_IMAGE
 from torch import Tensor
 
 from lerobot_wmrl.rl.protocol import Observation
@@ -26,7 +26,7 @@ class ObservationBuffer:
     def write(self, step: int, observation: Observation) -> None:
         """Store the observations (B, …) of `step`."""
         encoded = {
-            name: to_bytes(value) if name.startswith(OBS_IMAGES) else value
+            name: to_bytes(value) if name.startswith(OBS_IMAGE) else value
             for name, value in observation.items()
             if isinstance(value, Tensor)
         }
@@ -59,7 +59,7 @@ class ObservationBuffer:
 def decoded(stored: dict[str, Tensor], instructions: Sequence[str]) -> Observation:
     """Return stored observations as the policy sees them: images in [0, 1], instructions as texts."""
     return {
-        name: value.float() / 255 if name.startswith(OBS_IMAGES)
+        name: value.float() / 255 if name.startswith(OBS_IMAGE)
         else [instructions[index] for index in value.tolist()] if name == TASK
         else value
         for name, value in stored.items()
@@ -74,6 +74,6 @@ def to_bytes(image: Tensor) -> Tensor:
 def as_read_back(observation: Observation) -> Observation:
     """Return the observation with images rounded to bytes, as an ObservationBuffer would return it."""
     return {
-        name: to_bytes(value).float() / 255 if name.startswith(OBS_IMAGES) else value
+        name: to_bytes(value).float() / 255 if name.startswith(OBS_IMAGE) else value
         for name, value in observation.items()
     }

@@ -9,6 +9,7 @@ from lerobot.optim.optimizers import AdamWConfig
 from lerobot.optim.schedulers import CosineDecayWithWarmupSchedulerConfig, LRSchedulerConfig
 
 from lerobot_wmrl.common.errors import FieldError, require_at_least
+from lerobot_wmrl.common.images import camera_key
 
 PATCH: Final = 4
 """Side in pixels of the squares that the first convolution sees as one."""
@@ -31,7 +32,7 @@ class TokenizerConfig:
     """Which frames become tokens, and how.
 
     Args:
-        cameras: names of the cameras, without `observation.images.`.
+        cameras: names of the cameras, without `observation.images.`; `observation.image` by that name.
         image_size: side of the dataset's square frames in pixels. The dataset must have this size.
         widths: channels from fine to coarse. With one entry a token is 4x4 pixels; each further entry doubles
             its side.
@@ -115,7 +116,7 @@ class TokenizerConfig:
     @property
     def camera_keys(self) -> list[str]:
         """The dataset's keys of the cameras."""
-        return [f"observation.images.{camera}" for camera in self.cameras]
+        return [camera_key(camera) for camera in self.cameras]
 
 
 @RewardModelConfig.register_subclass("frame_tokenizer")

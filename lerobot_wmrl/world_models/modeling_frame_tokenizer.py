@@ -5,6 +5,7 @@ from typing import Any, Final
 
 import torch
 from lerobot.rewards.pretrained import PreTrainedRewardModel
+from lerobot.utils.constants import OBS_IMAGE
 from torch import Tensor
 
 from lerobot_wmrl.common.errors import FieldError
@@ -24,7 +25,7 @@ def stack_cameras(batch: dict[str, Tensor], keys: Sequence[str], size: int) -> T
     """Stack camera images (…, 3, H, W) of a batch → (…, N, 3, H, W). ValueError if one is not there."""
     missing = [key for key in keys if key not in batch]
     if missing:
-        present = [key for key in batch if "images" in key]
+        present = [key for key in batch if key.startswith(OBS_IMAGE)]
         raise ValueError(
             f"the batch lacks the cameras {missing}; it has {present}. Train on a dataset with them."
         )
@@ -64,7 +65,7 @@ class FrameTokenizerRewardModel(HubCard, PreTrainedRewardModel):
         whether it holds at the frames, is needed with the option `success`, which adds the classifier's loss.
         The loss is the same at any `progress` of the training.
         """
-        images, reference = self._stack(batch, "observation.images"), self._reference(batch)
+        images, reference = self._observed(batch), self._reference(batch)
         weight, context = None, NO_CONTEXT
         if reference is not None:
             weight = motion_weight(images, reference)
@@ -75,6 +76,10 @@ class FrameTokenizerRewardModel(HubCard, PreTrainedRewardModel):
         assert reference is not None  # success needs context, and context the reference
         success_loss, success_metrics = self.tokenizer.success.loss(reference, images, batch["success"])
         return loss + SUCCESS_WEIGHT * success_loss, metrics | success_metrics
+
+    def _observed(self, batch: dict[str, Tensor]) -> Tensor:
+        sizes = self.config.tokenizer
+        return stack_cameras(batch, sizes.camera_keys, sizes.image_size)
 
     def _stack(self, batch: dict[str, Tensor], prefix: str) -> Tensor:
         keys = [f"{prefix}.{camera}" for camera in self.config.tokenizer.cameras]
@@ -107,7 +112,7 @@ class FrameTokenizerRewardModel(HubCard, PreTrainedRewardModel):
 
         A context-conditioned tokenizer also needs `reference.*`, the first frames of the episodes.
         """
-        images, reference = self._stack(batch, "observation.images"), self._reference(batch)
+        images, reference = self._observed(batch), self._reference(batch)
         goal = self._stack(batch, "goal")
         context = NO_CONTEXT if reference is None else self.tokenizer.context(reference)
         goal_tokens = self.tokenizer.encode(goal, context)

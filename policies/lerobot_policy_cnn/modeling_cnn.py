@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from huggingface_hub import ModelCard
 from lerobot.policies.pretrained import PreTrainedPolicy
-from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 from torch import Tensor, nn
 from torch.distributions import Normal
 
@@ -205,7 +205,7 @@ class CnnPolicy(PreTrainedPolicy):
         """Return images in [0, 1], the clamped state and instructions of a preprocessed observation."""
         missing = [camera for camera in self.cameras if camera not in observation]
         if missing:
-            shown = ", ".join(name for name in observation if name.startswith(OBS_IMAGES)) or "none"
+            shown = ", ".join(name for name in observation if name.startswith(OBS_IMAGE)) or "none"
             raise ValueError(
                 f"the policy needs {', '.join(missing)}, the environment or dataset shows {shown}: use "
                 "one with the cameras that the policy was trained on"

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 import torch
-from lerobot.utils.constants import OBS_IMAGES
+from lerobot.utils.constants import OBS_IMAGE
 from tokenizers import (
     AddedToken,
     Tokenizer,
@@ -178,7 +178,7 @@ def select_inputs(config: OpenVLAConfig, observation: dict[str, Any]) -> tuple[T
 
 def camera_name(config: OpenVLAConfig, observation: dict[str, Any]) -> str:
     """Return the camera the policy was trained on; else the one that is named, or the only one."""
-    shown = sorted(name for name in observation if name.startswith(OBS_IMAGES))
+    shown = sorted(name for name in observation if name.startswith(OBS_IMAGE))
     wanted = list(config.input_features or ()) or ([config.camera] if config.camera else shown)
     if len(wanted) != 1 or wanted[0] not in shown:
         raise FieldError(

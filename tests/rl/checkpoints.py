@@ -8,6 +8,7 @@ from lerobot.policies.factory import make_pre_post_processors
 
 from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
+from lerobot_wmrl.common.images import camera_key
 
 
 def save_untrained_policy(
@@ -18,7 +19,7 @@ def save_untrained_policy(
     action = PolicyFeature(type=FeatureType.ACTION, shape=(actions,))
     config = CnnConfig(
         device="cpu",
-        input_features={f"observation.images.{camera}": image},
+        input_features={camera_key(camera): image},
         output_features={"action": action},
     )
     CnnPolicy(config).save_pretrained(folder)

@@ -1,4 +1,4 @@
-"""The whole way with a robot that nobody here has built for: three joints in degrees, at 30 Hz."""
+"""The whole way with a robot that nobody here has built for: three joints in degrees, one camera, 30 Hz."""
 
 from pathlib import Path
 
@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.utils.constants import OBS_IMAGE
 
 from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
 from lerobot_policy_wm_mpc.modeling_wm_mpc import WmMpcPolicy
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
+from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from tests.rl.checkpoints import save_untrained_policy
 from tests.scripts.test_train import SHORT, improve
@@ -27,7 +29,7 @@ def episodes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     joints = {"dtype": "float32", "shape": (3,), "names": JOINTS}
     features = {
         "action": joints, "observation.state": joints,
-        "observation.images.top": {
+        OBS_IMAGE: {
             "dtype": "image", "shape": (SIZE, SIZE, 3), "names": ["height", "width", "channels"],
         },
         "next.success": {"dtype": "bool", "shape": (1,), "names": None},
@@ -39,7 +41,7 @@ def episodes(tmp_path_factory: pytest.TempPathFactory) -> Path:
             angles = (LOW + share * np.subtract(HIGH, LOW)).astype(np.float32)
             dataset.add_frame({
                 "action": angles, "observation.state": angles, "task": "reach",
-                "observation.images.top": rng.integers(0, 255, (SIZE, SIZE, 3), np.uint8),
+                OBS_IMAGE: rng.integers(0, 255, (SIZE, SIZE, 3), np.uint8),
                 "next.success": np.array([bool(episode % 2) and frame >= FRAMES - 3]),
             })  # fmt: skip
         dataset.save_episode()
@@ -50,7 +52,7 @@ def episodes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def world_model(episodes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("joints_models")
-    tokenizer = run_training(tokenizer_config(cameras=["top"]), episodes, folder / "tokenizer")
+    tokenizer = run_training(tokenizer_config(cameras=[OBS_IMAGE]), episodes, folder / "tokenizer")
     return run_training(action_config(tokenizer), episodes, folder / "world_model")
 
 
@@ -71,7 +73,7 @@ def test_the_environment_is_that_robot(world_model: Path, episodes: Path) -> Non
     np.testing.assert_allclose(env.single_action_space.low, LOW)
     np.testing.assert_allclose(env.single_action_space.high, HIGH)
     assert env.model.config.embodiment.action_names == JOINTS
-    env.reset(seed=0)
+    assert EvaluationAdapter(env).reset(seed=0)[0]["pixels"].shape == (2, SIZE, SIZE, 3)
     info = env.step(torch.tensor([LOW, [*HIGH[:2], 101.0]]))[-1]
     assert info["reward_parts"]["clipped"].tolist() == pytest.approx([0, 1 / 3])
 
@@ -79,7 +81,7 @@ def test_the_environment_is_that_robot(world_model: Path, episodes: Path) -> Non
 def test_its_policy_is_improved_in_imagination(
     world_model: Path, episodes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    policy = save_untrained_policy(tmp_path / "policy", camera="top", constant=30.0)
+    policy = save_untrained_policy(tmp_path / "policy", camera=OBS_IMAGE, constant=30.0)
     flags = [f"--policy.path={policy}", *SHORT, *imagination(world_model, episodes)]
     improve(monkeypatch, *flags, f"--output_dir={tmp_path / 'rl'}")
     line = read_metrics(tmp_path / "rl")[-1]
@@ -90,7 +92,7 @@ def test_a_policy_in_other_units_is_refused(
     world_model: Path, episodes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
-    policy = save_untrained_policy(tmp_path / "policy", camera="top", constant=5000.0)
+    policy = save_untrained_policy(tmp_path / "policy", camera=OBS_IMAGE, constant=5000.0)
     flags = [f"--policy.path={policy}", *SHORT, *imagination(world_model, episodes)]
     with pytest.raises(SystemExit):
         improve(monkeypatch, *flags, f"--output_dir={tmp_path / 'rl'}")
@@ -107,6 +109,6 @@ def test_it_can_be_planned_for(world_model: Path) -> None:
     image = torch.rand(2, 3, SIZE, SIZE)
     state = torch.tensor([LOW, HIGH])
     planner = WmMpcPolicy(config)
-    action = planner.select_action({"observation.images.top": image, "observation.state": state})
+    action = planner.select_action({OBS_IMAGE: image, "observation.state": state})
     assert action.shape == (2, 3)
     assert ((action >= torch.tensor(LOW)) & (action <= torch.tensor(HIGH))).all()
