@@ -12,12 +12,13 @@ from torch import Tensor
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.manifest import EpisodePlan, Part
-from lerobot_dataset_maniskill.worker import EpisodeResult, ExplorationNoise, Report, whole_part
+from lerobot_dataset_maniskill.worker import EpisodeResult, Report, whole_part
 from lerobot_dataset_maniskill.writer import Outcome, StartColumns, add_step
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.exploration import ExplorationNoise
 from lerobot_wmrl.common.policies import fit_to_environment, load_policy, load_processors
 from lerobot_wmrl.envs.evaluation_adapter import images_to_numpy
-from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW, ACTION_NAMES, STATE_NAMES
+from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW, ACTION_NAMES, STATE_NAMES, TRANSLATION
 from lerobot_wmrl.maniskill.episode import Frame
 from lerobot_wmrl.maniskill.tasks import task_of
 from lerobot_wmrl.rl.policy_adapters import make_pipeline
@@ -61,7 +62,7 @@ class ImaginedPartRecorder:
     def _imagine(self, plans: Sequence[EpisodePlan]) -> list[tuple[str, list[Row]]]:
         """Return each episode's instruction and rows, to the k-frame done or to the horizon."""
         count = self.env.num_envs
-        noises = [ExplorationNoise(self.config.exploration, plan.seed) for plan in plans]
+        noises = [ExplorationNoise(self.config.exploration, plan.seed, TRANSLATION) for plan in plans]
         torch.manual_seed(plans[0].seed)
         for part in (self.policy, *self.processors):
             part.reset()

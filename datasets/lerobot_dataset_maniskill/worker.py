@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import av
 import datasets
@@ -25,21 +25,16 @@ from lerobot_dataset_maniskill.planners import MOTIONS, follow_plan
 from lerobot_dataset_maniskill.planners.kinds import PLAY_STEPS
 from lerobot_dataset_maniskill.writer import HOLD_FRAMES, Outcome, StartColumns, add_step, create_dataset
 from lerobot_wmrl.common.constants import KINDS, PLAY
+from lerobot_wmrl.common.exploration import ExplorationNoise
 from lerobot_wmrl.common.policies import load_policy, load_processors
 from lerobot_wmrl.common.processes import own_progress_lock
 from lerobot_wmrl.maniskill.backend import leave_with_command
-from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW
+from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW, TRANSLATION
 from lerobot_wmrl.maniskill.episode import Frame
 from lerobot_wmrl.maniskill.tasks import task_of
 
 if TYPE_CHECKING:
     from lerobot_wmrl.maniskill.simulation import Simulation
-
-EXPLORATION_STREAM: Final = 1 << 20
-"""Separates the random stream of this noise from that of the starts, seeded by (seed, task, scene)."""
-
-NOISE_MEMORY: Final = 0.9
-"""Autocorrelation of exploration noise from one step to the next: it lasts about ten steps."""
 
 
 class Driver(Protocol):
@@ -67,30 +62,6 @@ class PlannerDriver:
         return self.follower.act(simulation.tcp_position, simulation.object_position)
 
 
-class ExplorationNoise:
-    """First-order autoregressive noise on the translations, its level drawn once an episode.
-
-    Independent noise averages out within a few steps. This noise leads an episode away from the policy's
-    trajectory, to where the policy may be once it has changed.
-
-    Args:
-        largest: of the levels, as a share of the action box.
-        seed: of the episode.
-    """
-
-    def __init__(self, largest: float, seed: int) -> None:
-        self.rng = np.random.default_rng((seed, EXPLORATION_STREAM))
-        self.level = self.rng.uniform(0.0, largest) * np.array(ACTION_HIGH[:3])
-        self.state = self.rng.normal(size=3)
-
-    def __call__(self) -> np.ndarray:
-        """Return what to add to the next action (3,), metres."""
-        offset = self.level * self.state
-        fresh = np.sqrt(1.0 - NOISE_MEMORY**2) * self.rng.normal(size=3)
-        self.state = NOISE_MEMORY * self.state + fresh
-        return offset
-
-
 class PolicyDriver:
     """Acts by a LeRobot policy with its own pre- and postprocessors, and exploration noise on its actions."""
 
@@ -101,7 +72,7 @@ class PolicyDriver:
 
     def begin(self, simulation: "Simulation", plan: EpisodePlan) -> None:
         torch.manual_seed(plan.seed)
-        self.noise = ExplorationNoise(self.exploration, plan.seed)
+        self.noise = ExplorationNoise(self.exploration, plan.seed, TRANSLATION)
         self.policy.reset()
         self.preprocess.reset()
         self.postprocess.reset()

@@ -2,6 +2,8 @@
 
 from typing import Final
 
+import numpy as np
+
 FPS: Final = 25
 """Control and recording rate in Hz."""
 
@@ -15,3 +17,6 @@ Deltas and angles are along and about the axes of the base."""
 ACTION_LOW: Final = (-0.05, -0.05, -0.05, -0.25, -0.25, -0.25, -1.0)
 ACTION_HIGH: Final = (0.05, 0.05, 0.05, 0.25, 0.25, 0.25, 1.0)
 """The range of actions: the environment clips to it, the recorder never exceeds it."""
+
+TRANSLATION: Final = np.array(ACTION_HIGH[:3])
+"""Largest displacement a step along each axis, which exploration noise is measured by. (3,)"""

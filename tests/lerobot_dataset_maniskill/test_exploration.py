@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
-from lerobot_dataset_maniskill.worker import ExplorationNoise
-from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH
+from lerobot_wmrl.common.exploration import ExplorationNoise
+from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, TRANSLATION
 
 STEPS = 400
 
 
 def walk(largest: float, seed: int) -> np.ndarray:
-    noise = ExplorationNoise(largest, seed)
+    noise = ExplorationNoise(largest, seed, TRANSLATION)
     return np.array([noise() for _ in range(STEPS)]) / ACTION_HIGH[:3]
 
 
