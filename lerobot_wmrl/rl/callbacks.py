@@ -7,22 +7,15 @@ was killed and resumed reads the record instead of running the callback again.
 import json
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-import draccus
-from lerobot.envs.configs import EnvConfig
-from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from lerobot.utils.utils import flatten_dict
 
 from lerobot_wmrl.common.distributed import rank_and_size, wait_for_all
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.lerobot_compat import checkpoint_name
-from lerobot_wmrl.common.presets import Flags, format_flags
-from lerobot_wmrl.common.processes import run_subcommand
 from lerobot_wmrl.common.tracking import Tracker
-from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.rl.seeds import preserved_randomness
 
 RECORD_FILE = "record.json"
@@ -31,9 +24,6 @@ REAL_STEPS = "real_steps"
 
 Record = dict[str, Any]
 """JSON that a callback returns. Its numbers are logged as `<name>/<key>`."""
-
-DERIVED = ("features", "features_map", "cameras")
-"""Settings of an environment that are derived from others, or that the caller passes itself."""
 
 
 class Callback(Protocol):
@@ -149,52 +139,3 @@ def record_metrics(name: str, record: Record) -> dict[str, float]:
         for key, value in flatten_dict(record).items()
         if isinstance(value, int | float) and not isinstance(value, bool) and key != REAL_STEPS
     }
-
-
-@dataclass(frozen=True)
-class RolloutRecorder:
-    """Records a policy in ManiSkill with lerobot-wmrl-record, in a process of its own.
-
-    Args:
-        env: the environment.
-        num_workers: simulators at once.
-        cameras: names of the recorded cameras.
-        depth: whether depth is recorded too.
-        budget: ledger in which the episodes are entered; None without.
-    """
-
-    env: WmrlManiSkillEnv
-    num_workers: int
-    cameras: Sequence[str]
-    depth: bool
-    budget: Path | None = None
-
-    def record(
-        self, checkpoint: Path, episodes: int, seed: int, folder: Path, exploration: float = 0.0
-    ) -> None:
-        """Record a dataset in `folder`, or complete it after a kill. Episode i starts from `seed` + i."""
-        flags: Flags = {
-            "policy.path": str(checkpoint / PRETRAINED_MODEL_DIR), **env_flags(self.env),
-            "env.cameras": str(list(self.cameras)), "depth": self.depth, "num_workers": self.num_workers,
-            "num_episodes": episodes, "seed": seed, "exploration": exploration, "output_dir": str(folder),
-            **budget_flags(self.budget),
-        }  # fmt: skip
-        run_subcommand(["lerobot-wmrl-record", *format_flags(flags)])
-
-
-def budget_flags(budget: Path | None) -> Flags:
-    """Return the flag that keeps a command within the budget of this training, if it has one."""
-    return {} if budget is None else {"budget": str(budget)}
-
-
-def env_flags(env: EnvConfig) -> Flags:
-    """Return `env.type` and the settings that differ from their defaults, as a command takes them."""
-    given, default = (flatten_dict(draccus.encode(each, EnvConfig), sep=".") for each in (env, type(env)()))
-    differing = [name for name in given if given[name] != default.get(name)]
-    chosen = {
-        name
-        for name in given
-        if name.endswith(".type") and any(each.startswith(name.removesuffix("type")) for each in differing)
-    }
-    kept = [name for name in given if name in {*differing, *chosen} and name.split(".")[0] not in DERIVED]
-    return {"env.type": env.type, **{f"env.{name}": given[name] for name in kept}}

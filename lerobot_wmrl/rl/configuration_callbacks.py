@@ -8,7 +8,6 @@ from lerobot.envs.configs import EnvConfig
 
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice, require_share, within
 from lerobot_wmrl.data.episodes import DatasetSource
-from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 
 GATE_ACTIONS: Final = ("stop", "warn", "off")
@@ -119,11 +118,6 @@ class CallbackSettings:
         if self.budget is not None and self.selection.freq:
             self._check_selection_is_imagined(env)
 
-    @property
-    def simulator(self) -> WmrlManiSkillEnv | None:
-        """The environment in which lerobot-wmrl-record can record, if `real_env` is one."""
-        return self.real_env if isinstance(self.real_env, WmrlManiSkillEnv) else None
-
     def learnt(self, env: EnvConfig) -> DatasetSource:
         """Return the dataset that the world model was trained on."""
         own = self.dyna.learnt
@@ -149,13 +143,13 @@ class CallbackSettings:
             )  # fmt: skip
 
     def _check_gate_has_labels(self) -> None:
-        if not self.gate.dataset.given and self.simulator is None:
+        if not self.gate.dataset.given and self.real_env is None:
             raise FieldError(
                 "gate.action", self.gate.action,
                 "no episode says what success is outside the world model, so its false positives cannot be "
                 "counted",
-                "give labelled rollouts (`gate.dataset.root`) or a simulator (`real_env.type`, "
-                "wmrl_maniskill), or train unchecked with `gate.action` warn",
+                "give labelled rollouts (`gate.dataset.root`) or an environment to record some in "
+                "(`real_env.type`), or train unchecked with `gate.action` warn",
             )  # fmt: skip
 
     def _check_dyna_sizes(self, iterations: int) -> None:
@@ -183,11 +177,11 @@ class CallbackSettings:
                 "refreshed one"
             )
             remedy = "choose `env.reward.type` general or proxy"
-        elif self.simulator is None and self.dyna.dataset.roots is None:
+        elif self.real_env is None and self.dyna.dataset.roots is None:
             problem = "there are no new episodes to learn from"
             remedy = (
-                "give a simulator to record in (`real_env.type`, wmrl_maniskill), or datasets recorded "
-                "elsewhere (`dyna.dataset.roots`)"
+                "give an environment to record in (`real_env.type`), or datasets recorded elsewhere "
+                "(`dyna.dataset.roots`)"
             )
         elif not self.learnt(env).given:
             problem = "the world model would forget what it was trained on"

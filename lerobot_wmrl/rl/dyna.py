@@ -18,8 +18,9 @@ from lerobot_wmrl.common.processes import run_subcommand
 from lerobot_wmrl.data.episodes import DatasetSource, open_dataset
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.rl.algorithm import TrainingStopped
-from lerobot_wmrl.rl.callbacks import REAL_STEPS, Record, RolloutRecorder, budget_flags, record_folder
+from lerobot_wmrl.rl.callbacks import REAL_STEPS, Record, record_folder
 from lerobot_wmrl.rl.configuration_callbacks import DYNA_SEEDS, DynaConfig
+from lerobot_wmrl.rl.recorders import Recorder, budget_flags
 from lerobot_wmrl.world_models.checkpoint import load_model
 
 NOISE_LEVELS: Final = {"calm": 0.0, "noisy": 0.4}
@@ -54,7 +55,7 @@ class DynaRounds:
 
     config: DynaConfig
     env: WorldModelVectorEnv
-    recorder: RolloutRecorder | None
+    recorder: Recorder | None
     learnt: DatasetSource
     output_dir: Path
     total: int
@@ -96,9 +97,7 @@ class DynaRounds:
             f"`dyna.dataset.roots` ({len(given)} there now), and repeat the command: it continues from here"
         )
 
-    def _record(
-        self, recorder: RolloutRecorder, noise: str, number: int, checkpoint: Path, folder: Path
-    ) -> Path:
+    def _record(self, recorder: Recorder, noise: str, number: int, checkpoint: Path, folder: Path) -> Path:
         half, n_episodes = list(NOISE_LEVELS).index(noise), self.config.n_episodes  # first or second half
         seed = EVALUATION_SEED - DYNA_SEEDS + number * n_episodes + half * (n_episodes // 2)
         recorder.record(checkpoint, (n_episodes + half) // 2, seed, folder / noise, NOISE_LEVELS[noise])

@@ -21,8 +21,9 @@ from lerobot_wmrl.evaluation.gate import Gate, Outcomes, gate_at, labelled_recor
 from lerobot_wmrl.evaluation.pictures import save_strip, side_by_side
 from lerobot_wmrl.evaluation.replay import Recording, replay_episodes
 from lerobot_wmrl.rl.algorithm import TrainingStopped
-from lerobot_wmrl.rl.callbacks import REAL_STEPS, Record, RolloutRecorder
+from lerobot_wmrl.rl.callbacks import REAL_STEPS, Record
 from lerobot_wmrl.rl.configuration_callbacks import GateConfig
+from lerobot_wmrl.rl.recorders import Recorder
 
 SEEDS = 1_000_000
 """Number of seeds from GATE_SEED on."""
@@ -44,14 +45,14 @@ class SuccessGate:
     Args:
         config: when to check, the limit, and what to do above it.
         env: the world model as the environment of the training.
-        recorder: records fresh rollouts; None without a simulator.
+        recorder: records fresh rollouts; None without `real_env`.
         refreshed: iterations after which a Dyna round replaces the world model.
         total: iterations of the training.
     """
 
     config: GateConfig
     env: WorldModelVectorEnv
-    recorder: RolloutRecorder | None
+    recorder: Recorder | None
     refreshed: frozenset[int]
     total: int
     name: str = "gate"
@@ -95,7 +96,7 @@ class SuccessGate:
     def _new_model(self, iteration: int) -> bool:
         return iteration == 0 or iteration in self.refreshed
 
-    def _fresh(self, recorder: RolloutRecorder, iteration: int, checkpoint: Path, folder: Path) -> Recording:
+    def _fresh(self, recorder: Recorder, iteration: int, checkpoint: Path, folder: Path) -> Recording:
         """Record the current policy, from seeds that no earlier rollouts had."""
         episodes = self.config.n_episodes
         first = GATE_SEED + iteration * episodes % (SEEDS - episodes)
@@ -117,8 +118,8 @@ class SuccessGate:
         if not verdicts:
             return (
                 "Gate: nobody has checked how many failures this world model calls successes, so success in "
-                "imagination may be wrong; give labelled rollouts (`gate.dataset.root`) or a simulator "
-                "(`real_env.type`, wmrl_maniskill)"
+                "imagination may be wrong; give labelled rollouts (`gate.dataset.root`) or an environment to "
+                "record some in (`real_env.type`)"
             )
         if not any(verdict.false_positives.n for verdict in verdicts.values()):
             return f"Gate, iteration {iteration}: no rollout failed, so false positives were not counted"

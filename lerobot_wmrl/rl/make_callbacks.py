@@ -8,13 +8,15 @@ from typing import Any, NamedTuple
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_wmrl.common.constants import SELECTION_SEED
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv, make_success_env
 from lerobot_wmrl.evaluation.agreement import evaluate_policy, evaluate_within
-from lerobot_wmrl.rl.callbacks import Callback, RolloutRecorder
+from lerobot_wmrl.rl.callbacks import Callback
 from lerobot_wmrl.rl.configuration_callbacks import CallbackSettings
 from lerobot_wmrl.rl.dyna import DynaRounds, round_iterations
 from lerobot_wmrl.rl.gate import SuccessGate
+from lerobot_wmrl.rl.recorders import EnvRecorder, ManiSkillRecorder, Recorder
 from lerobot_wmrl.rl.selection import IMAGINED, REAL, Measure, Selection
 
 
@@ -49,13 +51,15 @@ def make_callbacks(
     return callbacks
 
 
-def make_recorder(settings: CallbackSettings, env: WorldModelVectorEnv) -> RolloutRecorder | None:
-    """Return a recorder of the cameras that policy and world model need; None without a simulator."""
-    simulator, model = settings.simulator, env.model.config
+def make_recorder(settings: CallbackSettings, env: WorldModelVectorEnv) -> Recorder | None:
+    """Return a recorder of what policy and world model see in `real_env`; None without one."""
+    simulator, model = settings.real_env, env.model.config
     if simulator is None:
         return None
+    if not isinstance(simulator, WmrlManiSkillEnv):
+        return EnvRecorder(simulator, model.embodiment, env.device.type, settings.budget)
     cameras = list(dict.fromkeys([*simulator.cameras, *model.tokenizer.cameras]))
-    return RolloutRecorder(simulator, settings.real_num_envs, cameras, model.depth, settings.budget)
+    return ManiSkillRecorder(simulator, settings.real_num_envs, cameras, model.depth, settings.budget)
 
 
 def make_measures(settings: CallbackSettings, trained: Trained) -> dict[str, Measure]:

@@ -5,8 +5,8 @@
     lerobot-wmrl-train --policy.path=outputs/sft --env.type=wmrl_maniskill --num_envs=2 --output_dir=rl
 
 Before the first update the gate measures the world model's false positive rate: how many failures it predicts
-as successes. It needs labelled rollouts (`--gate.dataset.root=ROLLOUTS`) or a simulator to record some in
-(`--real_env.type=wmrl_maniskill …`). Above `--gate.limit` the training stops.
+as successes. It needs labelled rollouts (`--gate.dataset.root=ROLLOUTS`) or an environment to record some
+in (`--real_env.type=wmrl_maniskill …`). Above `--gate.limit` the training stops.
 `--selection.freq=5` measures success every five iterations, in `--real_env` if it is set, and keeps the best
 checkpoint as `checkpoints/best`.
 `--dyna.rounds=2` trains the world model further, twice, on new rollouts of the current policy.
@@ -40,6 +40,7 @@ from lerobot_wmrl.common.errors import FieldError, require_at_least
 from lerobot_wmrl.common.precision import keep_freed_memory
 from lerobot_wmrl.common.presets import expand_preset, format_flags
 from lerobot_wmrl.common.tracking import make_wandb
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.rl.configuration_algorithms import PolicyGradientConfig, PPOConfig
 from lerobot_wmrl.rl.configuration_callbacks import CallbackSettings
@@ -99,9 +100,10 @@ class TrainConfig(CallbackSettings, RunConfig):
         job_name: name of the run in Weights & Biases.
         budget: ledger of the real episodes that a method may learn from, a JSON file (docs/protocol.md). It
             must know the episodes of all datasets. Recordings in `real_env` are entered, and so are the steps
-            of a training in the simulator, as rollouts. Selection in a simulator is refused.
-        real_env: simulator for selection, gate and Dyna, `--real_env.type=wmrl_maniskill` and its settings.
-        real_num_envs: simulators that run at once in `real_env`.
+            of a training outside a world model, as rollouts. Selection in `real_env` is refused.
+        real_env: any environment of LeRobot's, for selection, gate and Dyna: `--real_env.type=…` and its
+            settings.
+        real_num_envs: environments that run at once in `real_env`.
         selection: choice of the checkpoint that is kept as `checkpoints/best`; off by default.
         gate: check of the world model's false positive rate.
         dyna: rounds that train the world model further on new rollouts of the current policy; off by default.
@@ -270,8 +272,8 @@ def train_in(
     if isinstance(cfg.env, WorldModelEnv):
         names = env.model.config.embodiment.action_names
         check_units(config, processors[1], names, env.action_low, env.action_high)
-    if cfg.simulator is not None:
-        check_fit(config, cfg.simulator.observation_shapes(), cfg.simulator.features[ACTION].shape[0])
+    if isinstance(cfg.real_env, WmrlManiSkillEnv):
+        check_fit(config, cfg.real_env.observation_shapes(), cfg.real_env.features[ACTION].shape[0])
     if cfg.peft is not None:
         policy = with_new_adapters(policy, cfg.peft)
     algorithm = make_algorithm(policy, cfg.algorithm, cfg.output_dir)
@@ -304,7 +306,8 @@ def chosen_checkpoint(cfg: TrainConfig) -> Path:
 def summary(cfg: TrainConfig) -> list[str]:
     """Return lines that say what was made, how good it is, and how to evaluate it."""
     from lerobot_wmrl.common.tracking import read_metrics
-    from lerobot_wmrl.rl.callbacks import env_flags, read_record
+    from lerobot_wmrl.rl.callbacks import read_record
+    from lerobot_wmrl.rl.recorders import env_flags
     from lerobot_wmrl.rl.selection import Selection, success
 
     iterations = [line for line in read_metrics(cfg.output_dir) if "success_rate" in line]

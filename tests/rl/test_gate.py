@@ -14,9 +14,9 @@ from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelE
 from lerobot_wmrl.evaluation.gate import success_gate
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rl.algorithm import TrainingStopped
-from lerobot_wmrl.rl.callbacks import RolloutRecorder, env_flags
 from lerobot_wmrl.rl.configuration_callbacks import GateConfig
 from lerobot_wmrl.rl.gate import SuccessGate
+from lerobot_wmrl.rl.recorders import ManiSkillRecorder, env_flags
 
 BELIEVES_ALL, BELIEVES_NONE = 0.0001, 0.9999
 """Done thresholds."""
@@ -99,7 +99,7 @@ def test_what_nobody_has_asked_about_has_not_passed(
 def test_it_asks_in_every_new_world_model_and_again_where_it_can_roll_out(make_gate: Any, env: Any) -> None:
     gate = make_gate(BELIEVES_ALL, freq=2)
     assert [iteration for iteration in range(9) if gate.due(iteration)] == [0, 3]
-    gate.recorder = RolloutRecorder(WmrlManiSkillEnv(), 1, ["third_view"], False)
+    gate.recorder = ManiSkillRecorder(WmrlManiSkillEnv(), 1, ["third_view"], False)
     assert [iteration for iteration in range(9) if gate.due(iteration)] == [0, 2, 3, 4, 6]
 
 

@@ -170,7 +170,7 @@ def test_gate_and_selection_in_the_simulator(improve: Any) -> None:
     ([*PUSH, *SIMULATOR, "--real_env.image_size=64"], "the environment has (3, 64, 64)"),
     ([*PUSH, *SIMULATOR, "--real_env.cameras=[wrist]"], "which the environment does not have"),
     ([*PUSH, *SIMULATOR, "--dyna.rounds=2"], "--dyna.rounds=2: there is room for 1"),
-    ([*PUSH, "--gate.action=off", "--dyna.rounds=1"], "give a simulator to record in (--real_env.type"),
+    ([*PUSH, "--gate.action=off", "--dyna.rounds=1"], "give an environment to record in (--real_env.type"),
     (["--policy.path={pointing}", *IMAGINED, "--gate.action=off"], "has 3 action components, the environ"),
     ([*POINT, "--dyna.rounds=1"], "no world model to refresh"),
     ([*POINT, "--selection.freq=-1"], "--selection.freq=-1: must be at least 0"),

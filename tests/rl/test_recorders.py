@@ -1,0 +1,73 @@
+"""A policy is recorded in an environment that nobody here has built: PushT, by LeRobot's own plugin."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lerobot.envs.configs import PushtEnv
+from lerobot.utils.constants import OBS_IMAGE
+
+from lerobot_wmrl.common.constants import KINDS, POLICY, START_KIND
+from lerobot_wmrl.data.embodiment import Embodiment, check_same_robot
+from lerobot_wmrl.data.episodes import EpisodeTable, open_dataset, read_episodes
+from lerobot_wmrl.rl.recorders import EnvRecorder
+from tests.rl.checkpoints import save_untrained_policy
+
+STEPS, AIM = 5, 250.0
+ROBOT = Embodiment(
+    fps=10, action_names=["x", "y"], action_low=[0.0, 0.0], action_high=[512.0, 512.0],
+    state_names=["agent_x", "agent_y"],
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A policy that always goes to the same place."""
+    folder = tmp_path_factory.mktemp("pusht")
+    save_untrained_policy(folder / "pretrained_model", OBS_IMAGE, size=96, actions=2, constant=AIM)
+    return folder
+
+
+def recorded(checkpoint: Path, folder: Path, seed: int = 7, exploration: float = 0.0) -> EpisodeTable:
+    recorder = EnvRecorder(PushtEnv(episode_length=STEPS), ROBOT, "cpu")
+    recorder.record(checkpoint, 2, seed, folder, exploration)
+    return read_episodes(open_dataset(folder))
+
+
+def test_rows_are_what_the_policy_saw_and_did(checkpoint: Path, tmp_path: Path) -> None:
+    table = recorded(checkpoint, tmp_path / "rollouts")
+    assert table.length.tolist() == [STEPS, STEPS]
+    assert np.allclose(table.action, AIM)
+    assert (table.done_known, table.success.any()) == (True, False)
+    assert set(table.column(START_KIND)) == {KINDS.index(POLICY)}
+    check_same_robot(ROBOT, table.dataset.meta)
+    assert tuple(table.dataset.features[OBS_IMAGE]["shape"]) == (96, 96, 3)
+    first = table.dataset[0][OBS_IMAGE]
+    assert 0.5 < first.mean() <= 1
+    moved = np.linalg.norm(table.state[STEPS - 1] - table.state[0])
+    assert moved > 1, "the state of the second frame follows the first action"
+
+
+def test_seeds_decide_the_start_and_noise_stays_in_range(checkpoint: Path, tmp_path: Path) -> None:
+    first = recorded(checkpoint, tmp_path / "first")
+    again = recorded(checkpoint, tmp_path / "again")
+    other = recorded(checkpoint, tmp_path / "other", seed=8, exploration=1.0)
+    assert np.array_equal(first.state, again.state)
+    assert np.array_equal(first.state[STEPS], other.state[0]), "episode i starts from seed + i"
+    assert other.action.std() > 1
+    assert (other.action >= 0).all()
+    assert (other.action <= 512).all()
+
+
+def test_what_is_recorded_is_not_recorded_again_and_is_entered_in_the_ledger(
+    checkpoint: Path, tmp_path: Path
+) -> None:
+    ledger = tmp_path / "budget.json"
+    ledger.write_text(json.dumps({"limits": {"demonstrations": 0, "rollouts": 2, "play": 0}}))
+    recorder = EnvRecorder(PushtEnv(episode_length=STEPS), ROBOT, "cpu", ledger)
+    (tmp_path / ".rollouts.partial").mkdir()
+    for _ in range(2):
+        recorder.record(checkpoint, 2, 7, tmp_path / "rollouts")
+    with pytest.raises(ValueError, match="rollouts"):
+        recorder.record(checkpoint, 2, 17, tmp_path / "more")
