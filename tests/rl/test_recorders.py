@@ -11,6 +11,7 @@ from lerobot.utils.constants import OBS_IMAGE
 from lerobot_wmrl.common.constants import KINDS, POLICY, START_KIND
 from lerobot_wmrl.data.embodiment import Embodiment, check_same_robot
 from lerobot_wmrl.data.episodes import EpisodeTable, open_dataset, read_episodes
+from lerobot_wmrl.evaluation.agreement import policy_outcomes
 from lerobot_wmrl.rl.recorders import EnvRecorder
 from tests.rl.checkpoints import save_untrained_policy
 
@@ -71,3 +72,10 @@ def test_what_is_recorded_is_not_recorded_again_and_is_entered_in_the_ledger(
         recorder.record(checkpoint, 2, 7, tmp_path / "rollouts")
     with pytest.raises(ValueError, match="rollouts"):
         recorder.record(checkpoint, 2, 17, tmp_path / "more")
+
+
+def test_success_is_measured_there(checkpoint: Path) -> None:
+    env = PushtEnv(episode_length=STEPS)
+    assert (
+        policy_outcomes(env, checkpoint / "pretrained_model", episodes=3, seed=7, num_envs=2) == [False] * 3
+    )
