@@ -18,8 +18,8 @@ from scipy.stats import pearsonr
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.policies import load_policy, load_processors, read_policy_config
 from lerobot_wmrl.common.statistics import Proportion
-from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter, StepCounter
+from lerobot_wmrl.envs.lerobot_env import is_own
 
 MIN_POLICIES = 3
 """Policies that a correlation needs."""
@@ -64,12 +64,8 @@ def evaluate_policy(
     Args:
         processors: the policy's pre- and postprocessor.
         seed: of the first episode; each further one adds one.
-
-    ManiSkill's simulators run in processes of their own. Other environments do not: LeRobot's rollout asks
-    them for `task_description`, and asynchronous ones that lack it, such as PushT, do not survive that.
     """
-    processes = isinstance(env, WmrlManiSkillEnv)
-    made: Any = env.create_envs(min(num_envs, episodes), use_async_envs=processes)
+    made: Any = env.create_envs(min(num_envs, episodes), use_async_envs=is_own(env))
     envs = {suite: {task: StepCounter(one) for task, one in tasks.items()} for suite, tasks in made.items()}
     info = eval_policy_all(
         envs, policy, *make_env_pre_post_processors(env, policy.config), *processors,

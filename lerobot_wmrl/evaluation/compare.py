@@ -26,6 +26,7 @@ from lerobot_wmrl.common.policies import (
     read_policy_config,
 )
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
+from lerobot_wmrl.envs.lerobot_env import is_own
 from lerobot_wmrl.evaluation.comparison import Comparison, Episode
 
 type Envs = dict[str, dict[int, gym.vector.VectorEnv]]
@@ -84,7 +85,7 @@ def _check_environment(config: PreTrainedConfig, env: EnvConfig) -> None:
 
     Only this project's environments are checked: LeRobot's own may show a policy more than they declare.
     """
-    if not hasattr(env, "create_tensor_env"):
+    if not is_own(env):
         return
     features = env_to_policy_features(env)
     action = features.pop(ACTION)
@@ -104,7 +105,7 @@ def load_policies(configs: Mapping[str, PreTrainedConfig]) -> list[LoadedPolicy]
 @contextmanager
 def opened(config: EnvConfig, n_envs: int, trust_remote_code: bool) -> Iterator[Envs]:
     """Make the environment for `n_envs` episodes at once, and close it in the end."""
-    envs = make_env(config, n_envs, use_async_envs=True, trust_remote_code=trust_remote_code)
+    envs = make_env(config, n_envs, use_async_envs=is_own(config), trust_remote_code=trust_remote_code)
     try:
         yield envs
     finally:

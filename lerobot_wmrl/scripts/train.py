@@ -140,8 +140,8 @@ def check_config(cfg: TrainConfig) -> None:
         raise FieldError(
             "algorithm.type", cfg.algorithm.type, "this command trains with ppo, grpo or distillation"
         )
-    if cfg.env is None or not hasattr(cfg.env, "create_tensor_env"):
-        raise FieldError("env.type", cfg.env and cfg.env.type, "choose world_model or wmrl_maniskill")
+    if cfg.env is None:
+        raise FieldError("env.type", None, "is missing", "choose world_model, or another environment")
     require_at_least(cfg, 1, "num_envs", "iterations", "save_freq", "log_freq")
     if isinstance(cfg.algorithm, GRPOConfig):
         cfg.algorithm.check_num_envs(cfg.num_envs)
@@ -209,6 +209,7 @@ def train_policy(cfg: TrainConfig) -> None:
     from lerobot.utils.random_utils import set_seed
 
     from lerobot_wmrl.common.policies import load_policy, load_processors
+    from lerobot_wmrl.envs.lerobot_env import make_tensor_env
     from lerobot_wmrl.rl.budget import check_data
 
     check_config(cfg)
@@ -223,7 +224,7 @@ def train_policy(cfg: TrainConfig) -> None:
     else:
         set_seed(cfg.seed)
         policy, processors = load_policy(config), load_processors(config)
-        env: Any = cfg.env.create_tensor_env(cfg.num_envs, config.device)  # type: ignore[union-attr]
+        env: Any = make_tensor_env(cfg.env, cfg.num_envs, config.device or "cpu")
         try:
             train_in(env, cfg, policy, processors)
         finally:

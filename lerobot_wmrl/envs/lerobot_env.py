@@ -1,0 +1,156 @@
+"""Any environment of LeRobot's for reinforcement learning: tensors in, tensors out."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from gymnasium.vector import AutoresetMode
+from lerobot.envs import make_env_pre_post_processors
+from lerobot.envs.configs import EnvConfig
+from lerobot.envs.utils import NEW_ROLLOUT_OPTION, preprocess_observation
+from lerobot.utils.constants import ACTION
+from torch import Tensor
+
+Observation = dict[str, Any]
+
+
+def make_tensor_env(config: EnvConfig, n_envs: int, device: str) -> gym.vector.VectorEnv:
+    """Return `n_envs` environments for reinforcement learning, as this project's own or around LeRobot's."""
+    if is_own(config):
+        own: gym.vector.VectorEnv = config.create_tensor_env(n_envs, device)
+        return own
+    return LeRobotTensorEnv(config, n_envs, device)
+
+
+def is_own(config: EnvConfig) -> bool:
+    """Return whether an environment is one of this project's.
+
+    Only these can run in processes of their own: LeRobot's rollout asks for `task_description`, and an
+    asynchronous environment that lacks it, such as PushT, does not survive the question.
+    """
+    return hasattr(config, "create_tensor_env")
+
+
+class LeRobotTensorEnv(gym.vector.VectorEnv):
+    """B environments of LeRobot's, stepped one after the other, with SAME_STEP autoreset.
+
+    Observations have LeRobot's names, as its rollout makes them: images (B, 3, H, W) in [0, 1], `task`
+    (B instructions). If the environment has several tasks, they are shared out among the B.
+
+    Actions (B, A) that are out of the environment's range are clipped to it and counted:
+    `info["reward_parts"]["clipped"]`, the share of components. NaN is refused. When an episode ends in a
+    step, `info["final_obs"]` holds the observations before the reset, and `info["final_info"]` holds
+    `is_success` and `episode_length`, (B,) each.
+    """
+
+    def __init__(self, config: EnvConfig, n_envs: int, device: str) -> None:
+        made = [
+            [env for tasks in config.create_envs(1, use_async_envs=False).values() for env in tasks.values()]
+            for _ in range(n_envs)
+        ]
+        self.envs: list[gym.vector.VectorEnv] = [envs[row % len(envs)] for row, envs in enumerate(made)]
+        self.spare = [env for row, envs in enumerate(made) for env in envs if env is not self.envs[row]]
+        self.before, self.after = make_env_pre_post_processors(config, None)
+        self.num_envs, self.device = n_envs, torch.device(device)
+        self.single_action_space = self.envs[0].single_action_space
+        self.action_space = gym.vector.utils.batch_space(self.single_action_space, n_envs)
+        self.max_episode_steps = int(self.envs[0].call("_max_episode_steps")[0])
+        self.metadata = {"render_fps": config.fps, "autoreset_mode": AutoresetMode.SAME_STEP}
+        self._length = np.zeros(n_envs, np.int64)
+
+    def reset(
+        self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin B episodes, from `seed`, `seed` + 1, … or from the seeds given."""
+        seeds: list[Any] = [None] * self.num_envs
+        if seed is not None:
+            seeds = (
+                list(seed) if isinstance(seed, list | tuple) else [seed + row for row in range(len(seeds))]
+            )
+        self._seen = [self._begin(row, each) for row, each in enumerate(seeds)]
+        return self._stacked(self._seen), {}
+
+    def step(self, actions: Tensor) -> tuple[Observation, Tensor, Tensor, Tensor, dict[str, Any]]:
+        """Step all, and begin new episodes where one has ended. ValueError if an action is NaN."""
+        if bool(actions.isnan().any()):
+            rows = actions.isnan().any(1).nonzero().flatten().tolist()
+            raise ValueError(f"action: NaN in environments {rows}")
+        given = self.after({ACTION: actions})[ACTION].detach().cpu().numpy().astype(np.float32)
+        box: Any = self.single_action_space
+        taken = np.clip(given, box.low, box.high)
+        reward, flags = np.zeros(self.num_envs, np.float32), np.zeros((3, self.num_envs), bool)
+        for row, env in enumerate(self.envs):
+            observation, gained, terminated, truncated, info = env.step(taken[row : row + 1])
+            self._length[row] += 1
+            reward[row], flags[:, row] = gained[0], (terminated[0], truncated[0], succeeded(info))
+            self._seen[row] = self._observe(row, final_observation(observation, info))
+        ended = flags[0] | flags[1]
+        result = self._stacked(self._seen)
+        info = {"reward_parts": {"clipped": self._vector((given != taken).mean(1).astype(np.float32))}}
+        if ended.any():
+            info["final_obs"] = result
+            info["final_info"] = {
+                "is_success": self._vector(flags[2]), "episode_length": self._vector(self._length.copy()),
+            }  # fmt: skip
+            for row in np.flatnonzero(ended):
+                self._seen[row] = self._begin(row, None)
+            result = self._stacked(self._seen)
+        return result, self._vector(reward), self._vector(flags[0]), self._vector(flags[1]), info
+
+    def close_extras(self, **kwargs: Any) -> None:
+        for env in (*self.envs, *self.spare):
+            env.close()
+
+    def _begin(self, row: int, seed: int | None) -> Observation:
+        self._length[row] = 0
+        seeds = None if seed is None else [seed]
+        return self._observe(row, self.envs[row].reset(seed=seeds, options={NEW_ROLLOUT_OPTION: True})[0])
+
+    def _observe(self, row: int, raw: Any) -> Observation:
+        """Return an observation as LeRobot's rollout shows it to a policy's processors, batch of one."""
+        observation = preprocess_observation(raw)
+        observation["task"] = self._instruction(row)
+        seen: Observation = self.before(observation)
+        return seen
+
+    def _instruction(self, row: int) -> list[str]:
+        for name in ("task_description", "task"):
+            try:
+                return [str(text) for text in self.envs[row].call(name)]
+            except (AttributeError, NotImplementedError):
+                continue
+        return [""]
+
+    def _stacked(self, seen: list[Observation]) -> Observation:
+        stacked: Observation = {
+            key: torch.cat([each[key] for each in seen]).to(self.device)
+            for key, value in seen[0].items()
+            if isinstance(value, Tensor)
+        }
+        return {**stacked, "task": [text for each in seen for text in each["task"]]}
+
+    def _vector(self, values: np.ndarray) -> Tensor:
+        return torch.from_numpy(values).to(self.device)
+
+
+def succeeded(info: dict[str, Any]) -> bool:
+    """Return whether the step of a single environment was a success, as LeRobot's rollout reads it."""
+    found = info.get("final_info", info)
+    found = found if isinstance(found, dict) else (found[0] or {})
+    return bool(np.asarray(found.get("is_success", False)).reshape(-1)[0])
+
+
+def final_observation(observation: Any, info: dict[str, Any]) -> Any:
+    """Return what a single environment showed last, before it was reset in the same step."""
+    final = info.get("final_obs")
+    if final is None or final[0] is None:
+        return observation
+    return batch_of_one(final[0])
+
+
+def batch_of_one(observation: Any) -> Any:
+    """Add a batch dimension to the arrays of an observation."""
+    if isinstance(observation, dict):
+        return {name: batch_of_one(value) for name, value in observation.items()}
+    return np.asarray(observation)[None]

@@ -1,0 +1,70 @@
+"""Environments of LeRobot's own for RL, with PushT."""
+
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from lerobot.envs.configs import PushtEnv
+from lerobot.utils.constants import OBS_IMAGE, OBS_STATE
+
+from lerobot_wmrl.common.tracking import read_metrics
+from lerobot_wmrl.envs.lerobot_env import LeRobotTensorEnv, make_tensor_env
+from lerobot_wmrl.scripts.train import main
+from tests.rl.checkpoints import save_untrained_policy
+
+B, STEPS = 2, 3
+
+
+@pytest.fixture
+def env() -> LeRobotTensorEnv:
+    made = make_tensor_env(PushtEnv(episode_length=STEPS), B, "cpu")
+    assert isinstance(made, LeRobotTensorEnv)
+    return made
+
+
+def test_episodes_begin_anew_when_they_end(env: LeRobotTensorEnv) -> None:
+    first, _ = env.reset(seed=5)
+    assert first[OBS_IMAGE].shape == (B, 3, 96, 96)
+    assert 0 <= first[OBS_IMAGE].min() <= first[OBS_IMAGE].max() <= 1
+    assert first["task"] == ["", ""] or len(first["task"]) == B
+    for _ in range(STEPS - 1):
+        seen, reward, terminated, truncated, info = env.step(torch.full((B, 2), 250.0))
+        assert reward.shape == (B,)
+        assert not (terminated | truncated).any()
+        assert "final_obs" not in info
+    after, _, terminated, truncated, info = env.step(torch.full((B, 2), 250.0))
+    assert (terminated | truncated).all()
+    assert info["final_info"]["episode_length"].tolist() == [STEPS] * B
+    assert not info["final_info"]["is_success"].any()
+    moved = (info["final_obs"][OBS_STATE] - seen[OBS_STATE]).abs().max()
+    begun = (after[OBS_STATE] - seen[OBS_STATE]).abs().max()
+    assert moved < begun, "the last frame is near the one before, the new start is elsewhere"
+
+
+def test_seeds_decide_where_episodes_begin(env: LeRobotTensorEnv) -> None:
+    first, _ = env.reset(seed=5)
+    other, _ = env.reset(seed=[6, 5])
+    assert torch.equal(first[OBS_STATE][0], other[OBS_STATE][1])
+    assert torch.equal(first[OBS_STATE][1], other[OBS_STATE][0])
+
+
+def test_actions_out_of_range_are_counted_and_nan_is_refused(env: LeRobotTensorEnv) -> None:
+    env.reset(seed=5)
+    info = env.step(torch.tensor([[250.0, 250.0], [600.0, 250.0]]))[-1]
+    assert info["reward_parts"]["clipped"].tolist() == [0.0, 0.5]
+    with pytest.raises(ValueError, match=r"NaN in environments \[1\]"):
+        env.step(torch.tensor([[0.0, 0.0], [torch.nan, 0.0]]))
+
+
+def test_ppo_trains_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    policy = save_untrained_policy(tmp_path / "policy", OBS_IMAGE, size=96, actions=2, constant=250.0)
+    flags = [
+        f"--policy.path={policy}", "--env.type=pusht", f"--env.episode_length={STEPS}",
+        "--algorithm.type=ppo", "--algorithm.value_iterations=1", f"--num_envs={B}", "--iterations=1",
+        f"--output_dir={tmp_path / 'rl'}",
+    ]  # fmt: skip
+    monkeypatch.setattr(sys, "argv", ["lerobot-wmrl-train", *flags])
+    main()
+    line = read_metrics(tmp_path / "rl")[-1]
+    assert (line["step"], line["episode_length"]) == (1, STEPS)
