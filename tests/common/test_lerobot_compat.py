@@ -40,7 +40,9 @@ UNDOCUMENTED = {
     "lerobot.datasets.depth_utils": {"MM_PER_METRE", "dequantize_depth"},
     "lerobot.datasets.factory": {"resolve_delta_timestamps"},
     "lerobot.datasets.video_utils": {"decode_video_frames"},
-    "lerobot.envs.utils": {"FreezeAfterEpisodeEnd", "env_to_policy_features"},
+    "lerobot.envs.utils": {
+        "NEW_ROLLOUT_OPTION", "FreezeAfterEpisodeEnd", "env_to_policy_features", "preprocess_observation",
+    },
     "lerobot.optim.optimizers": {"AdamWConfig"},
     "lerobot.optim.schedulers": {"CosineDecayWithWarmupSchedulerConfig", "LRSchedulerConfig"},
     "lerobot.policies.factory": {"get_policy_class", "make_pre_post_processors"},
@@ -49,7 +51,7 @@ UNDOCUMENTED = {
     },
     "lerobot.rl.algorithms.base": {"RLAlgorithm"},
     "lerobot.rl.algorithms.configs": {"RLAlgorithmConfig", "TrainingStats"},
-    "lerobot.scripts.lerobot_eval": {"eval_policy", "eval_policy_all"},
+    "lerobot.scripts.lerobot_eval": {"eval_policy", "eval_policy_all", "rollout"},
     "lerobot.utils.import_utils": {"register_third_party_plugins"},
     "lerobot.utils.logging_utils": {"MetricsTracker"},
     "lerobot.utils.random_utils": {

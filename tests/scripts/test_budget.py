@@ -13,7 +13,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot_wmrl.data.budget import Ledger, Limits
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.maniskill.scenes import scenes_of
-from lerobot_wmrl.rl import callbacks, dyna
+from lerobot_wmrl.rl import dyna, recorders
 from lerobot_wmrl.rl.budget import check_data
 from lerobot_wmrl.scripts.train import TrainConfig
 from lerobot_wmrl.scripts.train import main as train
@@ -169,7 +169,7 @@ def test_what_a_training_records_is_charged_by_the_commands_that_it_runs(
         if command[0] == "lerobot-wmrl-train-world-model":
             raise ValueError("enough")
 
-    for module in (callbacks, dyna):
+    for module in (dyna, recorders):
         monkeypatch.setattr(module, "run_subcommand", stop)
     with pytest.raises(SystemExit):
         run(train, "--budget={budget}", *IMAGINED, STARTS, *REAL, "--gate.action=off", "--dyna.rounds=1")
