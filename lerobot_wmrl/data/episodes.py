@@ -51,10 +51,10 @@ class DatasetSource:
         """The folder, or the name on the hub, for messages and file names."""
         return self.root or self.repo_id or ""
 
-    def flags(self, prefix: str = "dataset") -> dict[str, str]:
+    def flags(self) -> dict[str, str]:
         """Return the flags that name the dataset on a command line."""
         named = {"root": self.root} if self.root else {"repo_id": self.repo_id, "revision": self.revision}
-        return {f"{prefix}.{name}": value for name, value in named.items() if value}
+        return {f"dataset.{name}": value for name, value in named.items() if value}
 
     def open(self) -> LeRobotDataset:
         """Open the dataset; download it first if it is named by `repo_id` alone.

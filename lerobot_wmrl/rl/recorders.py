@@ -27,6 +27,7 @@ from lerobot_wmrl.data.budget import Ledger, spending
 from lerobot_wmrl.data.embodiment import HIGH, LOW, Embodiment
 from lerobot_wmrl.data.episodes import open_dataset, read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.rl.observations import to_bytes
 
 DERIVED = ("features", "features_map", "cameras")
 """Settings of an environment that are derived from others, or that the caller passes itself."""
@@ -204,7 +205,9 @@ def add_episode(dataset: LeRobotDataset, seen: Witness, taken: dict[str, Tensor]
     for step in range(length):
         observation = seen.observations[step]
         frame: dict[str, Any] = {
-            key: to_pixels(value) if key.startswith(OBS_IMAGE) else value[0].cpu().numpy().astype(np.float32)
+            key: to_bytes(value[0]).permute(1, 2, 0).cpu().numpy()
+            if key.startswith(OBS_IMAGE)
+            else value[0].cpu().numpy().astype(np.float32)
             for key, value in observation.items()
             if isinstance(value, Tensor)
         }
@@ -217,12 +220,6 @@ def add_episode(dataset: LeRobotDataset, seen: Witness, taken: dict[str, Tensor]
             "task": next(iter(observation.get("task") or [""])),
         })  # fmt: skip
     dataset.save_episode()
-
-
-def to_pixels(image: Tensor) -> np.ndarray:
-    """(1, 3, H, W) in [0, 1] → (H, W, 3) uint8."""
-    pixels: np.ndarray = (image[0].permute(1, 2, 0) * 255).round().byte().cpu().numpy()
-    return pixels
 
 
 def budget_flags(budget: Path | None) -> Flags:
