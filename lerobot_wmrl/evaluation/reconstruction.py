@@ -14,7 +14,7 @@ from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.data.episodes import EpisodeTable, choose_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames, frames_to_tensor
 from lerobot_wmrl.evaluation.image_metrics import motion_mask, psnr_from_mse
-from lerobot_wmrl.world_models.codebook import CodeBook, make_codebook
+from lerobot_wmrl.world_models.codebook import CodeBook, make_codebook, perplexity
 from lerobot_wmrl.world_models.modeling_frame_tokenizer import FrameTokenizerRewardModel
 from lerobot_wmrl.world_models.modeling_world_model import WorldModelRewardModel
 
@@ -135,6 +135,4 @@ def _rows(table: EpisodeTable, episodes: np.ndarray, at_most: int) -> tuple[np.n
 
 
 def _use(indices: Tensor, size: int) -> dict[str, float]:
-    counts = indices.unique(return_counts=True)[1].double()
-    entropy = torch.special.entr(counts / counts.sum()).sum()
-    return {"size": size, "used": len(counts) / size, "perplexity": round(entropy.exp().item(), 2)}
+    return {"size": size, "used": len(indices.unique()) / size, "perplexity": round(perplexity(indices), 2)}

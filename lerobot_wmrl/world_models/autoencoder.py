@@ -74,7 +74,7 @@ class Encoder(nn.Module):
         self.stem = nn.Conv2d(3 * PATCH**2, widths[0], 3, padding=1)
         self.downs = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in itertools.pairwise(widths))
         self.block = ResidualBlock(widths[-1])
-        self.head = nn.Conv2d(widths[-1], channels, 1)
+        self.head = nn.Conv2d(widths[-1], channels, 1, bias=False)  # normalised next
         self.fusion = Fusion(widths[-1]) if context else None
 
     def project(self, scales: Sequence[Tensor]) -> list[Tensor]:

@@ -133,3 +133,9 @@ CODEBOOKS: Final[dict[str, type[CodeBook]]] = {"fsq": CodeBook, "lfq": BinaryCod
 def make_codebook(quantizer: str, levels: Sequence[int]) -> CodeBook:
     """Return the code book of `fsq` or `lfq`."""
     return CODEBOOKS[quantizer](levels)
+
+
+def perplexity(tokens: Tensor) -> float:
+    """Return the exponential of the entropy of tokens (…): how many are in use, were all equally frequent."""
+    counts = tokens.unique(return_counts=True)[1].double()
+    return torch.special.entr(counts / counts.sum()).sum().exp().item()

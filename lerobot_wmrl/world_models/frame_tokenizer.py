@@ -13,9 +13,9 @@ from torch.nn import functional as F
 
 from lerobot_wmrl.data.frames import NO_CONTEXT, Context
 from lerobot_wmrl.world_models.autoencoder import ContextEncoder, Decoder, Encoder
-from lerobot_wmrl.world_models.codebook import make_codebook
+from lerobot_wmrl.world_models.codebook import make_codebook, perplexity
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
-from lerobot_wmrl.world_models.quantizer import make_quantizer
+from lerobot_wmrl.world_models.quantizer import Quantized, make_quantizer
 from lerobot_wmrl.world_models.success import SuccessClassifier
 
 MOTION_THRESHOLD = 0.08
@@ -52,6 +52,7 @@ class FrameTokenizer(nn.Module):
         self.grid = config.image_size // config.downsample
         channels = make_codebook(config.quantizer, config.levels).channels
         self.encoder = Encoder(widths, channels, context)
+        self.normalise = nn.BatchNorm2d(channels, affine=False)
         self.decoder = Decoder(widths, channels, context)
         self.quantizer = make_quantizer(config.quantizer, config.levels)
         self.whiten = nn.ModuleList(nn.BatchNorm2d(width, affine=False) for width in (widths[-1], widths[0]))
@@ -76,8 +77,7 @@ class FrameTokenizer(nn.Module):
         """Images (B, N, 3, H, W) in [0, 1] → tokens (B, S) int64. ValueError for other cameras or sizes."""
         self._check_images(images)
         self._check_context(context, len(images))
-        vectors = self.encoder(images.flatten(0, 1) * 2 - 1, context.projections()[:1])
-        return self.quantizer(vectors).tokens.reshape(len(images), -1)
+        return self._quantize(images.flatten(0, 1) * 2 - 1, context).tokens.reshape(len(images), -1)
 
     def decode_with_features(self, tokens: Tensor, context: Context = NO_CONTEXT) -> Decoded:
         """Tokens (B, S) → images and the whitened feature maps from which similarity is measured."""
@@ -109,6 +109,15 @@ class FrameTokenizer(nn.Module):
         self._check_images(first)
         self._check_images(images)
         return self.success.features(first, images)
+
+    def _quantize(self, pixels: Tensor, context: Context) -> Quantized:
+        """Pixels (F, 3, H, W) in [−1, 1] → their quantised vectors.
+
+        Every channel of the vectors is brought to mean 0 and variance 1 over the training frames. Nothing
+        else bounds the encoder: its vectors could grow until all are rounded to the same code.
+        """
+        vectors = self.encoder(pixels, context.projections()[:1])
+        return self.quantizer(self.normalise(vectors))
 
     def _check_images(self, images: Tensor) -> None:
         expected = (self.num_cameras, 3, self.image_size, self.image_size)
@@ -150,13 +159,14 @@ class FrameTokenizer(nn.Module):
             context: of the episodes' first frames, with the option `context`.
 
         Returns:
-            The loss () and metrics, among them the PSNR in dB.
+            The loss () and metrics, among them the PSNR in dB, the perplexity of the
+            batch's tokens, and the number of distinct frames among them, as a share.
         """
         self._check_images(images)
         self._check_context(context, len(images))
-        flat, projections = images.flatten(0, 1) * 2 - 1, context.projections()
-        quantized = self.quantizer(self.encoder(flat, projections[:1]))
-        pixels, features = self.decoder(quantized.values, projections[1:])
+        flat = images.flatten(0, 1) * 2 - 1
+        quantized = self._quantize(flat, context)
+        pixels, features = self.decoder(quantized.values, context.projections()[1:])
         if self.training:
             self._whitened([feature.detach() for feature in features])
         error = pixels - flat
@@ -164,7 +174,12 @@ class FrameTokenizer(nn.Module):
         if weight is not None:
             weighted = weighted * weight.flatten(0, 1)
         mse = error.detach().square().mean() / 4
-        loss, metrics = weighted.mean() + quantized.loss, {"psnr": float(-10 * torch.log10(mse))}
+        loss = weighted.mean() + quantized.loss
+        metrics = {
+            "psnr": float(-10 * torch.log10(mse)),
+            "token_perplexity": perplexity(quantized.tokens),
+            "distinct_frames": len(quantized.tokens.reshape(len(images), -1).unique(dim=0)) / len(images),
+        }
         if perceptual is not None:
             term = perceptual(pixels, flat)
             loss, metrics["perceptual_loss"] = loss + term, term.item()

@@ -20,6 +20,12 @@ from lerobot_wmrl.world_models.perceptual import PerceptualLoss, lpips_network, 
 SUCCESS_WEIGHT: Final = 0.1
 """Weight of the success classifier's loss. They share no weights, only the limit on the gradient's norm."""
 
+COLLAPSE_BEGINS: Final = 0.1
+"""Share of the training from which the tokens of different frames must differ."""
+
+COLLAPSE_BATCH: Final = 8
+"""Frames of a batch that can be told to be all alike not by chance."""
+
 
 def stack_cameras(batch: dict[str, Tensor], keys: Sequence[str], size: int) -> Tensor:
     """Stack camera images (…, 3, H, W) of a batch → (…, N, 3, H, W). ValueError if one is not there."""
@@ -64,6 +70,9 @@ class FrameTokenizerRewardModel(HubCard, PreTrainedRewardModel):
         `reference.*` are the episodes' first frames, needed with the option `context`; `success` (B,) bool,
         whether it holds at the frames, is needed with the option `success`, which adds the classifier's loss.
         The loss is the same at any `progress` of the training.
+
+        Raises:
+            ValueError: a tenth of the training is done, and all frames of the batch have the same tokens.
         """
         images, reference = self._observed(batch), self._reference(batch)
         weight, context = None, NO_CONTEXT
@@ -71,11 +80,21 @@ class FrameTokenizerRewardModel(HubCard, PreTrainedRewardModel):
             weight = motion_weight(images, reference)
             context = self.tokenizer.context(reference)
         loss, metrics = self.tokenizer(images, weight, self._perceptual_loss(images.device), context)
+        if self.training and progress >= COLLAPSE_BEGINS and len(images) >= COLLAPSE_BATCH:
+            self._require_distinct(metrics["distinct_frames"] * len(images))
         if self.tokenizer.success is None:
             return loss, metrics
         assert reference is not None  # success needs context, and context the reference
         success_loss, success_metrics = self.tokenizer.success.loss(reference, images, batch["success"])
         return loss + SUCCESS_WEIGHT * success_loss, metrics | success_metrics
+
+    def _require_distinct(self, distinct: float) -> None:
+        if round(distinct) <= 1:
+            raise ValueError(
+                "distinct_frames: all frames of a batch have the same tokens, from which nothing can be "
+                f"learnt; look at the frames of {self.config.tokenizer.camera_keys}, which may be alike, or "
+                f"lower `model.learning_rate` (now {self.config.learning_rate})"
+            )
 
     def _observed(self, batch: dict[str, Tensor]) -> Tensor:
         sizes = self.config.tokenizer

@@ -24,11 +24,11 @@ from tests.trained import CLIP_LENGTH, SIZES, nested, small_tokenizer, tokenizer
 
 EPISODES, ROWS, TOKENS, CODES = 4, 14, 16, 20
 GOLDEN = {
-    "frame_tokenizer": [0.804, 1.4174, 1.3384, 1.2073, 1.2096, 0.7358, 1.4921, 1.9857],
-    "autoregressive": [3.7676, 3.7407, 3.5661, 3.7063, 3.6131, 3.6347, 3.4579, 3.5781],
-    "cross_attention": [3.8262, 3.7196, 3.5669, 3.6501, 3.6174, 3.609, 3.4422, 3.57],
-    "action_world_model": [4.7408, 4.7984, 4.7682, 4.3515, 4.2269, 4.1675, 4.176, 4.0623],
-    "text_world_model": [3.7513, 3.5552, 3.3833, 3.4729, 3.4508, 3.4538, 3.2883, 3.4127],
+    "frame_tokenizer": [0.8046, 1.4138, 1.3305, 1.2068, 1.186, 0.7207, 1.4571, 1.9478],
+    "autoregressive": [3.3465, 3.2143, 3.1728, 3.1338, 3.2174, 3.1554, 3.103, 3.1382],
+    "cross_attention": [3.5473, 3.3998, 3.2762, 3.2653, 3.3108, 3.2467, 3.1596, 3.2198],
+    "action_world_model": [4.9458, 5.0635, 4.8316, 4.4963, 4.4221, 4.3848, 4.3603, 4.2395],
+    "text_world_model": [3.4957, 3.2739, 3.2533, 3.2365, 3.2799, 3.2537, 3.1759, 3.1622],
 }
 WORLD_MODEL: dict[str, Any] = {
     "device": "cpu", "tokenizer": small_tokenizer(), "clip_length": CLIP_LENGTH, **SIZES,
