@@ -25,7 +25,7 @@ from lerobot_wmrl.common.constants import START_SCENE
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.statistics import RESAMPLES
 from lerobot_wmrl.data.episodes import choose_episodes, open_dataset, read_episodes
-from lerobot_wmrl.data.frame_cache import cached_frames, frames_to_tensor
+from lerobot_wmrl.data.frame_cache import frames_to_tensor
 from lerobot_wmrl.evaluation.goals import TrainedProbe, goal_quality, imagine_goals, train_probe
 from lerobot_wmrl.evaluation.replay import Recording
 from lerobot_wmrl.maniskill.recordings import scene_splits
@@ -108,7 +108,7 @@ def main() -> None:
     scenes = scene_splits(table.column(START_SCENE), given.split)
     episodes = choose_episodes(table, given.split, given.max_episodes, scenes)
     first = load_model(given.models[0], MODEL)
-    recording = Recording(table, cached_frames(table.dataset, first.config.tokenizer.camera_keys))
+    recording = Recording.read(table, first)
     probe = train_probe(first.tokenizer, recording)
     write_json(
         given.output,

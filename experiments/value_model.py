@@ -21,7 +21,7 @@ from lerobot_policy_cnn.networks import ObservationEncoder, Readout
 from lerobot_policy_cnn.processor_cnn import MIN_DATASET_STD
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.images import random_shift
-from lerobot_wmrl.data.episodes import EpisodeTable
+from lerobot_wmrl.data.episodes import EpisodeTable, frame_size
 from lerobot_wmrl.data.frame_cache import cached_frames, frames_to_tensor
 
 FOLDS: Final = 3
@@ -66,9 +66,10 @@ class LabelledFrames:
         if not cameras:
             raise FieldError("root", table.dataset.root, "has no camera", "use a dataset with images")
         std = np.maximum(table.state.std(0), MIN_DATASET_STD[OBS_STATE])
+        side, _ = frame_size(table.dataset.features[cameras[0]])
         state = torch.from_numpy((table.state - table.state.mean(0)) / std)
         return cls(
-            cached_frames(table.dataset, cameras),
+            cached_frames(table.dataset, cameras, side),
             state.clamp(-STATE_LIMIT, STATE_LIMIT),
             np.repeat(np.array(table.instructions), table.length),
             torch.from_numpy(np.repeat(table.success, table.length)).float(),

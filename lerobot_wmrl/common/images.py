@@ -4,11 +4,22 @@ import torch
 from lerobot.utils.constants import OBS_IMAGES
 from torch import Tensor
 from torch.nn import functional as F
+from torchvision.transforms.v2 import functional as transforms
 
 
 def camera_key(camera: str) -> str:
     """Return a camera's key in a dataset: `observation.images.` and its name, or a name that is a key."""
     return camera if camera.startswith("observation.") else f"{OBS_IMAGES}.{camera}"
+
+
+def stretch(images: Tensor, height: int, width: int) -> Tensor:
+    """Stretch images to a size, each axis by itself: (…, C, h, w) → (…, C, height, width).
+
+    Bilinear; where an axis shrinks, over all the pixels that become one (antialiasing).
+    """
+    if images.shape[-2:] == (height, width):
+        return images
+    return transforms.resize(images, [height, width], antialias=True)
 
 
 def coordinates(height: int, width: int, like: Tensor) -> tuple[Tensor, Tensor]:

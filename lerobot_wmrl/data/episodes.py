@@ -300,8 +300,8 @@ def frame_size(feature: Mapping[str, Any]) -> tuple[int, int]:
     return height, width
 
 
-def check_cameras(features: Mapping[str, Any], camera_keys: Sequence[str], image_size: int) -> None:
-    """Raise FieldError unless the dataset has these cameras at that image size."""
+def check_cameras(features: Mapping[str, Any], camera_keys: Sequence[str]) -> None:
+    """Raise FieldError unless the dataset has these cameras."""
     for key in camera_keys:
         if key not in features:
             cameras = ", ".join(name for name in features if name.startswith(OBS_IMAGE)) or "none"
@@ -309,12 +309,6 @@ def check_cameras(features: Mapping[str, Any], camera_keys: Sequence[str], image
                 "tokenizer.cameras", camera_names(camera_keys),
                 f"the dataset has no {key} (its cameras: {cameras})",
                 "set `tokenizer.cameras` to match, or use a dataset with this camera",
-            )  # fmt: skip
-        height, width = frame_size(features[key])
-        if (height, width) != (image_size, image_size):
-            raise FieldError(
-                "tokenizer.image_size", image_size, f"the dataset's {key} is {height}x{width}",
-                f"train a tokenizer with `tokenizer.image_size`={height} or record at {image_size}",
             )  # fmt: skip
 
 
@@ -328,16 +322,12 @@ def depth_key(camera_key: str) -> str:
     return f"{camera_key}_depth"
 
 
-def check_depth(features: Mapping[str, Any], camera_keys: Sequence[str], image_size: int) -> None:
-    """Raise FieldError unless the dataset has the depth of these cameras, at their image size."""
+def check_depth(features: Mapping[str, Any], camera_keys: Sequence[str]) -> None:
+    """Raise FieldError unless the dataset has the depth of these cameras."""
     for key in map(depth_key, camera_keys):
-        found = frame_size(features[key]) if key in features else None
-        if found != (image_size, image_size):
-            size = "none" if found is None else f"one of {found[0]}x{found[1]}"
+        if key not in features:
             raise FieldError(
-                "depth", True,
-                f"the world model looks at {key} of {image_size} x {image_size} pixels, the dataset has "
-                f"{size}",
+                "depth", True, f"the world model looks at {key}, which the dataset lacks",
                 "record it with lerobot-wmrl-record --depth=true",
             )  # fmt: skip
 

@@ -25,7 +25,8 @@ from torch.nn import functional as F
 from tqdm import tqdm
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.episodes import VIDEO_BACKEND, depth_key, frame_size
+from lerobot_wmrl.common.images import stretch
+from lerobot_wmrl.data.episodes import VIDEO_BACKEND, depth_key
 from lerobot_wmrl.data.frames import NO_CONTEXT, Context
 
 ENCODE_BATCH = 128
@@ -33,6 +34,8 @@ ENCODE_BATCH = 128
 
 class FrameEncoder(Protocol):
     """Interface of a frame tokenizer, as the caches use it."""
+
+    image_size: int
 
     @property
     def tokens_per_frame(self) -> int:
@@ -59,17 +62,21 @@ def cache_dir(dataset: LeRobotDataset) -> Path:
     return root.with_name(root.name + ".cache")
 
 
-def cached_frames(dataset: LeRobotDataset, camera_keys: Sequence[str]) -> np.ndarray:
-    """Return all frames as a read-only memory map, uint8 (rows, N, H, W, 3); decoded on the first call."""
-    shape = (dataset.num_frames, len(camera_keys), *frame_size(dataset.features[camera_keys[0]]), 3)
-    key = digest([dataset.num_episodes, dataset.num_frames, *camera_keys, *file_stamps(dataset)])
+def cached_frames(dataset: LeRobotDataset, camera_keys: Sequence[str], side: int) -> np.ndarray:
+    """Return all frames as a read-only memory map, uint8 (rows, N, side, side, 3).
+
+    They are decoded on the first call, and stretched where they are of another size.
+    """
+    shape = (dataset.num_frames, len(camera_keys), side, side, 3)
+    key = digest([dataset.num_episodes, dataset.num_frames, side, *camera_keys, *file_stamps(dataset)])
 
     def fill(target: np.ndarray) -> None:
         for episode in tqdm(range(dataset.num_episodes), desc="Decoding frames", unit="episode"):
             rows = dataset.meta.episodes[episode]
             begin, end = rows["dataset_from_index"], rows["dataset_to_index"]
             for camera, name in enumerate(camera_keys):
-                target[begin:end, camera] = _decode_episode(dataset, episode, name)
+                frames = stretch(decode_episode(dataset, episode, name), side, side)
+                target[begin:end, camera] = frames.permute(0, 2, 3, 1).numpy()
 
     return memory_map(cache_dir(dataset) / f"frames-{key}.npy", shape, np.uint8, fill)
 
@@ -79,7 +86,7 @@ def cached_tokens(dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer
 
     A context-conditioned tokenizer is given the first frame of each row's episode.
     """
-    frames = cached_frames(dataset, camera_keys)
+    frames = cached_frames(dataset, camera_keys, tokenizer.image_size)
     device = next(tokenizer.parameters()).device
     starts = first_rows(dataset)
 
@@ -103,7 +110,8 @@ def cached_context(
 
     float32 (E, N, C, g, g), encoded on the first call.
     """
-    frames, device = cached_frames(dataset, camera_keys), next(tokenizer.parameters()).device
+    frames = cached_frames(dataset, camera_keys, tokenizer.image_size)
+    device = next(tokenizer.parameters()).device
     starts = np.asarray(dataset.meta.episodes["dataset_from_index"])
 
     def features(rows: np.ndarray) -> np.ndarray:
@@ -126,7 +134,8 @@ def cached_features(
 
     float32 (rows, F), encoded on the first call.
     """
-    frames, device = cached_frames(dataset, camera_keys), next(tokenizer.parameters()).device
+    frames = cached_frames(dataset, camera_keys, tokenizer.image_size)
+    device = next(tokenizer.parameters()).device
     starts = first_rows(dataset)
 
     def features(part: slice) -> np.ndarray:
@@ -162,15 +171,15 @@ def frames_to_tensor(frames: np.ndarray) -> Tensor:
     return torch.from_numpy(np.array(frames)).permute(0, 1, 4, 2, 3).float() / 255
 
 
-def _decode_episode(dataset: LeRobotDataset, episode: int, key: str) -> np.ndarray:
-    """Decode one episode and camera, uint8 (T, H, W, 3), from video or from stored images."""
+def decode_episode(dataset: LeRobotDataset, episode: int, key: str) -> Tensor:
+    """Decode one episode and camera, uint8 (T, 3, H, W), from video or from stored images."""
     rows = dataset.meta.episodes[episode]
     indices = range(rows["dataset_from_index"], rows["dataset_to_index"])
     if key not in dataset.meta.video_keys:
-        return np.stack(
-            [np.asarray(image.convert("RGB")) for image in dataset.hf_dataset.with_format(None)[indices][key]]
-        )
-    return decode_video(dataset, episode, key).permute(0, 2, 3, 1).numpy()
+        images = dataset.hf_dataset.with_format(None)[indices][key]
+        frames = np.stack([np.asarray(image.convert("RGB")) for image in images])
+        return torch.from_numpy(frames).permute(0, 3, 1, 2)
+    return decode_video(dataset, episode, key)
 
 
 def decode_video(dataset: LeRobotDataset, episode: int, key: str) -> Tensor:

@@ -128,10 +128,10 @@ class WorldModelEnv(EnvConfig):
         self.features[ACTION] = PolicyFeature(type=FeatureType.ACTION, shape=(model.action_size,))
         if model.state_size:
             self.features["agent_pos"] = PolicyFeature(type=FeatureType.STATE, shape=(model.state_size,))
-        for camera in model.tokenizer.cameras:
-            shape = (model.tokenizer.image_size, model.tokenizer.image_size, 3)
+        shapes = model.tokenizer.frame_shapes.values()
+        for camera, (colors, height, width) in zip(model.tokenizer.cameras, shapes, strict=True):
             pixels = "pixels" if camera == OBS_IMAGE else f"pixels/{camera}"  # as LeRobot's environments do
-            self.features[pixels] = PolicyFeature(type=FeatureType.VISUAL, shape=shape)
+            self.features[pixels] = PolicyFeature(FeatureType.VISUAL, (height, width, colors))
             self.features_map[pixels] = camera_key(camera)
 
     def _check(self) -> None:

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from lerobot_wmrl.common.constants import START_SCENE, START_TASK, TASKS
 from lerobot_wmrl.common.errors import FieldError, within
+from lerobot_wmrl.common.images import stretch
 from lerobot_wmrl.data.budget import Ledger
 from lerobot_wmrl.data.episodes import (
     EpisodeTable,
@@ -34,6 +35,7 @@ from lerobot_wmrl.maniskill.scenes import scene_for_seed
 from lerobot_wmrl.maniskill.tasks import task_of
 from lerobot_wmrl.rewards.similarity import Features, Similarity
 from lerobot_wmrl.world_models.checkpoint import check_dataset
+from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 from lerobot_wmrl.world_models.configuration_world_model import WorldModelConfig
 from lerobot_wmrl.world_models.goal import imagine_goal
 from lerobot_wmrl.world_models.modeling_world_model import (
@@ -169,7 +171,8 @@ def undecided_after(table: EpisodeTable, frames: int) -> np.ndarray:
 
 def read_dataset_frames(source: StartFrames, config: WorldModelConfig) -> FirstFrames:
     """Read the first frames of a LeRobotDataset's episodes."""
-    assert config.tokenizer is not None, "a trained world model knows its tokenizer"
+    sizes = config.tokenizer
+    assert sizes is not None, "a trained world model knows its tokenizer"
     table = read_episodes(source.open())
     check_dataset(config, table.dataset.meta)
     episodes = chosen_episodes(table, source)
@@ -186,7 +189,7 @@ def read_dataset_frames(source: StartFrames, config: WorldModelConfig) -> FirstF
         return every if every is None else every.unflatten(0, rows.shape)
 
     return FirstFrames(
-        cached_frames(table.dataset, config.tokenizer.camera_keys)[rows],
+        cached_frames(table.dataset, sizes.camera_keys, sizes.image_size)[rows],
         table.state[rows],
         table.action[rows[:, :-1]],
         [table.instructions[episode] for episode in episodes],
@@ -209,8 +212,9 @@ def read_saved_frames(path: Path, max_starts: int, config: WorldModelConfig) -> 
     """
     assert config.tokenizer is not None, "a trained world model knows its tokenizer"
     found = read_arrays(path)
-    side, cameras = config.tokenizer.image_size, config.tokenizer.camera_keys
-    wanted = {**dict.fromkeys(cameras, (side, side, 3)), OBS_STATE: (config.state_size,), INSTRUCTION: ()}
+    side, shapes = config.tokenizer.image_size, config.tokenizer.frame_shapes
+    images = {key: (height, width, 3) for key, (_, height, width) in shapes.items()}
+    wanted = {**images, OBS_STATE: (config.state_size,), INSTRUCTION: ()}
     count = max((len(found[name]) for name in wanted if name in found and found[name].ndim), default=0)
     for name, size in wanted.items():
         if name not in found or not count or found[name].shape != (count, *size):
@@ -218,15 +222,21 @@ def read_saved_frames(path: Path, max_starts: int, config: WorldModelConfig) -> 
             raise FieldError(
                 "dataset.frames", path, f"needs {name} of shape {(count or 'K', *size)}, has {has}"
             )
-    images = np.stack([found[name] for name in cameras], 1)
-    if images.dtype != np.uint8:
-        raise FieldError("dataset.frames", path, f"images are {images.dtype}, they must be uint8")
+    for name in shapes:
+        if found[name].dtype != np.uint8:
+            raise FieldError("dataset.frames", path, f"{name} is {found[name].dtype}, it must be uint8")
     if not np.isfinite(found[OBS_STATE]).all():
         raise FieldError("dataset.frames", path, f"{OBS_STATE} contains NaN or infinity")
     rows = evenly_spread(count, max_starts)
     instructions = [str(text) for text in found[INSTRUCTION][rows]]
     state = found[OBS_STATE][rows].astype(np.float32)
-    return _without_past(images[rows], state, instructions, np.full(len(rows), -1), config)
+    squares = np.stack([_squares(found[name][rows], side) for name in shapes], 1)
+    return _without_past(squares, state, instructions, np.full(len(rows), -1), config)
+
+
+def _squares(images: np.ndarray, side: int) -> np.ndarray:
+    """Stretch images uint8 (K, H, W, 3) → (K, side, side, 3)."""
+    return stretch(torch.from_numpy(images).permute(0, 3, 1, 2), side, side).permute(0, 2, 3, 1).numpy()
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
@@ -249,7 +259,7 @@ def simulate_first_frames(source: StartFrames, config: WorldModelConfig) -> Firs
     assert sizes is not None, "a trained world model knows its tokenizer"
     env = WmrlManiSkillEnv(
         task=tasks[0], split="ood" if source.split == "ood" else "ind", scenes=source.scenes,
-        cameras=list(sizes.cameras), image_size=sizes.image_size,
+        cameras=list(sizes.cameras), image_size=resets_side(sizes),
     )  # fmt: skip
     with within("dataset"):
         scenes = env.selected_scenes()
@@ -261,9 +271,25 @@ def simulate_first_frames(source: StartFrames, config: WorldModelConfig) -> Firs
         instructions.append(simulation.instruction)
         indices.append(simulation.task.index)
     simulation.close()
-    images = np.stack([np.stack([frame.images[camera] for camera in sizes.cameras]) for frame in frames])
+    views = ([frame.images[camera] for frame in frames] for camera in sizes.cameras)
+    images = np.stack([_squares(np.stack(view), sizes.image_size) for view in views], 1)
     state = np.stack([frame.state for frame in frames])
     return _without_past(images, state, instructions, np.array(indices), config)
+
+
+def resets_side(sizes: TokenizerConfig) -> int:
+    """Return the side of the frames that ManiSkill renders for its resets, the dataset's.
+
+    Raises:
+        FieldError: the dataset's frames are no squares of one size.
+    """
+    sides = {side for _, *size in sizes.frame_shapes.values() for side in size}
+    if len(sides) > 1:
+        raise FieldError(
+            "dataset.resets", sorted(sides), "are the sides of the dataset's frames; ManiSkill's are squares",
+            "start in the dataset's episodes (`dataset.root`)",
+        )  # fmt: skip
+    return sides.pop()
 
 
 def _without_past(

@@ -23,6 +23,7 @@ from lerobot_wmrl.world_models.checkpoint import check_same_tokenizer, load_mode
 from lerobot_wmrl.world_models.dynamics import Imagined
 from lerobot_wmrl.world_models.frame_tokenizer import Decoded
 from lerobot_wmrl.world_models.goal import select_features
+from lerobot_wmrl.world_models.modeling_frame_tokenizer import split_cameras
 from lerobot_wmrl.world_models.modeling_world_model import (
     ActionWorldModelRewardModel,
     TextWorldModelRewardModel,
@@ -34,9 +35,10 @@ Observation = dict[str, Any]
 class WorldModelVectorEnv(gym.vector.VectorEnv):
     """B imagined episodes: tensors in, tensors out, SAME_STEP autoreset with `final_obs` and `final_info`.
 
-    Observations: `observation.images.<camera>` (B, 3, H, W) in [0, 1], `observation.state` (B, P) if the
-    model predicts it, `task` (B strings). Actions (B, A) in the dataset's units; NaN is refused, and what is
-    out of their range is clipped to it and counted: `reward_parts["clipped"]`, the share of components.
+    Observations: `observation.images.<camera>` (B, 3, H, W) in [0, 1], of the size that the dataset's frames
+    have, `observation.state` (B, P) if the model predicts it, `task` (B strings). Actions (B, A) in the
+    dataset's units; NaN is refused, and what is out of their range is clipped to it and counted:
+    `reward_parts["clipped"]`, the share of components.
 
     A step synchronises with the device once, to learn whether an episode has ended and whether every action
     was a number. Resets are expensive, so they run only when an episode has ended, and only then the
@@ -65,9 +67,9 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
 
     def _observation_space(self) -> gym.spaces.Dict:
         config = self.model.config
-        size = config.tokenizer.image_size
         spaces: dict[str, gym.Space] = {
-            key: gym.spaces.Box(0.0, 1.0, (3, size, size), np.float32) for key in config.tokenizer.camera_keys
+            key: gym.spaces.Box(0.0, 1.0, shape, np.float32)
+            for key, shape in config.tokenizer.frame_shapes.items()
         }
         if config.state_size:
             spaces[OBS_STATE] = gym.spaces.Box(-np.inf, np.inf, (config.state_size,), np.float32)
@@ -227,9 +229,7 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
     def _observe(
         self, images: Tensor, state: Tensor, instructions: Sequence[str] | None = None
     ) -> Observation:
-        observation: Observation = {
-            key: images[:, index] for index, key in enumerate(self.model.config.tokenizer.camera_keys)
-        }
+        observation: Observation = {**split_cameras(images, self.model.config.tokenizer.frame_shapes)}
         if self.model.config.state_size:
             observation[OBS_STATE] = state
         observation["task"] = list(self._instructions if instructions is None else instructions)

@@ -19,7 +19,6 @@ from lerobot_wmrl.common.constants import KINDS, PLAY, START_KIND, START_TASK, T
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.statistics import Estimate, Proportion
 from lerobot_wmrl.data.episodes import EpisodeTable, open_dataset, read_episodes
-from lerobot_wmrl.data.frame_cache import cached_frames
 from lerobot_wmrl.evaluation.replay import MAX_ACTIONS, EpisodeReplay, Recording, in_batches
 from lerobot_wmrl.world_models.checkpoint import check_dataset
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
@@ -171,7 +170,7 @@ def labelled_recording(model: ActionWorldModelRewardModel, dataset: LeRobotDatas
             "has neither next.success nor next.done, which say whether success holds",
             "use rollouts with labels",
         )  # fmt: skip
-    return Recording(table, cached_frames(table.dataset, model.config.tokenizer.camera_keys))
+    return Recording.read(table, model)
 
 
 def predict_outcomes(model: ActionWorldModelRewardModel, recording: Recording) -> Outcomes:

@@ -119,7 +119,8 @@ def write_reconstruction(model: TokenizingModel, table: EpisodeTable, output_dir
         return known
     split = "validation" if table.validation.any() else "all"
     episodes = choose_episodes(table, split, MAX_FRAMES)
-    frames = cached_frames(table.dataset, model.config.tokenizer.camera_keys)
+    sizes = model.config.tokenizer
+    frames = cached_frames(table.dataset, sizes.camera_keys, sizes.image_size)
     measured = {"split": split, **reconstruction_metrics(model.eval(), table, frames, episodes)}
     write_json(path, measured)
     return measured

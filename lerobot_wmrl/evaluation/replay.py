@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lerobot_wmrl.data.episodes import EpisodeTable
-from lerobot_wmrl.data.frame_cache import frames_to_tensor
+from lerobot_wmrl.data.frame_cache import cached_frames, frames_to_tensor
 from lerobot_wmrl.data.frames import Context, Frames
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
 from lerobot_wmrl.world_models.modeling_world_model import (
@@ -42,6 +42,12 @@ class Recording:
                 "that counts as a failure",
                 self.table.dataset.root, cut, len(self.table.length), MAX_ACTIONS,
             )  # fmt: skip
+
+    @classmethod
+    def read(cls, table: EpisodeTable, model: Any) -> "Recording":
+        """Read the frames of the cameras that a world model looks at, at its size."""
+        sizes = model.config.tokenizer
+        return cls(table, cached_frames(table.dataset, sizes.camera_keys, sizes.image_size))
 
     def rows(self, episode: int) -> slice:
         """Return the rows of the episode that are replayed, at most `MAX_ACTIONS`."""

@@ -78,7 +78,8 @@ class ProxyConfig(LearnedRewardConfig):
 
     Args:
         cameras: cameras whose frames the network sees.
-        image_size: side of the square frames in pixels; read from the dataset when training begins.
+        image_size: side in pixels of the squares to which frames are stretched; by default the height of the
+            dataset's frames.
         width: channels of the first convolution.
     """
 

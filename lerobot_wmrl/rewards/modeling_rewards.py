@@ -69,16 +69,16 @@ class ProxyRewardModel(HubCard, PreTrainedRewardModel):
         first = self.config.camera_keys[0]
         if not self.config.image_size and first in features:
             self.config.image_size = frame_size(features[first])[0]
-        check_cameras(features, self.config.camera_keys, self.config.image_size)
+        check_cameras(features, self.config.camera_keys)
 
     def check_world_model(self, model: ActionWorldModelRewardModel) -> None:
         """Raise FieldError unless the model imagines frames like those that the network was trained on."""
-        size, cameras = model.config.tokenizer.image_size, model.config.tokenizer.cameras
-        if self.config.image_size != size or not {*self.config.cameras} <= {*cameras}:
+        cameras = model.config.tokenizer.cameras
+        if not {*self.config.cameras} <= {*cameras}:
             raise FieldError(
                 "reward.pretrained_path", self.config.pretrained_path,
-                f"this proxy reward looks at {', '.join(self.config.cameras)} of {self.config.image_size} "
-                f"pixels, the world model imagines {', '.join(cameras)} of {size}",
+                f"this proxy reward looks at {', '.join(self.config.cameras)}, the world model imagines "
+                f"{', '.join(cameras)}",
                 "train the reward again on the world model's cameras",
             )  # fmt: skip
 

@@ -14,7 +14,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from lerobot_wmrl.data.episodes import open_dataset, read_episodes
-from lerobot_wmrl.data.frame_cache import cached_frames
+from lerobot_wmrl.data.frame_cache import decode_episode
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.envs.start_frames import chosen_episodes
 from lerobot_wmrl.rl.observations import TASK, decoded
@@ -126,8 +126,10 @@ def recorded_successes(
     labels = action_chunks(torch.from_numpy(table.action[rows]), acting, chunk)
     step, episode = acting.nonzero(as_tuple=True)
     chosen = rows[step, episode]
-    frames = torch.from_numpy(cached_frames(table.dataset, cameras)[chosen]).permute(1, 0, 4, 2, 3)
-    labels |= dict(zip(cameras, frames.contiguous(), strict=True))
+    place = (table.length[episodes].cumsum() - table.length[episodes])[episode] + step.numpy()
+    for camera in cameras:
+        frames = [decode_episode(table.dataset, int(each), camera) for each in episodes]
+        labels[camera] = torch.cat(frames)[place]
     if state_size:
         labels[OBS_STATE] = torch.from_numpy(table.state[chosen])
     labels[TASK] = episode

@@ -114,7 +114,6 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     from lerobot_wmrl.common.constants import START_SCENE
     from lerobot_wmrl.common.files import write_json, write_text
     from lerobot_wmrl.data.episodes import choose_episodes, read_episodes
-    from lerobot_wmrl.data.frame_cache import cached_frames
     from lerobot_wmrl.evaluation.reconstruction import reconstruction_metrics
     from lerobot_wmrl.evaluation.replay import Recording
     from lerobot_wmrl.evaluation.report import evaluate, report_action_model, report_agreement
@@ -129,7 +128,7 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     scenes = scene_splits(table.column(START_SCENE), cfg.split)
     episodes = choose_episodes(table, cfg.split, cfg.max_episodes, scenes)
     claim_output_dir(cfg.output_dir, draccus.encode(cfg))
-    recording = Recording(table, cached_frames(table.dataset, model.config.tokenizer.camera_keys))
+    recording = Recording.read(table, model)
     evaluation = evaluate(model, recording, episodes)
     reports = [
         report_action_model(model, recording, evaluation, cfg.done_threshold, cfg.done_frames, cfg.output_dir)

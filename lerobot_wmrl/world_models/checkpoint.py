@@ -121,10 +121,10 @@ def check_dataset(config: FrameTokenizerConfig | WorldModelConfig, meta: Any) ->
     features = meta.features
     sizes = config.tokenizer
     assert sizes is not None, "a trained model knows its tokenizer"
-    check_cameras(features, sizes.camera_keys, sizes.image_size)
+    check_cameras(features, sizes.camera_keys)
     if isinstance(config, WorldModelConfig):
         if config.depth:
-            check_depth(features, sizes.camera_keys, sizes.image_size)
+            check_depth(features, sizes.camera_keys)
         check_widths(features, {OBS_STATE: config.state_size})
     if isinstance(config, ActionWorldModelConfig):
         check_widths(features, {ACTION: config.action_size})

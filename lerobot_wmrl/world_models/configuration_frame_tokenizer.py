@@ -33,7 +33,8 @@ class TokenizerConfig:
 
     Args:
         cameras: names of the cameras, without `observation.images.`; `observation.image` by that name.
-        image_size: side of the dataset's square frames in pixels. The dataset must have this size.
+        image_size: side in pixels of the square frames that become tokens. Frames of another size or shape
+            are stretched to it, and decoded ones back, so that policies see them as the dataset has them.
         widths: channels from fine to coarse. With one entry a token is 4x4 pixels; each further entry doubles
             its side.
         quantizer: `fsq` (finite scalar quantisation) or `lfq` (MAGVIT-2's lookup-free quantisation).
@@ -42,6 +43,7 @@ class TokenizerConfig:
         context: show encoder and decoder the episode's first frame too, so that tokens encode what moves.
         success: learn to classify success in frames too. An anchored world model then predicts the
             classifier's features, and reads success from them. Needs labels of success, and `context`.
+        frame_sizes: height and width of each camera's frames, read from the dataset.
     """
 
     cameras: list[str] = field(default_factory=lambda: ["third_view"])
@@ -51,6 +53,7 @@ class TokenizerConfig:
     levels: list[int] = field(default_factory=lambda: [5, 5, 5, 5, 5, 5])
     context: bool = False
     success: bool = False
+    frame_sizes: list[list[int]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         if not self.cameras or len(set(self.cameras)) < len(self.cameras):
@@ -112,6 +115,12 @@ class TokenizerConfig:
     def downsample(self) -> int:
         """Side of a token in pixels."""
         return PATCH * 2 ** (len(self.widths) - 1)
+
+    @property
+    def frame_shapes(self) -> dict[str, tuple[int, int, int]]:
+        """Shape (3, H, W) of each camera's frames as the dataset has them, by the camera's key."""
+        sizes = self.frame_sizes or [[self.image_size, self.image_size]] * len(self.cameras)
+        return {key: (3, *size) for key, size in zip(self.camera_keys, sizes, strict=True)}  # type: ignore[misc]
 
     @property
     def camera_keys(self) -> list[str]:

@@ -1,5 +1,6 @@
 """The frame tokenizer as a LeRobot reward model: trained, saved and published like one."""
 
+import logging
 from collections.abc import Sequence
 from typing import Any, Final
 
@@ -9,7 +10,8 @@ from lerobot.utils.constants import OBS_IMAGE
 from torch import Tensor
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.episodes import check_cameras
+from lerobot_wmrl.common.images import stretch
+from lerobot_wmrl.data.episodes import check_cameras, frame_size
 from lerobot_wmrl.data.frames import NO_CONTEXT
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer, ImageLoss, motion_weight
@@ -28,7 +30,10 @@ COLLAPSE_BATCH: Final = 8
 
 
 def stack_cameras(batch: dict[str, Tensor], keys: Sequence[str], size: int) -> Tensor:
-    """Stack camera images (…, 3, H, W) of a batch → (…, N, 3, H, W). ValueError if one is not there."""
+    """Stack camera images (…, 3, H, W) of a batch, stretched to squares → (…, N, 3, size, size).
+
+    ValueError if one is not there, or is none of three colours.
+    """
     missing = [key for key in keys if key not in batch]
     if missing:
         present = [key for key in batch if key.startswith(OBS_IMAGE)]
@@ -36,12 +41,17 @@ def stack_cameras(batch: dict[str, Tensor], keys: Sequence[str], size: int) -> T
             f"the batch lacks the cameras {missing}; it has {present}. Train on a dataset with them."
         )
     for key in keys:
-        if tuple(batch[key].shape[-3:]) != (3, size, size):
+        if batch[key].shape[-3] != 3:
             raise ValueError(
-                f"{key}: frames of shape {tuple(batch[key].shape[-3:])}, but the tokenizer's are (3, {size}, "
-                f"{size}); resize them, or train a tokenizer at their size"
+                f"{key}: frames of shape {tuple(batch[key].shape[-3:])}; give them as (3, H, W), in RGB"
             )
-    return torch.stack([batch[key] for key in keys], dim=-4)
+    return torch.stack([stretch(batch[key], size, size) for key in keys], dim=-4)
+
+
+def split_cameras(images: Tensor, shapes: dict[str, tuple[int, int, int]]) -> dict[str, Tensor]:
+    """Return decoded images (…, N, 3, S, S) by camera, stretched to the shapes (3, H, W) of its frames."""
+    views = zip(shapes.items(), images.unbind(-4), strict=True)
+    return {key: stretch(view, height, width) for (key, (_, height, width)), view in views}
 
 
 class FrameTokenizerRewardModel(HubCard, PreTrainedRewardModel):
@@ -59,10 +69,22 @@ class FrameTokenizerRewardModel(HubCard, PreTrainedRewardModel):
         self.config: FrameTokenizerConfig = config
         sizes = config.tokenizer
         if dataset_meta is not None:
-            check_cameras(dataset_meta.features, sizes.camera_keys, sizes.image_size)
+            check_cameras(dataset_meta.features, sizes.camera_keys)
+            self._adopt_frame_sizes(dataset_meta.features)
             if config.perceptual_weight:
                 require_backbone("vgg", "perceptual_weight", config.perceptual_weight, "0")
         self.tokenizer = FrameTokenizer(sizes)
+
+    def _adopt_frame_sizes(self, features: dict[str, Any]) -> None:
+        """Take the sizes of the cameras' frames from the dataset, and say which are stretched."""
+        sizes = self.config.tokenizer
+        sizes.frame_sizes = [list(frame_size(features[key])) for key in sizes.camera_keys]
+        for key, (_, height, width) in sizes.frame_shapes.items():
+            if (height, width) != (sizes.image_size, sizes.image_size):
+                logging.info(
+                    "%s: frames of %d x %d (height x width) are stretched to `tokenizer.image_size`=%d",
+                    key, height, width, sizes.image_size,
+                )  # fmt: skip
 
     def forward(self, batch: dict[str, Tensor], progress: float = 1.0) -> tuple[Tensor, dict[str, float]]:
         """Return the reconstruction loss of `observation.images.*` (B, 3, H, W) and metrics.

@@ -129,9 +129,9 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
         if self.config.pretrained_path:
             check_dataset(self.config, meta)
         sizes, features = self.config.tokenizer, meta.features
-        check_cameras(features, sizes.camera_keys, sizes.image_size)
+        check_cameras(features, sizes.camera_keys)
         if self.config.depth:
-            check_depth(features, sizes.camera_keys, sizes.image_size)
+            check_depth(features, sizes.camera_keys)
         if self.config.state_size and OBS_STATE not in features:
             logging.info("the dataset has no observation.state: the world model does without it")
         if self.config.state_size:

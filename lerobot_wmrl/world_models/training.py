@@ -123,8 +123,8 @@ def make_sampler(
                 f"{table.dataset.root} has neither next.success nor next.done, so its frames cannot be told "
                 "apart", "label its episodes, or leave `tokenizer.success` out",
             )  # fmt: skip
-        frames = cached_frames(table.dataset, config.tokenizer.camera_keys)
-        cameras = config.tokenizer.cameras
+        sizes = config.tokenizer
+        frames, cameras = cached_frames(table.dataset, sizes.camera_keys, sizes.image_size), sizes.cameras
         return FrameSampler(table, frames, episodes.nonzero()[0], cameras, batch_size, seed, config.device)
     if isinstance(config, TextWorldModelConfig):
         episodes = episodes & golden_episodes(table)

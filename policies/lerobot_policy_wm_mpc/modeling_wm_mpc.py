@@ -18,7 +18,7 @@ from lerobot_wmrl.common.policies import (
 )
 from lerobot_wmrl.data.frames import Context, Frames
 from lerobot_wmrl.world_models.checkpoint import check_same_tokenizer, load_model
-from lerobot_wmrl.world_models.modeling_frame_tokenizer import stack_cameras
+from lerobot_wmrl.world_models.modeling_frame_tokenizer import split_cameras, stack_cameras
 from lerobot_wmrl.world_models.planning import Planner
 
 Observation = dict[str, Any]
@@ -108,9 +108,8 @@ class Proposal:
 
     def __init__(self, config: WmMpcConfig, model: Any, low: Tensor, high: Tensor) -> None:
         self.model, self.low, self.high = model, low, high
-        self.cameras = model.config.tokenizer.camera_keys
-        size, path = model.config.tokenizer.image_size, config.proposal_path
-        shown: dict[str, tuple[int, ...]] = dict.fromkeys(self.cameras, (3, size, size))
+        self.shapes, path = model.config.tokenizer.frame_shapes, config.proposal_path
+        shown: dict[str, tuple[int, ...]] = {**self.shapes}
         if model.config.state_size:
             shown[OBS_STATE] = (model.config.state_size,)
         try:
@@ -129,7 +128,7 @@ class Proposal:
         self.policy.reset()
 
         def act(images: Tensor, state: Tensor) -> Tensor:
-            seen: Observation = {name: images[:, index] for index, name in enumerate(self.cameras)}
+            seen: Observation = {**split_cameras(images, self.shapes)}
             if self.model.config.state_size:
                 seen[OBS_STATE] = state
             action: Tensor = self.postprocess(

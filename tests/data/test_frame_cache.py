@@ -146,12 +146,12 @@ def test_the_environment_begins_with_the_depth_of_its_starts(deep_dataset, model
         _, _, _, truncated, _ = env.step(torch.full((2, 7), 0.01))
     assert truncated.all()
     np.testing.assert_allclose(begun(), first[starts[env._start_index.numpy()]], atol=1e-4)
-    with pytest.raises(ValueError, match=r"third_view_depth .*the dataset has none; record it with"):
+    with pytest.raises(ValueError, match=r"third_view_depth, which the dataset lacks; record it with"):
         config(small_dataset).create_tensor_env(2)
 
 
 def test_a_dataset_without_depth_is_named_before_anything_is_trained(small_dataset, trained_models, tmp_path):
-    with pytest.raises(FieldError, match=r"^depth=True: .*third_view_depth .*--depth=true"):
+    with pytest.raises(FieldError, match=r"^depth=True: .*third_view_depth, .*--depth=true"):
         run_training(
             action_config(trained_models["frame_tokenizer"], dynamics="autoregressive", depth=True),
             Path(small_dataset.root), tmp_path / "out",

@@ -47,7 +47,7 @@ def text_model(trained_models):
 
 
 def source_of(dataset, keys) -> Recording:
-    return Recording(read_episodes(dataset), cached_frames(dataset, keys))
+    return Recording(read_episodes(dataset), cached_frames(dataset, keys, 32))
 
 
 def test_the_least_allowed_distance_counts():

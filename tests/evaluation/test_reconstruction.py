@@ -38,7 +38,7 @@ def output_dir(dataset, tmp_path_factory) -> Path:
 @torch.no_grad()
 def test_psnr_is_that_of_each_camera_and_of_its_moved_pixels(dataset, output_dir):
     model, table = load_model(output_dir, "frame_tokenizer"), read_episodes(dataset)
-    frames = np.array(cached_frames(dataset, model.config.tokenizer.camera_keys))
+    frames = np.array(cached_frames(dataset, model.config.tokenizer.camera_keys, 32))
     frames[:, 1] = frames[table.start[4], 1]
     metrics = reconstruction_metrics(model, table, frames, np.array([4]))
     rows = slice(table.start[4], table.start[4] + table.length[4])
@@ -54,7 +54,7 @@ def test_psnr_is_that_of_each_camera_and_of_its_moved_pixels(dataset, output_dir
 
 def test_frames_are_thinned_evenly(dataset, output_dir):
     model, table = load_model(output_dir, "frame_tokenizer"), read_episodes(dataset)
-    frames = cached_frames(dataset, model.config.tokenizer.camera_keys)
+    frames = cached_frames(dataset, model.config.tokenizer.camera_keys, 32)
     assert reconstruction_metrics(model, table, frames, np.arange(21), max_frames=10)["frames"] == 10
 
 

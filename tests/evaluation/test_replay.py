@@ -12,7 +12,6 @@ import torch
 from lerobot_wmrl.common.constants import KINDS
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.episodes import DatasetSource, choose_episodes, open_dataset, read_episodes
-from lerobot_wmrl.data.frame_cache import cached_frames
 from lerobot_wmrl.data.frames import NO_CONTEXT
 from lerobot_wmrl.evaluation import replay as replay_module
 from lerobot_wmrl.evaluation.accuracy import (
@@ -39,9 +38,7 @@ def model(trained_models):
 
 @pytest.fixture
 def source(small_dataset, model) -> Recording:
-    return Recording(
-        read_episodes(small_dataset), cached_frames(small_dataset, model.config.tokenizer.camera_keys)
-    )
+    return Recording.read(read_episodes(small_dataset), model)
 
 
 def perfect(source: Recording, model, episode: int) -> EpisodeReplay:

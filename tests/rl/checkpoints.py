@@ -12,10 +12,16 @@ from lerobot_wmrl.common.images import camera_key
 
 
 def save_untrained_policy(
-    folder: Path, camera: str = "third_view", size: int = 32, actions: int = 3, constant: float | None = None
+    folder: Path,
+    camera: str = "third_view",
+    size: int | tuple[int, int] = 32,
+    actions: int = 3,
+    constant: float | None = None,
 ) -> Path:
     """A policy that sees one camera, with its processors; with `constant` all its actions are that number."""
-    image = PolicyFeature(type=FeatureType.VISUAL, shape=(3, size, size))
+    image = PolicyFeature(
+        type=FeatureType.VISUAL, shape=(3, *((size, size) if isinstance(size, int) else size))
+    )
     action = PolicyFeature(type=FeatureType.ACTION, shape=(actions,))
     config = CnnConfig(
         device="cpu",

@@ -1,4 +1,7 @@
-"""The whole way with a robot that nobody here has built for: three joints in degrees, one camera, 30 Hz."""
+"""The whole way with a robot that nobody here has built for: three joints in degrees, one camera, 30 Hz.
+
+Its frames are no squares, and of another size than the world model's.
+"""
 
 from pathlib import Path
 
@@ -18,7 +21,8 @@ from tests.rl.checkpoints import save_untrained_policy
 from tests.scripts.test_train import SHORT, improve
 from tests.trained import action_config, run_training, tokenizer_config
 
-JOINTS, FPS, SIZE, FRAMES = ["shoulder.pos", "elbow.pos", "gripper.pos"], 30, 32, 12
+JOINTS, FPS, FRAMES = ["shoulder.pos", "elbow.pos", "gripper.pos"], 30, 12
+HEIGHT, WIDTH, SIDE = 36, 48, 32
 LOW, HIGH = [-90.0, 10.0, 0.0], [90.0, 60.0, 100.0]
 
 
@@ -30,7 +34,7 @@ def episodes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     features = {
         "action": joints, "observation.state": joints,
         OBS_IMAGE: {
-            "dtype": "image", "shape": (SIZE, SIZE, 3), "names": ["height", "width", "channels"],
+            "dtype": "image", "shape": (HEIGHT, WIDTH, 3), "names": ["height", "width", "channels"],
         },
         "next.success": {"dtype": "bool", "shape": (1,), "names": None},
     }  # fmt: skip
@@ -41,7 +45,7 @@ def episodes(tmp_path_factory: pytest.TempPathFactory) -> Path:
             angles = (LOW + share * np.subtract(HIGH, LOW)).astype(np.float32)
             dataset.add_frame({
                 "action": angles, "observation.state": angles, "task": "reach",
-                OBS_IMAGE: rng.integers(0, 255, (SIZE, SIZE, 3), np.uint8),
+                OBS_IMAGE: rng.integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8),
                 "next.success": np.array([bool(episode % 2) and frame >= FRAMES - 3]),
             })  # fmt: skip
         dataset.save_episode()
@@ -52,7 +56,9 @@ def episodes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def world_model(episodes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("joints_models")
-    tokenizer = run_training(tokenizer_config(cameras=[OBS_IMAGE]), episodes, folder / "tokenizer")
+    tokenizer = run_training(
+        tokenizer_config(cameras=[OBS_IMAGE], image_size=SIDE), episodes, folder / "tokenizer"
+    )
     return run_training(action_config(tokenizer), episodes, folder / "world_model")
 
 
@@ -73,7 +79,8 @@ def test_the_environment_is_that_robot(world_model: Path, episodes: Path) -> Non
     np.testing.assert_allclose(env.single_action_space.low, LOW)
     np.testing.assert_allclose(env.single_action_space.high, HIGH)
     assert env.model.config.embodiment.action_names == JOINTS
-    assert EvaluationAdapter(env).reset(seed=0)[0]["pixels"].shape == (2, SIZE, SIZE, 3)
+    assert EvaluationAdapter(env).reset(seed=0)[0]["pixels"].shape == (2, HEIGHT, WIDTH, 3)
+    assert env.model.tokenizer.image_size == SIDE
     info = env.step(torch.tensor([LOW, [*HIGH[:2], 101.0]]))[-1]
     assert info["reward_parts"]["clipped"].tolist() == pytest.approx([0, 1 / 3])
 
@@ -81,7 +88,7 @@ def test_the_environment_is_that_robot(world_model: Path, episodes: Path) -> Non
 def test_its_policy_is_improved_in_imagination(
     world_model: Path, episodes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    policy = save_untrained_policy(tmp_path / "policy", camera=OBS_IMAGE, constant=30.0)
+    policy = save_untrained_policy(tmp_path / "policy", camera=OBS_IMAGE, size=(HEIGHT, WIDTH), constant=30.0)
     flags = [f"--policy.path={policy}", *SHORT, *imagination(world_model, episodes)]
     improve(monkeypatch, *flags, f"--output_dir={tmp_path / 'rl'}")
     line = read_metrics(tmp_path / "rl")[-1]
@@ -92,7 +99,9 @@ def test_a_policy_in_other_units_is_refused(
     world_model: Path, episodes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
-    policy = save_untrained_policy(tmp_path / "policy", camera=OBS_IMAGE, constant=5000.0)
+    policy = save_untrained_policy(
+        tmp_path / "policy", camera=OBS_IMAGE, size=(HEIGHT, WIDTH), constant=5000.0
+    )
     flags = [f"--policy.path={policy}", *SHORT, *imagination(world_model, episodes)]
     with pytest.raises(SystemExit):
         improve(monkeypatch, *flags, f"--output_dir={tmp_path / 'rl'}")
@@ -106,7 +115,7 @@ def test_it_can_be_planned_for(world_model: Path) -> None:
         world_model_path=str(world_model), horizon=6, execute=2, samples=4, elites=2, iterations=1, knots=2,
         device="cpu",
     )  # fmt: skip
-    image = torch.rand(2, 3, SIZE, SIZE)
+    image = torch.rand(2, 3, HEIGHT, WIDTH)
     state = torch.tensor([LOW, HIGH])
     planner = WmMpcPolicy(config)
     action = planner.select_action({OBS_IMAGE: image, "observation.state": state})

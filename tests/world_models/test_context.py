@@ -42,7 +42,7 @@ def table(small_dataset):
 
 @pytest.fixture(scope="module")
 def frames(small_dataset) -> np.ndarray:
-    return cached_frames(small_dataset, [CAMERA])
+    return cached_frames(small_dataset, [CAMERA], 32)
 
 
 def scenes() -> tuple[torch.Tensor, torch.Tensor]:

@@ -93,7 +93,7 @@ def bright_column(image: Tensor) -> float:
 def test_a_frame_is_labelled_by_the_action_before_it(small_dataset):
     """`next.success` of a row is about the frame after it, and the first frame follows no action."""
     table = read_episodes(small_dataset)
-    frames = cached_frames(small_dataset, [CAMERA])
+    frames = cached_frames(small_dataset, [CAMERA], 32)
     sampler = FrameSampler(table, frames, np.arange(len(table.start)), ["third_view"], 64, 0, "cpu")
     known: dict[bytes, bool] = {}
     for start, length in zip(table.start, table.length, strict=True):
@@ -109,7 +109,7 @@ def test_a_frame_is_labelled_by_the_action_before_it(small_dataset):
 def test_clips_carry_the_features_of_their_frames(models, small_dataset):
     table = read_episodes(small_dataset)
     model = load_model(models["action_world_model"], "action_world_model")
-    frames = cached_frames(small_dataset, [CAMERA])
+    frames = cached_frames(small_dataset, [CAMERA], 32)
     clip = make_sampler(model, table, None, batch_size=4, seed=0).clips(np.array([2, 0]), np.array([3, 0]))
     for row, (episode, offset) in enumerate([(2, 3), (0, 0)]):
         start = table.start[episode]
@@ -121,7 +121,7 @@ def test_clips_carry_the_features_of_their_frames(models, small_dataset):
 def test_cached_features_are_those_of_the_frames(models, small_dataset):
     tokenizer = load_model(models["frame_tokenizer"], "frame_tokenizer").tokenizer
     found = cached_features(small_dataset, [CAMERA], tokenizer)
-    frames, start = cached_frames(small_dataset, [CAMERA]), read_episodes(small_dataset).start[1]
+    frames, start = cached_frames(small_dataset, [CAMERA], 32), read_episodes(small_dataset).start[1]
     expected = tokenizer.success_features(*(frames_to_tensor(frames[[row]]) for row in (start, start + 2)))
     np.testing.assert_allclose(found[start + 2], expected[0], atol=1e-5)
 
@@ -167,7 +167,7 @@ def test_the_loss_of_features_compares_each_step_with_the_next_frame(models, sma
 def test_lerobots_windows_have_features_too(models, small_dataset):
     model = load_model(models["action_world_model"], "action_world_model")
     window = model.config.clip_length
-    images = frames_to_tensor(cached_frames(small_dataset, [CAMERA])[:window])[None, :, 0]
+    images = frames_to_tensor(cached_frames(small_dataset, [CAMERA], 32)[:window])[None, :, 0]
     batch = {
         CAMERA: images, "action": torch.zeros(1, window, 7), "observation.state": torch.zeros(1, window, 8),
     }  # fmt: skip

@@ -123,7 +123,7 @@ def test_done_is_left_alone_where_a_further_dataset_does_not_say_it(small_datase
 
 
 def test_cached_frames_are_those_of_the_dataset(small_dataset):
-    frames = cached_frames(small_dataset, ["observation.images.third_view"])
+    frames = cached_frames(small_dataset, ["observation.images.third_view"], 32)
     for index in (0, 7, len(frames) - 1):
         image = small_dataset[index]["observation.images.third_view"]
         assert np.array_equal(frames[index, 0], (image.permute(1, 2, 0) * 255).round().byte().numpy())
