@@ -18,8 +18,10 @@ from lerobot_wmrl.common.command_line import RunConfig
 from lerobot_wmrl.common.constants import EVALUATION_SEED, KINDS, POLICY
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
 from lerobot_wmrl.common.policies import read_policy_config, require_trained
+from lerobot_wmrl.data.episodes import DatasetSource
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
+from lerobot_wmrl.maniskill.embodiment import ACTION_NAMES, STATE_NAMES
 from lerobot_wmrl.maniskill.tasks import task_of
 
 LOCAL = "local"
@@ -64,6 +66,11 @@ class RecordConfig(RunConfig):
     """ManiSkill with a task, scenes, cameras and an image size (--env.type=wmrl_maniskill --env.task=push …),
     or a world model and the dataset with its start frames (--env.type=world_model
     --env.world_model_path=…)."""
+
+    like: DatasetSource = field(default_factory=DatasetSource)
+    """For an environment that is not ManiSkill: a dataset of the same robot, `like.root` or `like.repo_id`,
+    with which the recording can then be merged. Its columns, their names and the range of the actions are
+    taken from it. Without it, columns are LeRobot's, and actions have numbers for names."""
 
     depth: bool = False
     """Also record every camera's depth, as LeRobot's depth maps (observation.images.<camera>_depth)."""
@@ -123,8 +130,6 @@ class RecordConfig(RunConfig):
         """Raise FieldError for the first setting that cannot be."""
         if self.output_dir is None:
             raise FieldError("output_dir", None, "missing", "give the folder for the dataset")
-        if not isinstance(self.env, WmrlManiSkillEnv | WorldModelEnv):
-            raise FieldError("env.type", self.env.type, "choose wmrl_maniskill or world_model")
         require_at_least(self, 1, "num_episodes", "num_workers", "part_episodes")
         if self.seed < 0 or (self.policy is None and self.seed + self.num_episodes > EVALUATION_SEED):
             raise FieldError(
@@ -144,32 +149,30 @@ class RecordConfig(RunConfig):
         self._validate_kinds()
         if self.push_to_hub:
             self._validate_publishing()
-        if isinstance(self.env, WorldModelEnv):
-            self._validate_imagination()
+        if not isinstance(self.env, WmrlManiSkillEnv):
+            self._validate_rollouts()
         else:
             self.env.selected_scenes()
         for task in self.tasks:
             task_of(task)
 
-    def _validate_imagination(self) -> None:
+    def _validate_rollouts(self) -> None:
         """Raise FieldError for a setting that needs the simulator, or for a missing policy."""
         if self.policy is None:
-            raise FieldError("env.type", "world_model", "needs a policy", "give `policy.path`, or a planner")
+            raise FieldError("env.type", self.env.type, "needs a policy", "give `policy.path`, or a planner")
         for name in ("depth", "tasks"):
             if getattr(self, name):
                 raise FieldError(
-                    name,
-                    getattr(self, name),
-                    "cannot be chosen in a world model",
-                    "leave it out (`env.dataset.tasks` chooses among the starts)",
-                )
-        if self.imagination is not None and self.imagination.dataset.past:
+                    name, getattr(self, name), "can be chosen in ManiSkill alone",
+                    "leave it out (in a world model, `env.dataset.tasks` chooses among the starts)",
+                )  # fmt: skip
+        if isinstance(self.env, WorldModelEnv) and self.env.dataset.past:
             raise FieldError(
-                "env.dataset.past",
-                self.imagination.dataset.past,
-                "recorded episodes begin with first frames, so that they can be repeated in ManiSkill",
+                "env.dataset.past", self.env.dataset.past, "recorded episodes begin with first frames",
                 "leave it out",
-            )
+            )  # fmt: skip
+        if self.elsewhere and self.shard_of[1] > 1:
+            raise FieldError("shard", self.shard, "divides recordings in ManiSkill alone", "leave it out")
 
     def _validate_kinds(self) -> None:
         planned = [kind for kind in KINDS if kind != POLICY]
@@ -209,8 +212,18 @@ class RecordConfig(RunConfig):
         return self.output_dir
 
     @property
+    def elsewhere(self) -> bool:
+        """Whether the environment is neither ManiSkill nor a world model that imagines ManiSkill's robot."""
+        if isinstance(self.env, WorldModelEnv):
+            from lerobot_wmrl.world_models.checkpoint import read_config
+
+            robot = read_config(self.env.world_model_path, "action_world_model").embodiment
+            return (robot.action_names, robot.state_names) != (list(ACTION_NAMES), list(STATE_NAMES))
+        return not isinstance(self.env, WmrlManiSkillEnv)
+
+    @property
     def imagination(self) -> WorldModelEnv | None:
-        """The environment, if it is a world model."""
+        """The environment, if it is a world model of ManiSkill, for use after `validate`."""
         return self.env if isinstance(self.env, WorldModelEnv) else None
 
     @property
@@ -244,10 +257,10 @@ class RecordConfig(RunConfig):
             JSON values only.
         """
         return {
-            **(self._simulated_content() if self.imagination is None else imagined_content(self.imagination)),
+            **self._env_content(),
             "depth": self.depth,
             **({} if self.video else {"video": False}),
-            "episode_length": self.env.episode_length,
+            "episode_length": getattr(self.env, "episode_length", None),
             "num_episodes": self.num_episodes,
             "part_episodes": self.part_episodes,
             "shard": list(self.shard_of),
@@ -257,6 +270,13 @@ class RecordConfig(RunConfig):
             **self._policy_content(),
             "exploration": self.exploration,
         }
+
+    def _env_content(self) -> dict[str, Any]:
+        if isinstance(self.env, WorldModelEnv):
+            return imagined_content(self.env)
+        if self.elsewhere:
+            return {"env": draccus.encode(self.env, EnvConfig), "like": asdict(self.like)}
+        return self._simulated_content()
 
     def _policy_content(self) -> dict[str, Any]:
         """Return what decides a policy's actions: its checkpoint, or its own settings if it has none."""

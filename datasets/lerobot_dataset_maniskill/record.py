@@ -5,8 +5,11 @@
         --output_dir=outputs/rollouts
     lerobot-wmrl-record --policy.path=outputs/sft --env.type=world_model --env.world_model_path=W \\
         --env.dataset.root=D --output_dir=outputs/imagined
+    lerobot-wmrl-record --policy.path=outputs/sft --env.type=pusht --like.root=data/demonstrations \\
+        --output_dir=outputs/rollouts
 
-Planners act by default; with `--policy.path` that policy does, in ManiSkill or in a world model.
+Planners act by default; with `--policy.path` that policy does, in ManiSkill, in any environment of LeRobot's
+or in a world model.
 `--recipe=FILE` stands for the settings in a YAML file, `--preset=tiny|demo|cpu|gpu|paper` for one of those in
 the package; flags further right override them.
 Running the same command again continues an interrupted recording, or reports that it is complete.
@@ -79,10 +82,12 @@ def run(config: RecordConfig) -> None:
         return
     from huggingface_hub import HfApi
 
+    from lerobot_dataset_maniskill.elsewhere import record_elsewhere
     from lerobot_dataset_maniskill.merging import merge_shards
     from lerobot_dataset_maniskill.publishing import publish
     from lerobot_dataset_maniskill.recorder import record
     from lerobot_dataset_maniskill.worker import silence_libraries
+    from lerobot_wmrl.data.episodes import open_dataset
 
     silence_libraries()
     if config.merge_shards:
@@ -90,9 +95,13 @@ def run(config: RecordConfig) -> None:
         check_shards(config)
         with writing("output_dir", config.root):
             merge_shards(config.merge_shards, config.root, config.dataset_id)
+    elif config.elsewhere:
+        record_elsewhere(config)
     else:
         record(config)
-    if config.push_to_hub:
+    if config.push_to_hub and config.elsewhere:
+        open_dataset(config.root, config.dataset_id).push_to_hub(private=config.private)
+    elif config.push_to_hub:
         publish(HfApi(), config.root, config.dataset_id, config.private)
 
 

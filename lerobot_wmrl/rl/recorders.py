@@ -1,7 +1,8 @@
 """Recording what a policy does outside the world model, for the gate and for Dyna rounds."""
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -9,24 +10,27 @@ from typing import Any, Protocol
 import draccus
 import numpy as np
 import torch
+from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs import make_env_pre_post_processors
 from lerobot.envs.configs import EnvConfig
 from lerobot.scripts.lerobot_eval import rollout
-from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE, PRETRAINED_MODEL_DIR
+from lerobot.utils.constants import ACTION, DEFAULT_FEATURES, OBS_IMAGE, OBS_STATE, PRETRAINED_MODEL_DIR
 from lerobot.utils.utils import flatten_dict
 from torch import Tensor
 from tqdm import trange
 
 from lerobot_wmrl.common.constants import KINDS, POLICY, START_KIND, START_SEED
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.exploration import ExplorationNoise
 from lerobot_wmrl.common.policies import load_policy, load_processors, read_policy_config
 from lerobot_wmrl.common.presets import Flags, format_flags
 from lerobot_wmrl.common.processes import run_subcommand
 from lerobot_wmrl.data.budget import Ledger, spending
-from lerobot_wmrl.data.embodiment import HIGH, LOW, Embodiment
+from lerobot_wmrl.data.embodiment import HIGH, LOW, Embodiment, read_embodiment, recorded_range
 from lerobot_wmrl.data.episodes import open_dataset, read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.rl.observations import to_bytes
 
 DERIVED = ("features", "features_map", "cameras")
@@ -84,7 +88,7 @@ class ManiSkillRecorder:
 
 @dataclass(frozen=True)
 class EnvRecorder:
-    """Records in any environment of LeRobot's, one episode after the other, with LeRobot's own rollout.
+    """Records in any environment of LeRobot's with LeRobot's own rollout.
 
     Args:
         env: the environment; if it has several tasks, they take turns.
@@ -105,55 +109,83 @@ class EnvRecorder:
         if not folder.is_dir():
             if ledger is not None:
                 ledger.require_left({spending(POLICY): episodes})
-            partial = folder.with_name(f".{folder.name}.partial")
-            shutil.rmtree(partial, ignore_errors=True)
-            self._record(checkpoint, episodes, seed, partial, exploration)
-            partial.replace(folder)
+            path = str(checkpoint / PRETRAINED_MODEL_DIR)
+            policy = read_policy_config(path, [f"--device={self.device}"])
+            rollouts = RolloutRecorder(self.env, policy, self.robot, exploration)
+            with trange(episodes, desc="Recording rollouts", unit="episode") as bar, closing(rollouts):
+                rollouts.record(folder, range(seed, seed + episodes), lambda success: bar.update())
         if ledger is not None:
             ledger.charge(read_episodes(open_dataset(folder)))
 
-    def _record(self, checkpoint: Path, episodes: int, seed: int, folder: Path, exploration: float) -> None:
-        path = str(checkpoint / PRETRAINED_MODEL_DIR)
-        config = read_policy_config(path, [f"--device={self.device}"])
-        policy, processors = load_policy(config), load_processors(config)
-        env_processors = make_env_pre_post_processors(self.env, config)
-        made = self.env.create_envs(1, use_async_envs=False)
-        envs = [env for tasks in made.values() for env in tasks.values()]
+
+class RolloutRecorder:
+    """A policy in an environment of LeRobot's, whose episodes become LeRobotDatasets.
+
+    Args:
+        env: the environment; if it has several tasks, they take turns.
+        policy: configuration of the policy.
+        robot: names and range of the actions, and names of the state; None for what `like` or the
+            environment says.
+        exploration: largest noise on the actions, as a share of half their range.
+        like: metadata of a dataset with which the new one is to be merged, from which its columns are taken.
+        num_envs: episodes at once.
+        video: store the cameras as videos; without `like`, which decides it.
+    """
+
+    def __init__(
+        self, env: EnvConfig, policy: PreTrainedConfig, robot: Embodiment | None, exploration: float = 0.0,
+        like: Any | None = None, num_envs: int = 1, video: bool = False,
+    ) -> None:  # fmt: skip
+        self.config, self.exploration, self.like, self.video = env, exploration, like, video
+        self.hold = env.done_frames if isinstance(env, WorldModelEnv) else 1
+        self.policy, self.processors = load_policy(policy).eval(), load_processors(policy)
+        self.env_processors = make_env_pre_post_processors(env, policy)
+        made = env.create_envs(num_envs, use_async_envs=False)
+        self.envs = [each for tasks in made.values() for each in tasks.values()]
+        self.robot = robot or robot_of(env, self.envs[0], like)
+
+    def close(self) -> None:
+        """Close the environments."""
+        for env in self.envs:
+            env.close()
+
+    def record(self, folder: Path, seeds: Sequence[int], report: Callable[[bool], None]) -> None:
+        """Record a dataset in `folder`, which appears when it is whole: one episode from each seed.
+
+        report: is told of every episode whether it succeeds.
+        """
+        partial = folder.with_name(f".{folder.name}.partial")
+        shutil.rmtree(partial, ignore_errors=True)
         dataset = None
-        try:
-            for episode in trange(episodes, desc="Recording rollouts", unit="episode"):
-                noise = ExplorationNoise(exploration, seed + episode, self._scale())
-                seen = Witness(*processors, noise, self.robot)
-                taken = rollout(
-                    envs[episode % len(envs)], policy, *env_processors, seen.preprocess, seen.postprocess,
-                    seeds=[seed + episode],
-                )  # fmt: skip
-                dataset = dataset or self._create(folder, seen.observations[0])
-                add_episode(dataset, seen, taken, seed + episode)
-        finally:
-            for env in envs:
-                env.close()
-        assert dataset is not None
+        size = self.envs[0].num_envs
+        for number, first in enumerate(range(0, len(seeds), size)):
+            chosen = seeds[first : first + size]
+            seen, taken = self._roll_out(self.envs[number % len(self.envs)], chosen)
+            dataset = dataset or self._create(partial, seen.observations[0])
+            for row, seed in enumerate(chosen):
+                report(self._add_episode(dataset, seen, taken, row, seed))
+        assert dataset is not None, "there is no seed"
         dataset.finalize()
+        partial.replace(folder)
+
+    def _roll_out(self, env: Any, seeds: Sequence[int]) -> tuple["Witness", dict[str, Tensor]]:
+        """Return what the policy saw and did from these seeds, and LeRobot's record of the outcome."""
+        spare = [seeds[-1]] * (env.num_envs - len(seeds))
+        noises = [ExplorationNoise(self.exploration, seed, self._scale()) for seed in [*seeds, *spare]]
+        seen = Witness(*self.processors, noises, self.robot)
+        taken = rollout(
+            env, self.policy, *self.env_processors, seen.preprocess, seen.postprocess, seeds=[*seeds, *spare]
+        )
+        return seen, taken
 
     def _scale(self) -> np.ndarray:
         return (np.array(self.robot.action_high) - np.array(self.robot.action_low)) / 2
 
     def _create(self, folder: Path, observation: Observation) -> LeRobotDataset:
         """Create an empty dataset for what this observation shows."""
-        names = {OBS_STATE: self.robot.state_names}
-        features: dict[str, dict[str, Any]] = {
-            key: {"dtype": "float32", "shape": tuple(value.shape[1:]), "names": names.get(key) or None}
-            for key, value in observation.items()
-            if isinstance(value, Tensor) and not key.startswith(OBS_IMAGE)
-        }
-        for key, value in observation.items():
-            if key.startswith(OBS_IMAGE):
-                _, channels, height, width = value.shape
-                shape = (height, width, channels)
-                features[key] = {"dtype": "image", "shape": shape, "names": ["height", "width", "channels"]}
         flag, whole = ({"dtype": kind, "shape": (1,), "names": None} for kind in ("bool", "int64"))
-        features |= {
+        own = {
+            **observation_features(observation, self.robot.state_names, "video" if self.video else "image"),
             ACTION: {
                 "dtype": "float32", "shape": (len(self.robot.action_names),),
                 "names": self.robot.action_names,
@@ -163,9 +195,111 @@ class EnvRecorder:
             "next.success": flag, "next.done": flag,
             START_SEED: whole, START_KIND: whole,
         }  # fmt: skip
+        features = own if self.like is None else matched(own, self.like.features)
         return LeRobotDataset.create(
-            f"local/{folder.name.strip('.')}", self.env.fps, features, root=folder, use_videos=False
+            f"local/{folder.name.strip('.')}", self.config.fps, features, root=folder,
+            use_videos=any(feature["dtype"] == "video" for feature in features.values()),
+        )  # fmt: skip
+
+    def _add_episode(
+        self, dataset: LeRobotDataset, seen: "Witness", taken: dict[str, Tensor], row: int, seed: int
+    ) -> bool:
+        """Add the episode of one environment of a rollout. Return whether it succeeds."""
+        length = int(taken["done"][row].int().argmax()) + 1
+        success = bool(taken["success"][row, length - 1])
+        for step in range(length):
+            observation = seen.observations[step]
+            frame: dict[str, Any] = {
+                key: to_bytes(value[row]).permute(1, 2, 0).cpu().numpy()
+                if key.startswith(OBS_IMAGE)
+                else value[row].cpu().numpy().astype(np.float32)
+                for key, value in observation.items()
+                if isinstance(value, Tensor)
+            }
+            solved = bool(taken["success"][row, step]) or (success and step >= length - self.hold)
+            frame |= {
+                ACTION: seen.actions[step][row],
+                "next.reward": np.array([float(taken["reward"][row, step])], np.float32),
+                "next.success": np.array([solved]), "next.done": np.array([step == length - 1]),
+                START_SEED: np.array([seed]), START_KIND: np.array([KINDS.index(POLICY)]),
+            }  # fmt: skip
+            kept = {key: value for key, value in frame.items() if key in dataset.features}
+            dataset.add_frame({**kept, "task": (observation.get("task") or [""])[row]})
+        dataset.save_episode()
+        return success
+
+
+def observation_features(
+    observation: Observation, state_names: Sequence[str], camera: str
+) -> dict[str, dict[str, Any]]:
+    """Describe the columns of a batch of observations; `camera` is how images are stored, image or video."""
+    features: dict[str, dict[str, Any]] = {}
+    for key, value in observation.items():
+        if not isinstance(value, Tensor):
+            continue
+        if key.startswith(OBS_IMAGE):
+            _, channels, height, width = value.shape
+            shape = (height, width, channels)
+            features[key] = {"dtype": camera, "shape": shape, "names": ["height", "width", "channels"]}
+        else:
+            names = list(state_names) if key == OBS_STATE and state_names else None
+            features[key] = {"dtype": "float32", "shape": tuple(value.shape[1:]), "names": names}
+    return features
+
+
+def matched(own: Mapping[str, Any], columns: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the features with which a recording of `own` can be merged with a dataset of `columns`.
+
+    Raises:
+        FieldError: the dataset has a column that a rollout lacks, or has in another shape.
+    """
+    wanted = {name: dict(feature) for name, feature in columns.items() if name not in DEFAULT_FEATURES}
+    for name, feature in wanted.items():
+        found = tuple(own[name]["shape"]) if name in own else None
+        if found != tuple(feature["shape"]):
+            raise FieldError(
+                "like.root", name, f"the dataset has it with shape {tuple(feature['shape'])}, a rollout has "
+                f"{found or 'none'}", "leave `like` out, and give the recording as `dataset.more`",
+            )  # fmt: skip
+        if "info" in feature and feature["dtype"] == "video":
+            feature.pop("info")  # the encoder's, which LeRobot writes
+    return wanted
+
+
+def robot_of(config: EnvConfig, env: Any, like: Any | None) -> Embodiment:
+    """Return the robot of an environment.
+
+    Args:
+        config: the environment's.
+        env: the environment.
+        like: metadata of a dataset of the same robot, whose names are taken, and whose range if it states
+            one; without it, the range is that of the environment's action space, and numbers are the names.
+
+    Raises:
+        FieldError: the actions of both have other numbers of components, or neither says how large they are.
+    """
+    if isinstance(config, WorldModelEnv):
+        return env.env.model.config.embodiment
+    space = env.single_action_space
+    low, high = np.asarray(space.low, float).tolist(), np.asarray(space.high, float).tolist()
+    bounded = bool(np.isfinite([low, high]).all())
+    if like is not None:
+        count = int(np.prod(like.features[ACTION]["shape"]))
+        if count != len(low):
+            raise FieldError(
+                "like.root", like.root, f"its actions have {count} components, the environment's {len(low)}",
+                "give a dataset of the same robot",
+            )  # fmt: skip
+        stated = recorded_range(like.features[ACTION]) is not None
+        return read_embodiment(
+            like, Embodiment() if stated or not bounded else Embodiment(action_low=low, action_high=high)
         )
+    if not bounded:
+        raise FieldError(
+            "env.type", config.type, "does not say between which values its actions are",
+            "give a dataset of the same robot, `like.root` or `like.repo_id`",
+        )  # fmt: skip
+    return Embodiment(config.fps, [str(index) for index in range(len(low))], low, high)
 
 
 @dataclass
@@ -174,52 +308,29 @@ class Witness:
 
     Args:
         before, after: the policy's pre- and postprocessor.
-        noise: what is added to each action.
+        noises: what is added to the actions, one for each environment.
         robot: whose range the actions keep.
     """
 
     before: Any
     after: Any
-    noise: ExplorationNoise
+    noises: Sequence[ExplorationNoise]
     robot: Embodiment
     observations: list[Observation] = field(default_factory=list)
     actions: list[np.ndarray] = field(default_factory=list)
 
     def preprocess(self, observation: Observation) -> Observation:
-        """Keep an observation in LeRobot's names, batch of one, and prepare it for the policy."""
+        """Keep a batch of observations in LeRobot's names, and prepare it for the policy."""
         self.observations.append(dict(observation))
         prepared: Observation = self.before(observation)
         return prepared
 
     def postprocess(self, action: Tensor) -> Tensor:
-        """Return the policy's action in the dataset's units, with noise, within its range. (1, A)"""
-        chosen = self.after(action).cpu().numpy()[0] + self.noise()
+        """Return the policy's actions in the dataset's units, with noise, within their range. (B, A)"""
+        chosen = self.after(action).cpu().numpy() + np.stack([noise() for noise in self.noises])
         kept = np.clip(chosen, self.robot.action_low, self.robot.action_high).astype(np.float32)
         self.actions.append(kept)
-        return torch.from_numpy(kept)[None]
-
-
-def add_episode(dataset: LeRobotDataset, seen: Witness, taken: dict[str, Tensor], seed: int) -> None:
-    """Add an episode of which `taken` holds reward, success and done as LeRobot's rollout returns them."""
-    length = int(taken["done"][0].int().argmax()) + 1
-    for step in range(length):
-        observation = seen.observations[step]
-        frame: dict[str, Any] = {
-            key: to_bytes(value[0]).permute(1, 2, 0).cpu().numpy()
-            if key.startswith(OBS_IMAGE)
-            else value[0].cpu().numpy().astype(np.float32)
-            for key, value in observation.items()
-            if isinstance(value, Tensor)
-        }
-        dataset.add_frame({
-            **frame, ACTION: seen.actions[step],
-            "next.reward": np.array([float(taken["reward"][0, step])], np.float32),
-            "next.success": np.array([bool(taken["success"][0, step])]),
-            "next.done": np.array([step == length - 1]),
-            START_SEED: np.array([seed]), START_KIND: np.array([KINDS.index(POLICY)]),
-            "task": next(iter(observation.get("task") or [""])),
-        })  # fmt: skip
-    dataset.save_episode()
+        return torch.from_numpy(kept)
 
 
 def budget_flags(budget: Path | None) -> Flags:

@@ -134,7 +134,7 @@ def test_a_command_that_fails_at_once_leaves_nothing_behind(config, tmp_path):
 
 def test_what_a_world_model_cannot_do_is_refused(config, make_synthetic_dataset, tmp_path):
     config.depth = True
-    with pytest.raises(ValueError, match="depth=True: cannot be chosen in a world model"):
+    with pytest.raises(ValueError, match="depth=True: can be chosen in ManiSkill alone"):
         record(config)
     config.depth, config.policy = False, None
     with pytest.raises(

@@ -11,9 +11,13 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import OBS_IMAGE
 
+from lerobot_dataset_maniskill.configuration import RecordConfig
+from lerobot_dataset_maniskill.elsewhere import record_elsewhere
 from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
 from lerobot_policy_wm_mpc.modeling_wm_mpc import WmMpcPolicy
+from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.common.tracking import read_metrics
+from lerobot_wmrl.data.episodes import open_dataset, read_episodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
@@ -108,6 +112,30 @@ def test_a_policy_in_other_units_is_refused(
     assert (
         "shoulder.pos is 5000 on average, the environment's is between -90 and 90" in capsys.readouterr().err
     )
+
+
+@pytest.mark.parametrize(("threshold", "frames", "successes"), [(0.9999, 6, 0), (0.0001, 2, 3)])
+def test_its_imagined_episodes_are_recorded(
+    threshold: float, frames: int, successes: int, world_model: Path, episodes: Path, tmp_path: Path
+) -> None:
+    """Success is marked in the frames that made it, the last two."""
+    env = WorldModelEnv(
+        world_model_path=str(world_model), dataset=StartFrames(root=str(episodes)), episode_length=6,
+        reward=GeneralConfig(alpha=1.0), done_threshold=threshold, done_frames=2,
+    )  # fmt: skip
+    policy = save_untrained_policy(tmp_path / "policy", OBS_IMAGE, size=(HEIGHT, WIDTH), constant=30.0)
+    record_elsewhere(RecordConfig(
+        output_dir=tmp_path / "imagined", env=env, num_episodes=3, part_episodes=2, exploration=0.1,
+        policy=read_policy_config(str(policy), []), video=False,
+    ))  # fmt: skip
+    table = read_episodes(open_dataset(tmp_path / "imagined"))
+    features = table.dataset.features
+    assert (table.dataset.fps, features["action"]["names"]) == (FPS, JOINTS)
+    np.testing.assert_allclose([features["action"]["info"][end] for end in ("low", "high")], [LOW, HIGH])
+    assert tuple(features[OBS_IMAGE]["shape"]) == (HEIGHT, WIDTH, 3)
+    assert table.length.tolist() == [frames] * 3
+    assert table.success.sum() == successes
+    assert table.done.sum() == 2 * successes
 
 
 def test_it_can_be_planned_for(world_model: Path) -> None:

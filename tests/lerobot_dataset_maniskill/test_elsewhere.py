@@ -1,0 +1,116 @@
+"""Rollouts in an environment of LeRobot's, recorded so that they can be merged with demonstrations."""
+
+import runpy
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from lerobot.envs.configs import PushtEnv
+from lerobot.utils.constants import OBS_IMAGE
+
+from lerobot_dataset_maniskill.configuration import RecordConfig
+from lerobot_dataset_maniskill.elsewhere import record_elsewhere
+from lerobot_dataset_maniskill.merging import merge_folders
+from lerobot_wmrl.common.policies import read_policy_config
+from lerobot_wmrl.data.episodes import DatasetSource, open_dataset, read_episodes
+from lerobot_wmrl.rl.recorders import RolloutRecorder, matched
+from tests.rl.checkpoints import save_untrained_policy
+
+STEPS = 6
+EXAMPLE = Path(__file__).parents[2] / "examples" / "record_pusht.py"
+
+
+@pytest.fixture(scope="module")
+def demonstrations(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("pusht") / "demonstrations"
+    flags = [f"--root={root}", "--num_episodes=1", f"--steps={STEPS}", "--candidates", "1"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", [EXAMPLE.name, *flags])
+        runpy.run_path(str(EXAMPLE), run_name="__main__")
+    return root
+
+
+@pytest.fixture
+def config(demonstrations: Path, tmp_path: Path) -> RecordConfig:
+    """Three episodes in parts of two."""
+    policy = save_untrained_policy(tmp_path / "policy", OBS_IMAGE, size=96, actions=2, constant=250.0)
+    return RecordConfig(
+        output_dir=tmp_path / "rollouts", env=PushtEnv(episode_length=STEPS), num_episodes=3,
+        part_episodes=2, policy=read_policy_config(str(policy), []), like=DatasetSource(str(demonstrations)),
+    )  # fmt: skip
+
+
+def test_they_have_the_columns_of_the_demonstrations_and_can_be_merged(
+    config: RecordConfig, demonstrations: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record_elsewhere(config)
+    assert "3 episodes, 18 frames" in capsys.readouterr().out
+    table, given = (read_episodes(open_dataset(root)) for root in (config.root, demonstrations))
+    assert table.dataset.features == given.dataset.features
+    assert table.length.tolist() == [STEPS] * 3
+    assert np.allclose(table.action, 250.0), "the environment says how large actions are"
+    assert len({tuple(table.state[start]) for start in table.start}) == 3
+    merge_folders([demonstrations, config.root], tmp_path / "merged", "local/merged")
+    assert len(read_episodes(open_dataset(tmp_path / "merged")).length) == 4
+
+
+def test_an_interrupted_recording_continues_and_a_whole_one_is_left_alone(
+    config: RecordConfig, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record, parts = RolloutRecorder.record, []
+
+    def interrupted(self: RolloutRecorder, folder: Path, *args: Any) -> None:
+        if len(parts) == 1:
+            raise KeyboardInterrupt
+        parts.append(folder.name)
+        record(self, folder, *args)
+
+    monkeypatch.setattr(RolloutRecorder, "record", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        record_elsewhere(config)
+    assert not config.root.exists()
+    parts.clear()
+    record_elsewhere(config)
+    assert parts == ["part-00001"]
+    record_elsewhere(config)
+    assert "already recorded: 3 episodes" in capsys.readouterr().out
+    config.exploration = 0.5
+    with pytest.raises(ValueError, match=r"other settings \(exploration 0\.0 → 0\.5\)"):
+        record_elsewhere(config)
+
+
+def test_without_demonstrations_the_environment_says_what_the_actions_are(config: RecordConfig) -> None:
+    config.like, config.video = DatasetSource(), False
+    record_elsewhere(config)
+    features = open_dataset(config.root).features
+    assert features["action"]["info"] == {"low": [0.0, 0.0], "high": [512.0, 512.0]}
+    assert features[OBS_IMAGE]["dtype"] == "image"
+
+
+@pytest.mark.parametrize(("setting", "value", "message"), [
+    ("policy", None, "env.type=pusht: needs a policy"),
+    ("depth", True, "depth=True: can be chosen in ManiSkill alone"),
+    ("shard", "0/2", "shard=0/2: divides recordings in ManiSkill alone"),
+    ("like", DatasetSource("nowhere"), "like.*root=nowhere: no LeRobotDataset there"),
+])  # fmt: skip
+def test_bad_settings_are_named_and_nothing_is_left(
+    setting: str, value: object, message: str, config: RecordConfig
+) -> None:
+    setattr(config, setting, value)
+    with pytest.raises(ValueError, match=message):
+        record_elsewhere(config)
+    assert not list(config.root.parent.glob("*rollouts*"))
+
+
+def test_columns_that_a_rollout_lacks_are_named(
+    config: RecordConfig, make_synthetic_dataset, tmp_path
+) -> None:
+    """And so is a dataset of another robot."""
+    panda = make_synthetic_dataset(tmp_path / "panda", episodes=1)
+    config.like = DatasetSource(str(panda.root))
+    with pytest.raises(ValueError, match="its actions have 7 components, the environment's 2"):
+        record_elsewhere(config)
+    with pytest.raises(ValueError, match=r"third_view: the dataset has it with shape \(32, 32, 3\)"):
+        matched({"action": {"shape": (7,)}}, panda.meta.features)
