@@ -1,24 +1,17 @@
-import runpy
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from lerobot_wmrl.data.episodes import open_dataset, read_episodes
-
-EXAMPLES = Path(__file__).parents[1] / "examples"
+from tests.pusht import record_pusht
 
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory) -> Path:
     """Two episodes of PushT; the second succeeds before it must end."""
     root = tmp_path_factory.mktemp("pusht") / "data"
-    flags = [f"--root={root}", "--num_episodes=2", "--steps=200", "--candidates", "16", "--seed=0"]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["record_pusht.py", *flags])
-        runpy.run_path(str(EXAMPLES / "record_pusht.py"), run_name="__main__")
-    return root
+    return record_pusht(root, "--num_episodes=2", "--steps=200", "--candidates", "16")
 
 
 def test_the_scripted_pusher_records_what_a_world_model_can_learn_from(recorded):

@@ -13,7 +13,7 @@ from lerobot_wmrl.common.command_line import RunConfig
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import FieldError, require_at_least
 from lerobot_wmrl.common.presets import Flags, format_flags, preset_flags
-from lerobot_wmrl.demo.runner import Stage
+from lerobot_wmrl.common.stages import Stage
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
 SEED_STRIDE = 100_000

@@ -22,12 +22,12 @@ from lerobot_wmrl.demo.stages import DemoConfig, demo_stages
 
 def run_demo(cfg: DemoConfig) -> None:
     """Run every stage, write the report, and say what came of it."""
-    from lerobot_wmrl.demo.runner import claimed, run_stages
+    from lerobot_wmrl.common.stages import claimed, run_stages
 
     cfg.check()
     stages = demo_stages(cfg)
     with claimed(cfg.output_dir, {**asdict(cfg), "output_dir": str(cfg.output_dir)}):
-        run_stages(stages, cfg.output_dir)
+        run_stages(stages, cfg.output_dir, ["lerobot_wmrl.maniskill.simulation"], offline=True)
         from lerobot_wmrl.demo.report.page import conclusion, write_report
 
         page = write_report(cfg, [stage.name for stage in stages])
@@ -47,7 +47,7 @@ def interrupt(signal_number: int, frame: object) -> NoReturn:
 
 def main() -> None:
     """Run the console command."""
-    from lerobot_wmrl.demo.runner import StageError
+    from lerobot_wmrl.common.stages import StageError
 
     signal.signal(signal.SIGTERM, interrupt)
     try:

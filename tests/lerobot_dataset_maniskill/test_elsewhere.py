@@ -1,7 +1,5 @@
 """Rollouts in an environment of LeRobot's, recorded so that they can be merged with demonstrations."""
 
-import runpy
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,20 +14,16 @@ from lerobot_dataset_maniskill.merging import merge_folders
 from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.data.episodes import DatasetSource, open_dataset, read_episodes
 from lerobot_wmrl.rl.recorders import RolloutRecorder, matched
+from tests.pusht import record_pusht
 from tests.rl.checkpoints import save_untrained_policy
 
 STEPS = 6
-EXAMPLE = Path(__file__).parents[2] / "examples" / "record_pusht.py"
 
 
 @pytest.fixture(scope="module")
 def demonstrations(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("pusht") / "demonstrations"
-    flags = [f"--root={root}", "--num_episodes=1", f"--steps={STEPS}", "--candidates", "1"]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", [EXAMPLE.name, *flags])
-        runpy.run_path(str(EXAMPLE), run_name="__main__")
-    return root
+    return record_pusht(root, "--num_episodes=1", f"--steps={STEPS}", "--candidates", "1")
 
 
 @pytest.fixture

@@ -36,12 +36,7 @@ MARKER = "settings.json"
 SAMPLE_SECONDS = 1.0
 """Seconds between two samples of memory and two reports of progress."""
 
-PRELOADED = (
-    "lerobot.scripts.lerobot_train",
-    "lerobot.scripts.lerobot_eval",
-    "lerobot_env_wmrl",
-    "lerobot_wmrl.maniskill.simulation",
-)
+PRELOADED = ("lerobot.scripts.lerobot_train", "lerobot.scripts.lerobot_eval", "lerobot_env_wmrl")
 
 Progress = Callable[[float, int], None]
 """Called about once a second with the seconds since the start and the peak memory so far in bytes."""
@@ -98,8 +93,21 @@ def check_settings(output_dir: Path, found: Mapping[str, Any], wanted: Mapping[s
             )  # fmt: skip
 
 
-def run_stages(stages: Sequence[Stage], output_dir: Path) -> None:
-    """Run every stage that is not finished. Raises StageError when a command fails."""
+def run_stages(
+    stages: Sequence[Stage], output_dir: Path, modules: Sequence[str] = (), offline: bool = False
+) -> None:
+    """Run every stage that is not finished.
+
+    Args:
+        stages: in order.
+        output_dir: folder of their records and logs.
+        modules: what else to import once before the stages, beside LeRobot's commands.
+        offline: keep the stages off the network.
+
+    Raises:
+        StageError: a command fails.
+    """
+    preload(modules, offline)
     for number, stage in enumerate(stages, start=1):
         record = read_record(output_dir, stage)
         heading = f"[{number}/{len(stages)}] {stage.title}"
@@ -128,7 +136,6 @@ def run_stage(stage: Stage, heading: str, output_dir: Path, record: dict[str, An
     print(f"\n{heading}\n$ {shlex.join(command)}", flush=True)
     log = output_dir / "logs" / f"{stage.name}.log"
     log.parent.mkdir(parents=True, exist_ok=True)
-    preload()
     status = run_measured(command, log, save)
     if status != 0:
         raise StageError(
@@ -148,12 +155,12 @@ def read_record(output_dir: Path, stage: Stage) -> dict[str, Any]:
     return json.loads(path.read_text()) if path.exists() else {}
 
 
-def preload() -> None:
-    """Import once what every stage needs, and keep the stages off the network, which none of them needs."""
-    if "HF_HUB_OFFLINE" not in os.environ:
+def preload(modules: Sequence[str], offline: bool) -> None:
+    """Import once what the stages need."""
+    if offline and "HF_HUB_OFFLINE" not in os.environ:
         os.environ["HF_HUB_OFFLINE"] = "1"  # for processes that a stage starts
         huggingface_hub.constants.HF_HUB_OFFLINE = True  # the library read the variable at its import
-    for module in PRELOADED:
+    for module in (*PRELOADED, *modules):
         importlib.import_module(module)
 
 

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_wmrl.demo import runner
-from lerobot_wmrl.demo.runner import (
+from lerobot_wmrl.common import stages as runner
+from lerobot_wmrl.common.stages import (
     Stage,
     StageError,
     claimed,
@@ -33,7 +33,7 @@ def run_code() -> None:
 def commands_of_the_tests(monkeypatch: pytest.MonkeyPatch) -> None:
     """The test stages run code that takes a moment, and need none of the libraries that are preloaded."""
     monkeypatch.setattr(runner, "entry_point", lambda program: run_code)
-    monkeypatch.setattr(runner, "preload", lambda: None)
+    monkeypatch.setattr(runner, "preload", lambda modules, offline: None)
 
 
 def python(name: str, code: str) -> Stage:

@@ -1,0 +1,1 @@
+"""One command from a policy and a dataset to a better policy: `lerobot-wmrl-improve`."""

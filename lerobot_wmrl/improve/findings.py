@@ -1,0 +1,95 @@
+"""What a dataset offers to a policy that is to be improved, and what it lacks."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from lerobot.configs import PreTrainedConfig
+from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
+
+from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.policies import check_fit
+from lerobot_wmrl.data.embodiment import component_names
+from lerobot_wmrl.data.episodes import DONE, EpisodeTable, camera_names, frame_size, success_column
+
+FEW_FAILURES = 10
+"""Failed episodes below which a world model hardly learns what failure looks like."""
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What was found in a dataset.
+
+    Args:
+        lines: what it has, for people.
+        missing: what it lacks, and what that costs.
+        cameras: names of the cameras that the policy looks at.
+        frame_side: the shorter side of their frames in pixels.
+        episodes: how many there are.
+        longest: frames of the longest episode.
+        held: frames in which success holds in a successful episode, the median.
+    """
+
+    lines: list[str]
+    missing: list[str]
+    cameras: list[str]
+    frame_side: int
+    episodes: int
+    longest: int
+    held: int
+
+    def __str__(self) -> str:
+        return "\n".join([*(f"  {line}" for line in self.lines), *(f"  ! {line}" for line in self.missing)])
+
+
+def look(table: EpisodeTable, policy: PreTrainedConfig) -> Findings:
+    """Look at a dataset with the eyes of a policy.
+
+    Raises:
+        FieldError: the policy cannot be improved with it.
+    """
+    features, root, success = table.dataset.features, table.dataset.root, table.success
+    keys = [key for key in policy.image_features if key.startswith(OBS_IMAGE)]
+    sizes = {key: frame_size(features[key]) for key in keys if key in features}
+    state = {OBS_STATE: tuple(features[OBS_STATE]["shape"])} if OBS_STATE in features else {}
+    if not keys:
+        raise FieldError(
+            "policy.path", policy.pretrained_path, "looks at no camera, and a world model imagines frames",
+            "train a policy that looks at one",
+        )  # fmt: skip
+    check_fit(policy, {key: (3, *size) for key, size in sizes.items()} | state, table.action.shape[1])
+    if not success.any():
+        has = "has no successful episode" if table.done_known else "says nowhere whether an episode succeeds"
+        raise FieldError(
+            "dataset.root", root, f"{has}, so there is nothing to reward",
+            "add next.success with lerobot-wmrl-label, or record successes",
+        )  # fmt: skip
+    seconds, fps = table.length / table.dataset.fps, table.dataset.fps
+    cameras = [f"{name} {h}x{w}" for name, (h, w) in zip(camera_names(keys), sizes.values(), strict=True)]
+    lines = [
+        f"{len(success)} episodes, {table.length.sum()} frames at {fps} Hz; the longest has "
+        f"{table.length.max()} ({seconds.max():.1f} s)",
+        f"cameras that the policy sees (height x width): {', '.join(cameras)}",
+        f"action: {', '.join(component_names(features[ACTION]))}",
+        f"state: {', '.join(component_names(features[OBS_STATE])) if state else 'none'}",
+        f"{success.sum()} episodes succeed, {(~success).sum()} fail",
+    ]
+    done = [table.done[a : a + n].sum() for a, n in zip(table.start, table.length, strict=True)]
+    return Findings(
+        lines=lines, missing=missing(table), cameras=camera_names(keys),
+        frame_side=min(map(min, sizes.values())), episodes=len(success), longest=int(table.length.max()),
+        held=int(np.median(np.array(done)[success])),
+    )  # fmt: skip
+
+
+def missing(table: EpisodeTable) -> list[str]:
+    """Return what a dataset lacks, and what that costs."""
+    failures, found = int((~table.success).sum()), []
+    if success_column(table.dataset.features) == DONE:
+        found.append("next.done is taken for success: there is no next.success (lerobot-wmrl-label adds it)")
+    if failures < FEW_FAILURES:
+        found.append(
+            f"{failures or 'no'} failures: the world model will hardly tell them from successes, and the "
+            "policy learns what it takes for one. Record rollouts of the policy (--rollouts, with "
+            "--real_env), and leave the failures in"
+        )
+    return found

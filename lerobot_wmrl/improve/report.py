@@ -1,0 +1,75 @@
+"""The report of an improvement, `report.md`: what was found, learnt and gained."""
+
+import json
+from pathlib import Path
+from typing import Any, Final
+
+from lerobot_wmrl.common.files import write_text
+from lerobot_wmrl.common.stages import Stage, read_record
+from lerobot_wmrl.common.statistics import Proportion
+from lerobot_wmrl.improve.stages import Improvement
+
+DOUBTFUL_AUC: Final = 0.8
+"""AUC of held-out successes against failures below which the world model's reward says little."""
+
+
+def write_report(improvement: Improvement, stages: list[Stage]) -> Path:
+    """Write the report and return its path."""
+    path = improvement.out / "report.md"
+    records = [read_record(improvement.out, stage) for stage in stages]
+    listed = "\n\n".join(
+        f"{each['title']} ({each['seconds']:.0f} s):\n\n```\n{each['command']}\n```" for each in records
+    )
+    sections = {
+        "Result": verdict(improvement),
+        "Data": "\n".join(f"- {line}" for line in [*improvement.found.lines, *improvement.found.missing]),
+        "Can the world model be trusted?": trust(improvement),
+        "The commands": listed,
+    }  # fmt: skip
+    text = "\n\n".join(f"## {title}\n\n{body}" for title, body in sections.items())
+    write_text(path, f"# {improvement.policy}, improved in imagination\n\n{text}\n")
+    return path
+
+
+def verdict(improvement: Improvement) -> str:
+    """Say in a few lines what was gained, and where."""
+    found = read(improvement.out / "comparison" / "comparison.json")
+    before, after = (Proportion(each["k"], each["n"]) for each in found["policies"].values())
+    (pair,), real = found["pairs"], improvement.config.real_env
+    where = "in imagination, from first frames of the dataset" if real is None else f"in {real.type}"
+    said = (
+        f"Success {where}: {before} before, {after} after; {pair['gained']} starts gained, "
+        f"{pair['lost']} lost, p = {pair['p_value']:.2g}.\n\nThe improved policy: `{improvement.improved}`"
+    )
+    if real is None:
+        said += (
+            "\n\nThis is what the world model believes, and shows nothing about the real world. Run both "
+            "policies there, label what they did, and run the command again on all episodes."
+        )
+    return said
+
+
+def trust(improvement: Improvement) -> str:
+    """Say how well the world model tells recorded successes from failures."""
+    found = read(improvement.out / "check" / "metrics.json")
+    wins, losses = found["successes"], found["failures"]
+    kind = "held-out episodes" if improvement.holds_out else "episodes, from which it has learnt,"
+    if not wins or not losses:
+        return (
+            f"Unknown: of the {kind} {wins} succeed and {losses} fail, and both are needed. Record more: "
+            f"every twentieth episode is held out."
+        )
+    said = (
+        f"Of {wins + losses} {kind} it takes {Proportion(found['false_positives'], losses)} of the failures "
+        f"for successes, and recognises {Proportion(found['true_positives'], wins)} of the successes. A "
+        f"success scores higher than a failure with probability {found['auc']:.2f} (AUC; 0.5 is chance)."
+    )
+    if found["auc"] < DOUBTFUL_AUC:
+        said += " That is not enough to trust its reward: record more episodes, failures above all."
+    return said
+
+
+def read(path: Path) -> dict[str, Any]:
+    """Read a stage's JSON."""
+    found: dict[str, Any] = json.loads(path.read_text())
+    return found

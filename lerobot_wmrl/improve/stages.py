@@ -1,0 +1,245 @@
+"""The stages of an improvement: which command each one runs, as a user would type it."""
+
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import ClassVar, Final
+
+import torch
+from lerobot.configs import PreTrainedConfig, parser
+from lerobot.envs.configs import EnvConfig
+
+from lerobot_wmrl.common.checkpoints import LAST_CHECKPOINT
+from lerobot_wmrl.common.command_line import RunConfig
+from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
+from lerobot_wmrl.common.policies import read_policy_config, require_trained
+from lerobot_wmrl.common.presets import Flags, format_flags
+from lerobot_wmrl.common.stages import Stage
+from lerobot_wmrl.data.episodes import VALIDATION_EVERY, DatasetSource
+from lerobot_wmrl.improve.findings import Findings
+from lerobot_wmrl.rl.recorders import env_flags
+
+SIZES: Final = ("auto", "tiny", "demo", "cpu")
+"""Presets of the stages; `auto` is `demo` on a processor and `cpu` with an accelerator."""
+
+SIDES: Final = {"tiny": 32, "demo": 64, "cpu": 128}
+"""Pixels a side of imagined frames at each size, unless the dataset's are smaller."""
+
+SIDE_STEP: Final = 16
+"""A side is a multiple of this, a token's side at any of the sizes."""
+
+ALGORITHMS: Final[dict[str, Flags]] = {
+    "cnn": {"algorithm.type": "ppo", "algorithm.train_encoder": False},
+    "act": {"algorithm.type": "ppo", "algorithm.policy_lr": 1e-5, "algorithm.initial_std": 0.1},
+    "openvla": {"algorithm.type": "ppo", "algorithm.initial_std": "null"},
+}
+"""How policies of a type are trained."""
+
+OTHERS: Final[Flags] = {"algorithm.type": "distillation"}
+"""How all others are: they are fitted to a planner in the world model."""
+
+DONE_FRAMES: Final = 2
+"""Consecutive done frames that make an imagined success, if the data shows that many."""
+
+DONE_THRESHOLD: Final = 0.95
+"""RL finds every failure that the world model takes for a success: the threshold is strict."""
+
+
+@dataclass
+class ImproveConfig(RunConfig):
+    """Improve a policy with a dataset, inside a world model that learns from it.
+
+    The command looks at the data and says what it has and lacks, trains a frame tokenizer and a world model,
+    checks the world model on held-out episodes, trains the policy in imagination and compares it with what it
+    was: in `real_env` if there is one, else in imagination, which proves nothing about the real world. Every
+    stage is a command that you could call yourself; it is printed. Running the same command again continues.
+
+    Args:
+        policy: `--policy.path=FOLDER` or a name on the hub: the policy to improve, cloned from such data.
+        dataset: `--dataset.repo_id=USER/NAME` or `--dataset.root=FOLDER`: episodes with actions, the cameras
+            that the policy sees, and next.success. Failures belong into it.
+        real_env: `--real_env.type=…` and its settings: one of LeRobot's environments or wmrl_maniskill, to
+            record rollouts and to measure success in.
+        rollouts: rollouts of the policy that are recorded in `real_env` first, and learnt from.
+        exploration: noise on the actions of these rollouts, as a share of half their range.
+        size: how large models are and how long they train: `demo` (an hour on two cores), `cpu` (several),
+            `tiny` (seconds, to try the command), or `auto`.
+        iterations: of RL; by default those of the size.
+        eval_episodes: starts on which both policies are compared.
+        seed: of recording and training. Evaluation has seeds of its own, from 1,000,000 on.
+        output_dir: folder of everything; `report.md` is the page to read.
+    """
+
+    path_fields: ClassVar[list[str]] = ["policy"]
+
+    policy: PreTrainedConfig | None = None
+    dataset: DatasetSource = field(default_factory=DatasetSource)
+    real_env: EnvConfig | None = None
+    rollouts: int = 0
+    exploration: float = 0.2
+    size: str = "auto"
+    iterations: int | None = None
+    eval_episodes: int = 100
+    seed: int = 0
+    output_dir: Path = Path("outputs/improve")
+
+    def check(self) -> None:
+        """Read the policy's configuration. FieldError for a setting that cannot be."""
+        path = parser.get_path_arg("policy")
+        if path:
+            self.policy = read_policy_config(path, parser.get_cli_overrides("policy") or [])
+        if self.policy is None:
+            raise FieldError("policy.path", None, "is missing", "give the policy to improve")
+        require_trained(self.policy)
+        if not self.dataset.given:
+            raise FieldError("dataset.root", "", "is missing", "give `dataset.root` or `dataset.repo_id`")
+        require_choice(self, "size", SIZES)
+        require_at_least(self, 0, "rollouts")
+        require_at_least(self, 1, "eval_episodes")
+        if self.rollouts and self.real_env is None:
+            raise FieldError(
+                "rollouts", self.rollouts, "are recorded in a real environment", "give `real_env.type`"
+            )
+        if not 0 <= self.seed < EVALUATION_SEED:
+            raise FieldError("seed", self.seed, f"must be from 0 to {EVALUATION_SEED - 1}")
+
+    @property
+    def preset(self) -> str:
+        """The stages' preset."""
+        automatic = "cpu" if torch.cuda.is_available() else "demo"
+        return automatic if self.size == "auto" else self.size
+
+
+@dataclass(frozen=True)
+class Improvement:
+    """The stages for one configuration and one dataset; paths are relative to where the command runs."""
+
+    config: ImproveConfig
+    found: Findings
+
+    def stages(self) -> list[Stage]:
+        """List every stage in order."""
+        steps = {
+            "rollouts": "Record rollouts of the policy",
+            "tokenizer": "Train the frame tokenizer",
+            "world_model": "Train the world model",
+            "check": "Check the world model on held-out episodes",
+            "rl": "Train the policy in imagination",
+            "comparison": "Compare it with what it was",
+        }
+        if not self.config.rollouts:
+            del steps["rollouts"]
+        return [Stage(name, title, partial(getattr(self, f"_{name}"))) for name, title in steps.items()]
+
+    @property
+    def out(self) -> Path:
+        return self.config.output_dir
+
+    @property
+    def policy(self) -> str:
+        """Path or name of the policy that is improved."""
+        assert self.config.policy is not None
+        return str(self.config.policy.pretrained_path)
+
+    @property
+    def improved(self) -> Path:
+        """Folder of the improved policy's checkpoint."""
+        return self.out / "rl" / LAST_CHECKPOINT / "pretrained_model"
+
+    @property
+    def holds_out(self) -> bool:
+        """Whether the dataset is large enough for held-out episodes."""
+        return self.found.episodes >= VALIDATION_EVERY
+
+    def _side(self) -> int:
+        """Return the side of imagined frames in pixels."""
+        return max(SIDE_STEP, min(SIDES[self.config.preset], self.found.frame_side) // SIDE_STEP * SIDE_STEP)
+
+    def _data(self) -> Flags:
+        """Return the flags of all that is learnt from."""
+        more = f"[{self.out / 'rollouts'}]" if self.config.rollouts else None
+        return self.config.dataset.flags() | ({"dataset.more": more} if more else {})
+
+    def _done(self, prefix: str = "") -> Flags:
+        held = min(DONE_FRAMES, max(1, self.found.held))
+        return {f"{prefix}done_threshold": DONE_THRESHOLD, f"{prefix}done_frames": held}
+
+    def _real_env(self, prefix: str) -> Flags:
+        assert self.config.real_env is not None
+        given = env_flags(self.config.real_env)
+        return {name.replace("env.", f"{prefix}.", 1): value for name, value in given.items()}
+
+    def _imagination(self) -> Flags:
+        return {
+            "env.type": "world_model", "env.world_model_path": str(self.out / "world_model"),
+            **{f"env.{name}": value for name, value in self.config.dataset.flags().items()},
+            "env.dataset.max_starts": 1024, "env.reward.type": "general", "env.reward.alpha": 1,
+            "env.episode_length": self.found.longest, **self._done("env."),
+        }  # fmt: skip
+
+    def _command(self, program: str, flags: Flags) -> list[str]:
+        return [program, f"--preset={self.config.preset}", *format_flags(flags)]
+
+    def _rollouts(self) -> list[str]:
+        like = {name.replace("dataset.", "like."): each for name, each in self.config.dataset.flags().items()}
+        simulator = self.config.real_env is not None and self.config.real_env.type == "wmrl_maniskill"
+        flags: Flags = {
+            "policy.path": self.policy, **self._real_env("env"), **({} if simulator else like),
+            "video": False, "num_episodes": self.config.rollouts, "exploration": self.config.exploration,
+            "seed": self.config.seed, "output_dir": str(self.out / "rollouts"),
+        }  # fmt: skip
+        return ["lerobot-wmrl-record", *format_flags(flags)]
+
+    def _learn(self, model: str, flags: Flags, folder: str) -> list[str]:
+        return self._command("lerobot-wmrl-train-world-model", {
+            "model.type": model, **flags, **self._data(), "seed": self.config.seed,
+            "output_dir": str(self.out / folder),
+        })  # fmt: skip
+
+    def _tokenizer(self) -> list[str]:
+        return self._learn("frame_tokenizer", {
+            "model.tokenizer.cameras": f"[{','.join(self.found.cameras)}]",
+            "model.tokenizer.image_size": self._side(), "model.tokenizer.context": True,
+            "model.tokenizer.success": True,
+        }, "tokenizer")  # fmt: skip
+
+    def _world_model(self) -> list[str]:
+        return self._learn("action_world_model", {
+            "model.tokenizer_path": str(self.out / "tokenizer"), "model.clip_length": self.found.longest + 2,
+        }, "world_model")  # fmt: skip
+
+    def _check(self) -> list[str]:
+        flags: Flags = {
+            "model.path": str(self.out / "world_model"), **self.config.dataset.flags(),
+            "split": "validation" if self.holds_out else "all",
+            **self._done(), "max_episodes": 200, "output_dir": str(self.out / "check"),
+        }  # fmt: skip
+        return ["lerobot-wmrl-eval-world-model", *format_flags(flags)]
+
+    def _rl(self) -> list[str]:
+        assert self.config.policy is not None
+        real = {} if self.config.real_env is None else self._real_env("real_env")
+        flags: dict[str, str | int | float | bool] = {
+            "policy.path": self.policy, **self._imagination(), **real,
+            "gate.action": "warn" if real else "off", "gate.freq": 0,
+            "gate.n_episodes": min(50, self.config.eval_episodes),
+            **ALGORITHMS.get(self.config.policy.type, OTHERS), "seed": self.config.seed,
+            "output_dir": str(self.out / "rl"),
+        }  # fmt: skip
+        if self.config.iterations is not None:
+            flags["iterations"] = self.config.iterations
+        return self._command("lerobot-wmrl-train", flags)
+
+    def _comparison(self) -> list[str]:
+        imagined = self.config.real_env is None
+        env = self._imagination() if imagined else self._real_env("env")
+        starts = self.config.eval_episodes
+        if imagined:  # each start once
+            starts = min(starts, self.found.episodes)
+        flags: Flags = {
+            "policies": f"[{self.policy},{self.improved}]", **env, "n_episodes": starts,
+            "batch_size": min(16 if imagined else 1, starts), "stop_early": False, "seed": EVALUATION_SEED,
+            "output_dir": str(self.out / "comparison"),
+        }  # fmt: skip
+        return ["lerobot-wmrl-compare", *format_flags(flags)]

@@ -1,0 +1,69 @@
+"""lerobot-wmrl-improve: from a policy and a dataset to a better policy, with one command.
+
+    lerobot-wmrl-improve --policy.path=outputs/cloned --dataset.repo_id=user/episodes \\
+        --output_dir=outputs/improve
+    lerobot-wmrl-improve --policy.path=outputs/cloned --dataset.root=data/pusht --real_env.type=pusht \\
+        --rollouts=200 --output_dir=outputs/improve
+
+It looks at the data and says what it has and lacks; trains a frame tokenizer and a world model; checks the
+world model on held-out episodes; trains the policy in imagination; and compares it with what it was, in
+`--real_env` if there is one. With `--rollouts` it first records rollouts of the policy there, and learns from
+them too. Every stage is one console command, which it prints. Running the same command again continues where
+it stopped. It ends with a summary and `report.md`.
+"""
+
+import signal
+import sys
+from typing import NoReturn
+
+import draccus
+
+from lerobot_wmrl.common.command_line import run_command
+from lerobot_wmrl.improve.stages import ImproveConfig, Improvement
+
+
+def improve(cfg: ImproveConfig) -> None:
+    """Run every stage, write the report, and say what came of it."""
+    from lerobot_wmrl.common.stages import claimed, run_stages
+    from lerobot_wmrl.data.episodes import read_episodes
+    from lerobot_wmrl.improve.findings import look
+    from lerobot_wmrl.improve.report import verdict, write_report
+
+    cfg.check()
+    assert cfg.policy is not None
+    improvement = Improvement(cfg, look(read_episodes(cfg.dataset.open()), cfg.policy))
+    print(f"{cfg.dataset.name}:\n{improvement.found}")
+    stages = improvement.stages()
+    with claimed(cfg.output_dir, settings(cfg)):
+        run_stages(stages, cfg.output_dir)
+        page = write_report(improvement, stages)
+    print(f"\n{verdict(improvement)}\nThe report: {page}")
+
+
+def settings(cfg: ImproveConfig) -> dict[str, object]:
+    """Return what decides the result, as JSON."""
+    assert cfg.policy is not None
+    given = {name: value for name, value in draccus.encode(cfg).items() if name != "policy"}
+    return given | {"policy": str(cfg.policy.pretrained_path), "output_dir": str(cfg.output_dir)}
+
+
+def interrupt(signal_number: int, frame: object) -> NoReturn:
+    """Let `kill` end the command as Ctrl-C does: with its stage, and with a word on how to go on."""
+    raise KeyboardInterrupt
+
+
+def main() -> None:
+    """Run the console command."""
+    from lerobot_wmrl.common.stages import StageError
+
+    signal.signal(signal.SIGTERM, interrupt)
+    try:
+        run_command(improve, ImproveConfig, list)
+    except StageError as error:
+        sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        sys.exit("\nstopped: run the same command again to continue where it stopped")
+
+
+if __name__ == "__main__":
+    main()
