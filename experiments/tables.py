@@ -22,13 +22,14 @@ from lerobot_wmrl.common.files import write_text
 DOCS: Final = ROOT / "docs"
 STUDIES: Final = ROOT / "experiments"
 
+SECOND_ROWS: Final = partial(value.rows_above, study=value.SECOND_STUDY, parts=value.SECOND_PARTS)
+
 SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     "value_push": ("Policies", value.value_push),
     "value_pick_place": ("Policies", value.value_pick_place),
-    "value_pick_place_simulator": (
-        "Policies",
-        partial(value.rows_above, ["simulated_ppo"], study=value.SECOND_STUDY, parts=value.SECOND_PARTS),
-    ),
+    "value_pick_place_simulator": ("Policies", partial(SECOND_ROWS, ["simulated_ppo"])),
+    "value_pick_place_dyna": ("Policies", partial(SECOND_ROWS, ["dyna"])),
+    "value_pick_place_iterated": ("Policies", partial(SECOND_ROWS, ["iterated"])),
     "value_others": ("Policies", value.value_others),
     "value_iterated": ("Policies", partial(value.rows_above, ["iterated"])),
     "value_simulator": ("Policies", partial(value.rows_above, ["simulated_ppo"])),

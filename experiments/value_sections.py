@@ -64,7 +64,11 @@ PARTS: Final = (
 """Studies whose cells add methods to its table."""
 
 SECOND_STUDY: Final = "value_pick_place"
-SECOND_PARTS: Final = ("value_pick_place_simulator",)
+SECOND_PARTS: Final = (
+    "value_pick_place_simulator",
+    "value_pick_place_dyna",
+    "value_pick_place_iterated",
+)
 """The same of the second task."""
 
 Cell = dict[str, Any]
