@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 import torch
@@ -54,6 +55,19 @@ def split_cameras(images: Tensor, shapes: dict[str, tuple[int, int, int]]) -> di
     return {key: stretch(view, height, width) for (key, (_, height, width)), view in views}
 
 
+def with_frame_sizes(config: FrameTokenizerConfig, features: dict[str, Any]) -> FrameTokenizerConfig:
+    """Return the config with the sizes of a dataset's frames, and log which frames are stretched."""
+    keys, side = config.tokenizer.camera_keys, config.tokenizer.image_size
+    sizes = [list(frame_size(features[key])) for key in keys]
+    for key, (height, width) in zip(keys, sizes, strict=True):
+        if (height, width) != (side, side):
+            logging.info(
+                "%s: frames of %d x %d (height x width) are stretched to `tokenizer.image_size`=%d",
+                key, height, width, side,
+            )  # fmt: skip
+    return replace(config, tokenizer=replace(config.tokenizer, frame_sizes=sizes))
+
+
 class FrameTokenizerRewardModel(HubCard, PreTrainedRewardModel):
     """Frame tokenizer as a reward model: 1 − distance to a goal frame in feature space (eq. 5)."""
 
@@ -65,26 +79,14 @@ class FrameTokenizerRewardModel(HubCard, PreTrainedRewardModel):
     )
 
     def __init__(self, config: FrameTokenizerConfig, dataset_meta: Any = None, **kwargs: Any) -> None:
+        if dataset_meta is not None:
+            check_cameras(dataset_meta.features, config.tokenizer.camera_keys)
+            config = with_frame_sizes(config, dataset_meta.features)
         super().__init__(config)
         self.config: FrameTokenizerConfig = config
-        sizes = config.tokenizer
-        if dataset_meta is not None:
-            check_cameras(dataset_meta.features, sizes.camera_keys)
-            self._adopt_frame_sizes(dataset_meta.features)
-            if config.perceptual_weight:
-                require_backbone("vgg", "perceptual_weight", config.perceptual_weight, "0")
-        self.tokenizer = FrameTokenizer(sizes)
-
-    def _adopt_frame_sizes(self, features: dict[str, Any]) -> None:
-        """Take the sizes of the cameras' frames from the dataset, and say which are stretched."""
-        sizes = self.config.tokenizer
-        sizes.frame_sizes = [list(frame_size(features[key])) for key in sizes.camera_keys]
-        for key, (_, height, width) in sizes.frame_shapes.items():
-            if (height, width) != (sizes.image_size, sizes.image_size):
-                logging.info(
-                    "%s: frames of %d x %d (height x width) are stretched to `tokenizer.image_size`=%d",
-                    key, height, width, sizes.image_size,
-                )  # fmt: skip
+        if dataset_meta is not None and config.perceptual_weight:
+            require_backbone("vgg", "perceptual_weight", config.perceptual_weight, "0")
+        self.tokenizer = FrameTokenizer(config.tokenizer)
 
     def forward(self, batch: dict[str, Tensor], progress: float = 1.0) -> tuple[Tensor, dict[str, float]]:
         """Return the reconstruction loss of `observation.images.*` (B, 3, H, W) and metrics.

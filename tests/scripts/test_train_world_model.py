@@ -76,7 +76,7 @@ def test_a_training_ends_with_what_it_made_how_good_it_is_and_what_comes_next(
     monkeypatch.setattr(sys, "argv", flags(root, tokenizer))
     main()
     said = capsys.readouterr().out
-    assert f"{tokenizer}: a frame_tokenizer of 18,306 parameters, 0.1 MB." in said
+    assert f"{tokenizer}: a frame_tokenizer of 18,304 parameters, 0.1 MB." in said
     psnr = json.loads((tokenizer / "reconstruction.json").read_text())["psnr"]["third_view"]
     assert f"PSNR on held-out episodes: third_view {psnr:.1f} dB." in said
     following = said.strip().splitlines()[-1].split()
