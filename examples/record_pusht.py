@@ -2,12 +2,13 @@
 
     python examples/record_pusht.py --root=outputs/pusht --num_episodes=200 --seed=0
 
-The pusher goes around the block and pushes it in a straight line, again and again. Each push is the best of
-several random ones, tried in a copy of the physics. How many it tries is its skill, drawn for each episode
-(`--candidates`). Nothing here imports `lerobot_wmrl`: the dataset is what a LeRobot user would bring.
+The pusher goes around the block and pushes it in a straight line, again and again. Each push is the best of a
+fan of them, tried in a copy of the physics. Its skill is drawn for each episode: the error of its hand
+(`--noise`). Nothing here imports `lerobot_wmrl`: the dataset is what a LeRobot user would bring.
 """
 
 import argparse
+from itertools import product
 from pathlib import Path
 
 import gym_pusht  # noqa: F401  (registers the environment)
@@ -25,8 +26,14 @@ CLEARANCE = 110.0
 BOARD = (20.0, 492.0)
 """Targets of the pusher stay between, along both axes."""
 
-STRIDES = (10.0, 30.0)
-"""Distances between two targets of a push."""
+STRIDE = 20.0
+"""Distance between two targets of a push."""
+
+WALK = 30.0
+"""Distance between two targets around the block."""
+
+ANGLES = 12
+"""Directions from the block's centre in which a push may begin."""
 
 LONGEST_PUSH = 300.0
 """Length of a push at most."""
@@ -53,33 +60,34 @@ class ScriptedPusher:
 
     Args:
         env: the environment; its physics is tried out and put back.
-        candidates: random pushes to choose from.
         noise: standard deviation of the targets' error, in units of the board.
-        rng: of pushes and noise.
+        rng: of the noise.
     """
 
-    def __init__(self, env: gym.Env, candidates: int, noise: float, rng: np.random.Generator) -> None:
-        self.env, self.candidates, self.noise, self.rng = env.unwrapped, candidates, noise, rng
+    def __init__(self, env: gym.Env, noise: float, rng: np.random.Generator) -> None:
+        self.env, self.noise, self.rng = env.unwrapped, noise, rng
         self.plan: list[np.ndarray] = []
         self.goal = self._goal_corners()
 
     def act(self) -> np.ndarray:
         """Return the next target, (2,) float32."""
         if not self.plan:
-            tried = [self._try() for _ in range(self.candidates)]
+            fan = product(2 * np.pi / ANGLES * np.arange(ANGLES), range(len(self.goal)))
+            tried = [self._try(angle, corner) for angle, corner in fan]
             self.plan = list(min(tried, key=lambda each: each[1])[0])
         target = self.plan.pop(0) + self.noise * self.rng.standard_normal(2)
         return np.clip(target, *BOARD).astype(np.float32)
 
-    def _try(self) -> tuple[np.ndarray, float]:
-        """Draw a push; return its targets (T, 2), until the block is nearest to its goal, and its cost."""
+    def _try(self, angle: float, corner: int) -> tuple[np.ndarray, float]:
+        """Try the push that begins at an angle and aims near a corner.
+
+        Return its targets (T, 2), until the block is nearest to its goal, and its cost.
+        """
         centre, corners = self._corners().mean(0), self._corners()
-        angle = self.rng.uniform(-np.pi, np.pi)
         start = np.clip(centre + CLEARANCE * np.array([np.cos(angle), np.sin(angle)]), *BOARD)
-        aim = 0.8 * corners[self.rng.integers(len(corners))] + 0.2 * centre
+        aim = 0.8 * corners[corner] + 0.2 * centre
         way = (aim - start) / max(1.0, float(np.linalg.norm(aim - start)))
-        stride = float(self.rng.choice(STRIDES))
-        push = start + stride * np.arange(int(LONGEST_PUSH / stride))[:, None] * way
+        push = start + STRIDE * np.arange(int(LONGEST_PUSH / STRIDE))[:, None] * way
         targets = np.clip(np.concatenate([self._way_around(centre, start), push]), *BOARD)
         saved = self._save()
         costs = []
@@ -96,7 +104,7 @@ class ScriptedPusher:
         here, there = np.array(self.env.agent.position) - centre, start - centre
         angle = np.arctan2(here[1], here[0])
         turn = (np.arctan2(there[1], there[0]) - angle + np.pi) % (2 * np.pi) - np.pi
-        steps = 1 + int(abs(turn) * CLEARANCE / max(STRIDES))
+        steps = 1 + int(abs(turn) * CLEARANCE / WALK)
         angles = angle + turn * np.arange(steps + 1) / steps
         around = centre + CLEARANCE * np.stack([np.cos(angles), np.sin(angles)], 1)
         return np.concatenate([around, [start, start]])
@@ -142,7 +150,7 @@ class ScriptedPusher:
         self.env.space.reindex_shapes_for_body(self.env.block)
 
 
-def record(root: Path, num_episodes: int, seed: int, candidates: list[int], noise: float, steps: int) -> None:
+def record(root: Path, num_episodes: int, seed: int, noise: list[float], steps: int) -> None:
     """Record the episodes and print how many succeed."""
     env = gym.make(
         "gym_pusht/PushT-v0", obs_type="pixels_agent_pos", observation_width=SIZE, observation_height=SIZE,
@@ -153,7 +161,7 @@ def record(root: Path, num_episodes: int, seed: int, candidates: list[int], nois
     for episode in trange(num_episodes, unit="episode"):
         rng = np.random.default_rng((seed, episode))
         observation, _ = env.reset(seed=seed + episode)
-        pusher, done = ScriptedPusher(env, int(rng.choice(candidates)), noise, rng), False
+        pusher, done = ScriptedPusher(env, float(rng.choice(noise)), rng), False
         while not done:
             action = pusher.act()
             after, reward, success, truncated, _ = env.step(action)
@@ -181,8 +189,13 @@ def main() -> None:
     parser.add_argument("--root", type=Path, default=Path("outputs/pusht"), help="folder of the new dataset")
     parser.add_argument("--num_episodes", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0, help="of the starts and the pusher")
-    parser.add_argument("--candidates", type=int, nargs="+", default=[2, 8, 32], help="skills to draw from")
-    parser.add_argument("--noise", type=float, default=2.0, help="error of the targets, of 512")
+    parser.add_argument(
+        "--noise",
+        type=float,
+        nargs="+",
+        default=[2, 8, 32],
+        help="error of the targets, of 512; one is drawn for each episode",
+    )
     parser.add_argument("--steps", type=int, default=300, help="longest episode")
     record(**vars(parser.parse_args()))
 

@@ -78,13 +78,13 @@ def draw_learning_curve(variants: Mapping[str, Mapping[str, Any]], path: Path) -
     for (above, below), (prefix, amount) in zip(grid.T, CURVES, strict=True):
         rows = [row for name, row in variants.items() if name.startswith(("full", prefix))]
         rows.sort(key=lambda row: row[amount])
-        amounts, estimates = [row[amount] for row in rows], [row["delta_psnr_15"] for row in rows]
+        amounts, estimates = [row[amount] for row in rows], [row["delta_psnr_0_6s"] for row in rows]
         values = [each["value"] for each in estimates]
         errors = [[abs(each["value"] - each["bootstrap_95"][side]) for each in estimates] for side in (0, 1)]
         above.errorbar(amounts, values, errors, color=COLOURS[0], marker="o", capsize=3)
         below.plot(amounts, [row["gate"]["auc"] for row in rows], color=COLOURS[1], marker="o")
         below.set_xscale("log")
         below.set_xlabel(amount)
-    grid[0, 0].set_ylabel("delta-PSNR at step 15 (dB)")
+    grid[0, 0].set_ylabel("delta-PSNR after 0.6 s (dB)")
     grid[1, 0].set_ylabel("AUC of the gate")
     tidy(figure).savefig(path, dpi=130)

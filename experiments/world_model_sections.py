@@ -28,8 +28,8 @@ trained in this world model.
 
 
 GATE_ROWS: Final = {
-    "delta_psnr_15": ("delta-PSNR at step 15 (dB)", "4.5"),
-    "psnr_below_ceiling_30": ("below the tokenizer at step 30 (dB)", "3"),
+    "delta_psnr_0_6s": ("delta-PSNR after 0.6 s (dB)", "4.5"),
+    "psnr_below_ceiling_1_2s": ("below the tokenizer after 1.2 s (dB)", "3"),
     "done_f1": ("done F1 by frame", "0.9"),
     "done_delay_frames": ("delay of done (frames)", "3"),
     "tcp_error_mm": ("error of the imagined TCP (mm)", ""),
@@ -105,7 +105,7 @@ def four_tasks(load: Load) -> str:
     rows.append(["AUC", *(f"{gate['auc']:.2f}" for gate in columns.values())])
     head = found["headline"]
     return f"""Somewhat: it tells success from failure with an AUC of {found["auc"]:.2f} after eleven minutes
-of training; delta-PSNR at step 15 is {estimate(head["delta_psnr_15"])} dB.
+of training; delta-PSNR after 0.6 s is {estimate(head["delta_psnr_0_6s"])} dB.
 
 {table(["", *columns], rows)}
 
@@ -118,7 +118,7 @@ def training_rows(variants: Mapping[str, Mapping[str, Any]]) -> str:
         [
             name.rsplit("_", 1)[0].replace("_", " "), name.rsplit("_", 1)[1], f"{row['episodes']:,}",
             f"{row['steps']:,}", f"{row['minutes']:.0f}", f"{row['parameters'] / 1e6:.1f} M",
-            estimate(row["delta_psnr_15"]), estimate(row["moving_psnr"]), estimate(row["done_f1"], 2),
+            estimate(row["delta_psnr_0_6s"]), estimate(row["moving_psnr"]), estimate(row["done_f1"], 2),
             f"{row['gate']['auc']:.2f}",
         ]
         for name, row in variants.items()

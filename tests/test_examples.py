@@ -11,7 +11,7 @@ from tests.pusht import record_pusht
 def recorded(tmp_path_factory) -> Path:
     """Two episodes of PushT; the second succeeds before it must end."""
     root = tmp_path_factory.mktemp("pusht") / "data"
-    return record_pusht(root, "--num_episodes=2", "--steps=200", "--candidates", "16")
+    return record_pusht(root, "--num_episodes=2", "--steps=200", "--noise", "2")
 
 
 def test_the_scripted_pusher_records_what_a_world_model_can_learn_from(recorded):

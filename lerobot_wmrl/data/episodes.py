@@ -1,5 +1,6 @@
 """Episodes of a LeRobotDataset: all columns but the pictures, and checks of a dataset against a model."""
 
+import logging
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,6 +22,9 @@ VALIDATION_EVERY: Final = 20
 
 SUCCESS_COLUMNS: Final = ("next.success", DONE)
 """Columns that can hold success, best first: `next.done` may mark the mere end of an episode."""
+
+PLACE: Final = ("episode_index", "task_index")
+"""LeRobot's columns that say which episode and task a frame belongs to."""
 
 OWN_COLUMNS: Final = ("index", "episode_index", "frame_index", "task_index")
 """LeRobot's integer columns, which say nothing about an episode."""
@@ -98,7 +102,7 @@ class EpisodeTable:
         done: (N,), whether success holds at the frame; False everywhere where the dataset does not say.
         start: (E,), row of each episode's first frame.
         length: (E,), frames of each episode.
-        instructions: one an episode.
+        instructions: one an episode, that of its first frame.
         columns: the dataset's further integer columns by name, (E,): their values at the first frames.
     """
 
@@ -202,7 +206,7 @@ def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
     labels = () if success is None else (success,)
     measured = [name for name in (ACTION, OBS_STATE, *labels) if name in dataset.features]
     further = episode_columns(dataset.features)
-    rows = dataset.hf_dataset.with_format("numpy", columns=["episode_index", *measured, *further])[:]
+    rows = dataset.hf_dataset.with_format("numpy", columns=[*PLACE, *measured, *further])[:]
     for column in measured:
         check_finite(dataset, column, np.asarray(rows[column]), rows["episode_index"])
     frames = len(rows["episode_index"])
@@ -215,9 +219,26 @@ def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
         done=done.astype(bool),
         start=start,
         length=length,
-        instructions=[episode["tasks"][0] for episode in dataset.meta.episodes],
+        instructions=first_instructions(dataset, np.asarray(rows["task_index"]), start),
         columns={name: np.asarray(rows[name]).reshape(-1)[start] for name in further},
     )
+
+
+def first_instructions(dataset: LeRobotDataset, task: np.ndarray, start: np.ndarray) -> list[str]:
+    """Return the instruction of each episode's first frame; warn of episodes in which it changes.
+
+    Args:
+        task: index of each row's task (N,).
+        start: first row of each episode (E,).
+    """
+    ends = np.maximum.reduceat(task, start), np.minimum.reduceat(task, start)
+    if several := int((ends[0] != ends[1]).sum()):
+        logging.warning(
+            "%s: the instruction changes within %d of %d episodes; that of the first frame is taken for the "
+            "whole episode", dataset.root, several, len(start),
+        )  # fmt: skip
+    texts = {int(index): str(text) for text, index in dataset.meta.tasks["task_index"].items()}
+    return [texts[index] for index in task[start].tolist()]
 
 
 def episode_columns(features: Mapping[str, Any]) -> list[str]:

@@ -10,6 +10,7 @@ from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
 from lerobot_wmrl.common.statistics import Estimate, Proportion, bootstrap_ratio
+from lerobot_wmrl.data.episodes import EpisodeTable
 from lerobot_wmrl.data.frames import Context
 from lerobot_wmrl.evaluation.gate import first_run
 from lerobot_wmrl.evaluation.image_metrics import (
@@ -23,7 +24,7 @@ from lerobot_wmrl.evaluation.image_metrics import (
 )
 from lerobot_wmrl.evaluation.replay import (
     BATCH,
-    DELTA_PSNR_STEP,
+    DELTA_PSNR_SECONDS,
     EpisodeReplay,
     Recording,
     imagine_frames,
@@ -32,11 +33,14 @@ from lerobot_wmrl.maniskill.embodiment import STATE_NAMES
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer, feature_distance
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 
-HORIZON = 48
-"""Steps to which the accuracy over all episodes is reported: the model's window."""
+HORIZON_SECONDS = 1.92
+"""Imagined time over which accuracy is averaged: 48 frames at 25 a second."""
 
-CEILING_STEP = 30
-"""Step at which the prediction is compared with the tokenizer's reconstruction, the best that it could be."""
+CEILING_SECONDS = 1.2
+"""Imagined time after which a frame is compared with the tokenizer's reconstruction, the best it could be."""
+
+ABSOLUTE = 0.8
+"""Correlation with the state from which actions are taken for absolute targets, not for displacements."""
 
 
 @dataclass(frozen=True)
@@ -57,15 +61,20 @@ def measure(
     images = recording.images(replay.episode, replay.tokens.device)
     if len(images) < 2:
         return EpisodeAccuracy(replay.episode, {}, {})
-    steps, whole = compare_frames(model.tokenizer, images, replay.tokens[:-1], replay.context, lpips)
+    imagined, horizon = replay.tokens[: len(images) - 1], recording.steps(HORIZON_SECONDS)
+    steps, whole = compare_frames(model.tokenizer, images, imagined, replay.context, lpips, horizon)
     if predicts_tcp(recording, replay):
         steps["tcp_error_mm"] = tcp_error_mm(recording, replay)
     if replay.depth is not None:
         steps |= depth_accuracy(imagined=replay.depth[1], recorded=replay.depth[0])
     if replay.shuffled is not None:
-        target = images[DELTA_PSNR_STEP : DELTA_PSNR_STEP + 1]
+        step = recording.steps(DELTA_PSNR_SECONDS)
+        target = images[step : step + 1]
         other = psnr(model.tokenizer.decode(replay.shuffled[None], replay.context), target)
-        whole["delta_psnr_15"] = float(steps["psnr"][DELTA_PSNR_STEP - 1] - other)
+        whole["delta_psnr_0_6s"] = float(steps["psnr"][step - 1] - other)
+    if len(steps["psnr"]) >= (step := recording.steps(CEILING_SECONDS)):
+        own, best = (float(steps[name][step - 1]) for name in ("psnr", "psnr_ceiling"))
+        whole |= {"psnr_1_2s": own, "psnr_ceiling_1_2s": best, "psnr_below_ceiling_1_2s": best - own}
     return EpisodeAccuracy(
         replay.episode, {name: value.cpu().numpy() for name, value in steps.items()}, whole
     )
@@ -73,7 +82,7 @@ def measure(
 
 def compare_frames(
     tokenizer: FrameTokenizer, images: Tensor, imagined_tokens: Tensor, context: Context,
-    lpips: PerceptualDistance | None,
+    lpips: PerceptualDistance | None, horizon: int,
 ) -> tuple[dict[str, Tensor], dict[str, float]]:  # fmt: skip
     """Compare imagined with recorded frames, and with their reconstruction by the tokenizer, the ceiling.
 
@@ -82,6 +91,7 @@ def compare_frames(
         imagined_tokens: (T, S), of all frames but the first.
         context: of the first frame, one row.
         lpips: LPIPS, None to leave it out.
+        horizon: frames over which the measures of the episode are taken.
 
     Returns:
         Measures of every frame, each (T,), and measures of the episode.
@@ -104,8 +114,8 @@ def compare_frames(
     if lpips is not None:
         steps["lpips_alex"] = lpips(imagined.images, recorded)
     moved_imagined = motion_mask(imagined.images, tokenizer.decode(tokens[:1], context))
-    whole = physics_iq(moved[:HORIZON], moved_imagined[:HORIZON])
-    whole["mse"] = float((imagined.images[:HORIZON] - recorded[:HORIZON]).square().mean())
+    whole = physics_iq(moved[:horizon], moved_imagined[:horizon])
+    whole["mse"] = float((imagined.images[:horizon] - recorded[:horizon]).square().mean())
     return steps, whole
 
 
@@ -140,19 +150,16 @@ def by_step(measured: Sequence[EpisodeAccuracy], horizon: int) -> dict[str, Any]
     return {**result, "episodes_by_step": lasting.tolist()}
 
 
-def headline(measured: Sequence[EpisodeAccuracy]) -> dict[str, Estimate]:
-    """Average each measure over episodes; a step-wise one counts with its mean up to `HORIZON`."""
-    rows = [episode_means(each) for each in measured]
+def headline(measured: Sequence[EpisodeAccuracy], horizon: int) -> dict[str, Estimate]:
+    """Average each measure over episodes; a step-wise one counts with its mean over `horizon` steps."""
+    rows = [episode_means(each, horizon) for each in measured]
     keys = dict.fromkeys(name for row in rows for name in row)
     return {name: Estimate.mean(np.array([row.get(name, np.nan) for row in rows])) for name in keys}
 
 
-def episode_means(episode: EpisodeAccuracy) -> dict[str, float]:
+def episode_means(episode: EpisodeAccuracy, horizon: int) -> dict[str, float]:
     """Return one value of every measure for an episode, NaN where it has none."""
-    means = {name: _finite_mean(values[:HORIZON]) for name, values in episode.steps.items()}
-    if len(episode.steps.get("psnr", ())) >= CEILING_STEP:
-        own, best = (float(episode.steps[name][CEILING_STEP - 1]) for name in ("psnr", "psnr_ceiling"))
-        means |= {"psnr_30": own, "psnr_ceiling_30": best, "psnr_below_ceiling_30": best - own}
+    means = {name: _finite_mean(values[:horizon]) for name, values in episode.steps.items()}
     return means | episode.whole
 
 
@@ -175,24 +182,38 @@ def _finite_mean(values: np.ndarray) -> float:
     return float(known.mean()) if len(known) else np.nan
 
 
-def extreme_actions(own: Tensor, low: np.ndarray, high: np.ndarray) -> dict[str, Tensor]:
+def absolute_control(table: EpisodeTable) -> bool | None:
+    """Whether actions are absolute targets, which follow components of the state. None without a state."""
+    moving = table.action[:, np.ptp(table.action, axis=0) > 0]
+    measured = table.state[:, np.ptp(table.state, axis=0) > 0]
+    if not moving.size or not measured.size:
+        return None
+    together = np.corrcoef(moving, measured, rowvar=False)[: moving.shape[1], moving.shape[1] :]
+    return bool(np.median(np.abs(together).max(1)) >= ABSOLUTE)
+
+
+def extreme_actions(
+    own: Tensor, low: np.ndarray, high: np.ndarray, absolute: bool | None
+) -> dict[str, Tensor]:
     """Make actions that no demonstration holds, each (E, T, A).
 
     Args:
         own: the episodes' actions (E, T, A).
         low, high: extremes of the dataset's actions (A,).
+        absolute: whether actions are absolute targets or displacements, None if that is unknown.
 
     Returns:
         saturated: one corner of the box between the extremes all the time, another for each episode;
-        reversed: the own actions with the opposite sign; frozen: zeros.
+        reversed: the own motion in the opposite direction; frozen: actions under which the robot stays: zero
+        displacements, or the first target. Both are left out where `absolute` is None.
     """
     corner = np.random.default_rng(0).random((len(own), own.shape[-1])) < 0.5
     saturated = torch.from_numpy(np.where(corner, low, high).astype(np.float32)).to(own)
-    return {
-        "saturated": saturated[:, None].expand_as(own),
-        "reversed": -own,
-        "frozen": torch.zeros_like(own),
-    }
+    made = {"saturated": saturated[:, None].expand_as(own)}
+    if absolute is not None:
+        still = own[:, :1] if absolute else torch.zeros_like(own[:, :1])
+        made |= {"reversed": 2 * still - own, "frozen": still.expand_as(own)}
+    return made
 
 
 @torch.no_grad()
@@ -200,7 +221,7 @@ def robustness(
     model: ActionWorldModelRewardModel, recording: Recording, episodes: np.ndarray,
     threshold: float, frames: int,
 ) -> dict[str, Any]:  # fmt: skip
-    """Imagine `HORIZON` frames under each kind of extreme actions, from at most `BATCH` starts.
+    """Imagine `HORIZON_SECONDS` under each kind of extreme actions, from at most `BATCH` starts.
 
     Frozen actions cannot succeed and ought to leave the image as it is.
 
@@ -209,10 +230,12 @@ def robustness(
         first frame, both decoded.
     """
     episodes, device = episodes[:BATCH], model.state_mean.device
-    starts, own = recording.starts(model, episodes), recording.actions(episodes, HORIZON, device)
-    low, high = recording.table.action.min(0), recording.table.action.max(0)
-    result: dict[str, Any] = {"episodes": len(episodes), "frames": HORIZON}
-    for name, actions in extreme_actions(own, low, high).items():
+    table, horizon = recording.table, recording.steps(HORIZON_SECONDS)
+    starts, own = recording.starts(model, episodes), recording.actions(episodes, horizon, device)
+    absolute = absolute_control(table)
+    made = extreme_actions(own, table.action.min(0), table.action.max(0), absolute)
+    result: dict[str, Any] = {"episodes": len(episodes), "frames": horizon, "absolute_control": absolute}
+    for name, actions in made.items():
         imagined = imagine_frames(model, starts, actions)
         predicted = first_run((imagined.done_probability >= threshold).cpu().numpy(), frames) >= 0
         pair = starts.tokens, imagined.tokens[:, -1]

@@ -19,7 +19,7 @@ from lerobot_wmrl.common.constants import KINDS, PLAY, START_KIND, START_TASK, T
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.statistics import Estimate, Proportion
 from lerobot_wmrl.data.episodes import EpisodeTable, open_dataset, read_episodes
-from lerobot_wmrl.evaluation.replay import MAX_ACTIONS, EpisodeReplay, Recording, in_batches
+from lerobot_wmrl.evaluation.replay import EpisodeReplay, Recording, in_batches
 from lerobot_wmrl.world_models.checkpoint import check_dataset
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 
@@ -77,6 +77,11 @@ class Outcomes:
         return Outcomes(self.episodes[kept], self.probability[kept], self.done[kept])
 
     @property
+    def length(self) -> np.ndarray:
+        """Actions of each episode, (E,)."""
+        return np.sum(~np.isnan(self.probability), axis=1)
+
+    @property
     def success(self) -> np.ndarray:
         """Recorded success of each episode, (E,) bool."""
         return np.any(self.done, axis=1)
@@ -86,11 +91,32 @@ class Outcomes:
 
         As in the environment, `frames` consecutive frames must reach `threshold`; it is the first of them.
         """
-        return first_run(self.probability >= threshold, frames)
+        return first_run(self.lasting(frames) >= threshold, frames)
+
+    def cut_short(self, frames: int) -> np.ndarray:
+        """Mark episodes that end with a success that has held for fewer than `frames` frames. (E,)"""
+        at_end = self.done[np.arange(len(self.done)), self.length - 1]
+        return at_end & (first_run(self.done, frames) < 0)
+
+    def ends_at_success(self, frames: int) -> bool:
+        """Whether most of the successes are cut short, as in environments that end at the first success."""
+        return bool(2 * self.cut_short(frames).sum() > self.success.sum())
+
+    def lasting(self, frames: int) -> np.ndarray:
+        """Return the predicted probabilities. Where episodes end at success, last frames last longer. (E, T')
+
+        The prediction for the last frame, of failures as well, then counts for as long as `frames` needs.
+        """
+        if not self.ends_at_success(frames):
+            return self.probability
+        probability = np.pad(self.probability, ((0, 0), (0, frames - 1)), constant_values=np.nan)
+        for row, end in enumerate(self.length):
+            probability[row, end : end + frames - 1] = probability[row, end - 1]
+        return probability
 
     def scores(self, frames: int) -> np.ndarray:
         """Return the highest threshold at which the model predicts success for `frames` frames. (E,)"""
-        probability = np.nan_to_num(self.probability)
+        probability = np.nan_to_num(self.lasting(frames))
         if probability.shape[1] < frames:
             return np.zeros(len(probability))
         return np.lib.stride_tricks.sliding_window_view(probability, frames, axis=1).min(-1).max(1)
@@ -116,7 +142,9 @@ class Gate:
         frames: consecutive frames for which it must be reached.
         false_positives: of the recorded failures, those predicted as successes.
         recall: of the recorded successes, those predicted as successes.
-        cut_short: successes recorded for fewer than `frames` frames, which no model can predict here.
+        cut_short: episodes that end before their success has held for `frames` frames.
+        lasting: whether last frames count as if they lasted, `Outcomes.lasting`; if not, no model can predict
+            the successes that are cut short.
         auc: area under the ROC curve over all thresholds, `Outcomes.auc`.
     """
 
@@ -125,6 +153,7 @@ class Gate:
     false_positives: Proportion
     recall: Proportion
     cut_short: int
+    lasting: bool
     auc: float
 
     @property
@@ -139,6 +168,7 @@ class Gate:
             "false_positive_rate": self.false_positives.as_json(),
             "recall": self.recall.as_json(),
             "successes_cut_short": self.cut_short,
+            "last_frames_last": self.lasting,
             "auc": None if math.isnan(self.auc) else self.auc,
             "passed": self.passed,
         }
@@ -182,7 +212,7 @@ def predict_done(model: ActionWorldModelRewardModel, recording: Recording) -> It
     """Predict done for all episodes open loop, short ones first, without drawing frames."""
     device, length = model.state_mean.device, recording.table.length
     for batch in in_batches(np.argsort(length, kind="stable")):
-        actions = recording.actions(batch, min(int(length[batch].max()), MAX_ACTIONS), device)
+        actions = recording.actions(batch, int(length[batch].max()), device)
         ahead = model.open_loop(recording.starts(model, batch), actions, with_tokens=False)
         probability = ahead.done_logit.sigmoid()
         for row, episode in enumerate(batch.tolist()):
@@ -198,7 +228,8 @@ def gate_at(outcomes: Outcomes, threshold: float, frames: int) -> Gate:
         frames,
         Proportion(int((predicted & ~success).sum()), int((~success).sum())),
         Proportion(int((predicted & success).sum()), int(success.sum())),
-        int((success & (first_run(outcomes.done, frames) < 0)).sum()),
+        int(outcomes.cut_short(frames).sum()),
+        outcomes.ends_at_success(frames),
         outcomes.auc(frames),
     )
 
@@ -218,16 +249,17 @@ def sweep(outcomes: Outcomes) -> list[Gate]:
 
 
 def best_operating_point(gates: Sequence[Gate]) -> Gate | None:
-    """Return the operating point of highest recall with at most 5 % false positives, None if there is none.
+    """Return the operating point of highest recall with at most 5 % false positives.
 
-    Ties go to the fewest false positives, then to the strictest point.
+    None if nothing is recognised at any of these. Ties go to the fewest false positives, then to points
+    that the episodes are long enough for, then to the strictest.
     """
 
     def merit(gate: Gate) -> tuple[float, ...]:
-        return gate.recall.k, -gate.false_positives.k, gate.threshold, gate.frames
+        return gate.recall.k, -gate.false_positives.k, not gate.lasting, gate.threshold, gate.frames
 
     allowed = [
-        gate for gate in gates if gate.false_positives.share <= MAX_FALSE_POSITIVE_RATE and gate.recall.n
+        gate for gate in gates if gate.false_positives.share <= MAX_FALSE_POSITIVE_RATE and gate.recall.k
     ]
     return max(allowed, key=merit, default=None)
 

@@ -29,7 +29,7 @@ def side_by_side(
     model: ActionWorldModelRewardModel, recording: Recording, replay: EpisodeReplay
 ) -> np.ndarray:
     """Show one episode, recorded frames above imagined ones. → (T, 2H + gap, N·W, 3) uint8"""
-    recorded = recording.frames[recording.rows(replay.episode)]
+    recorded = recording.frames[recording.compared_rows(replay.episode)]
     first, context = recording.first_frames(np.array([replay.episode]), model.tokenizer)
     tokens = torch.cat([first, replay.tokens[: len(recorded) - 1]])
     imagined = to_uint8(model.tokenizer.decode(tokens, context[[0] * len(tokens)]))

@@ -1,6 +1,5 @@
 """Open-loop replay of recorded episodes: imagined from their first frame, with their own actions."""
 
-import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -19,11 +18,11 @@ from lerobot_wmrl.world_models.modeling_world_model import (
     WorldModelRewardModel,
 )
 
-DELTA_PSNR_STEP = 15
-"""Imagined frames after which delta-PSNR is measured, as in RoboScape."""
+DELTA_PSNR_SECONDS = 0.6
+"""Imagined time after which delta-PSNR is measured: RoboScape's 15 frames, at 25 a second."""
 
-MAX_ACTIONS = 300
-"""Actions of an episode that are replayed at most."""
+COMPARED_FRAMES = 300
+"""Frames of an episode that are compared with imagined ones at most. Outcomes are those of whole episodes."""
 
 BATCH = 64
 
@@ -35,14 +34,6 @@ class Recording:
     table: EpisodeTable
     frames: np.ndarray
 
-    def __post_init__(self) -> None:
-        if cut := int((self.table.length > MAX_ACTIONS).sum()):
-            logging.warning(
-                "%s: %d of %d episodes are longer than %d frames and are read up to there; a success after "
-                "that counts as a failure",
-                self.table.dataset.root, cut, len(self.table.length), MAX_ACTIONS,
-            )  # fmt: skip
-
     @classmethod
     def read(cls, table: EpisodeTable, model: Any) -> "Recording":
         """Read the frames of the cameras that a world model looks at, at its size."""
@@ -50,13 +41,22 @@ class Recording:
         return cls(table, cached_frames(table.dataset, sizes.camera_keys, sizes.image_size))
 
     def rows(self, episode: int) -> slice:
-        """Return the rows of the episode that are replayed, at most `MAX_ACTIONS`."""
+        """Return the rows of an episode."""
         start = int(self.table.start[episode])
-        return slice(start, start + min(int(self.table.length[episode]), MAX_ACTIONS))
+        return slice(start, start + int(self.table.length[episode]))
+
+    def compared_rows(self, episode: int) -> slice:
+        """Return the rows whose frames are compared with imagined ones, the first `COMPARED_FRAMES`."""
+        rows = self.rows(episode)
+        return slice(rows.start, min(rows.stop, rows.start + COMPARED_FRAMES))
 
     def images(self, episode: int, device: torch.device) -> Tensor:
         """Return the frames of those rows, (T, N, 3, H, W) in [0, 1]."""
-        return frames_to_tensor(self.frames[self.rows(episode)]).to(device)
+        return frames_to_tensor(self.frames[self.compared_rows(episode)]).to(device)
+
+    def steps(self, seconds: float) -> int:
+        """Return how many steps of the dataset take so long, at least one."""
+        return max(1, round(seconds * self.table.dataset.meta.fps))
 
     @torch.no_grad()
     def first_frames(self, episodes: np.ndarray, tokenizer: FrameTokenizer) -> tuple[Tensor, Context]:
@@ -105,8 +105,8 @@ class EpisodeReplay:
         tokens: (T, S).
         done_probability: (T,).
         state: (T, P).
-        shuffled: (S,), the frame at `DELTA_PSNR_STEP` under the actions of another episode; None where there
-            is none.
+        shuffled: (S,), the frame after `DELTA_PSNR_SECONDS` under the actions of another episode; None where
+            there is none.
         done: (T,), recorded success after each action.
         depth: recorded and imagined depth, each (T − 1, N, g, g) metres on the tokens' grids; None unless the
             model predicts it.
@@ -160,12 +160,12 @@ def _replay_batch(
     model: ActionWorldModelRewardModel, recording: Recording, episodes: np.ndarray, others: np.ndarray
 ) -> Iterator[EpisodeReplay]:
     device, table = model.state_mean.device, recording.table
-    longest = min(int(table.length[episodes].max()), MAX_ACTIONS)
+    longest, compared = int(table.length[episodes].max()), recording.steps(DELTA_PSNR_SECONDS)
     frames = recording.starts(model, episodes)
     own = imagine_frames(model, frames, recording.actions(episodes, longest, device))
-    comparable = (table.length[episodes] > DELTA_PSNR_STEP) & (episodes != others)
+    comparable = (table.length[episodes] > compared) & (episodes != others)
     if comparable.any():
-        actions = recording.actions(others, DELTA_PSNR_STEP, device)
+        actions = recording.actions(others, compared, device)
         shuffled = imagine_frames(model, frames, actions).tokens[:, -1]
     for row, episode in enumerate(episodes.tolist()):
         rows = recording.rows(episode)

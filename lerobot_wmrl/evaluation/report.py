@@ -13,7 +13,7 @@ from lerobot_wmrl.common.statistics import Estimate
 from lerobot_wmrl.data.frames import NO_CONTEXT
 from lerobot_wmrl.evaluation import pictures
 from lerobot_wmrl.evaluation.accuracy import (
-    HORIZON,
+    HORIZON_SECONDS,
     EpisodeAccuracy,
     by_step,
     headline,
@@ -35,7 +35,7 @@ from lerobot_wmrl.evaluation.gate import (
 )
 from lerobot_wmrl.evaluation.goals import goal_quality, imagine_goals, train_probe
 from lerobot_wmrl.evaluation.image_metrics import cached_lpips
-from lerobot_wmrl.evaluation.replay import MAX_ACTIONS, EpisodeReplay, Recording, replay_episodes
+from lerobot_wmrl.evaluation.replay import COMPARED_FRAMES, EpisodeReplay, Recording, replay_episodes
 from lerobot_wmrl.world_models.modeling_world_model import (
     ActionWorldModelRewardModel,
     TextWorldModelRewardModel,
@@ -44,18 +44,18 @@ from lerobot_wmrl.world_models.modeling_world_model import (
 MAX_GOALS = 64
 """Goal frames that a report looks at."""
 
-TOP_LEVEL = ("delta_psnr_15", "done_delay_frames")
+TOP_LEVEL = ("delta_psnr_0_6s", "done_delay_frames")
 """Headline numbers that metrics.json also holds without their intervals."""
 
 TITLES = {
     "psnr": "PSNR (dB)",
     "psnr_ceiling": "PSNR of the tokenizer alone (dB)",
-    "psnr_30": "PSNR at step 30 (dB)",
-    "psnr_ceiling_30": "PSNR of the tokenizer alone at step 30 (dB)",
-    "psnr_below_ceiling_30": "below the tokenizer at step 30 (dB)",
+    "psnr_1_2s": "PSNR after 1.2 s (dB)",
+    "psnr_ceiling_1_2s": "PSNR of the tokenizer alone after 1.2 s (dB)",
+    "psnr_below_ceiling_1_2s": "below the tokenizer after 1.2 s (dB)",
     "moving_psnr": "PSNR of moved pixels (dB)",
     "moving_psnr_ceiling": "PSNR of moved pixels, tokenizer alone (dB)",
-    "delta_psnr_15": "delta-PSNR at step 15 (dB)",
+    "delta_psnr_0_6s": "delta-PSNR after 0.6 s (dB)",
     "ssim": "SSIM",
     "tokenizer_lpips": "LPIPS's formula on tokenizer features",
     "lpips_alex": "LPIPS (AlexNet)",
@@ -137,17 +137,19 @@ def report_action_model(
 ) -> Report:  # fmt: skip
     """Report accuracy, done, gate and robustness, and save their pictures in `folder`."""
     outcomes = evaluation.outcomes
-    estimates = headline(evaluation.accuracy) | done_accuracy(outcomes, threshold, frames)
+    horizon = recording.steps(HORIZON_SECONDS)
+    estimates = headline(evaluation.accuracy, horizon) | done_accuracy(outcomes, threshold, frames)
     play = [
         e for e in evaluation.accuracy if recording.table.column(START_KIND)[e.episode] == KINDS.index(PLAY)
     ]
-    steps, play_steps = by_step(evaluation.accuracy, HORIZON), by_step(play, MAX_ACTIONS)
+    steps, play_steps = by_step(evaluation.accuracy, horizon), by_step(play, COMPARED_FRAMES)
     gates, by_task = sweep(outcomes), gates_by_task(outcomes, recording.table, threshold, frames)
     best = best_operating_point(gates)
     extremes = robustness(model, recording, evaluation.attempts, threshold, frames)
     metrics = {
         **gate_details(outcomes, threshold, frames),
         **{name: estimates[name].as_json()["value"] if name in estimates else None for name in TOP_LEVEL},
+        "horizon_frames": horizon,
         "headline": {name: estimate.as_json() for name, estimate in estimates.items()},
         **steps,
         "play": {"episodes": len(play), **play_steps},
@@ -218,11 +220,15 @@ def gate_lines(gate: Gate, best: Gate | None) -> str:
     ]
     if gate.cut_short:
         lines.append(
-            f"{gate.cut_short} of the successes were recorded for fewer than {gate.frames} frames of success "
-            "and cannot be predicted; lower done_frames, or record on after success."
+            f"{gate.cut_short} of the successes end before they have held for {gate.frames} frames. "
+            + (
+                "As most do, the last frame of every episode counts as if it lasted."
+                if gate.lasting
+                else "They cannot be predicted; lower done_frames, or record on after success."
+            )
         )
     if best is None:
-        lines.append("No operating point has at most 5 % false positives and any recall.")
+        lines.append("No operating point recognises a success with at most 5 % false positives.")
     else:
         lines.append(
             f"Best with at most 5 % false positives: done_threshold={best.threshold} and "

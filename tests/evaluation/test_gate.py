@@ -56,13 +56,27 @@ def test_the_gate_counts_as_the_environment_ends_episodes(outcomes, threshold, f
     assert not gate.passed
 
 
-def test_successes_that_end_too_early_for_anyone_are_counted(outcomes):
+def test_successes_that_end_too_early_are_counted(outcomes):
     """The third success holds for the last two of its four frames."""
     assert [gate_at(outcomes, 0.5, frames).cut_short for frames in (1, 2, 3, 4)] == [0, 0, 1, 1]
-    assert "1 of the successes were recorded for fewer than 3 frames" in gate_lines(
-        gate_at(outcomes, 0.5, 3), None
-    )
-    assert "recorded for fewer" not in gate_lines(gate_at(outcomes, 0.5, 2), None)
+    lines = gate_lines(gate_at(outcomes, 0.5, 3), None)
+    assert "1 of the successes end before they have held for 3 frames. They cannot be predicted" in lines
+    assert "have held" not in gate_lines(gate_at(outcomes, 0.5, 2), None)
+
+
+def test_where_episodes_end_at_success_their_last_frames_count_as_lasting():
+    """The success is recorded for one frame; a failure whose last frame looks the same counts as one too."""
+    nan = np.nan
+    probability = np.array([[0.1, 0.1, 0.9, nan], [0.1, 0.1, 0.1, 0.9], [0.1, 0.9, 0.1, 0.1]])
+    done = np.array([[False, False, True, False], [False] * 4, [False] * 4])
+    at_success = Outcomes(np.arange(3), probability, done)
+    gate = gate_at(at_success, 0.5, 3)
+    assert (gate.recall.k, gate.false_positives.k) == (1, 1)
+    assert "As most do, the last frame of every episode counts" in gate_lines(gate, None)
+    assert at_success.scores(3).tolist() == [0.9, 0.9, 0.1]
+    assert done_delay(at_success, 0.5, 3)[0] == 0
+    seen_out = Outcomes(np.arange(3), np.nan_to_num(probability), done)
+    assert gate_at(seen_out, 0.5, 3).recall.k == 0
 
 
 def test_auc_is_the_share_of_pairs_in_the_right_order(outcomes):
@@ -70,7 +84,8 @@ def test_auc_is_the_share_of_pairs_in_the_right_order(outcomes):
     assert outcomes.scores(3).tolist() == [0.9, 0.8, 0.1, 0.7, 0.1]
     assert outcomes.auc(3) == pytest.approx((2 + 2 + 0.5) / 6)
     assert math.isnan(Outcomes(np.arange(2), np.ones((2, 4)), np.ones((2, 4), bool)).auc(3))
-    assert outcomes.auc(7) == 0.5
+    assert outcomes.auc(7) == pytest.approx((2 + 2 + 1) / 6), "most successes are cut short: last frames last"
+    assert Outcomes(np.arange(2), np.ones((2, 4)), np.array([[True] * 4, [False] * 4])).auc(7) == 0.5
 
 
 def test_the_best_operating_point_is_tolerable_and_recognises_most(outcomes):

@@ -16,6 +16,7 @@ from lerobot_wmrl.data.frames import NO_CONTEXT
 from lerobot_wmrl.evaluation import replay as replay_module
 from lerobot_wmrl.evaluation.accuracy import (
     EpisodeAccuracy,
+    absolute_control,
     by_step,
     episode_means,
     extreme_actions,
@@ -23,7 +24,7 @@ from lerobot_wmrl.evaluation.accuracy import (
     robustness,
 )
 from lerobot_wmrl.evaluation.gate import Outcomes, gate_at, success_gate
-from lerobot_wmrl.evaluation.replay import MAX_ACTIONS, EpisodeReplay, Recording, replay_episodes
+from lerobot_wmrl.evaluation.replay import EpisodeReplay, Recording, replay_episodes
 from lerobot_wmrl.evaluation.report import evaluate
 from lerobot_wmrl.maniskill.recordings import scene_splits
 from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
@@ -83,8 +84,8 @@ def test_delta_psnr_compares_with_the_actions_of_another_episode(source, model):
     compared = {run.episode: run for run in replay_episodes(model, source, np.array([2, 5]))}[2]
     assert compared.shuffled is not None
     same = replace(compared, shuffled=compared.tokens[14])
-    assert measure(model, source, same, None).whole["delta_psnr_15"] == pytest.approx(0, abs=1e-5)
-    assert "delta_psnr_15" not in measure(model, source, alone, None).whole
+    assert measure(model, source, same, None).whole["delta_psnr_0_6s"] == pytest.approx(0, abs=1e-5)
+    assert "delta_psnr_0_6s" not in measure(model, source, alone, None).whole
 
 
 def test_depth_is_measured_where_a_replay_has_it(source, model):
@@ -104,24 +105,49 @@ def test_steps_are_averaged_over_the_episodes_that_last_so_long():
     assert by_step([], horizon=2) == {"bands": {}, "episodes_by_step": []}
 
 
-def test_step_30_is_compared_with_the_tokenizer():
-    steps = {"psnr": np.arange(40.0), "psnr_ceiling": np.full(40, 50.0)}
-    numbers = episode_means(EpisodeAccuracy(0, steps, {}))
-    assert (numbers["psnr_30"], numbers["psnr_below_ceiling_30"]) == (29, 21)
-    short = {name: values[:29] for name, values in steps.items()}
-    assert "psnr_30" not in episode_means(EpisodeAccuracy(0, short, {}))
+def test_step_wise_measures_are_averaged_up_to_the_horizon():
+    numbers = episode_means(EpisodeAccuracy(0, {"psnr": np.arange(40.0)}, {"mse": 1.0}), horizon=3)
+    assert numbers == {"psnr": 1, "mse": 1}
+
+
+def test_horizons_are_times_not_frames(source, model):
+    """At 25 frames a second 1.2 s are 30 frames, more than the episodes have; at 5 they are 6."""
+    info = source.table.dataset.meta.info
+    run = perfect(source, model, 0)
+    assert (source.steps(0.6), source.steps(1.2), source.steps(0.001)) == (15, 30, 1)
+    assert "psnr_1_2s" not in measure(model, source, run, None).whole
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(info, "fps", 5)
+        measured = measure(model, source, run, None)
+    assert measured.whole["psnr_1_2s"] == measured.steps["psnr"][5]
+    assert measured.whole["psnr_below_ceiling_1_2s"] == 0
 
 
 def test_extreme_actions_are_what_they_are_called(source, model):
     own = source.actions(np.arange(6), 4, torch.device("cpu"))
     low, high = source.table.action.min(0), source.table.action.max(0)
-    actions = extreme_actions(own, low, high)
+    actions = extreme_actions(own, low, high, absolute=False)
     at_a_bound = torch.from_numpy(low), torch.from_numpy(high)
     assert torch.stack([actions["saturated"] == bound for bound in at_a_bound]).any(0).all()
     assert torch.equal(actions["reversed"], -own)
     assert not actions["frozen"].any()
+    targets = extreme_actions(own, low, high, absolute=True)
+    assert torch.equal(targets["frozen"], own[:, :1].expand_as(own))
+    torch.testing.assert_close(targets["reversed"] - targets["frozen"], targets["frozen"] - own)
+    assert list(extreme_actions(own, low, high, absolute=None)) == ["saturated"]
     result = robustness(model, source, np.arange(6), threshold=1e-9, frames=1)
     assert result["frozen"]["predicted_success"]["share"] == 1
+
+
+def test_actions_are_absolute_where_they_follow_the_state(source):
+    table, rng = source.table, np.random.default_rng(0)
+    state = np.cumsum(rng.standard_normal((len(table.state), 2)), 0).astype(np.float32)
+    still = np.ones((len(state), 1), np.float32)
+    targets = replace(table, state=np.hstack([state, still]), action=np.hstack([state + 0.01, still]))
+    assert absolute_control(targets) is True
+    moves = np.diff(state, axis=0, append=state[-1:])
+    assert absolute_control(replace(targets, action=moves)) is False
+    assert absolute_control(replace(targets, state=state[:, :0])) is None
 
 
 def test_splits_compose(small_dataset):
@@ -154,13 +180,11 @@ def test_episodes_of_one_frame_are_named(source, model):
         evaluate(model, Recording(table, source.frames), np.arange(6))
 
 
-def test_episodes_that_are_cut_are_counted(source, caplog):
-    Recording(source.table, source.frames)
-    assert not caplog.records
-    length = source.table.length.copy()
-    length[:2] = MAX_ACTIONS + 1
-    Recording(replace(source.table, length=length), source.frames)
-    assert "2 of 6 episodes are longer than 300 frames" in caplog.text
+def test_frames_of_long_episodes_are_compared_in_part_and_outcomes_as_a_whole(source, model, monkeypatch):
+    monkeypatch.setattr(replay_module, "COMPARED_FRAMES", 5)
+    for run in replay_episodes(model, source, np.arange(2)):
+        assert len(run.done) == source.table.length[run.episode]
+        assert len(measure(model, source, run, None).steps["psnr"]) == 4
 
 
 def test_the_gate_is_one_call(small_dataset, model):
@@ -213,7 +237,7 @@ def test_the_command_writes_figures_and_pictures(small_dataset, trained_models, 
         assert len(metrics[f"{name}_by_step"]) == longest - 1
         low, high = metrics["headline"][name]["bootstrap_95"]
         assert low <= metrics["headline"][name]["value"] <= high
-    assert math.isfinite(metrics["delta_psnr_15"])
+    assert math.isfinite(metrics["delta_psnr_0_6s"])
     assert len(metrics["gate_sweep"]) == 14 * 6
     assert metrics["goal_frames"]["goals"] == 6
     page = (folder / "metrics.md").read_text()

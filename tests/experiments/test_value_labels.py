@@ -196,7 +196,9 @@ def test_negative_actions_and_no_others_have_another_instruction(
     assert negative[rollout].mean() == pytest.approx(0.6, abs=0.01)
     assert not negative[~rollout].any()
     assert copy.meta.episodes[0]["tasks"] == [plain]
-    assert read_episodes(copy).instructions == table.instructions
+    first = zip(table.instructions, negative[table.start], strict=True)
+    expected = [f"{text}{value_labels.NEGATIVE}" if bad else text for text, bad in first]
+    assert read_episodes(copy).instructions == expected
     before, after = table.dataset[20], copy[20]
     for key in ("action", "observation.state", "observation.images.third_view"):
         assert torch.equal(before[key], after[key])
