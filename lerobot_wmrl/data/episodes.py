@@ -159,7 +159,7 @@ def open_dataset(root: str | Path, repo_id: str | None = None) -> LeRobotDataset
         if not missing:
             return LeRobotDataset(name, root=root, video_backend=VIDEO_BACKEND)
     except Exception as error:  # parquet, JSON, datasets and the hub each raise their own
-        reason = str(error).strip().splitlines()[0]
+        reason = first_line(error.__cause__ or error)
         raise FieldError(
             "dataset.root",
             root,
@@ -177,12 +177,17 @@ def download_dataset(repo_id: str, revision: str | None = None) -> LeRobotDatase
     try:
         return LeRobotDataset(repo_id, revision=revision, video_backend=VIDEO_BACKEND)
     except Exception as error:  # the hub's client, parquet and JSON each raise their own
-        reason = str(error).strip().splitlines()[0]
+        reason = first_line(error)
         raise FieldError(
             "dataset.repo_id", repo_id, f"cannot be downloaded ({reason})",
             "correct the name, log in with `hf auth login` if it is private, or give a folder on disk, "
             "`dataset.root`",
         ) from error  # fmt: skip
+
+
+def first_line(error: BaseException) -> str:
+    """Return the first line of an error's message, or its kind if it has none."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
 def missing_files(meta: LeRobotDatasetMetadata) -> list[Path]:
@@ -206,9 +211,15 @@ def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
     labels = () if success is None else (success,)
     measured = [name for name in (ACTION, OBS_STATE, *labels) if name in dataset.features]
     further = episode_columns(dataset.features)
+    for column in measured:
+        check_whole(dataset, column)
     rows = dataset.hf_dataset.with_format("numpy", columns=[*PLACE, *measured, *further])[:]
     for column in measured:
-        check_finite(dataset, column, np.asarray(rows[column]), rows["episode_index"])
+        finite = np.isfinite(as_columns(rows[column])).all(1)
+        if not finite.all():
+            raise bad_row(
+                dataset, column, int(np.argmin(finite)), np.asarray(rows[column])[~finite][0].tolist()
+            )
     frames = len(rows["episode_index"])
     _, start, length = np.unique(rows["episode_index"], return_index=True, return_counts=True)
     done = np.asarray(rows[success]).reshape(-1) if success else np.zeros(frames, bool)
@@ -256,18 +267,24 @@ def as_columns(values: ArrayLike) -> np.ndarray:
     return columns.reshape(len(columns), -1)
 
 
-def check_finite(dataset: LeRobotDataset, column: str, values: np.ndarray, episode: np.ndarray) -> None:
-    """Raise FieldError with the first episode and frame at which values (N, …) hold NaN or infinity."""
-    finite = np.isfinite(values.astype(np.float64).reshape(len(values), -1)).all(1)
-    if not finite.all():
-        row = int(np.argmin(finite))
-        frame = row - int(np.argmax(episode == episode[row]))
-        raise FieldError(
-            "dataset.root", dataset.root,
-            f"{column} of episode {episode[row]}, frame {frame}, is {values[row].tolist()}",
-            "remove the episode with lerobot-edit-dataset --operation.type=delete_episodes "
-            f"--operation.episode_indices=[{episode[row]}]",
-        )  # fmt: skip
+def check_whole(dataset: LeRobotDataset, column: str) -> None:
+    """Raise FieldError with the first episode and frame at which a column has no value."""
+    rows = dataset.hf_dataset.select_columns([column]).with_format("arrow")[:][column]
+    if rows.null_count:
+        raise bad_row(dataset, column, rows.is_null().index(True).as_py(), "missing")
+
+
+def bad_row(dataset: LeRobotDataset, column: str, row: int, found: object) -> FieldError:
+    """Return the error for a row of a column, N rows in all, at which `found` is no value to learn from."""
+    episode = np.asarray(
+        dataset.hf_dataset.with_format("numpy", columns=["episode_index"])[:]["episode_index"]
+    )
+    frame = row - int(np.argmax(episode == episode[row]))
+    return FieldError(
+        "dataset.root", dataset.root, f"{column} of episode {episode[row]}, frame {frame}, is {found}",
+        "remove the episode with lerobot-edit-dataset --operation.type=delete_episodes "
+        f"--operation.episode_indices=[{episode[row]}]",
+    )  # fmt: skip
 
 
 def parquet_files(root: Path) -> list[Path]:

@@ -124,6 +124,13 @@ class WorldModelEnv(EnvConfig):
                 "fps", self.fps, f"the world model has learnt {model.embodiment.fps} frames a second",
                 "leave it out",
             )  # fmt: skip
+        if model.learnt_successes == 0 and isinstance(self.reward, GeneralConfig):
+            raise FieldError(
+                "world_model_path", self.world_model_path,
+                "has learnt from no episode that is known to succeed, so it would never reward",
+                "label the episodes with lerobot-wmrl-label and train it again, or choose another reward "
+                "(`reward.type`)",
+            )  # fmt: skip
         self.fps = model.embodiment.fps
         self.features[ACTION] = PolicyFeature(type=FeatureType.ACTION, shape=(model.action_size,))
         if model.state_size:

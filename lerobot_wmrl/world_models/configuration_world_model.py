@@ -154,10 +154,14 @@ class ActionWorldModelConfig(WorldModelConfig):
     Args:
         action_size: width of `action`, filled in from the dataset.
         embodiment: names, ranges and frame rate, filled in from the dataset; imagined episodes keep to them.
+        learnt_successes: successful episodes that it has learnt from, filled in from the datasets.
+        learnt_failures: failed ones; episodes of which nobody knows the outcome are neither.
     """
 
     action_size: int = 7
     embodiment: Embodiment = field(default_factory=Embodiment)
+    learnt_successes: int | None = None
+    learnt_failures: int | None = None
 
 
 @RewardModelConfig.register_subclass("text_world_model")

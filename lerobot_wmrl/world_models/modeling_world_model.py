@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import torch
 from lerobot.configs.rewards import RewardModelConfig
 from lerobot.rewards.pretrained import PreTrainedRewardModel
@@ -79,6 +80,26 @@ def make_dynamics(config: WorldModelConfig, grid: int) -> Dynamics:
     return AutoregressiveDynamics(chosen, sizes)
 
 
+def statistics_of(stats: Any, key: str, size: int) -> tuple[Tensor, Tensor]:
+    """Return a feature's mean and standard deviation, (size,) each, from a dataset's statistics.
+
+    Raises:
+        FieldError: there are none, or they are not `size` finite numbers.
+    """
+    found = []
+    for name in ("mean", "std"):
+        given = np.asarray(stats.get(key, {}).get(name, ()), np.float64).reshape(-1)
+        if len(given) != size or not np.isfinite(given).all():
+            raise FieldError(
+                "dataset.root", None,
+                f"its statistics (meta/stats.json) say that the {name} of {key} is {given.tolist()}, where "
+                f"{size} finite numbers should be",
+                "compute them again with lerobot-edit-dataset --operation.type=recompute_stats",
+            )  # fmt: skip
+        found.append(torch.as_tensor(given, dtype=torch.float32))
+    return found[0], found[1]
+
+
 class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
     """Base of both world models: what they learn from, and imagination in the dataset's units."""
 
@@ -141,8 +162,7 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
         """Register mean and standard deviation of the feature `key`, the latter at least `least`."""
         mean, std = torch.zeros(size), torch.ones(size)
         if stats is not None and size:
-            mean = torch.as_tensor(stats[key]["mean"], dtype=torch.float32)
-            std = torch.as_tensor(stats[key]["std"], dtype=torch.float32)
+            mean, std = statistics_of(stats, key, size)
             std = torch.where(std < MIN_SPREAD, 1.0, std).clamp_min(least)
         self.register_buffer(f"{name}_mean", mean)
         self.register_buffer(f"{name}_std", std)

@@ -7,7 +7,7 @@ averages the gradients, and the first process alone writes.
 import logging
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -52,7 +52,7 @@ from lerobot_wmrl.data.frame_cache import (
 )
 from lerobot_wmrl.world_models.checkpoint import check_dataset, load_model
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import cosine_schedule
-from lerobot_wmrl.world_models.configuration_world_model import TextWorldModelConfig
+from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig, TextWorldModelConfig
 
 HELD_OUT_BATCHES = 8
 """Held-out batches on which a trained world model is measured, which takes a few seconds."""
@@ -136,7 +136,7 @@ def make_sampler(
     elif not table.done_known:
         logging.warning(
             "dataset.root=%s: has neither next.success nor next.done: the model cannot learn from it what "
-            "success is, and from it alone learns that nothing succeeds",
+            "success is",
             table.dataset.root,
         )
     return make_clip_sampler(model, table, episodes.nonzero()[0], batch_size, seed, done_known)
@@ -174,12 +174,41 @@ def make_joint_sampler(
     more = [read_episodes(open_dataset(root)) for root in data.more]
     for other in more:
         check_dataset(model.config, other.dataset.meta)
+    if isinstance(model.config, ActionWorldModelConfig):
+        note_outcomes(model.config, [(table, data.episodes), *((each, None) for each in more)])
     unlabelled = not any(each.done_known for each in (table, *more))
     first, *others = (
         make_sampler(model, each, chosen, batch_size, seed, unlabelled or each.done_known)
         for each, chosen in zip((table, *more), (data.episodes, *[None] * len(more)), strict=True)
     )
     return InTurn(first, others) if others else first
+
+
+def note_outcomes(
+    config: ActionWorldModelConfig, sources: Iterable[tuple[EpisodeTable, Sequence[int] | None]]
+) -> None:
+    """Write into a world model's configuration how many successes and failures it learns from.
+
+    A model that is trained further keeps what it has learnt from before, if that was more.
+    """
+    successes, failures = config.learnt_successes or 0, config.learnt_failures or 0
+    learnt = [
+        table.success[~table.validation & table.among(chosen)]
+        for table, chosen in sources
+        if table.done_known
+    ]
+    config.learnt_successes = max(successes, sum(int(each.sum()) for each in learnt))
+    config.learnt_failures = max(failures, sum(int((~each).sum()) for each in learnt))
+    if not config.learnt_successes:
+        logging.warning(
+            "no episode is known to succeed: the world model never rewards. RL in it needs labels "
+            "(lerobot-wmrl-label) or a reward of another kind"
+        )
+    elif not config.learnt_failures:
+        logging.warning(
+            "no episode is known to fail: the world model has not seen how one does, and a policy will learn "
+            "what it takes for success. No gate on such episodes can tell; record rollouts with failures"
+        )
 
 
 def train(

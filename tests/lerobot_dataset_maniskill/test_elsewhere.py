@@ -23,7 +23,7 @@ STEPS = 6
 @pytest.fixture(scope="module")
 def demonstrations(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("pusht") / "demonstrations"
-    return record_pusht(root, "--num_episodes=1", f"--steps={STEPS}", "--candidates", "1")
+    return record_pusht(root, "--num_episodes=1", f"--steps={STEPS}", "--noise", "2")
 
 
 @pytest.fixture
