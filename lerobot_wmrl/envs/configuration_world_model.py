@@ -84,7 +84,8 @@ class WorldModelEnv(EnvConfig):
         dataset: where imagined episodes start. Give one of `root`, `frames` and `resets`.
         reward: `general` and its settings; `embedding` or `proxy` with the output folder of its training as
             `reward.pretrained_path`; or one of LeRobot's own, such as `reward_classifier`.
-        episode_length: frames after which an episode is truncated.
+        episode_length: frames after which an episode is truncated; by default as many as the clips that the
+            world model has learnt from have (`clip_length`).
         done_threshold: predicted success probability θ at which a frame counts as done (eq. 7).
         done_frames: consecutive done frames k that make a success.
         uncertainty: what happens to episodes about which the world model is uncertain.
@@ -98,7 +99,7 @@ class WorldModelEnv(EnvConfig):
     text_world_model_path: str = ""
     dataset: StartFrames = field(default_factory=StartFrames)
     reward: RewardModelConfig = field(default_factory=GeneralConfig)
-    episode_length: int = 40
+    episode_length: int | None = None
     done_threshold: float = 0.5
     done_frames: int = 3
     uncertainty: Uncertainty = field(default_factory=Uncertainty)
@@ -131,7 +132,8 @@ class WorldModelEnv(EnvConfig):
                 "label the episodes with lerobot-wmrl-label and train it again, or choose another reward "
                 "(`reward.type`)",
             )  # fmt: skip
-        self.fps = model.embodiment.fps
+        self.fps, self.episode_length = model.embodiment.fps, self.episode_length or model.clip_length
+        self._check_length()
         self.features[ACTION] = PolicyFeature(type=FeatureType.ACTION, shape=(model.action_size,))
         if model.state_size:
             self.features["agent_pos"] = PolicyFeature(type=FeatureType.STATE, shape=(model.state_size,))
@@ -142,13 +144,8 @@ class WorldModelEnv(EnvConfig):
             self.features_map[pixels] = camera_key(camera)
 
     def _check(self) -> None:
-        require_at_least(self, 1, "episode_length", "done_frames")
-        if self.episode_length < self.done_frames:
-            raise FieldError(
-                "episode_length", self.episode_length,
-                f"shorter than the {self.done_frames} frames for which done must hold, so that no episode "
-                "could succeed", "raise it, or lower `done_frames`",
-            )  # fmt: skip
+        require_at_least(self, 1, "done_frames")
+        self._check_length()
         if not 0 < self.done_threshold < 1:
             raise FieldError("done_threshold", self.done_threshold, "must be a probability")
         if self.dataset.max_starts < 1:
@@ -157,6 +154,24 @@ class WorldModelEnv(EnvConfig):
         if unknown:
             raise FieldError("dataset.tasks", unknown, f"choose from {', '.join(TASKS)}")
         self.uncertainty.check()
+
+    def _check_length(self) -> None:
+        if self.episode_length is None:
+            return
+        require_at_least(self, 1, "episode_length")
+        if self.episode_length < self.done_frames:
+            raise FieldError(
+                "episode_length", self.episode_length,
+                f"shorter than the {self.done_frames} frames for which done must hold, so that no episode "
+                "could succeed", "raise it, or lower `done_frames`",
+            )  # fmt: skip
+
+    @property
+    def horizon(self) -> int:
+        """Frames after which an episode is truncated. ValueError without a world model, which says it."""
+        if self.episode_length is None:
+            raise ValueError("world_model_path: is missing; it says how long episodes are")
+        return self.episode_length
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:

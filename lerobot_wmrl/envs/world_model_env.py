@@ -1,5 +1,6 @@
 """The world model as a natively batched environment: many imagined episodes, one forward pass a step."""
 
+import logging
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -20,6 +21,7 @@ from lerobot_wmrl.rewards.general import consecutive_count, is_done
 from lerobot_wmrl.rewards.loading import Reward, load_reward
 from lerobot_wmrl.rewards.similarity import Similarity, make_similarity
 from lerobot_wmrl.world_models.checkpoint import check_same_tokenizer, load_model
+from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig
 from lerobot_wmrl.world_models.dynamics import Imagined
 from lerobot_wmrl.world_models.frame_tokenizer import Decoded
 from lerobot_wmrl.world_models.goal import select_features
@@ -51,7 +53,7 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
     ) -> None:  # fmt: skip
         self.model, self.starts, self.goals = model, starts, goals
         self.reward, self.config = reward, config
-        self.num_envs, self.max_episode_steps = n_envs, config.episode_length
+        self.num_envs, self.max_episode_steps = n_envs, config.horizon
         self.device = starts.images.device
         embodiment = model.config.embodiment
         self.metadata = {"render_fps": embodiment.fps, "autoreset_mode": AutoresetMode.SAME_STEP}
@@ -260,7 +262,18 @@ def load_world_models(config: WorldModelEnv, device: str | None) -> WorldModels:
 def make_world_model_env(config: WorldModelEnv, n_envs: int, device: str | None) -> WorldModelVectorEnv:
     """Return one environment for all start frames."""
     models = load_world_models(config, device)
+    warn_of_long_episodes(config, models.model.config)
     return make_env_at(read_first_frames(config.dataset, models.model.config), models, config, n_envs)
+
+
+def warn_of_long_episodes(config: WorldModelEnv, model: ActionWorldModelConfig) -> None:
+    """Say so if imagined episodes are longer than anything that the world model has learnt from."""
+    if config.horizon > model.clip_length:
+        logging.warning(
+            "imagined episodes of %d frames are longer than the clips of %d frames that the world model has "
+            "learnt from, and less reliable from there on: train it with --model.clip_length=%d, or lower "
+            "env.episode_length", config.horizon, model.clip_length, config.horizon,
+        )  # fmt: skip
 
 
 def make_task_envs(config: WorldModelEnv, n_envs: int, device: str | None) -> dict[int, WorldModelVectorEnv]:

@@ -88,8 +88,8 @@ def missing(table: EpisodeTable) -> list[str]:
         found.append("next.done is taken for success: there is no next.success (lerobot-wmrl-label adds it)")
     if failures < FEW_FAILURES:
         found.append(
-            f"{failures or 'no'} failures: the world model will hardly tell them from successes, and the "
-            "policy learns what it takes for one. Record rollouts of the policy (--rollouts, with "
+            f"failures: {failures}. The world model will hardly tell them from successes, and the policy "
+            "learns what it takes for one. Record rollouts of the policy (--rollouts, with "
             "--real_env), and leave the failures in"
         )
     return found

@@ -204,7 +204,7 @@ def policy_agreement(cfg: EvalWorldModelConfig) -> "Agreement":
     longest = getattr(cfg.real_env, "horizon", None) or getattr(cfg.real_env, "episode_length", None)
     imagination = WorldModelEnv(
         world_model_path=cfg.model.path, reward=GeneralConfig(alpha=1.0), device=cfg.device,
-        episode_length=longest or WorldModelEnv.episode_length,
+        episode_length=longest,
         dataset=StartFrames(cfg.dataset.root, cfg.dataset.repo_id, cfg.dataset.revision, split=cfg.split),
         done_threshold=cfg.done_threshold, done_frames=cfg.done_frames,
     )  # fmt: skip

@@ -147,6 +147,14 @@ def make_clip_sampler(
 ) -> ClipSampler:
     """Make a sampler of clips from these episodes, with what else the model looks at or predicts."""
     config, tokenizer, dataset = model.config, model.tokenizer, table.dataset
+    longer, longest = table.length[episodes] > config.clip_length, int(table.length[episodes].max())
+    if 2 * longer.sum() > len(episodes):
+        logging.warning(
+            "%s: %d of %d episodes are longer than the clips that are learnt from, clip_length=%d frames "
+            "(%.1f s): success is learnt up to there alone. --model.clip_length=%d holds the longest",
+            dataset.root, longer.sum(), len(episodes), config.clip_length, config.clip_length / dataset.fps,
+            longest,
+        )  # fmt: skip
     cameras = config.tokenizer.camera_keys
     return ClipSampler(
         table,

@@ -19,7 +19,7 @@ from lerobot_wmrl.rewards.similarity import TokenizerSimilarity
 from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
 from lerobot_wmrl.world_models.frame_tokenizer import Decoded
 from tests.read_backs import fetched
-from tests.trained import action_config, run_training
+from tests.trained import CLIP_LENGTH, action_config, run_training
 
 B = 4
 IMAGE, STATE = "observation.images.third_view", "observation.state"
@@ -494,3 +494,20 @@ def test_what_the_world_model_is_uncertain_of_ends_or_pays_less(config):
         name, value = next(iter(wrong.items()))
         with pytest.raises(ValueError, match=rf"^uncertainty\.{name}={value}"):
             uncertain(config, **wrong)
+
+
+def test_episodes_last_as_long_as_the_world_model_has_learnt(config, trained_models, caplog):
+    path = str(trained_models["action_world_model"])
+    by_default = replace(config, episode_length=None)
+    assert by_default.horizon == CLIP_LENGTH
+    by_default.create_tensor_env(1)
+    assert not caplog.records
+    replace(config, episode_length=CLIP_LENGTH + 1).create_tensor_env(1)
+    assert (
+        f"imagined episodes of {CLIP_LENGTH + 1} frames are longer than the clips of {CLIP_LENGTH}"
+        in caplog.text
+    )
+    with pytest.raises(ValueError, match=f"episode_length={CLIP_LENGTH}: shorter than the 11 frames"):
+        WorldModelEnv(world_model_path=path, done_frames=11, reward=GeneralConfig(alpha=1.0))
+    with pytest.raises(ValueError, match="world_model_path: is missing"):
+        _ = WorldModelEnv().horizon

@@ -1,0 +1,90 @@
+"""Record a Meta-World task with its scripted expert, made worse by noise, by LeRobot's own API alone.
+
+    pip install 'lerobot[metaworld]'
+    MUJOCO_GL=egl python examples/record_metaworld.py --task=push-v3 --root=outputs/metaworld
+
+The expert's skill is drawn for each episode: the noise on its actions (`--noise`). Nothing here imports
+`lerobot_wmrl`: the dataset is what a LeRobot user would bring.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.envs.configs import MetaworldEnv as MetaworldConfig
+from lerobot.envs.metaworld import MetaworldEnv
+from tqdm import trange
+
+SMOOTHNESS = 0.8
+"""Share of the noise that an action takes over from the one before."""
+
+FEATURES = {
+    "observation.image": {
+        "dtype": "image",
+        "shape": (480, 480, 3),
+        "names": ["height", "width", "channel"],
+    },
+    "observation.state": {"dtype": "float32", "shape": (4,), "names": ["x", "y", "z", "gripper"]},
+    "action": {
+        "dtype": "float32",
+        "shape": (4,),
+        "names": ["x", "y", "z", "gripper"],
+        "info": {"low": [-1.0] * 4, "high": [1.0] * 4},
+    },
+    "next.reward": {"dtype": "float32", "shape": (1,), "names": None},
+    "next.success": {"dtype": "bool", "shape": (1,), "names": None},
+    "next.done": {"dtype": "bool", "shape": (1,), "names": None},
+}
+
+
+def record(task: str, root: Path, num_episodes: int, seed: int, noise: list[float], steps: int) -> None:
+    """Record the episodes and print how many succeed."""
+    env = MetaworldEnv(task, obs_type="pixels_agent_pos")
+    fps = MetaworldConfig().fps
+    dataset = LeRobotDataset.create(f"local/{task}", fps, FEATURES, root=root, use_videos=False)
+    successes = 0
+    for episode in trange(num_episodes, unit="episode"):
+        rng = np.random.default_rng((seed, episode))
+        observation, _ = env.reset(seed=seed + episode)
+        skill, error, success = float(rng.choice(noise)), np.zeros(4), False
+        for step in range(steps):
+            error = SMOOTHNESS * error + np.sqrt(1 - SMOOTHNESS**2) * skill * rng.standard_normal(4)
+            planned = env.expert_policy.get_action(env._env._get_obs())
+            action = np.clip(planned + error, -1, 1).astype(np.float32)
+            after, reward, success, truncated, _ = env.step(action)
+            done = success or truncated or step == steps - 1
+            dataset.add_frame({
+                "observation.image": observation["pixels"],
+                "observation.state": observation["agent_pos"].astype(np.float32),
+                "action": action,
+                "next.reward": np.array([reward], np.float32),
+                "next.success": np.array([success]),
+                "next.done": np.array([done]),
+                "task": env.task_description,
+            })  # fmt: skip
+            observation = after
+            if done:
+                break
+        dataset.save_episode()
+        successes += int(success)
+    dataset.finalize()
+    print(f"{root}: {num_episodes} episodes, {successes} succeed")
+
+
+def main() -> None:
+    """Entry point."""
+    verbatim = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=verbatim)
+    parser.add_argument("--task", default="push-v3", help="one of Meta-World's tasks")
+    parser.add_argument("--root", type=Path, default=Path("outputs/metaworld"), help="new dataset's folder")
+    parser.add_argument("--num_episodes", type=int, default=60)
+    parser.add_argument("--seed", type=int, default=0, help="of the starts and the noise")
+    noise = {"type": float, "nargs": "+", "default": [0.1, 0.4, 0.8]}
+    parser.add_argument("--noise", **noise, help="standard deviation, of 1; one is drawn for each episode")
+    parser.add_argument("--steps", type=int, default=150, help="longest episode")
+    record(**vars(parser.parse_args()))
+
+
+if __name__ == "__main__":
+    main()
