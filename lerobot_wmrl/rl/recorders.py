@@ -1,6 +1,5 @@
 """Recording what a policy does outside the world model, for the gate and for Dyna rounds."""
 
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -23,6 +22,7 @@ from tqdm import trange
 from lerobot_wmrl.common.constants import KINDS, POLICY, START_KIND, START_SEED
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.exploration import ExplorationNoise
+from lerobot_wmrl.common.files import whole_folder
 from lerobot_wmrl.common.policies import load_policy, load_processors, read_policy_config
 from lerobot_wmrl.common.presets import Flags, format_flags
 from lerobot_wmrl.common.processes import run_subcommand
@@ -154,19 +154,17 @@ class RolloutRecorder:
 
         report: is told of every episode whether it succeeds.
         """
-        partial = folder.with_name(f".{folder.name}.partial")
-        shutil.rmtree(partial, ignore_errors=True)
         dataset = None
         size = self.envs[0].num_envs
-        for number, first in enumerate(range(0, len(seeds), size)):
-            chosen = seeds[first : first + size]
-            seen, taken = self._roll_out(self.envs[number % len(self.envs)], chosen)
-            dataset = dataset or self._create(partial, seen.observations[0])
-            for row, seed in enumerate(chosen):
-                report(self._add_episode(dataset, seen, taken, row, seed))
-        assert dataset is not None, "there is no seed"
-        dataset.finalize()
-        partial.replace(folder)
+        with whole_folder(folder) as partial:
+            for number, first in enumerate(range(0, len(seeds), size)):
+                chosen = seeds[first : first + size]
+                seen, taken = self._roll_out(self.envs[number % len(self.envs)], chosen)
+                dataset = dataset or self._create(partial, seen.observations[0])
+                for row, seed in enumerate(chosen):
+                    report(self._add_episode(dataset, seen, taken, row, seed))
+            assert dataset is not None, "there is no seed"
+            dataset.finalize()
 
     def _roll_out(self, env: Any, seeds: Sequence[int]) -> tuple["Witness", dict[str, Tensor]]:
         """Return what the policy saw and did from these seeds, and LeRobot's record of the outcome."""

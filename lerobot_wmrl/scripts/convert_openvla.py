@@ -10,14 +10,13 @@ loads.
 Weights keep their number format. An import followed by an export gives equal weights bit by bit.
 """
 
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.files import foreign_files, writing
+from lerobot_wmrl.common.files import foreign_files, whole_folder, writing
 
 DIRECTIONS = ("import", "export")
 
@@ -52,8 +51,9 @@ def convert(cfg: ConvertOpenVLAConfig) -> None:
     if cfg.direction == "export" and cfg.unnorm_key is not None:
         raise FieldError("unnorm_key", cfg.unnorm_key, "the export keeps all statistics; leave it out")
     write = importer(cfg.source, cfg.unnorm_key) if cfg.direction == "import" else exporter(cfg.source)
-    with writing("target", cfg.target):
-        write_whole(cfg.target, write)
+    with writing("target", cfg.target), whole_folder(cfg.target) as partial:
+        partial.mkdir()
+        write(partial)
     print(conclusion(cfg.direction, cfg.target))
 
 
@@ -99,17 +99,6 @@ def exporter(source: str) -> Callable[[Path], None]:
         write_openvla(folder, weights, config.sizes, policy.files, config.norm_stats)
 
     return write
-
-
-def write_whole(target: Path, write: Callable[[Path], None]) -> None:
-    """Let `write` fill a folder beside the target, then rename it."""
-    partial = target.with_name(f".{target.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
-    write(partial)
-    if target.exists():
-        target.rmdir()
-    partial.rename(target)
 
 
 def main() -> None:

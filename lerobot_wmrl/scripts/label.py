@@ -14,7 +14,6 @@ World models learn from this column when an imagined episode succeeds. The datas
 command says how many episodes succeed and for how long, and what cannot be learnt from such labels.
 """
 
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,7 +23,7 @@ import numpy as np
 
 from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.files import writing
+from lerobot_wmrl.common.files import whole_folder, writing
 from lerobot_wmrl.data.episodes import SUCCESS_COLUMNS, DatasetSource
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.rewards.success_rules import EndsRule, SuccessRule, rows_of
@@ -83,12 +82,9 @@ def write_labelled(dataset: "LeRobotDataset", solved: np.ndarray, output_dir: Pa
     """Copy a dataset with `next.success` (N,) by LeRobot's own function; the folder is whole or absent."""
     from lerobot.datasets.dataset_tools import add_features
 
-    partial = output_dir.with_name(f".{output_dir.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.parent.mkdir(parents=True, exist_ok=True)
     column = {SUCCESS: (solved[:, None], {"dtype": "bool", "shape": (1,), "names": None})}
-    add_features(dataset, column, output_dir=partial, repo_id=repo_id)
-    partial.rename(output_dir)
+    with whole_folder(output_dir) as partial:
+        add_features(dataset, column, output_dir=partial, repo_id=repo_id)
 
 
 def longest_run(solved: np.ndarray) -> int:

@@ -17,7 +17,7 @@ EPISODES = 3
 @pytest.fixture(scope="module")
 def demonstrations(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("pusht") / "demonstrations"
-    return record_pusht(root, f"--num_episodes={EPISODES}", "--steps=120", "--noise", "2", "64")
+    return record_pusht(root, f"--num_episodes={EPISODES}", "--steps=150", "--noise", "2")
 
 
 def run(folder: Path, demonstrations: Path, *flags: str) -> subprocess.CompletedProcess[str]:

@@ -13,7 +13,7 @@ from safetensors.torch import load_file
 from lerobot_policy_openvla.checkpoint import write_openvla
 from lerobot_policy_openvla.modeling_openvla import OpenVLAPolicy
 from lerobot_wmrl.common.policies import load_policy, load_processors, read_policy_config
-from lerobot_wmrl.scripts.convert_openvla import main, write_whole
+from lerobot_wmrl.scripts.convert_openvla import main
 from tests.hub_server import Hub
 from tests.lerobot_policy_openvla.small import SMALL_SIZES, observe, small_policy
 
@@ -75,15 +75,3 @@ def test_a_published_policy_is_the_same_policy(hub: Hub) -> None:
 def test_a_model_that_is_nowhere_is_named(hub: Hub) -> None:
     with pytest.raises(ValueError, match="somebody/gone: neither a folder nor a model on the hub"):
         OpenVLAPolicy.from_openvla("somebody/gone")
-
-
-def test_a_torn_conversion_leaves_no_target(tmp_path: Path) -> None:
-    def tear(folder: Path) -> None:
-        (folder / "half").write_text("")
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        write_whole(tmp_path / "target", tear)
-    assert not (tmp_path / "target").exists()
-    write_whole(tmp_path / "target", lambda folder: (folder / "whole").touch())
-    assert [path.name for path in (tmp_path / "target").iterdir()] == ["whole"]

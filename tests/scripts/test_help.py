@@ -16,6 +16,7 @@ from lerobot_wmrl.scripts import (
     demo,
     eval_world_model,
     label,
+    resample,
     train,
     train_world_model,
 )
@@ -32,6 +33,7 @@ COMMANDS = {
     ),
     "lerobot-wmrl-compare": (compare.compare, compare.CompareConfig),
     "lerobot-wmrl-label": (label.label, label.LabelConfig),
+    "lerobot-wmrl-resample": (resample.resample, resample.ResampleConfig),
     "lerobot-wmrl-convert-openvla": (convert_openvla.convert, convert_openvla.ConvertOpenVLAConfig),
 }  # fmt: skip
 
@@ -43,7 +45,7 @@ def test_help_explains_and_shows_no_source_code(command: str, monkeypatch: pytes
     text = help_of(function, config_class)
     assert text.startswith(f"{command}: ")
     assert f"    {command} --" in text  # an example
-    assert "--preset=" in text or command.endswith(("compare", "label", "openvla"))
+    assert "--preset=" in text or command.endswith(("compare", "label", "openvla", "resample"))
     assert "def " not in text
     assert "default_factory" not in text
     settings = list(settings_of(config_class))

@@ -1,0 +1,167 @@
+"""lerobot-wmrl-resample: copy a dataset at a lower frame rate, every second frame of it, or every third.
+
+    lerobot-wmrl-resample --dataset.root=data/50hz --every=2 --output_dir=data/25hz
+    lerobot-wmrl-resample --dataset.root=data/80hz --every=4 --displacements=[x,y,z] --output_dir=data/20hz
+
+Frames that hardly differ cost as much to imagine as others. 500 frames at 50 Hz become 250 at 25 Hz. A frame
+that is kept gets the action that was sent last before the next one, or, of the components in
+`--displacements`, the sum of the actions in between; the rewards in between are added up. A policy for the
+new rate has to be trained on the copy, and acts at that rate.
+"""
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from lerobot_wmrl.common.command_line import RunConfig, run_command
+from lerobot_wmrl.common.errors import FieldError, require_at_least
+from lerobot_wmrl.data.episodes import DatasetSource
+
+if TYPE_CHECKING:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+AFTER: Final = "next."
+"""How the names of columns begin that say what came after a frame's action."""
+
+
+@dataclass
+class ResampleConfig(RunConfig):
+    """Copy a dataset at a lower frame rate.
+
+    Args:
+        dataset: the dataset to copy.
+        every: keep every so manieth frame; its frame rate must be a multiple.
+        displacements: names, or numbers from 0 on, of the action's components that add up, such as changes of
+            a position. The others, such as targets and grippers, keep the last value.
+        output_dir: folder of the copy.
+        repo_id: its name, for the hub; by default `local/` and the folder's.
+    """
+
+    dataset: DatasetSource = field(default_factory=DatasetSource)
+    every: int = 2
+    displacements: list[str] = field(default_factory=list)
+    output_dir: Path = Path("outputs/resampled")
+    repo_id: str | None = None
+
+
+def resample(cfg: ResampleConfig) -> None:
+    """Write the copy and say what is in it."""
+    from lerobot_wmrl.common.files import writing
+    from lerobot_wmrl.data.episodes import read_episodes
+    from lerobot_wmrl.evaluation.accuracy import absolute_control
+
+    dataset = cfg.dataset.open()
+    summed = check(cfg, dataset)
+    table = read_episodes(dataset)
+    if absolute_control(table) is False and not summed.any():
+        logging.warning(
+            "the actions do not follow the state: if they are displacements, name the components that add up "
+            "with --displacements"
+        )
+    with writing("output_dir", cfg.output_dir):
+        write_resampled(dataset, cfg, summed)
+    frames = sum(-(-int(length) // cfg.every) for length in table.length)
+    print(
+        f"{cfg.output_dir}: {len(table.length)} episodes, {frames} frames at {dataset.fps // cfg.every} Hz, "
+        f"the longest has {-(-int(table.length.max()) // cfg.every)}.\n"
+        f"Next: lerobot-train --dataset.root={cfg.output_dir} …"
+    )
+
+
+def check(cfg: ResampleConfig, dataset: "LeRobotDataset") -> np.ndarray:
+    """Mark the components of the action that add up. FieldError for a setting that cannot be. (A,)"""
+    from lerobot.utils.constants import ACTION
+
+    from lerobot_wmrl.data.embodiment import component_names
+
+    require_at_least(cfg, 2, "every")
+    if dataset.fps % cfg.every:
+        raise FieldError(
+            "every", cfg.every, f"does not divide the dataset's {dataset.fps} frames a second",
+            "choose a number that does",
+        )  # fmt: skip
+    names = component_names(dataset.features[ACTION])
+    for name in cfg.displacements:
+        if name not in names:
+            raise FieldError(
+                "displacements", name, "the action has no such component", f"choose from {names}"
+            )
+    if cfg.output_dir.exists():
+        raise FieldError("output_dir", cfg.output_dir, "there is something already", "choose a new folder")
+    return np.isin(names, cfg.displacements)
+
+
+def write_resampled(dataset: "LeRobotDataset", cfg: ResampleConfig, summed: np.ndarray) -> None:
+    """Copy every so manieth frame with LeRobot's own functions; the folder is whole or absent."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from tqdm import trange
+
+    from lerobot_wmrl.common.files import whole_folder
+
+    with whole_folder(cfg.output_dir) as partial:
+        copy = LeRobotDataset.create(
+            cfg.repo_id or f"local/{cfg.output_dir.name}", dataset.fps // cfg.every,
+            scaled_features(dataset.features, summed, cfg.every), root=partial,
+            robot_type=dataset.meta.robot_type, use_videos=bool(dataset.meta.video_keys),
+        )  # fmt: skip
+        for episode in trange(dataset.num_episodes, unit="episode", desc="Copying"):
+            for row in episode_rows(dataset, episode, copy.features, cfg.every, summed):
+                copy.add_frame(row)
+            copy.save_episode()
+        copy.finalize()
+
+
+def scaled_features(features: Mapping[str, Any], summed: np.ndarray, every: int) -> dict[str, Any]:
+    """Return a dataset's own features; the recorded range of components that add up grows with them."""
+    from lerobot.utils.constants import ACTION, DEFAULT_FEATURES
+
+    own = {name: dict(each) for name, each in features.items() if name not in DEFAULT_FEATURES}
+    info = dict(own[ACTION].get("info") or {})
+    for end in {"low", "high"} & info.keys():
+        info[end] = (np.asarray(info[end]) * np.where(summed, every, 1)).tolist()
+    return own | {ACTION: own[ACTION] | ({"info": info} if info else {})}
+
+
+def episode_rows(
+    dataset: "LeRobotDataset", episode: int, features: Mapping[str, Any], every: int, summed: np.ndarray
+) -> list[dict[str, Any]]:
+    """Return the rows of an episode's copy, as LeRobotDataset's `add_frame` takes them."""
+    from lerobot.utils.constants import ACTION, DEFAULT_FEATURES
+
+    from lerobot_wmrl.data.frame_cache import decode_episode
+
+    begin, end = (dataset.meta.episodes[episode][f"dataset_{edge}_index"] for edge in ("from", "to"))
+    kept, names = np.arange(0, end - begin, every), [key for key in features if key not in DEFAULT_FEATURES]
+    pictures = {key: decode_episode(dataset, episode, key)[kept] for key in dataset.meta.camera_keys}
+    numbers = [key for key in names if key not in pictures]
+    table = dataset.hf_dataset.with_format("numpy", columns=[*numbers, "task_index"])[begin:end]
+    last, columns = np.append(kept[1:], end - begin) - 1, {}
+    for key in numbers:
+        values = np.asarray(table[key]).reshape(end - begin, -1)
+        total = np.add.reduceat(values, kept, axis=0, dtype=values.dtype)
+        if key == ACTION:
+            columns[key] = np.where(summed, total, values[last])
+        elif key.startswith(AFTER):
+            columns[key] = total if values.dtype.kind == "f" else values[last]
+        else:
+            columns[key] = values[kept]
+    tasks = [dataset.meta.tasks.index[index] for index in np.asarray(table["task_index"])[kept]]
+    return [
+        {key: frames[row].permute(1, 2, 0).numpy() for key, frames in pictures.items()}
+        | {key: values[row].reshape(features[key]["shape"]) for key, values in columns.items()}
+        | {"task": tasks[row]}
+        for row in range(len(kept))
+    ]
+
+
+def main() -> None:
+    """Run the console command."""
+    run_command(resample, ResampleConfig, list)
+
+
+if __name__ == "__main__":
+    main()

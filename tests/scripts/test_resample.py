@@ -1,0 +1,97 @@
+"""lerobot-wmrl-resample: what is kept, what is added up, and what is refused."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from lerobot_wmrl.data.episodes import open_dataset, read_episodes
+from lerobot_wmrl.scripts.resample import main
+
+LENGTHS, FPS, SIDE = (7, 4), 50, 8
+CAMERA = "observation.images.top"
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two episodes in which every number tells its frame; success holds from frame 3 on."""
+    root = tmp_path_factory.mktemp("resample") / "fast"
+    bound = {"low": [-1.0, 0.0], "high": [1.0, 500.0]}
+    features: dict[str, Any] = {
+        "action": {"dtype": "float32", "shape": (2,), "names": ["dx", "target"], "info": bound},
+        "observation.state": {"dtype": "float32", "shape": (1,), "names": ["x"]},
+        CAMERA: {"dtype": "image", "shape": (SIDE, SIDE, 3), "names": ["height", "width", "channels"]},
+        "next.reward": {"dtype": "float32", "shape": (1,), "names": None},
+        "next.success": {"dtype": "bool", "shape": (1,), "names": None},
+        "start.seed": {"dtype": "int64", "shape": (1,), "names": None},
+    }
+    dataset = LeRobotDataset.create("local/fast", FPS, features, root=root, use_videos=False)
+    for episode, length in enumerate(LENGTHS):
+        for frame in range(length):
+            dataset.add_frame({
+                "action": np.array([0.1, 10 * frame], np.float32), "task": f"task {episode}",
+                "observation.state": np.array([frame], np.float32),
+                CAMERA: np.full((SIDE, SIDE, 3), 20 * frame, np.uint8),
+                "next.reward": np.array([1], np.float32), "next.success": np.array([frame >= 3]),
+                "start.seed": np.array([5 + episode]),
+            })  # fmt: skip
+        dataset.save_episode()
+    dataset.finalize()
+    return root
+
+
+def resample(monkeypatch: pytest.MonkeyPatch, *flags: str) -> None:
+    monkeypatch.setattr(sys, "argv", ["lerobot-wmrl-resample", *flags])
+    main()
+
+
+def test_what_happened_between_two_kept_frames_belongs_to_the_first(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    slow = tmp_path / "slow"
+    resample(
+        monkeypatch, f"--dataset.root={source}", "--every=2", "--displacements=[dx]", f"--output_dir={slow}"
+    )
+    assert "2 episodes, 6 frames at 25 Hz, the longest has 4" in capsys.readouterr().out
+    dataset = open_dataset(slow)
+    table = read_episodes(dataset)
+    assert (dataset.fps, table.length.tolist()) == (25, [4, 2])
+    np.testing.assert_allclose(table.action[:4], [[0.2, 10], [0.2, 30], [0.2, 50], [0.1, 60]], rtol=1e-6)
+    assert table.state[:, 0].tolist() == [0, 2, 4, 6, 0, 2]
+    assert table.done.tolist() == [False, True, True, True, False, True]
+    assert table.instructions == ["task 0", "task 1"]
+    assert table.column("start.seed").tolist() == [5, 6]
+    rows = dataset.hf_dataset.with_format("numpy")
+    assert np.ravel(rows["next.reward"]).tolist() == [2, 2, 2, 1, 2, 2]
+    assert [round(float(dataset[row][CAMERA].mean()) * 255) for row in range(4)] == [0, 40, 80, 120]
+    assert dataset.features["action"]["info"] == {"low": [-2, 0], "high": [2, 500]}
+
+
+def test_videos_stay_videos(make_synthetic_dataset: Any, tmp_path: Path, monkeypatch) -> None:
+    fast = make_synthetic_dataset(tmp_path / "fast", episodes=1)
+    resample(monkeypatch, f"--dataset.root={fast.root}", "--every=5", f"--output_dir={tmp_path / 'slow'}")
+    slow = open_dataset(tmp_path / "slow")
+    assert slow.meta.video_keys == fast.meta.video_keys
+    key = slow.meta.video_keys[0]
+    far = [float((slow[1][key] - fast[row][key]).abs().mean()) for row in (0, 5, 10)]
+    assert np.argmin(far) == 1
+
+
+@pytest.mark.parametrize(("flags", "message"), [
+    (["--every=1"], "--every=1: must be at least 2"),
+    (["--every=3"], "--every=3: does not divide the dataset's 50 frames a second"),
+    (["--displacements=[dy]"], "--displacements=dy: the action has no such component; choose from"),
+    (["--output_dir={source}"], "there is something already"),
+])  # fmt: skip
+def test_what_cannot_be_is_refused(
+    flags: list[str], message: str, source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    given = [flag.format(source=source) for flag in flags]
+    with pytest.raises(SystemExit):
+        resample(monkeypatch, f"--dataset.root={source}", f"--output_dir={tmp_path / 'slow'}", *given)
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
