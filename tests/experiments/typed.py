@@ -14,6 +14,7 @@ import draccus
 from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.scripts.lerobot_edit_dataset import EditDatasetConfig
+from lerobot.scripts.lerobot_rollout import RolloutConfig
 from lerobot.utils.import_utils import register_third_party_plugins
 
 import lerobot_env_wmrl  # noqa: F401 (registers what LeRobot is to know)
@@ -27,6 +28,7 @@ LEROBOT: dict[str, type[Any]] = {
     "lerobot-train": TrainPipelineConfig,
     "lerobot-eval": EvalPipelineConfig,
     "lerobot-edit-dataset": EditDatasetConfig,
+    "lerobot-rollout": RolloutConfig,
 }
 SHELL = {"cp", "ln", "source", "pip", "make", "hf", "apt", "lerobot-record", ".uv/bin/uv"}
 
