@@ -501,7 +501,7 @@ def test_episodes_last_as_long_as_the_world_model_has_learnt(config, trained_mod
     by_default = replace(config, episode_length=None)
     assert by_default.horizon == CLIP_LENGTH
     by_default.create_tensor_env(1)
-    assert not caplog.records
+    assert "longer than the clips" not in caplog.text
     replace(config, episode_length=CLIP_LENGTH + 1).create_tensor_env(1)
     assert (
         f"imagined episodes of {CLIP_LENGTH + 1} frames are longer than the clips of {CLIP_LENGTH}"
