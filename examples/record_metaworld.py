@@ -3,7 +3,8 @@
     pip install 'lerobot[metaworld]'
     MUJOCO_GL=egl python examples/record_metaworld.py --task=push-v3 --root=outputs/metaworld
 
-The expert's skill is drawn for each episode: the noise on its actions (`--noise`). Nothing here imports
+The expert's skill is drawn for each episode: the noise on its actions (`--noise`). LeRobot's environment ends
+an episode at its first success, so that success is recorded in one frame alone. Nothing here imports
 `lerobot_wmrl`: the dataset is what a LeRobot user would bring.
 """
 
@@ -52,8 +53,9 @@ def record(task: str, root: Path, num_episodes: int, seed: int, noise: list[floa
             error = SMOOTHNESS * error + np.sqrt(1 - SMOOTHNESS**2) * skill * rng.standard_normal(4)
             planned = env.expert_policy.get_action(env._env._get_obs())
             action = np.clip(planned + error, -1, 1).astype(np.float32)
-            after, reward, success, truncated, _ = env.step(action)
-            done = success or truncated or step == steps - 1
+            after, reward, terminated, truncated, info = env.step(action)
+            success = info["is_success"]
+            done = terminated or truncated or step == steps - 1
             dataset.add_frame({
                 "observation.image": observation["pixels"],
                 "observation.state": observation["agent_pos"].astype(np.float32),
@@ -81,7 +83,7 @@ def main() -> None:
     parser.add_argument("--num_episodes", type=int, default=60)
     parser.add_argument("--seed", type=int, default=0, help="of the starts and the noise")
     noise = {"type": float, "nargs": "+", "default": [0.1, 0.4, 0.8]}
-    parser.add_argument("--noise", **noise, help="standard deviation, of 1; one is drawn for each episode")
+    parser.add_argument("--noise", **noise, help="standard deviation of the noise; actions are from -1 to 1")
     parser.add_argument("--steps", type=int, default=150, help="longest episode")
     record(**vars(parser.parse_args()))
 

@@ -28,6 +28,11 @@ class FieldError(ValueError):
         return f"{said}; {self.remedy}" if self.remedy else said
 
 
+def first_line(error: BaseException) -> str:
+    """Return the first line of an error's message, or its kind if it has none."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+
+
 def require_at_least(settings: object, least: float, *fields: str) -> None:
     """Raise FieldError for the first of the `fields` of `settings` that is below `least`."""
     for field in fields:

@@ -22,7 +22,10 @@ def write_text(path: Path, text: str) -> None:
 
 @contextmanager
 def whole_folder(target: Path) -> Iterator[Path]:
-    """Give a folder beside `target` to fill, which does not exist yet; rename it when it is whole."""
+    """Give a folder beside `target` to fill, which does not exist yet; rename it when it is whole.
+
+    `target` must be empty or not exist. What a torn call left is removed by the next one.
+    """
     partial = target.with_name(f".{target.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.parent.mkdir(parents=True, exist_ok=True)
@@ -37,16 +40,20 @@ def foreign_files(folder: Path, *own: str) -> bool:
 
 
 @contextmanager
-def writing(flag: str, folder: Path) -> Iterator[None]:
-    """Raise ValueError with `flag` and the remedy if the disk is full or must not be written."""
+def writing(flag: str, folder: Path, *, resumes: bool = True) -> Iterator[None]:
+    """Raise ValueError with `flag` and the remedy if the disk is full or must not be written.
+
+    resumes: whether the same command continues where it stopped; otherwise it begins again.
+    """
     try:
         yield
     except OSError as error:
         if error.errno not in NOT_WRITABLE:
             raise
+        then = "continues: nothing that was finished is lost" if resumes else "begins again"
         raise ValueError(
             f"--{flag}={folder}: cannot be written ({error}); make room or choose another folder. "
-            "The same command continues: nothing that was finished is lost"
+            f"The same command {then}"
         ) from error
 
 

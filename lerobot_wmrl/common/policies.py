@@ -15,7 +15,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from lerobot_wmrl.common.checkpoints import ADAPTERS_FILE, resolve_checkpoint
-from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.errors import FieldError, first_line
 
 
 def read_policy_config(path: str, overrides: list[str]) -> PreTrainedConfig:
@@ -30,7 +30,7 @@ def read_policy_config(path: str, overrides: list[str]) -> PreTrainedConfig:
         config = PreTrainedConfig.from_pretrained(str(folder), cli_overrides=overrides)
     except Exception as error:  # draccus, the hub and json each raise their own
         raise FieldError(
-            "policy.path", path, f"no policy can be loaded from it ({_first_line(error)})",
+            "policy.path", path, f"no policy can be loaded from it ({first_line(error)})",
             "give the output folder of a policy's training, or a hub id",
         ) from error  # fmt: skip
     config.pretrained_path = folder
@@ -244,10 +244,6 @@ def load_trained_weights(policy: Any, weights: dict[str, Any]) -> None:
 def _unreadable(config: PreTrainedConfig, error: Exception) -> FieldError:
     return FieldError(
         "policy.path", config.pretrained_path,
-        f"{weights_file(config)} cannot be read ({_first_line(error)})",
+        f"{weights_file(config)} cannot be read ({first_line(error)})",
         "it is missing, truncated or of another version: use an earlier checkpoint or train again",
     )  # fmt: skip
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip() or type(error).__name__).splitlines()[0]

@@ -12,7 +12,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import ACTION, DONE, OBS_IMAGE, OBS_IMAGES, OBS_STATE
 from numpy.typing import ArrayLike
 
-from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.errors import FieldError, first_line
 
 VIDEO_BACKEND: Final = "pyav"
 """pyav ships its own FFmpeg, torchcodec needs the system's. Speed matters little: frames are decoded once."""
@@ -183,11 +183,6 @@ def download_dataset(repo_id: str, revision: str | None = None) -> LeRobotDatase
             "correct the name, log in with `hf auth login` if it is private, or give a folder on disk, "
             "`dataset.root`",
         ) from error  # fmt: skip
-
-
-def first_line(error: BaseException) -> str:
-    """Return the first line of an error's message, or its kind if it has none."""
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
 def missing_files(meta: LeRobotDatasetMetadata) -> list[Path]:
@@ -379,6 +374,20 @@ def check_widths(features: Mapping[str, Any], wanted: Mapping[str, int]) -> None
                 f"{name}: the world model was trained with {width} components, the dataset has "
                 f"{found or 'none'}; use a dataset like the one it was trained on"
             )
+
+
+def check_statistics(meta: Any, key: str) -> None:
+    """Raise FieldError unless a dataset's statistics of a feature are a finite number for each component."""
+    size = int(np.prod(meta.features[key]["shape"]))
+    for name in ("mean", "std"):
+        found = np.asarray((meta.stats or {}).get(key, {}).get(name, ()), np.float64).reshape(-1)
+        if len(found) != size or not np.isfinite(found).all():
+            raise FieldError(
+                "dataset.root", meta.root,
+                f"its statistics (meta/stats.json) say that the {name} of {key} is {found.tolist()}, where "
+                f"{size} finite numbers should be",
+                "compute them again with lerobot-edit-dataset --operation.type=recompute_stats",
+            )  # fmt: skip
 
 
 def check_episode_lengths(meta: Any) -> None:

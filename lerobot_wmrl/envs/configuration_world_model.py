@@ -125,7 +125,8 @@ class WorldModelEnv(EnvConfig):
                 "fps", self.fps, f"the world model has learnt {model.embodiment.fps} frames a second",
                 "leave it out",
             )  # fmt: skip
-        if model.learnt_successes == 0 and isinstance(self.reward, GeneralConfig):
+        success_alone = isinstance(self.reward, GeneralConfig) and not self.reward.needs_goal
+        if model.learnt_successes == 0 and success_alone:
             raise FieldError(
                 "world_model_path", self.world_model_path,
                 "has learnt from no episode that is known to succeed, so it would never reward",

@@ -127,7 +127,7 @@ def predicts_tcp(recording: Recording, replay: EpisodeReplay) -> bool:
 
 def tcp_error_mm(recording: Recording, replay: EpisodeReplay) -> Tensor:
     """Distance of the imagined from the recorded TCP in millimetres, (T − 1,)."""
-    recorded = torch.from_numpy(recording.table.state[recording.rows(replay.episode)][1:, :3])
+    recorded = torch.from_numpy(recording.table.state[recording.compared_rows(replay.episode)][1:, :3])
     return 1000 * (replay.state[:-1, :3].cpu() - recorded).norm(dim=-1)
 
 

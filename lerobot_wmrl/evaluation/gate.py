@@ -50,11 +50,27 @@ class Outcomes:
         episodes: their indices (E,).
         probability: predicted done probability after each action (E, T), NaN after the end.
         done: recorded success after each action (E, T).
+        held: median of the frames for which successes hold at the end of their episodes. It is that of all
+            episodes, also of a part of them.
     """
 
     episodes: np.ndarray
     probability: np.ndarray
     done: np.ndarray
+    held: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.held is None:
+            object.__setattr__(self, "held", self._median_held())
+
+    def _median_held(self) -> float:
+        """Return infinity without a success; one that ends before its episode counts as infinite too."""
+        held = []
+        for row, end in zip(self.done[self.success], self.length[self.success], strict=True):
+            backwards = row[:end][::-1]
+            frames = end if backwards.all() else int(np.argmin(backwards))
+            held.append(frames or np.inf)
+        return float(np.median(held)) if held else np.inf
 
     @classmethod
     def stack(cls, predictions: Iterable[EpisodeReplay | PredictedDone]) -> "Outcomes":
@@ -74,7 +90,7 @@ class Outcomes:
 
     def where(self, kept: np.ndarray) -> "Outcomes":
         """Return the episodes where `kept` (E,) is True."""
-        return Outcomes(self.episodes[kept], self.probability[kept], self.done[kept])
+        return Outcomes(self.episodes[kept], self.probability[kept], self.done[kept], self.held)
 
     @property
     def length(self) -> np.ndarray:
@@ -99,8 +115,9 @@ class Outcomes:
         return at_end & (first_run(self.done, frames) < 0)
 
     def ends_at_success(self, frames: int) -> bool:
-        """Whether most of the successes are cut short, as in environments that end at the first success."""
-        return bool(2 * self.cut_short(frames).sum() > self.success.sum())
+        """Whether successes mostly end before this, as in environments that end at the first success."""
+        assert self.held is not None
+        return self.held < frames
 
     def lasting(self, frames: int) -> np.ndarray:
         """Return the predicted probabilities. Where episodes end at success, last frames last longer. (E, T')

@@ -99,16 +99,18 @@ class ImaginedFrames(NamedTuple):
 class EpisodeReplay:
     """Open-loop prediction of one episode of T actions; row t belongs to recorded frame t + 1.
 
+    Pictures, states and depth are those of C actions, at most `COMPARED_FRAMES`.
+
     Args:
         episode: its index.
         context: of its first frame, one row.
-        tokens: (T, S).
+        tokens: (C, S).
         done_probability: (T,).
-        state: (T, P).
+        state: (C, P).
         shuffled: (S,), the frame after `DELTA_PSNR_SECONDS` under the actions of another episode; None where
             there is none.
         done: (T,), recorded success after each action.
-        depth: recorded and imagined depth, each (T − 1, N, g, g) metres on the tokens' grids; None unless the
+        depth: recorded and imagined depth, each (C − 1, N, g, g) metres on the tokens' grids; None unless the
             model predicts it.
     """
 
@@ -162,19 +164,24 @@ def _replay_batch(
     device, table = model.state_mean.device, recording.table
     longest, compared = int(table.length[episodes].max()), recording.steps(DELTA_PSNR_SECONDS)
     frames = recording.starts(model, episodes)
-    own = imagine_frames(model, frames, recording.actions(episodes, longest, device))
+    actions = recording.actions(episodes, longest, device)
+    own = imagine_frames(model, frames, actions[:, :COMPARED_FRAMES])
+    probability = own.done_probability
+    if longest > COMPARED_FRAMES:
+        probability = model.open_loop(frames, actions, with_tokens=False).done_logit.sigmoid()
     comparable = (table.length[episodes] > compared) & (episodes != others)
     if comparable.any():
-        actions = recording.actions(others, compared, device)
-        shuffled = imagine_frames(model, frames, actions).tokens[:, -1]
+        other = recording.actions(others, compared, device)
+        shuffled = imagine_frames(model, frames, other).tokens[:, -1]
     for row, episode in enumerate(episodes.tolist()):
-        rows = recording.rows(episode)
-        steps = slice(0, rows.stop - rows.start)
+        rows, shown = recording.rows(episode), recording.compared_rows(episode)
+        steps = slice(0, shown.stop - shown.start)
         yield EpisodeReplay(
-            episode, frames.context[[row]], own.tokens[row, steps], own.done_probability[row, steps],
-            own.state[row, steps], shuffled[row] if comparable[row] else None, table.done[rows],
+            episode, frames.context[[row]], own.tokens[row, steps],
+            probability[row, : rows.stop - rows.start], own.state[row, steps],
+            shuffled[row] if comparable[row] else None, table.done[rows],
             recorded_and_imagined_depth(
-                model, recording, rows, None if own.depth is None else own.depth[row, steps]
+                model, recording, shown, None if own.depth is None else own.depth[row, steps]
             ),
         )  # fmt: skip
 

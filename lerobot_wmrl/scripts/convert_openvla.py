@@ -51,7 +51,7 @@ def convert(cfg: ConvertOpenVLAConfig) -> None:
     if cfg.direction == "export" and cfg.unnorm_key is not None:
         raise FieldError("unnorm_key", cfg.unnorm_key, "the export keeps all statistics; leave it out")
     write = importer(cfg.source, cfg.unnorm_key) if cfg.direction == "import" else exporter(cfg.source)
-    with writing("target", cfg.target), whole_folder(cfg.target) as partial:
+    with writing("target", cfg.target, resumes=False), whole_folder(cfg.target) as partial:
         partial.mkdir()
         write(partial)
     print(conclusion(cfg.direction, cfg.target))

@@ -202,12 +202,16 @@ def policy_agreement(cfg: EvalWorldModelConfig) -> "Agreement":
 
     assert cfg.real_env is not None
     longest = getattr(cfg.real_env, "horizon", None) or getattr(cfg.real_env, "episode_length", None)
-    imagination = WorldModelEnv(
-        world_model_path=cfg.model.path, reward=GeneralConfig(alpha=1.0), device=cfg.device,
-        episode_length=longest,
-        dataset=StartFrames(cfg.dataset.root, cfg.dataset.repo_id, cfg.dataset.revision, split=cfg.split),
-        done_threshold=cfg.done_threshold, done_frames=cfg.done_frames,
-    )  # fmt: skip
+    starts = StartFrames(cfg.dataset.root, cfg.dataset.repo_id, cfg.dataset.revision, split=cfg.split)
+    try:
+        imagination = WorldModelEnv(
+            world_model_path=cfg.model.path, reward=GeneralConfig(alpha=1.0), device=cfg.device,
+            episode_length=longest, dataset=starts,
+            done_threshold=cfg.done_threshold, done_frames=cfg.done_frames,
+        )  # fmt: skip
+    except FieldError as error:
+        field = "model.path" if error.field == "world_model_path" else error.field
+        raise FieldError(field, error.value, error.problem, error.remedy) from error
     outcomes = {
         str(path): (
             policy_outcomes(imagination, path, cfg.policy_episodes, EVALUATION_SEED, IMAGINED_AT_ONCE),

@@ -59,7 +59,7 @@ def label(cfg: LabelConfig) -> None:
     dataset = cfg.dataset.open()
     check(cfg, dataset)
     solved = cfg.success.frames(dataset)
-    with writing("output_dir", cfg.output_dir):
+    with writing("output_dir", cfg.output_dir, resumes=False):
         write_labelled(dataset, solved, cfg.output_dir, cfg.repo_id or f"local/{cfg.output_dir.name}")
     episode, *_ = rows_of(dataset)
     runs = [longest_run(solved[episode == index]) for index in np.unique(episode)]

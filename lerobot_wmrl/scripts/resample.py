@@ -5,8 +5,8 @@
 
 Frames that hardly differ cost as much to imagine as others. 500 frames at 50 Hz become 250 at 25 Hz. A frame
 that is kept gets the action that was sent last before the next one, or, of the components in
-`--displacements`, the sum of the actions in between; the rewards in between are added up. A policy for the
-new rate has to be trained on the copy, and acts at that rate.
+`--displacements`, the sum of the actions in between. The rewards in between are added up, and a success in
+between counts. A policy for the new rate has to be trained on the copy, and acts at that rate.
 """
 
 import logging
@@ -19,7 +19,7 @@ import numpy as np
 
 from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.errors import FieldError, require_at_least
-from lerobot_wmrl.data.episodes import DatasetSource
+from lerobot_wmrl.data.episodes import SUCCESS_COLUMNS, DatasetSource
 
 if TYPE_CHECKING:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -34,7 +34,7 @@ class ResampleConfig(RunConfig):
 
     Args:
         dataset: the dataset to copy.
-        every: keep every so manieth frame; its frame rate must be a multiple.
+        every: keep every second frame, third, …; must divide the dataset's frames a second.
         displacements: names, or numbers from 0 on, of the action's components that add up, such as changes of
             a position. The others, such as targets and grippers, keep the last value.
         output_dir: folder of the copy.
@@ -55,14 +55,14 @@ def resample(cfg: ResampleConfig) -> None:
     from lerobot_wmrl.evaluation.accuracy import absolute_control
 
     dataset = cfg.dataset.open()
-    summed = check(cfg, dataset)
     table = read_episodes(dataset)
+    summed = check(cfg, dataset)
     if absolute_control(table) is False and not summed.any():
         logging.warning(
             "the actions do not follow the state: if they are displacements, name the components that add up "
             "with --displacements"
         )
-    with writing("output_dir", cfg.output_dir):
+    with writing("output_dir", cfg.output_dir, resumes=False):
         write_resampled(dataset, cfg, summed)
     frames = sum(-(-int(length) // cfg.every) for length in table.length)
     print(
@@ -90,13 +90,19 @@ def check(cfg: ResampleConfig, dataset: "LeRobotDataset") -> np.ndarray:
             raise FieldError(
                 "displacements", name, "the action has no such component", f"choose from {names}"
             )
+    if dataset.meta.depth_keys:
+        depth = ", ".join(dataset.meta.depth_keys)
+        raise FieldError(
+            "dataset.root", dataset.root, f"has depth ({depth}), which is not copied",
+            "remove it first: lerobot-edit-dataset --operation.type=remove_feature",
+        )  # fmt: skip
     if cfg.output_dir.exists():
-        raise FieldError("output_dir", cfg.output_dir, "there is something already", "choose a new folder")
+        raise FieldError("output_dir", cfg.output_dir, "already exists", "choose a new folder")
     return np.isin(names, cfg.displacements)
 
 
 def write_resampled(dataset: "LeRobotDataset", cfg: ResampleConfig, summed: np.ndarray) -> None:
-    """Copy every so manieth frame with LeRobot's own functions; the folder is whole or absent."""
+    """Copy the frames that are kept with LeRobot's own functions; the folder is whole or absent."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
     from tqdm import trange
 
@@ -130,7 +136,7 @@ def episode_rows(
     dataset: "LeRobotDataset", episode: int, features: Mapping[str, Any], every: int, summed: np.ndarray
 ) -> list[dict[str, Any]]:
     """Return the rows of an episode's copy, as LeRobotDataset's `add_frame` takes them."""
-    from lerobot.utils.constants import ACTION, DEFAULT_FEATURES
+    from lerobot.utils.constants import ACTION, DEFAULT_FEATURES, REWARD
 
     from lerobot_wmrl.data.frame_cache import decode_episode
 
@@ -142,17 +148,21 @@ def episode_rows(
     last, columns = np.append(kept[1:], end - begin) - 1, {}
     for key in numbers:
         values = np.asarray(table[key]).reshape(end - begin, -1)
-        total = np.add.reduceat(values, kept, axis=0, dtype=values.dtype)
         if key == ACTION:
-            columns[key] = np.where(summed, total, values[last])
-        elif key.startswith(AFTER):
-            columns[key] = total if values.dtype.kind == "f" else values[last]
+            columns[key] = np.where(summed, np.add.reduceat(values, kept), values[last])
+        elif key == REWARD:
+            columns[key] = np.add.reduceat(values, kept)
+        elif key in SUCCESS_COLUMNS:
+            columns[key] = np.logical_or.reduceat(values, kept)
         else:
-            columns[key] = values[kept]
+            columns[key] = values[last if key.startswith(AFTER) else kept]
     tasks = [dataset.meta.tasks.index[index] for index in np.asarray(table["task_index"])[kept]]
     return [
         {key: frames[row].permute(1, 2, 0).numpy() for key, frames in pictures.items()}
-        | {key: values[row].reshape(features[key]["shape"]) for key, values in columns.items()}
+        | {
+            key: str(values[row, 0]) if features[key]["dtype"] == "string" else values[row]
+            for key, values in columns.items()
+        }
         | {"task": tasks[row]}
         for row in range(len(kept))
     ]

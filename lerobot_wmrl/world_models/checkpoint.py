@@ -13,7 +13,7 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from safetensors import SafetensorError
 
 from lerobot_wmrl.common.checkpoints import resolve_checkpoint
-from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.errors import FieldError, first_line
 from lerobot_wmrl.data.embodiment import check_same_robot
 from lerobot_wmrl.data.episodes import check_cameras, check_depth, check_widths
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
@@ -62,7 +62,7 @@ def read_config(
         return RewardModelConfig.from_pretrained(str(folder), cli_overrides=[f"--device={device}"])
     except (ParsingError, TypeError, KeyError) as error:
         raise FieldError(
-            field, path, f"its configuration is of an earlier version of this package ({_first_line(error)})",
+            field, path, f"its configuration is of an earlier version of this package ({first_line(error)})",
             "train the model again",
         ) from error  # fmt: skip
 
@@ -74,15 +74,11 @@ def config_to_continue(path: str, overrides: Sequence[str]) -> RewardModelConfig
         config = RewardModelConfig.from_pretrained(str(folder), cli_overrides=list(overrides))
     except Exception as error:  # draccus, the hub and json each raise their own
         raise FieldError(
-            "model.path", path, f"no model can be loaded from it ({_first_line(error)})",
+            "model.path", path, f"no model can be loaded from it ({first_line(error)})",
             "give the output folder of a training with this version of the package, or a hub id",
         ) from error  # fmt: skip
     config.pretrained_path = str(folder)
     return config
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip() or type(error).__name__).splitlines()[0]
 
 
 def _stored_type(path: Path) -> Any:

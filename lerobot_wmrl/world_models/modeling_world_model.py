@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
 import torch
 from lerobot.configs.rewards import RewardModelConfig
 from lerobot.rewards.pretrained import PreTrainedRewardModel
@@ -23,6 +22,7 @@ from lerobot_wmrl.data.episodes import (
     check_cameras,
     check_depth,
     check_episode_lengths,
+    check_statistics,
     success_column,
 )
 from lerobot_wmrl.data.frame_cache import depth_of_windows
@@ -80,26 +80,6 @@ def make_dynamics(config: WorldModelConfig, grid: int) -> Dynamics:
     return AutoregressiveDynamics(chosen, sizes)
 
 
-def statistics_of(stats: Any, key: str, size: int) -> tuple[Tensor, Tensor]:
-    """Return a feature's mean and standard deviation, (size,) each, from a dataset's statistics.
-
-    Raises:
-        FieldError: there are none, or they are not `size` finite numbers.
-    """
-    found = []
-    for name in ("mean", "std"):
-        given = np.asarray(stats.get(key, {}).get(name, ()), np.float64).reshape(-1)
-        if len(given) != size or not np.isfinite(given).all():
-            raise FieldError(
-                "dataset.root", None,
-                f"its statistics (meta/stats.json) say that the {name} of {key} is {given.tolist()}, where "
-                f"{size} finite numbers should be",
-                "compute them again with lerobot-edit-dataset --operation.type=recompute_stats",
-            )  # fmt: skip
-        found.append(torch.as_tensor(given, dtype=torch.float32))
-    return found[0], found[1]
-
-
 class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
     """Base of both world models: what they learn from, and imagination in the dataset's units."""
 
@@ -155,6 +135,8 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
             check_depth(features, sizes.camera_keys)
         if self.config.state_size and OBS_STATE not in features:
             logging.info("the dataset has no observation.state: the world model does without it")
+        elif self.config.state_size:
+            check_statistics(meta, OBS_STATE)
         if self.config.state_size:
             self.config.state_size = features[OBS_STATE]["shape"][0] if OBS_STATE in features else 0
 
@@ -162,7 +144,8 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
         """Register mean and standard deviation of the feature `key`, the latter at least `least`."""
         mean, std = torch.zeros(size), torch.ones(size)
         if stats is not None and size:
-            mean, std = statistics_of(stats, key, size)
+            mean = torch.as_tensor(stats[key]["mean"], dtype=torch.float32)
+            std = torch.as_tensor(stats[key]["std"], dtype=torch.float32)
             std = torch.where(std < MIN_SPREAD, 1.0, std).clamp_min(least)
         self.register_buffer(f"{name}_mean", mean)
         self.register_buffer(f"{name}_std", std)
@@ -244,6 +227,7 @@ class ActionWorldModelRewardModel(WorldModelRewardModel):
 
     def _adopt_dataset(self, meta: Any) -> None:
         super()._adopt_dataset(meta)
+        check_statistics(meta, ACTION)
         self.config.action_size = meta.features[ACTION]["shape"][0]
         if not self.config.pretrained_path:
             self.config.embodiment = read_embodiment(meta, self.config.embodiment)

@@ -19,7 +19,7 @@ from transformers import (
 )
 from transformers.tokenization_utils_base import VERY_LARGE_INTEGER
 
-from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.errors import FieldError, first_line
 from lerobot_wmrl.world_models.layers import Condition
 
 MAX_TOKENS: Final = 512
@@ -79,11 +79,6 @@ def check_one_each(instructions: Sequence[str], batch: int) -> None:
     if isinstance(instructions, str) or len(instructions) != batch:
         given = "a single string" if isinstance(instructions, str) else f"{len(instructions)} instructions"
         raise ValueError(f"task: {given} for {batch} episodes; give a list with one instruction for each")
-
-
-def first_line(error: BaseException) -> str:
-    """Return the first line of an error's message."""
-    return str(error).strip().partition("\n")[0]
 
 
 class FrozenT5:

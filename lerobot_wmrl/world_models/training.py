@@ -199,12 +199,14 @@ def note_outcomes(
 
     A model that is trained further keeps what it has learnt from before, if that was more.
     """
-    successes, failures = config.learnt_successes or 0, config.learnt_failures or 0
     learnt = [
         table.success[~table.validation & table.among(chosen)]
         for table, chosen in sources
         if table.done_known
     ]
+    if not learnt and config.pretrained_path and config.learnt_successes is None:
+        return  # what it has learnt before is not known
+    successes, failures = config.learnt_successes or 0, config.learnt_failures or 0
     config.learnt_successes = max(successes, sum(int(each.sum()) for each in learnt))
     config.learnt_failures = max(failures, sum(int((~each).sum()) for each in learnt))
     if not config.learnt_successes:

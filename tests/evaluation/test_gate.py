@@ -75,6 +75,10 @@ def test_where_episodes_end_at_success_their_last_frames_count_as_lasting():
     assert "As most do, the last frame of every episode counts" in gate_lines(gate, None)
     assert at_success.scores(3).tolist() == [0.9, 0.9, 0.1]
     assert done_delay(at_success, 0.5, 3)[0] == 0
+    parts = [at_success.where(np.array(kept)) for kept in ([True, False, True], [False, True, False])]
+    assert [gate_at(part, 0.5, 3).false_positives.k for part in parts] == [0, 1], (
+        "a part is judged as the whole"
+    )
     seen_out = Outcomes(np.arange(3), np.nan_to_num(probability), done)
     assert gate_at(seen_out, 0.5, 3).recall.k == 0
 

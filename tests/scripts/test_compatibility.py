@@ -62,7 +62,7 @@ class Data:
         longest, shortest = max(self.lengths), min(self.lengths)
         return [
             f"{len(self.cameras)}: {', '.join(sizes)}", "video" if self.video else "images", f"{self.fps}",
-            f"{self.state or 'none'}", f"{self.action} {self.control}" + (
+            f"{self.state or 'none'}", f"{self.action}, {self.control}" + (
                 f", {self.constant} constant" if self.constant else ""
             ),
             ", ".join(f"`{name}`" for name in self.labels) or "none",

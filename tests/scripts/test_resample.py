@@ -17,7 +17,7 @@ CAMERA = "observation.images.top"
 
 @pytest.fixture(scope="module")
 def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two episodes in which every number tells its frame; success holds from frame 3 on."""
+    """Two episodes in which every number tells its frame; success holds in frame 3 alone."""
     root = tmp_path_factory.mktemp("resample") / "fast"
     bound = {"low": [-1.0, 0.0], "high": [1.0, 500.0]}
     features: dict[str, Any] = {
@@ -26,6 +26,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
         CAMERA: {"dtype": "image", "shape": (SIDE, SIDE, 3), "names": ["height", "width", "channels"]},
         "next.reward": {"dtype": "float32", "shape": (1,), "names": None},
         "next.success": {"dtype": "bool", "shape": (1,), "names": None},
+        "note": {"dtype": "string", "shape": (1,), "names": None},
         "start.seed": {"dtype": "int64", "shape": (1,), "names": None},
     }
     dataset = LeRobotDataset.create("local/fast", FPS, features, root=root, use_videos=False)
@@ -35,8 +36,8 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 "action": np.array([0.1, 10 * frame], np.float32), "task": f"task {episode}",
                 "observation.state": np.array([frame], np.float32),
                 CAMERA: np.full((SIDE, SIDE, 3), 20 * frame, np.uint8),
-                "next.reward": np.array([1], np.float32), "next.success": np.array([frame >= 3]),
-                "start.seed": np.array([5 + episode]),
+                "next.reward": np.array([1], np.float32), "next.success": np.array([frame == 3]),
+                "note": f"frame {frame}", "start.seed": np.array([5 + episode]),
             })  # fmt: skip
         dataset.save_episode()
     dataset.finalize()
@@ -61,13 +62,21 @@ def test_what_happened_between_two_kept_frames_belongs_to_the_first(
     assert (dataset.fps, table.length.tolist()) == (25, [4, 2])
     np.testing.assert_allclose(table.action[:4], [[0.2, 10], [0.2, 30], [0.2, 50], [0.1, 60]], rtol=1e-6)
     assert table.state[:, 0].tolist() == [0, 2, 4, 6, 0, 2]
-    assert table.done.tolist() == [False, True, True, True, False, True]
+    assert table.done.tolist() == [False, True, False, False, False, True]
     assert table.instructions == ["task 0", "task 1"]
     assert table.column("start.seed").tolist() == [5, 6]
     rows = dataset.hf_dataset.with_format("numpy")
+    assert list(rows["note"])[:2] == ["frame 0", "frame 2"]
     assert np.ravel(rows["next.reward"]).tolist() == [2, 2, 2, 1, 2, 2]
     assert [round(float(dataset[row][CAMERA].mean()) * 255) for row in range(4)] == [0, 40, 80, 120]
     assert dataset.features["action"]["info"] == {"low": [-2, 0], "high": [2, 500]}
+
+
+def test_depth_is_refused(make_synthetic_dataset: Any, tmp_path: Path, monkeypatch, capsys) -> None:
+    deep = make_synthetic_dataset(tmp_path / "deep", episodes=1, depth=True)
+    with pytest.raises(SystemExit):
+        resample(monkeypatch, f"--dataset.root={deep.root}", "--every=5", f"--output_dir={tmp_path / 'slow'}")
+    assert "has depth (observation.images.third_view_depth), which is not copied" in capsys.readouterr().err
 
 
 def test_videos_stay_videos(make_synthetic_dataset: Any, tmp_path: Path, monkeypatch) -> None:
@@ -84,7 +93,7 @@ def test_videos_stay_videos(make_synthetic_dataset: Any, tmp_path: Path, monkeyp
     (["--every=1"], "--every=1: must be at least 2"),
     (["--every=3"], "--every=3: does not divide the dataset's 50 frames a second"),
     (["--displacements=[dy]"], "--displacements=dy: the action has no such component; choose from"),
-    (["--output_dir={source}"], "there is something already"),
+    (["--output_dir={source}"], "already exists"),
 ])  # fmt: skip
 def test_what_cannot_be_is_refused(
     flags: list[str], message: str, source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
