@@ -212,9 +212,8 @@ def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
     for column in measured:
         finite = np.isfinite(as_columns(rows[column])).all(1)
         if not finite.all():
-            raise bad_row(
-                dataset, column, int(np.argmin(finite)), np.asarray(rows[column])[~finite][0].tolist()
-            )
+            row = int(np.argmin(finite))
+            raise bad_row(dataset, column, row, np.asarray(rows[column][row]).tolist())
     frames = len(rows["episode_index"])
     _, start, length = np.unique(rows["episode_index"], return_index=True, return_counts=True)
     done = np.asarray(rows[success]).reshape(-1) if success else np.zeros(frames, bool)

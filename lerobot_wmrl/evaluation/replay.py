@@ -162,16 +162,16 @@ def _replay_batch(
     model: ActionWorldModelRewardModel, recording: Recording, episodes: np.ndarray, others: np.ndarray
 ) -> Iterator[EpisodeReplay]:
     device, table = model.state_mean.device, recording.table
-    longest, compared = int(table.length[episodes].max()), recording.steps(DELTA_PSNR_SECONDS)
+    longest, until = int(table.length[episodes].max()), recording.steps(DELTA_PSNR_SECONDS)
     frames = recording.starts(model, episodes)
     actions = recording.actions(episodes, longest, device)
     own = imagine_frames(model, frames, actions[:, :COMPARED_FRAMES])
     probability = own.done_probability
     if longest > COMPARED_FRAMES:
         probability = model.open_loop(frames, actions, with_tokens=False).done_logit.sigmoid()
-    comparable = (table.length[episodes] > compared) & (episodes != others)
+    comparable = (table.length[episodes] > until) & (episodes != others)
     if comparable.any():
-        other = recording.actions(others, compared, device)
+        other = recording.actions(others, until, device)
         shuffled = imagine_frames(model, frames, other).tokens[:, -1]
     for row, episode in enumerate(episodes.tolist()):
         rows, shown = recording.rows(episode), recording.compared_rows(episode)

@@ -1,11 +1,13 @@
 """The world model as an evaluator of policies."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from lerobot_wmrl.common.checkpoints import resolve_checkpoint
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.data.episodes import DatasetSource
@@ -84,6 +86,18 @@ def test_imagined_episodes_are_as_long_as_real_ones(imagination, monkeypatch):
     imagined, of_pick_place, again, of_imagination = asked
     assert imagined.episode_length == of_pick_place.horizon > 100
     assert again.episode_length == of_imagination.episode_length == 4
+
+
+def test_a_world_model_without_a_known_success_is_named_by_the_commands_own_flag(imagination, tmp_path):
+    root = tmp_path / "model"
+    shutil.copytree(resolve_checkpoint(imagination.world_model_path), root)
+    config = json.loads((root / "config.json").read_text())
+    (root / "config.json").write_text(json.dumps({**config, "learnt_successes": 0}))
+    cfg = EvalWorldModelConfig(model=Checkpoint(str(root)), policies=["policy"], real_env=imagination)
+    with pytest.raises(
+        ValueError, match=r"^model\.path=.*has learnt from no episode that is known to succeed"
+    ):
+        policy_agreement(cfg)
 
 
 def test_agreement_is_pearsons_correlation_with_fishers_interval():
