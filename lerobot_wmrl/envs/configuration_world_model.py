@@ -28,7 +28,10 @@ class StartFrames(DatasetSource):
             that training may see) or `ood` (scenes held out). Several joined by a comma: their intersection.
         tasks: only episodes of these tasks, by name.
         scenes: only episodes of these scenes, by index.
-        max_starts: number of episodes or saved frames at most, spread evenly; each needs a goal frame.
+        max_starts: number of starts at most, spread evenly over the episodes or saved frames; each needs a
+            goal frame.
+        branches: later frames of each episode of the dataset from which imagined episodes begin too, spread
+            over those before its success (branched rollouts, Janner et al. 2019).
         past: frames of each episode of the dataset that the world model is shown, with their actions, before
             it imagines on from the next one.
         frames: a file written by numpy.savez, in place of a dataset: `observation.images.<camera>`
@@ -41,6 +44,7 @@ class StartFrames(DatasetSource):
     tasks: list[str] | None = None
     scenes: list[int] | None = None
     max_starts: int = 256
+    branches: int = 0
     past: int = 0
     frames: Path | None = None
     resets: int = 0
@@ -58,6 +62,12 @@ class StartFrames(DatasetSource):
             raise FieldError(
                 "dataset.past", self.past, "the frames before a start are those of a dataset, at least 0",
                 "give a dataset; saved frames and resets have no past",
+            )  # fmt: skip
+        if self.branches < 0 or (self.branches and (self.past or not self.given)):
+            raise FieldError(
+                "dataset.branches", self.branches,
+                "imagined episodes branch off from episodes of a dataset, at least 0 times, without a past",
+                "give a dataset, and leave out `dataset.past`",
             )  # fmt: skip
         if self.frames and (self.tasks or self.scenes or self.split != "all"):
             raise FieldError(

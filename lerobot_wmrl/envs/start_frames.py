@@ -52,14 +52,16 @@ INSTRUCTION = "task"
 
 
 class FirstFrames(NamedTuple):
-    """The frames in which K episodes begin, each after T − 1 frames that the model is only shown.
+    """The frames in which K imagined episodes begin, each after T − 1 frames that the model is only shown.
 
-    images (K, T, N, H, W, 3) uint8; state (K, T, P); actions (K, T − 1, A); K instructions; tasks (K,),
-    indices into `TASKS`, −1 where unknown; depth, a function of a world model that returns (K, T, S) in
-    metres, or None if the model does not look at depth.
+    images (K, T, N, H, W, 3) uint8; beginning (K, N, H, W, 3) uint8, the first frame of the episode that each
+    is taken from; state (K, T, P); actions (K, T − 1, A); K instructions; tasks (K,), indices into `TASKS`,
+    −1 where unknown; depth, a function of a world model that returns (K, T, S) in metres, or None if the
+    model does not look at depth.
     """
 
     images: np.ndarray
+    beginning: np.ndarray
     state: np.ndarray
     actions: np.ndarray
     instructions: list[str]
@@ -76,13 +78,14 @@ class FirstFrames(NamedTuple):
 
         instructions = [self.instructions[row] for row in rows]
         return FirstFrames(
-            self.images[rows], self.state[rows], self.actions[rows], instructions, self.tasks[rows], depth
-        )
+            self.images[rows], self.beginning[rows], self.state[rows], self.actions[rows], instructions,
+            self.tasks[rows], depth,
+        )  # fmt: skip
 
 
 class Starts(NamedTuple):
     """K starts, tokenised: the first frames (now), the images (K, N, 3, H, W) that these decode to, the
-    frames before (past), K instructions. The context of `now` is that of the earliest frame."""
+    frames before (past), K instructions. The context of `now` is that of their episodes' first frames."""
 
     now: Frames
     images: Tensor
@@ -134,8 +137,9 @@ def chosen_episodes(table: EpisodeTable, source: StartFrames) -> np.ndarray:
             )
         wanted &= np.isin(column, values) if values else True
     if source.past:
-        wanted &= undecided_after(table, source.past)
-    return choose_episodes(table, source.split, source.max_starts, scene_splits(scene, source.split), wanted)
+        wanted &= undecided_frames(table) > source.past
+    episodes = max(1, source.max_starts // (1 + source.branches))
+    return choose_episodes(table, source.split, episodes, scene_splits(scene, source.split), wanted)
 
 
 def check_starts(source: StartFrames, ledger: Ledger | None) -> None:
@@ -163,25 +167,48 @@ def check_starts(source: StartFrames, ledger: Ledger | None) -> None:
         ledger.require_known(table, episodes)
 
 
-def undecided_after(table: EpisodeTable, frames: int) -> np.ndarray:
-    """Return which episodes last longer than `frames` frames and have not succeeded by then. (E,) bool"""
-    begun = [table.done[start : start + frames + 1].any() for start in table.start]
-    return (table.length > frames) & ~np.array(begun)
+def undecided_frames(table: EpisodeTable) -> np.ndarray:
+    """Return the number of frames before each episode's first success, all of them if there is none. (E,)"""
+    return np.array([
+        np.flatnonzero([*table.done[start : start + length], True])[0]
+        for start, length in zip(table.start, table.length, strict=True)
+    ])  # fmt: skip
+
+
+def branch_frames(table: EpisodeTable, episodes: np.ndarray, branches: int) -> np.ndarray:
+    """Return the rows of each episode's first frame and `branches` later ones. (K,), without repetitions
+
+    They are spread evenly over the frames before its success, and before its last frame.
+    """
+    last = np.minimum(undecided_frames(table)[episodes], table.length[episodes] - 1)
+    offsets = np.maximum(last, 1)[:, None] * np.arange(1 + branches) // (1 + branches)
+    return np.unique(table.start[episodes, None] + offsets)
 
 
 def read_dataset_frames(source: StartFrames, config: WorldModelConfig) -> FirstFrames:
-    """Read the first frames of a LeRobotDataset's episodes."""
+    """Read frames of a LeRobotDataset's episodes: the first ones, and those of the branches."""
     sizes = config.tokenizer
     assert sizes is not None, "a trained world model knows its tokenizer"
     table = read_episodes(source.open())
     check_dataset(config, table.dataset.meta)
+    if source.branches and not sizes.context:
+        raise FieldError(
+            "dataset.branches", source.branches,
+            "the world model is not shown how an episode began, so it cannot tell success from its middle on",
+            "train its tokenizer with `model.tokenizer.context=true`, or leave `branches` out",
+        )  # fmt: skip
     episodes = chosen_episodes(table, source)
     if source.past >= config.memory:
         raise FieldError(
             "dataset.past", source.past, f"the world model remembers {config.memory} frames",
             f"give at most {config.memory - 1}",
         )  # fmt: skip
-    rows = table.start[episodes, None] + np.arange(source.past + 1)
+    if source.branches:
+        rows = branch_frames(table, episodes, source.branches)[:, None]
+        episodes = np.searchsorted(table.start, rows[:, 0], side="right") - 1
+    else:
+        rows = table.start[episodes, None] + np.arange(source.past + 1)
+    images = cached_frames(table.dataset, sizes.camera_keys, sizes.image_size)
 
     def depth(model: WorldModelRewardModel) -> Tensor | None:
         check_dataset(model.config, table.dataset.meta)
@@ -189,7 +216,8 @@ def read_dataset_frames(source: StartFrames, config: WorldModelConfig) -> FirstF
         return every if every is None else every.unflatten(0, rows.shape)
 
     return FirstFrames(
-        cached_frames(table.dataset, sizes.camera_keys, sizes.image_size)[rows],
+        images[rows],
+        images[table.start[episodes]],
         table.state[rows],
         table.action[rows[:, :-1]],
         [table.instructions[episode] for episode in episodes],
@@ -298,7 +326,7 @@ def _without_past(
 ) -> FirstFrames:  # fmt: skip
     """Return starts of a single frame each, without depth. images (K, N, H, W, 3), state (K, P)"""
     actions = np.zeros((len(images), 0, getattr(config, "action_size", 0)), np.float32)
-    return FirstFrames(images[:, None], state[:, None], actions, instructions, tasks, _no_depth)
+    return FirstFrames(images[:, None], images, state[:, None], actions, instructions, tasks, _no_depth)
 
 
 def _no_depth(model: WorldModelRewardModel) -> None:
@@ -318,7 +346,7 @@ def load_starts(
     """Tokenise first frames and, with a text model, imagine each one's goal frame once (eq. 6)."""
     device = model.state_mean.device
     state, actions = (torch.from_numpy(each).to(device) for each in (frames.state, frames.actions))
-    context = model.tokenizer.context(frames_to_tensor(frames.images[:, 0]).to(device))
+    context = model.tokenizer.context(frames_to_tensor(frames.beginning).to(device))
     depth, seen = frames.depth(model), []
     for row in range(state.shape[1]):
         images = frames_to_tensor(frames.images[:, row]).to(device)

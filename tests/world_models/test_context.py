@@ -10,11 +10,13 @@ from lerobot_wmrl.data.episodes import DatasetSource, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames, cached_tokens, frames_to_tensor
 from lerobot_wmrl.data.frames import NO_CONTEXT
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
+from lerobot_wmrl.envs.start_frames import read_first_frames
 from lerobot_wmrl.evaluation.pictures import side_by_side, to_uint8
 from lerobot_wmrl.evaluation.replay import Recording, replay_episodes
+from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
 from lerobot_wmrl.world_models.autoencoder import Fusion
-from lerobot_wmrl.world_models.checkpoint import load_model
+from lerobot_wmrl.world_models.checkpoint import load_model, read_config
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
 from lerobot_wmrl.world_models.training import make_sampler
 from tests.trained import action_config, run_training, small_tokenizer, text_config, tokenizer_config
@@ -169,6 +171,44 @@ def test_environments_decode_beside_their_own_start_also_after_a_restart(models,
             expected = env.model.decode(tokens, starts.now.context[start]).images[:, 0]
             torch.testing.assert_close(observation[CAMERA], expected)
     assert not torch.equal(before, env._start_index)
+
+
+def test_imagined_episodes_branch_off_from_recorded_ones_before_their_success(models, small_dataset, table):
+    """From frames spread over what comes before it, each beside the first frame of its episode."""
+    starts = StartFrames(root=str(Path(small_dataset.root)), branches=2)
+    path = str(models["action_world_model"])
+    env = WorldModelEnv(world_model_path=path, dataset=starts, reward=GeneralConfig(alpha=1.0))
+    frames = read_first_frames(starts, read_config(path, "action_world_model"))
+    expected = []
+    for start, length in zip(table.start, table.length, strict=True):
+        solved = np.flatnonzero(table.done[start : start + length])
+        last = min([length - 1, *solved[:1]])
+        expected += [start, start + last // 3, start + 2 * last // 3]
+    np.testing.assert_array_equal(frames.state[:, 0], table.state[expected])
+    assert not table.done[expected].any()
+    tensor_env = env.create_tensor_env(len(expected))
+    observation, _ = tensor_env.reset(seed=list(range(len(expected))))
+    torch.testing.assert_close(observation["observation.state"], torch.from_numpy(table.state[expected]))
+    first = frames_to_tensor(cached_frames(small_dataset, [CAMERA], 32)[np.repeat(table.start, 3)])
+    torch.testing.assert_close(
+        tensor_env.starts.now.context.maps, tensor_env.model.tokenizer.context(first).maps
+    )
+
+
+@pytest.mark.parametrize(("given", "message"), [
+    ({"branches": -1}, r"^dataset\.branches=-1: imagined episodes branch off from episodes of a dataset"),
+    ({"branches": 1, "past": 1}, r"^dataset\.branches=1: .* leave out `dataset.past`"),
+])  # fmt: skip
+def test_branches_that_cannot_be_are_refused(models, small_dataset, given, message):
+    starts = StartFrames(root=str(Path(small_dataset.root)), **given)
+    with pytest.raises(ValueError, match=message):
+        read_first_frames(starts, read_config(models["action_world_model"], "action_world_model"))
+
+
+def test_branches_need_a_world_model_that_knows_how_the_episode_began(trained_models, small_dataset):
+    starts = StartFrames(root=str(Path(small_dataset.root)), branches=1)
+    with pytest.raises(ValueError, match=r"^dataset\.branches=1: .* `model.tokenizer.context=true`"):
+        read_first_frames(starts, read_config(trained_models["action_world_model"], "action_world_model"))
 
 
 def test_evaluation_decodes_beside_the_start_and_runs_whole(models, small_dataset, table, frames, tmp_path):
