@@ -25,13 +25,16 @@ TITLES: Final = {
     "imagined_ppo": "PPO in imagination",
     "planned": "PPO in imagination, then planning in it at test time",
     "dyna": "PPO in imagination, with rollouts in three rounds (Dyna)",
+    "iterated_ppo": "filtered cloning, with rollouts in three rounds, then PPO in imagination",
     "imagined_cloning": "cloning of recorded and imagined successes",
     "distilled": "planner distilled in imagination",
     "distilled_ppo": "planner distilled, then PPO in imagination",
 }
 """Methods in the order of the table."""
 
-IMAGINED: Final = ("imagined_ppo", "planned", "dyna", "imagined_cloning", "distilled", "distilled_ppo")
+IMAGINED: Final = (
+    "imagined_ppo", "planned", "dyna", "iterated_ppo", "imagined_cloning", "distilled", "distilled_ppo",
+)  # fmt: skip
 """Methods that use a world model."""
 
 CONTROLLED: Final = ("imagined_ppo", "planned")
@@ -50,7 +53,17 @@ CONTROLS: Final = {
 """What a control's world model learnt from."""
 
 BUDGET: Final = ("demonstrations", "rollouts", "seed")
-MORE_COLOURS: Final = ("#b83280", "#333333", "#d69e2e", "#319795", "#718096", "#9c4221", "#63b3ed", "#553c9a")
+MORE_COLOURS: Final = (
+    "#b83280",
+    "#333333",
+    "#d69e2e",
+    "#319795",
+    "#718096",
+    "#9c4221",
+    "#63b3ed",
+    "#553c9a",
+    "#b7791f",
+)
 
 STUDY: Final = "value_push"
 PARTS: Final = (

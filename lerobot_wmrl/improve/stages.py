@@ -23,6 +23,9 @@ from lerobot_wmrl.rl.recorders import env_flags
 SIZES: Final = ("auto", "tiny", "demo", "cpu")
 """Presets of the stages; `auto` is `demo` on a processor and `cpu` with an accelerator."""
 
+DURATIONS: Final = {"tiny": "a minute", "demo": "an hour", "cpu": "several hours"}
+"""What all stages but those in `real_env` take on two cores."""
+
 SIDES: Final = {"tiny": 32, "demo": 64, "cpu": 128}
 """Pixels a side of imagined frames at each size, unless the dataset's are smaller."""
 
@@ -131,6 +134,13 @@ class Improvement:
         if not self.config.rollouts:
             del steps["rollouts"]
         return [Stage(name, title, partial(getattr(self, f"_{name}"))) for name, title in steps.items()]
+
+    @property
+    def duration(self) -> str:
+        """What it takes, for people."""
+        size, real = self.config.preset, self.config.real_env
+        beside = "" if real is None else f", beside what {real.type} takes"
+        return f"size {size}: about {DURATIONS[size]} on two cores{beside}; each stage shows the time left"
 
     @property
     def out(self) -> Path:

@@ -28,6 +28,7 @@ from lerobot_wmrl.data.episodes import DatasetSource
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 
 if TYPE_CHECKING:
+    from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
     from lerobot_wmrl.evaluation.agreement import Agreement
     from lerobot_wmrl.evaluation.replay import Recording
     from lerobot_wmrl.evaluation.report import Evaluation, Report
@@ -125,6 +126,7 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     table = read_episodes(cfg.dataset.open())
     check_dataset(model.config, table.dataset.meta)
     text_model = load_text_model(cfg, model)
+    imagination = policies_imagination(cfg) if cfg.policies else None
     scenes = scene_splits(table.column(START_SCENE), cfg.split)
     episodes = choose_episodes(table, cfg.split, cfg.max_episodes, scenes)
     claim_output_dir(cfg.output_dir, draccus.encode(cfg))
@@ -135,8 +137,8 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     ]
     if text_model is not None:
         reports.append(report_text_model(cfg, model, text_model, recording, evaluation))
-    if cfg.policies:
-        reports.append(report_agreement(policy_agreement(cfg), cfg.output_dir))
+    if imagination is not None:
+        reports.append(report_agreement(policy_agreement(cfg, imagination), cfg.output_dir))
     metrics = {name: value for report in reports for name, value in report.metrics.items()}
     metrics["tokenizer"] = reconstruction_metrics(model, table, recording.frames, episodes)
     metrics |= {"dataset": cfg.dataset.name, "split": cfg.split}
@@ -195,16 +197,14 @@ def load_text_model(
     return text_model
 
 
-def policy_agreement(cfg: EvalWorldModelConfig) -> "Agreement":
-    """Evaluate every policy in the world model and in `real_env`."""
+def policies_imagination(cfg: EvalWorldModelConfig) -> "WorldModelEnv":
+    """Return the world model as `policies` are evaluated in it. FieldError if none can be."""
     from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
-    from lerobot_wmrl.evaluation.agreement import Agreement, policy_checkpoints, policy_outcomes
 
-    assert cfg.real_env is not None
     longest = getattr(cfg.real_env, "horizon", None) or getattr(cfg.real_env, "episode_length", None)
     starts = StartFrames(cfg.dataset.root, cfg.dataset.repo_id, cfg.dataset.revision, split=cfg.split)
     try:
-        imagination = WorldModelEnv(
+        return WorldModelEnv(
             world_model_path=cfg.model.path, reward=GeneralConfig(alpha=1.0), device=cfg.device,
             episode_length=longest, dataset=starts,
             done_threshold=cfg.done_threshold, done_frames=cfg.done_frames,
@@ -212,6 +212,13 @@ def policy_agreement(cfg: EvalWorldModelConfig) -> "Agreement":
     except FieldError as error:
         field = "model.path" if error.field == "world_model_path" else error.field
         raise FieldError(field, error.value, error.problem, error.remedy) from error
+
+
+def policy_agreement(cfg: EvalWorldModelConfig, imagination: "WorldModelEnv") -> "Agreement":
+    """Evaluate every policy in the world model and in `real_env`."""
+    from lerobot_wmrl.evaluation.agreement import Agreement, policy_checkpoints, policy_outcomes
+
+    assert cfg.real_env is not None
     outcomes = {
         str(path): (
             policy_outcomes(imagination, path, cfg.policy_episodes, EVALUATION_SEED, IMAGINED_AT_ONCE),

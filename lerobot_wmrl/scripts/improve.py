@@ -32,7 +32,7 @@ def improve(cfg: ImproveConfig) -> None:
     cfg.check()
     assert cfg.policy is not None
     improvement = Improvement(cfg, look(read_episodes(cfg.dataset.open()), cfg.policy))
-    print(f"{cfg.dataset.name}:\n{improvement.found}")
+    print(f"{cfg.dataset.name}:\n{improvement.found}\n  {improvement.duration}")
     stages = improvement.stages()
     with claimed(cfg.output_dir, settings(cfg)):
         run_stages(stages, cfg.output_dir)

@@ -13,7 +13,6 @@ from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.data.episodes import DatasetSource
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
-from lerobot_wmrl.evaluation import agreement as agreement_module
 from lerobot_wmrl.evaluation.agreement import Agreement, policy_checkpoints, policy_outcomes
 from lerobot_wmrl.evaluation.report import agreement_table
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
@@ -21,7 +20,7 @@ from lerobot_wmrl.scripts.eval_world_model import (
     Checkpoint,
     EvalWorldModelConfig,
     eval_world_model,
-    policy_agreement,
+    policies_imagination,
 )
 from tests.rl.checkpoints import save_untrained_policy
 
@@ -73,31 +72,30 @@ def test_the_evaluation_reports_policies_beside_reality(imagination, small_datas
     assert (cfg.output_dir / "policies.png").is_file()
 
 
-def test_imagined_episodes_are_as_long_as_real_ones(imagination, monkeypatch):
+def test_imagined_episodes_are_as_long_as_real_ones(imagination):
     """Those of a simulator's task, or of another environment."""
-    asked = []
-    monkeypatch.setattr(
-        agreement_module, "policy_outcomes", lambda env, *_: asked.append(env) or [True, False]
-    )
     for real in (WmrlManiSkillEnv(task="pick_place"), imagination):
-        policy_agreement(EvalWorldModelConfig(
-            model=Checkpoint(imagination.world_model_path), policies=["policy"], real_env=real, device="cpu"
-        ))  # fmt: skip
-    imagined, of_pick_place, again, of_imagination = asked
-    assert imagined.episode_length == of_pick_place.horizon > 100
-    assert again.episode_length == of_imagination.episode_length == 4
+        model = Checkpoint(imagination.world_model_path)
+        cfg = EvalWorldModelConfig(model=model, policies=["policy"], real_env=real, device="cpu")
+        assert policies_imagination(cfg).episode_length == real.horizon
 
 
-def test_a_world_model_without_a_known_success_is_named_by_the_commands_own_flag(imagination, tmp_path):
+def test_a_world_model_without_a_known_success_is_refused_by_the_commands_own_flag_before_anything_is_made(
+    imagination, small_dataset, tmp_path
+):
     root = tmp_path / "model"
     shutil.copytree(resolve_checkpoint(imagination.world_model_path), root)
     config = json.loads((root / "config.json").read_text())
     (root / "config.json").write_text(json.dumps({**config, "learnt_successes": 0}))
-    cfg = EvalWorldModelConfig(model=Checkpoint(str(root)), policies=["policy"], real_env=imagination)
+    cfg = EvalWorldModelConfig(
+        model=Checkpoint(str(root)), dataset=DatasetSource(str(Path(small_dataset.root))),
+        policies=["policy"], real_env=imagination, output_dir=tmp_path / "check",
+    )  # fmt: skip
     with pytest.raises(
         ValueError, match=r"^model\.path=.*has learnt from no episode that is known to succeed"
     ):
-        policy_agreement(cfg)
+        eval_world_model(cfg)
+    assert not cfg.output_dir.exists()
 
 
 def test_agreement_is_pearsons_correlation_with_fishers_interval():

@@ -40,6 +40,7 @@ def test_with_a_real_environment_its_rollouts_are_learnt_from_and_success_is_mea
     first, folder = run(tmp_path, demonstrations, *real), tmp_path / "improve"
     assert first.returncode == 0, first.stdout[-3000:] + first.stderr[-3000:]
     assert "observation.image 96x96" in first.stdout
+    assert "size tiny: about a minute on two cores, beside what pusht takes" in first.stdout
     assert "failures: 0. The world model will hardly tell them" in first.stdout
     report = (folder / "report.md").read_text()
     assert "Success in pusht: 0 % (0 of 2" in report
