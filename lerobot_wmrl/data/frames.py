@@ -70,23 +70,3 @@ class Frames:
 
     def __len__(self) -> int:
         return len(self.tokens)
-
-
-@dataclass(frozen=True)
-class Past:
-    """The H frames before those with which B imaginations begin, oldest first, and the action after each.
-
-    Args:
-        frames: H of them, without context. It is the same for a whole episode, and the frames after have it.
-        actions: H of (B, A), in the dataset's units.
-    """
-
-    frames: tuple[Frames, ...] = ()
-    actions: tuple[Tensor, ...] = ()
-
-    def __getitem__(self, rows: Any) -> "Past":
-        """Return some of the B rows: an index, mask or slice of the first dimension."""
-        return Past(tuple(each[rows] for each in self.frames), tuple(each[rows] for each in self.actions))
-
-
-NO_PAST: Final = Past()

@@ -32,8 +32,6 @@ class StartFrames(DatasetSource):
             goal frame.
         branches: later frames of each episode of the dataset from which imagined episodes begin too, spread
             over those before its success (branched rollouts, Janner et al. 2019).
-        past: frames of each episode of the dataset that the world model is shown, with their actions, before
-            it imagines on from the next one.
         frames: a file written by numpy.savez, in place of a dataset: `observation.images.<camera>`
             (K, H, W, 3) uint8, `observation.state` (K, P) and `task` (K,), the instructions.
         resets: number of start frames to take from ManiSkill, in place of a dataset, of `tasks` (push by
@@ -45,7 +43,6 @@ class StartFrames(DatasetSource):
     scenes: list[int] | None = None
     max_starts: int = 256
     branches: int = 0
-    past: int = 0
     frames: Path | None = None
     resets: int = 0
 
@@ -58,16 +55,11 @@ class StartFrames(DatasetSource):
                 "dataset.root", self.name, f"starts are given by {named}",
                 "give one of `dataset.root`, `dataset.repo_id`, `dataset.frames` and `dataset.resets`",
             )  # fmt: skip
-        if self.past < 0 or (self.past and not self.given):
-            raise FieldError(
-                "dataset.past", self.past, "the frames before a start are those of a dataset, at least 0",
-                "give a dataset; saved frames and resets have no past",
-            )  # fmt: skip
-        if self.branches < 0 or (self.branches and (self.past or not self.given)):
+        if self.branches < 0 or (self.branches and not self.given):
             raise FieldError(
                 "dataset.branches", self.branches,
-                "imagined episodes branch off from episodes of a dataset, at least 0 times, without a past",
-                "give a dataset, and leave out `dataset.past`",
+                "imagined episodes branch off from episodes of a dataset, at least 0 times",
+                "give a dataset; saved frames and resets are first frames",
             )  # fmt: skip
         if self.frames and (self.tasks or self.scenes or self.split != "all"):
             raise FieldError(

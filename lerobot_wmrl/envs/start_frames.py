@@ -2,11 +2,10 @@
 
 First frames are read from a dataset's episodes, from a file or from ManiSkill's resets (`FirstFrames`). A
 world model then tokenises them (`Starts`), and the text world model imagines their goal frames (`Goals`).
-K is the number of starts, T the frames of each (all but the last are the past), N the number of cameras.
+K is the number of starts, N the number of cameras.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 from zipfile import BadZipFile
@@ -27,7 +26,7 @@ from lerobot_wmrl.data.episodes import (
     read_episodes,
 )
 from lerobot_wmrl.data.frame_cache import cached_frames, frames_to_tensor
-from lerobot_wmrl.data.frames import Frames, Past
+from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.maniskill.recordings import require_unreported, scene_splits
@@ -52,18 +51,17 @@ INSTRUCTION = "task"
 
 
 class FirstFrames(NamedTuple):
-    """The frames in which K imagined episodes begin, each after T − 1 frames that the model is only shown.
+    """The frames in which K imagined episodes begin.
 
-    images (K, T, N, H, W, 3) uint8; beginning (K, N, H, W, 3) uint8, the first frame of the episode that each
-    is taken from; state (K, T, P); actions (K, T − 1, A); K instructions; tasks (K,), indices into `TASKS`,
-    −1 where unknown; depth, a function of a world model that returns (K, T, S) in metres, or None if the
-    model does not look at depth.
+    images (K, N, H, W, 3) uint8; beginning, of the same shape: the first frame of the recorded episode that
+    each is taken from; state (K, P); K instructions; tasks (K,), indices into `TASKS`, −1 where unknown;
+    depth, a function of a world model that returns (K, S) in metres, or None if the model does not look at
+    depth.
     """
 
     images: np.ndarray
     beginning: np.ndarray
     state: np.ndarray
-    actions: np.ndarray
     instructions: list[str]
     tasks: np.ndarray
     depth: Callable[[WorldModelRewardModel], Tensor | None]
@@ -78,18 +76,16 @@ class FirstFrames(NamedTuple):
 
         instructions = [self.instructions[row] for row in rows]
         return FirstFrames(
-            self.images[rows], self.beginning[rows], self.state[rows], self.actions[rows], instructions,
-            self.tasks[rows], depth,
-        )  # fmt: skip
+            self.images[rows], self.beginning[rows], self.state[rows], instructions, self.tasks[rows], depth
+        )
 
 
 class Starts(NamedTuple):
-    """K starts, tokenised: the first frames (now), the images (K, N, 3, H, W) that these decode to, the
-    frames before (past), K instructions. The context of `now` is that of their episodes' first frames."""
+    """K starts, tokenised: their frames, with the context of their episodes' first frames, the images
+    (K, N, 3, H, W) that these decode to, and K instructions."""
 
-    now: Frames
+    frames: Frames
     images: Tensor
-    past: Past
     instructions: list[str]
 
     def __len__(self) -> int:
@@ -136,8 +132,6 @@ def chosen_episodes(table: EpisodeTable, source: StartFrames) -> np.ndarray:
                 f"dataset.{name}", getattr(source, name), f"no episode of {source.name} has one of them"
             )
         wanted &= np.isin(column, values) if values else True
-    if source.past:
-        wanted &= undecided_frames(table) > source.past
     episodes = max(1, source.max_starts // (1 + source.branches))
     return choose_episodes(table, source.split, episodes, scene_splits(scene, source.split), wanted)
 
@@ -198,28 +192,18 @@ def read_dataset_frames(source: StartFrames, config: WorldModelConfig) -> FirstF
             "train its tokenizer with `model.tokenizer.context=true`, or leave `branches` out",
         )  # fmt: skip
     episodes = chosen_episodes(table, source)
-    if source.past >= config.memory:
-        raise FieldError(
-            "dataset.past", source.past, f"the world model remembers {config.memory} frames",
-            f"give at most {config.memory - 1}",
-        )  # fmt: skip
-    if source.branches:
-        rows = branch_frames(table, episodes, source.branches)[:, None]
-        episodes = np.searchsorted(table.start, rows[:, 0], side="right") - 1
-    else:
-        rows = table.start[episodes, None] + np.arange(source.past + 1)
+    rows = branch_frames(table, episodes, source.branches)
+    episodes = np.searchsorted(table.start, rows, side="right") - 1
     images = cached_frames(table.dataset, sizes.camera_keys, sizes.image_size)
 
     def depth(model: WorldModelRewardModel) -> Tensor | None:
         check_dataset(model.config, table.dataset.meta)
-        every = model.recorded_depth(table.dataset, rows.reshape(-1))
-        return every if every is None else every.unflatten(0, rows.shape)
+        return model.recorded_depth(table.dataset, rows)
 
     return FirstFrames(
         images[rows],
         images[table.start[episodes]],
         table.state[rows],
-        table.action[rows[:, :-1]],
         [table.instructions[episode] for episode in episodes],
         table.column(START_TASK)[episodes],
         depth,
@@ -259,7 +243,7 @@ def read_saved_frames(path: Path, max_starts: int, config: WorldModelConfig) -> 
     instructions = [str(text) for text in found[INSTRUCTION][rows]]
     state = found[OBS_STATE][rows].astype(np.float32)
     squares = np.stack([_squares(found[name][rows], side) for name in shapes], 1)
-    return _without_past(squares, state, instructions, np.full(len(rows), -1), config)
+    return FirstFrames(squares, squares, state, instructions, np.full(len(rows), -1), _no_depth)
 
 
 def _squares(images: np.ndarray, side: int) -> np.ndarray:
@@ -302,7 +286,7 @@ def simulate_first_frames(source: StartFrames, config: WorldModelConfig) -> Firs
     views = ([frame.images[camera] for frame in frames] for camera in sizes.cameras)
     images = np.stack([_squares(np.stack(view), sizes.image_size) for view in views], 1)
     state = np.stack([frame.state for frame in frames])
-    return _without_past(images, state, instructions, np.array(indices), config)
+    return FirstFrames(images, images, state, instructions, np.array(indices), _no_depth)
 
 
 def resets_side(sizes: TokenizerConfig) -> int:
@@ -318,15 +302,6 @@ def resets_side(sizes: TokenizerConfig) -> int:
             "start in the dataset's episodes (`dataset.root`)",
         )  # fmt: skip
     return sides.pop()
-
-
-def _without_past(
-    images: np.ndarray, state: np.ndarray, instructions: list[str], tasks: np.ndarray,
-    config: WorldModelConfig,
-) -> FirstFrames:  # fmt: skip
-    """Return starts of a single frame each, without depth. images (K, N, H, W, 3), state (K, P)"""
-    actions = np.zeros((len(images), 0, getattr(config, "action_size", 0)), np.float32)
-    return FirstFrames(images[:, None], images, state[:, None], actions, instructions, tasks, _no_depth)
 
 
 def _no_depth(model: WorldModelRewardModel) -> None:
@@ -345,23 +320,15 @@ def load_starts(
 ) -> tuple[Starts, Goals | None]:  # fmt: skip
     """Tokenise first frames and, with a text model, imagine each one's goal frame once (eq. 6)."""
     device = model.state_mean.device
-    state, actions = (torch.from_numpy(each).to(device) for each in (frames.state, frames.actions))
+    state = torch.from_numpy(frames.state).to(device)
     context = model.tokenizer.context(frames_to_tensor(frames.beginning).to(device))
-    depth, seen = frames.depth(model), []
-    for row in range(state.shape[1]):
-        images = frames_to_tensor(frames.images[:, row]).to(device)
-        known = None if depth is None else depth[:, row]
-        tokens = model.tokenizer.encode(images, context)
-        seen.append(Frames(tokens, state[:, row, : model.config.state_size], depth=known))
-    *before, last = seen
-    now = replace(last, context=context)
-    decoded = model.tokenizer.decode_with_features(now.tokens, context)
-    past = Past(tuple(before), actions.unbind(1))
-    starts = Starts(now, decoded.images, past, frames.instructions)
+    tokens = model.tokenizer.encode(frames_to_tensor(frames.images).to(device), context)
+    begin = Frames(tokens, state[:, : model.config.state_size], context, frames.depth(model))
+    decoded = model.tokenizer.decode_with_features(tokens, context)
+    starts = Starts(begin, decoded.images, frames.instructions)
     if text_model is None:
         return starts, None
-    depth = frames.depth(text_model)
-    begin = Frames(now.tokens, state[:, -1], context, depth if depth is None else depth[:, -1])
+    begin = Frames(tokens, state, context, frames.depth(text_model))
     goals = imagine_goals(text_model, begin, frames.instructions, measure.features(decoded), measure)
     return starts, goals
 

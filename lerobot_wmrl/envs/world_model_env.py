@@ -90,13 +90,13 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         """
         drawn = self._seeded_starts(seed)
         self._begin_at(drawn)
-        starts, now = self.starts, self.starts.now[drawn]
-        self._imagination = self.model.start(now, past=starts.past[drawn])
+        frames = self.starts.frames[drawn]
+        self._imagination = self.model.start(frames)
         self._elapsed = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
         self._done_streak = torch.zeros_like(self._elapsed)
         if self.goals is not None:
             self._similarity = self.goals.similarity[drawn]
-        return self._observe(self.starts.images[drawn], now.state), {}
+        return self._observe(self.starts.images[drawn], frames.state), {}
 
     @torch.no_grad()
     def step(self, actions: Tensor) -> tuple[Observation, Tensor, Tensor, Tensor, dict[str, Any]]:
@@ -173,13 +173,13 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         """Begin new episodes where `mask` (B,) is True. Return the observation with these rows replaced."""
         self._begin_at(torch.where(mask, self._draw_starts(), self._start_index))
         index, starts = self._start_index, self.starts
-        now = starts.now[index]
-        self.model.restart(self._imagination, mask, now, starts.past[index])
+        frames = starts.frames[index]
+        self.model.restart(self._imagination, mask, frames)
         self._elapsed = self._elapsed.masked_fill(mask, 0)
         self._done_streak = self._done_streak.masked_fill(mask, 0)
         if self.goals is not None:
             self._similarity = torch.where(mask, self.goals.similarity[index], self._similarity)
-        fresh = self._observe(starts.images[index], now.state)
+        fresh = self._observe(starts.images[index], frames.state)
         for key, value in observation.items():
             if isinstance(value, Tensor):
                 fresh[key] = torch.where(mask.reshape(-1, *[1] * (value.ndim - 1)), fresh[key], value)

@@ -49,10 +49,6 @@ class DynamicsConfig(ChoiceRegistry):
         """The name by which `dynamics.type` chooses this kind."""
         return self.get_choice_name(type(self))
 
-    def memory(self, clip_length: int) -> int:
-        """Frames that imagination remembers at most, after training on clips of this length."""
-        raise NotImplementedError
-
     def _require_at_least(self, name: str, least: float) -> None:
         if getattr(self, name) < least:
             raise FieldError(f"dynamics.{name}", getattr(self, name), f"must be at least {least}")
@@ -77,9 +73,6 @@ class AnchoredConfig(DynamicsConfig):
         super().__post_init__()
         if not 0 <= self.dropout < 1:
             raise FieldError("dynamics.dropout", self.dropout, "must be a share, from 0 to below 1")
-
-    def memory(self, clip_length: int) -> int:
-        return clip_length
 
 
 @dataclass
@@ -116,11 +109,6 @@ class WorldModelConfig(RewardModelConfig):
 
     def get_scheduler_preset(self) -> LRSchedulerConfig | None:
         return None
-
-    @property
-    def memory(self) -> int:
-        """Frames that imagination remembers at most."""
-        return self.dynamics.memory(self.clip_length)
 
     @property
     def depth(self) -> bool:

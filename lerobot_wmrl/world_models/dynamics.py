@@ -66,18 +66,6 @@ class Imagination:
         """Begin anew in the environments in `mask` (B,): their past is masked, not moved."""
         self.cache.restart(mask)
 
-    def start_before(self, other: "Imagination", frames: int) -> None:
-        """Move to `frames` frames before the position of another imagination, with an empty past."""
-        self.cache.start_before(other.cache, frames)
-
-    def put(self, rows: Tensor, other: "Imagination") -> None:
-        """Replace the imaginations of the environments `rows` (R,) by the R imaginations of `other`."""
-        self.codes.index_copy_(0, rows, other.codes)
-        self.state.index_copy_(0, rows, other.state)
-        maps = zip(self.context.maps, other.context.maps, strict=True)
-        self.context = Context(tuple(own.index_copy(0, rows, new) for own, new in maps))
-        self.cache.put(rows, other.cache)
-
 
 def spread_rows(frames: int, sequences: int, device: torch.device) -> Tensor:
     """Return the frame of each action sequence, 0, …, 0, 1, …, for as many a frame. → (sequences,)"""

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from lerobot_wmrl.common.precision import compute_in, imagination_dtype
 from lerobot_wmrl.data.frame_cache import cached_depth
-from lerobot_wmrl.data.frames import NO_CONTEXT, NO_PAST, Context, Frames, Past
+from lerobot_wmrl.data.frames import NO_CONTEXT, Context, Frames
 from lerobot_wmrl.world_models.dynamics import Dynamics, Imagination, Imagined, OpenLoopPrediction
 from lerobot_wmrl.world_models.frame_tokenizer import Decoded, FrameTokenizer
 from lerobot_wmrl.world_models.layers import Condition
@@ -36,52 +36,29 @@ class ImaginationMixin:
 
     @torch.no_grad()
     def start(
-        self, frames: Frames, instructions: Sequence[str] | None = None, past: Past = NO_PAST,
-        dtype: torch.dtype | None = None,
-    ) -> Imagination:  # fmt: skip
+        self, frames: Frames, instructions: Sequence[str] | None = None, dtype: torch.dtype | None = None
+    ) -> Imagination:
         """Begin to imagine at B frames.
 
         Args:
             frames: where the imaginations begin. ValueError if depth that the model looks at is missing; a
                 missing context raises it in the first step.
             instructions: one an imagination, of a model that is conditioned on text.
-            past: frames before these, which are remembered as if they had been imagined.
             dtype: what the network computes in, by default the fastest format; what is returned is float32.
         """
-        first = replace((*past.frames, frames)[0], context=frames.context)
-        imagination = self.dynamics.start(self._normalized(first), dtype)
+        imagination = self.dynamics.start(self._normalized(frames), dtype)
         if instructions is not None:
             imagination.condition = self.encode_instructions(instructions, len(frames))
-        self._follow_past(imagination, past, frames)
         return imagination
 
     @torch.no_grad()
-    def restart(self, imagination: Imagination, mask: Tensor, frames: Frames, past: Past = NO_PAST) -> None:
-        """Begin anew at frames (as in `start`, of all B) in the environments in `mask` (B,).
-
-        With a past, they start in an imagination of their own, as many frames back as the past is long. It
-        follows the past up to now, and then replaces theirs.
-        """
+    def restart(self, imagination: Imagination, mask: Tensor, frames: Frames) -> None:
+        """Begin anew at frames (as in `start`, of all B) in the environments in `mask` (B,)."""
         if imagination.condition is not None:
             raise ValueError(
                 "restart: its instructions are those of the start; start a new imagination instead"
             )
-        if not past.frames:
-            self.dynamics.restart(imagination, mask, self._normalized(frames))
-            return
-        rows = mask.nonzero().squeeze(1)
-        first = replace(past.frames[0][rows], context=frames.context[rows])
-        apart = self.dynamics.start(self._normalized(first), imagination.dtype)
-        apart.start_before(imagination, len(past.frames))
-        self._follow_past(apart, past[rows], frames[rows])
-        imagination.put(rows, apart)
-
-    def _follow_past(self, imagination: Imagination, past: Past, now: Frames) -> None:
-        """Take the past's actions in an imagination, and replace each imagined frame by the recorded one."""
-        everyone = torch.ones(len(now), dtype=torch.bool, device=now.tokens.device)
-        for action, after in zip(past.actions, (*past.frames, now)[1:], strict=True):
-            self.step(imagination, action)
-            self.dynamics.show(imagination, everyone, self._normalized(after))
+        self.dynamics.restart(imagination, mask, self._normalized(frames))
 
     @torch.no_grad()
     def step(self, imagination: Imagination, action: Tensor | None = None) -> Imagined:

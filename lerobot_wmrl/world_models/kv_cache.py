@@ -61,27 +61,6 @@ class KVCache:
         """Begin anew in the environments in `mask` (B,): their past is masked, not moved."""
         self.started.copy_(torch.where(mask, self.position, self.started))
 
-    def start_before(self, other: "KVCache", frames: int) -> None:
-        """Move to `frames` frames before the other cache's position, with its slots and rotations.
-
-        ValueError unless it has had as many, and the window is longer.
-        """
-        if not frames < min(self.window, int(other.position) + 1):
-            raise ValueError(
-                f"a past of {frames} frames, of a world model that remembers {self.window} and imaginations "
-                f"that are {int(other.position)} frames old: it must be shorter than the first, "
-                "and no longer than the second"
-            )
-        self.position.copy_(other.position - frames)
-        self.started.copy_(self.position.expand_as(self.started))
-        self.visible = other.visible
-
-    def put(self, rows: Tensor, other: "KVCache") -> None:
-        """Copy another cache of R environments, at the same frame, into the rows `rows` (R,)."""
-        for ring, theirs in ((self.keys, other.keys), (self.values, other.values)):
-            ring.index_copy_(1, rows, theirs)
-        self.started.index_copy_(0, rows, other.started)
-
     def past(self, layer: int) -> tuple[Tensor, Tensor]:
         """Keys and values of the visible slots, (B, S, h, visible, d)."""
         return self.keys[layer, ..., : self.visible, :], self.values[layer, ..., : self.visible, :]

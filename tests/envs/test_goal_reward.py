@@ -37,15 +37,15 @@ def measure(request) -> Similarity:
 
 def way_to_goal(env: WorldModelVectorEnv) -> list[Tensor]:
     """Tokens (1, S) of the start, of a frame in between, and of one in which all are others."""
-    tokens = env.starts.now.tokens
+    tokens = env.starts.frames.tokens
     goal = (tokens + 7) % 20
     return [tokens, torch.where(torch.arange(tokens.shape[1]) % 2 == 0, goal, tokens), goal]
 
 
 def set_goal(env: WorldModelVectorEnv, measure: Similarity, tokens: Tensor) -> None:
     """The goal frame of the one start."""
-    frames = torch.cat([env.starts.now.tokens, tokens])
-    context = env.starts.now.context
+    frames = torch.cat([env.starts.frames.tokens, tokens])
+    context = env.starts.frames.context
     begin, goal = (measure.features(env.model.decode(frame[None], context)) for frame in frames)
     similarity = measure(begin, goal, env.model.tokenizer.num_cameras)
     assert env.goals is not None

@@ -114,7 +114,7 @@ def test_truncated_at_the_horizon_with_the_final_observation_kept(env):
     assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
     assert not info["final_info"]["is_success"].any()
     assert info["final_info"]["episode_length"].tolist() == [5] * B
-    starts = env.starts.now.state[env._start_index]
+    starts = env.starts.frames.state[env._start_index]
     assert torch.equal(observation[STATE], starts)
     assert not torch.equal(info["final_obs"][STATE], starts)
 
@@ -291,8 +291,8 @@ def test_episodes_begin_in_saved_frames_as_in_those_of_the_dataset(config, env, 
     saved = replace(config, dataset=StartFrames(frames=path, max_starts=4))
     np.savez(path, **whole)
     found, spread = saved.create_tensor_env(2).starts, [0, 1, 3, 5]
-    assert torch.equal(found.now.tokens, env.starts.now.tokens[spread])
-    assert torch.equal(found.now.state, env.starts.now.state[spread])
+    assert torch.equal(found.frames.tokens, env.starts.frames.tokens[spread])
+    assert torch.equal(found.frames.state, env.starts.frames.state[spread])
     assert found.instructions == [env.starts.instructions[row] for row in spread]
     for name, value in (
         (IMAGE, whole[IMAGE][:, :16]), (STATE, whole[STATE][:, :3]), ("task", whole["task"][:3]),
@@ -351,38 +351,13 @@ def test_models_that_do_not_fit_together_are_refused(config, small_dataset, trai
         replace(config, text_world_model_path=str(trained_models["action_world_model"])).create_tensor_env(1)
 
 
-def test_episodes_can_begin_after_a_past_that_is_looked_at(config, small_dataset):
-    """From the frame after it, of episodes that are still undecided then; a restart is as a first start."""
-    env = replace(config, dataset=replace(config.dataset, past=3)).create_tensor_env(B)
-    rows = small_dataset.meta.episodes["dataset_from_index"]
-    states = [small_dataset[int(row) + 3][STATE] for row in rows]
-    observation, _ = env.reset(seed=list(range(B)))
-    for state in observation[STATE]:
-        assert any(torch.allclose(state, real) for real in states)
-    always_done(env, torch.tensor([True, False, False, False]))
-    for _ in range(3):
-        env.step(torch.full((B, 7), 0.02))
-    index = env._start_index.tolist()
-    after, *_ = env.step(torch.full((B, 7), 0.01))
-    env.reset(seed=index)
-    alone, *_ = env.step(torch.full((B, 7), 0.01))
-    torch.testing.assert_close(alone[STATE][0], after[STATE][0], atol=1e-5, rtol=1e-4)
-    with pytest.raises(ValueError, match=r"no episode of those that are asked for"):
-        replace(config, dataset=replace(config.dataset, past=500)).create_tensor_env(1)
-    with pytest.raises(ValueError, match=r"^dataset\.past=1: the frames before a start are those of"):
-        replace(config, dataset=StartFrames(resets=1, past=1)).create_tensor_env(1)
-    remembered = env.model.config.clip_length
-    with pytest.raises(
-        ValueError, match=rf"past={remembered}: the world model remembers {remembered} frames"
-    ):
-        replace(config, dataset=replace(config.dataset, past=remembered)).create_tensor_env(1)
-
-
 @pytest.mark.parametrize(("given", "message"), [
     ({"frames": Path("starts.npz"), "tasks": [TASKS[0]]}, "saved frames do not say their task"),
     ({"frames": Path("starts.npz"), "split": "ood"}, "saved frames do not say their task, scene or split"),
     ({"resets": 2, "split": "validation,ood"}, r"split=validation,ood: .*ManiSkill.* ind or ood"),
     ({"resets": -1}, r"^dataset\.resets=-1: must be at least 1"),
+    ({"resets": 2, "branches": 1}, r"^dataset\.branches=1: .*; saved frames and resets are first frames"),
+    ({"root": "data", "branches": -1}, r"^dataset\.branches=-1: .* branch off from episodes of a dataset"),
 ])  # fmt: skip
 def test_what_starts_cannot_be_chosen_by_is_refused(config, given, message):
     """Rather than ignored."""

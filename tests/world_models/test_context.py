@@ -157,7 +157,7 @@ def test_environments_decode_beside_their_own_start_also_after_a_restart(models,
     )  # fmt: skip
     env = config.create_tensor_env(4)
     starts = env.starts
-    assert len(starts.now.context) == len(starts)
+    assert len(starts.frames.context) == len(starts)
     env.reset(seed=0)
     before = env._start_index.clone()
     for step in range(4):
@@ -168,7 +168,7 @@ def test_environments_decode_beside_their_own_start_also_after_a_restart(models,
         tokens = env.model.dynamics.network.codebook.tokens(env._imagination.codes[:, 0])
         start = before if step < 3 else env._start_index
         if step != 2:
-            expected = env.model.decode(tokens, starts.now.context[start]).images[:, 0]
+            expected = env.model.decode(tokens, starts.frames.context[start]).images[:, 0]
             torch.testing.assert_close(observation[CAMERA], expected)
     assert not torch.equal(before, env._start_index)
 
@@ -184,25 +184,15 @@ def test_imagined_episodes_branch_off_from_recorded_ones_before_their_success(mo
         solved = np.flatnonzero(table.done[start : start + length])
         last = min([length - 1, *solved[:1]])
         expected += [start, start + last // 3, start + 2 * last // 3]
-    np.testing.assert_array_equal(frames.state[:, 0], table.state[expected])
+    np.testing.assert_array_equal(frames.state, table.state[expected])
     assert not table.done[expected].any()
     tensor_env = env.create_tensor_env(len(expected))
     observation, _ = tensor_env.reset(seed=list(range(len(expected))))
     torch.testing.assert_close(observation["observation.state"], torch.from_numpy(table.state[expected]))
     first = frames_to_tensor(cached_frames(small_dataset, [CAMERA], 32)[np.repeat(table.start, 3)])
     torch.testing.assert_close(
-        tensor_env.starts.now.context.maps, tensor_env.model.tokenizer.context(first).maps
+        tensor_env.starts.frames.context.maps, tensor_env.model.tokenizer.context(first).maps
     )
-
-
-@pytest.mark.parametrize(("given", "message"), [
-    ({"branches": -1}, r"^dataset\.branches=-1: imagined episodes branch off from episodes of a dataset"),
-    ({"branches": 1, "past": 1}, r"^dataset\.branches=1: .* leave out `dataset.past`"),
-])  # fmt: skip
-def test_branches_that_cannot_be_are_refused(models, small_dataset, given, message):
-    starts = StartFrames(root=str(Path(small_dataset.root)), **given)
-    with pytest.raises(ValueError, match=message):
-        read_first_frames(starts, read_config(models["action_world_model"], "action_world_model"))
 
 
 def test_branches_need_a_world_model_that_knows_how_the_episode_began(trained_models, small_dataset):

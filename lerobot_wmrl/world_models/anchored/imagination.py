@@ -28,20 +28,6 @@ class AnchoredImagination(Imagination):
         self.phases.add(self._phase)
         super().restart(mask)
 
-    def start_before(self, other: Imagination, frames: int) -> None:
-        assert isinstance(other, AnchoredImagination)
-        super().start_before(other, frames)
-        self.frame = other.frame - frames
-        self.phases = {self._phase}
-
-    def put(self, rows: Tensor, other: Imagination) -> None:
-        assert isinstance(other, AnchoredImagination)
-        assert other.scene is not None
-        assert other.rollout is not None
-        self.begin(rows, other.scene, other.rollout)
-        super().put(rows, other)
-        self.phases |= other.phases
-
     def due(self) -> Tensor:
         """Return the environments that have to begin now, rows (R,).
 

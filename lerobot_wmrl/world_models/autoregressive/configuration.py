@@ -50,6 +50,3 @@ class AutoregressiveConfig(DynamicsConfig):
         for name in ("self_forcing", "self_rollout"):
             if not 0 <= getattr(self, name) <= 1:
                 raise FieldError(f"dynamics.{name}", getattr(self, name), "must be between 0 and 1")
-
-    def memory(self, clip_length: int) -> int:
-        return self.window

@@ -80,11 +80,6 @@ class AutoregressiveImagination(Imagination):
 
     depth: Tensor = field(default_factory=lambda: torch.empty(0))
 
-    def put(self, rows: Tensor, other: Imagination) -> None:
-        assert isinstance(other, AutoregressiveImagination)
-        super().put(rows, other)
-        self.depth.index_copy_(0, rows, other.depth)
-
 
 class AutoregressiveDynamics(Dynamics):
     """Predict each frame from those before it, in imagination from imagined ones."""
