@@ -140,7 +140,7 @@ def value_push(load: Load) -> str:
     return f"""{comparison(found)}
 
 PPO in imagination begins from the policy cloned from demonstrations and successful rollouts, or from that
-cloned from the demonstrations alone where this one succeeds more often in the world model (256 starts,
+cloned from the demonstrations alone where this one succeeds more often in the world model (256 starts or all,
 McNemar's test): {begun(cells)}. PPO in ManiSkill begins from the latter.
 
 Planning changes what PPO's policy would do, and plans anew after eight actions. An episode of it takes

@@ -166,10 +166,10 @@ class RecordConfig(RunConfig):
                     name, getattr(self, name), "can be chosen in ManiSkill alone",
                     "leave it out (in a world model, `env.dataset.tasks` chooses among the starts)",
                 )  # fmt: skip
-        if isinstance(self.env, WorldModelEnv) and self.env.dataset.past:
+        if isinstance(self.env, WorldModelEnv) and self.env.dataset.branches:
             raise FieldError(
-                "env.dataset.past", self.env.dataset.past, "recorded episodes begin with first frames",
-                "leave it out",
+                "env.dataset.branches", self.env.dataset.branches,
+                "recorded episodes begin with first frames", "leave it out",
             )  # fmt: skip
         if self.elsewhere and self.shard_of[1] > 1:
             raise FieldError("shard", self.shard, "divides recordings in ManiSkill alone", "leave it out")

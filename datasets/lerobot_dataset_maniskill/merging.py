@@ -11,6 +11,7 @@ from lerobot.datasets.aggregate import aggregate_datasets
 
 from lerobot_dataset_maniskill.card import CARD_FILE, success_by_kind, write_card
 from lerobot_dataset_maniskill.writer import VOCABULARY_FILE, find_damage, write_vocabulary
+from lerobot_wmrl.common.command_line import different_settings
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.maniskill.embodiment import FPS
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
@@ -76,9 +77,7 @@ def already_recorded(output_dir: Path, content: Mapping[str, Any], episodes: int
 
 def require_same(stored: Mapping[str, Any], content: Mapping[str, Any], folder: Path) -> None:
     """Raise FieldError unless both settings describe the same episodes."""
-    differing = [
-        f"{key} {stored.get(key)!r} → {value!r}" for key, value in content.items() if stored.get(key) != value
-    ]
+    differing = different_settings({key: stored[key] for key in content if key in stored}, content, ())
     if differing:
         raise FieldError(
             "output_dir",

@@ -286,11 +286,15 @@ def require_free(output_dir: Path, config: dict[str, Any], free: Collection[str]
 def different_settings(
     stored: Mapping[str, Any], given: Mapping[str, Any], free: Collection[str]
 ) -> list[str]:
-    """Return `name 'stored' → 'given'` of every setting that differs, unless it or its group is `free`."""
+    """Return `name 'stored' → 'given'` of every setting that differs, unless it or its group is `free`.
+
+    A setting that one of the two lacks, being of another version, is off there: None, 0 or empty.
+    """
     before, now = (flatten_dict(dict(settings), sep=".") for settings in (stored, given))
+    shared = before.keys() & now.keys()
     return [
         f"{name} {before.get(name)!r} → {now.get(name)!r}"
         for name in {**before, **now}
-        if before.get(name) != now.get(name)
+        if (before[name] != now[name] if name in shared else before.get(name) or now.get(name))
         and not any(name == each or name.startswith(f"{each}.") for each in free)
     ]

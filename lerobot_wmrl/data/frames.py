@@ -1,4 +1,4 @@
-"""Frames at which imaginations begin, the past before them, and the context of their episodes."""
+"""Frames at which imaginations begin, and the context of their episodes."""
 
 from dataclasses import dataclass
 from typing import Any, Final

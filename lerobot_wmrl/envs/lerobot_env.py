@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode
-from lerobot.envs import make_env_pre_post_processors
+from lerobot.envs import make_env, make_env_pre_post_processors
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION, preprocess_observation
 from lerobot.utils.constants import ACTION
@@ -45,17 +45,19 @@ class LeRobotTensorEnv(gym.vector.VectorEnv):
     """
 
     def __init__(self, config: EnvConfig, n_envs: int, device: str) -> None:
-        made = [
-            [env for tasks in config.create_envs(1, use_async_envs=False).values() for env in tasks.values()]
-            for _ in range(n_envs)
-        ]
-        self.envs: list[gym.vector.VectorEnv] = [envs[row % len(envs)] for row, envs in enumerate(made)]
-        self.spare = [env for row, envs in enumerate(made) for env in envs if env is not self.envs[row]]
+        self.envs: list[gym.vector.VectorEnv] = []
+        for row in range(n_envs):
+            made = make_env(config, 1, use_async_envs=False)
+            every = [env for tasks in made.values() for env in tasks.values()]
+            self.tasks = len(every)
+            self.envs.append(every.pop(row % self.tasks))
+            for spare in every:
+                spare.close()
         self.before, self.after = make_env_pre_post_processors(config, None)
         self.num_envs, self.device = n_envs, torch.device(device)
         self.single_action_space = self.envs[0].single_action_space
         self.action_space = gym.vector.utils.batch_space(self.single_action_space, n_envs)
-        self.max_episode_steps = int(self.envs[0].call("_max_episode_steps")[0])
+        self.max_episode_steps = max(int(env.call("_max_episode_steps")[0]) for env in self.envs)
         self.metadata = {"render_fps": config.fps, "autoreset_mode": AutoresetMode.SAME_STEP}
         self._length = np.zeros(n_envs, np.int64)
 
@@ -99,7 +101,7 @@ class LeRobotTensorEnv(gym.vector.VectorEnv):
         return result, self._vector(reward), self._vector(flags[0]), self._vector(flags[1]), info
 
     def close_extras(self, **kwargs: Any) -> None:
-        for env in (*self.envs, *self.spare):
+        for env in self.envs:
             env.close()
 
     def _begin(self, row: int, seed: int | None) -> Observation:

@@ -6,6 +6,7 @@ K is the number of starts, N the number of cameras.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 from zipfile import BadZipFile
@@ -136,10 +137,16 @@ def chosen_episodes(table: EpisodeTable, source: StartFrames) -> np.ndarray:
     return choose_episodes(table, source.split, episodes, scene_splits(scene, source.split), wanted)
 
 
+def every_chosen_episode(table: EpisodeTable, source: StartFrames) -> np.ndarray:
+    """Return the same episodes without a limit to their number. (K,)"""
+    return chosen_episodes(table, replace(source, max_starts=len(table.start), branches=0))
+
+
 def check_starts(source: StartFrames, ledger: Ledger | None) -> None:
     """Raise FieldError for starts from which nothing may be learnt.
 
     These are starts that results are reported on, and, if there is a ledger, starts that are not in it.
+    Every episode of the split, tasks and scenes is looked at: distillation learns from all that succeed.
     """
     if ledger is not None and not source.given:
         kind = "frames" if source.frames else "resets"
@@ -155,7 +162,7 @@ def check_starts(source: StartFrames, ledger: Ledger | None) -> None:
     if not source.given:
         return
     table = read_episodes(source.open())
-    episodes = chosen_episodes(table, source)
+    episodes = every_chosen_episode(table, source)
     require_unreported(table, episodes, "choose others with `dataset.split=ind` or `dataset.scenes`")
     if ledger is not None:
         ledger.require_known(table, episodes)

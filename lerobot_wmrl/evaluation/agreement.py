@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import torch
-from lerobot.envs import make_env_pre_post_processors
+from lerobot.envs import make_env, make_env_pre_post_processors
 from lerobot.envs.configs import EnvConfig
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.scripts.lerobot_eval import eval_policy, eval_policy_all
@@ -65,7 +65,7 @@ def evaluate_policy(
         processors: the policy's pre- and postprocessor.
         seed: of the first episode; each further one adds one.
     """
-    made: Any = env.create_envs(min(num_envs, episodes), use_async_envs=is_own(env))
+    made: Any = make_env(env, min(num_envs, episodes), use_async_envs=is_own(env))
     envs = {suite: {task: StepCounter(one) for task, one in tasks.items()} for suite, tasks in made.items()}
     info = eval_policy_all(
         envs, policy, *make_env_pre_post_processors(env, policy.config), *processors,

@@ -6,6 +6,7 @@ import numpy as np
 from lerobot.configs import PreTrainedConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 
+from lerobot_wmrl.common.constants import START_TASK
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.policies import check_fit
 from lerobot_wmrl.data.embodiment import component_names
@@ -20,11 +21,12 @@ class Findings:
     """What was found in a dataset.
 
     Args:
-        lines: what it has, for people.
+        lines: what it has, as text.
         missing: what it lacks, and what that costs.
         cameras: names of the cameras that the policy looks at.
         frame_side: the shorter side of their frames in pixels.
         episodes: how many there are.
+        fewest: how many there are of the task that has the fewest.
         longest: frames of the longest episode.
         held: frames in which success holds in a successful episode, the median.
     """
@@ -34,6 +36,7 @@ class Findings:
     cameras: list[str]
     frame_side: int
     episodes: int
+    fewest: int
     longest: int
     held: int
 
@@ -42,7 +45,7 @@ class Findings:
 
 
 def look(table: EpisodeTable, policy: PreTrainedConfig) -> Findings:
-    """Look at a dataset with the eyes of a policy.
+    """Describe a dataset, and check that a policy can be improved with it.
 
     Raises:
         FieldError: the policy cannot be improved with it.
@@ -73,10 +76,12 @@ def look(table: EpisodeTable, policy: PreTrainedConfig) -> Findings:
         f"state: {', '.join(component_names(features[OBS_STATE])) if state else 'none'}",
         f"{success.sum()} episodes succeed, {(~success).sum()} fail",
     ]
+    tasks = np.unique(table.column(START_TASK), return_counts=True)[1]
     done = [table.done[a : a + n].sum() for a, n in zip(table.start, table.length, strict=True)]
     return Findings(
         lines=lines, missing=missing(table), cameras=camera_names(keys),
-        frame_side=min(map(min, sizes.values())), episodes=len(success), longest=int(table.length.max()),
+        frame_side=min(map(min, sizes.values())), episodes=len(success),
+        fewest=int(tasks.min()), longest=int(table.length.max()),
         held=int(np.median(np.array(done)[success])),
     )  # fmt: skip
 

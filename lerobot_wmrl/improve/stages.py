@@ -13,7 +13,7 @@ from lerobot_wmrl.common.checkpoints import LAST_CHECKPOINT
 from lerobot_wmrl.common.command_line import RunConfig
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
-from lerobot_wmrl.common.policies import read_policy_config, require_trained
+from lerobot_wmrl.common.policies import read_policy_config, require_single_observations, require_trained
 from lerobot_wmrl.common.presets import Flags, format_flags
 from lerobot_wmrl.common.stages import Stage
 from lerobot_wmrl.data.episodes import VALIDATION_EVERY, DatasetSource
@@ -23,8 +23,11 @@ from lerobot_wmrl.rl.recorders import env_flags
 SIZES: Final = ("auto", "tiny", "demo", "cpu")
 """Presets of the stages; `auto` is `demo` on a processor and `cpu` with an accelerator."""
 
-DURATIONS: Final = {"tiny": "a minute", "demo": "an hour", "cpu": "several hours"}
-"""What all stages but those in `real_env` take on two cores."""
+DURATIONS: Final = {
+    "tiny": "about a minute on two cores", "demo": "about an hour on two cores",
+    "cpu": "several hours on two cores, less with an accelerator",
+}  # fmt: skip
+"""How long all stages but those in `real_env` take."""
 
 SIDES: Final = {"tiny": 32, "demo": 64, "cpu": 128}
 """Pixels a side of imagined frames at each size, unless the dataset's are smaller."""
@@ -95,6 +98,8 @@ class ImproveConfig(RunConfig):
         if self.policy is None:
             raise FieldError("policy.path", None, "is missing", "give the policy to improve")
         require_trained(self.policy)
+        if self.policy.type not in ALGORITHMS:
+            require_single_observations(self.policy)
         if not self.dataset.given:
             raise FieldError("dataset.root", "", "is missing", "give `dataset.root` or `dataset.repo_id`")
         require_choice(self, "size", SIZES)
@@ -129,7 +134,7 @@ class Improvement:
             "world_model": "Train the world model",
             "check": "Check the world model on held-out episodes",
             "rl": "Train the policy in imagination",
-            "comparison": "Compare it with what it was",
+            "comparison": "Compare the policy before and after",
         }
         if not self.config.rollouts:
             del steps["rollouts"]
@@ -137,10 +142,10 @@ class Improvement:
 
     @property
     def duration(self) -> str:
-        """What it takes, for people."""
+        """The expected duration, as text."""
         size, real = self.config.preset, self.config.real_env
-        beside = "" if real is None else f", beside what {real.type} takes"
-        return f"size {size}: about {DURATIONS[size]} on two cores{beside}; each stage shows the time left"
+        beside = "" if real is None else f", plus the time in {real.type}"
+        return f"size {size}: {DURATIONS[size]}{beside}; each stage shows the time left"
 
     @property
     def out(self) -> Path:
@@ -245,8 +250,8 @@ class Improvement:
         imagined = self.config.real_env is None
         env = self._imagination() if imagined else self._real_env("env")
         starts = self.config.eval_episodes
-        if imagined:  # each start once
-            starts = min(starts, self.found.episodes)
+        if imagined:  # each start of each task once
+            starts = min(starts, self.found.fewest)
         flags: Flags = {
             "policies": f"[{self.policy},{self.improved}]", **env, "n_episodes": starts,
             "batch_size": min(16 if imagined else 1, starts), "stop_early": False, "seed": EVALUATION_SEED,

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +13,10 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from lerobot_wmrl.data.episodes import open_dataset, read_episodes
+from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.frame_cache import decode_episode
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
-from lerobot_wmrl.envs.start_frames import chosen_episodes
+from lerobot_wmrl.envs.start_frames import every_chosen_episode
 from lerobot_wmrl.rl.observations import TASK, decoded
 from lerobot_wmrl.rl.policy_adapters import ACTION_IS_PAD
 
@@ -113,10 +113,10 @@ def recorded_successes(
         state_size: components of the state, 0 for observations without it.
         chunk: actions of a chunk, n; 0 for policies without chunks.
     """
-    if not source.root:
+    if not source.given:
         return []
-    table = read_episodes(open_dataset(source.root, source.repo_id))
-    episodes = chosen_episodes(table, replace(source, max_starts=len(table.start)))
+    table = read_episodes(source.open())
+    episodes = every_chosen_episode(table, source)
     episodes = episodes[table.success[episodes]]
     if not len(episodes):
         return []

@@ -1,6 +1,7 @@
 """Construction of a training's callbacks from its configuration."""
 
 import logging
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,6 +11,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot_wmrl.common.constants import SELECTION_SEED
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
+from lerobot_wmrl.envs.lerobot_env import is_own
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv, make_success_env
 from lerobot_wmrl.evaluation.agreement import evaluate_policy, evaluate_within
 from lerobot_wmrl.rl.callbacks import Callback
@@ -75,9 +77,14 @@ def make_measures(settings: CallbackSettings, trained: Trained) -> dict[str, Mea
         )  # fmt: skip
 
     def measure_in_training_env() -> Any:
+        if not is_own(config):
+            return evaluate_policy(config, policy, processors, episodes, SELECTION_SEED, num_envs=1)
         measured_env = env
-        if dataset.given and isinstance(env, WorldModelVectorEnv):
-            measured_env = make_success_env(env, StartFrames(dataset.root, dataset.repo_id, dataset.revision))
+        if isinstance(env, WorldModelVectorEnv):
+            own = replace(env.config.dataset, branches=0)
+            given = StartFrames(dataset.root, dataset.repo_id, dataset.revision)
+            if dataset.given or env.config.dataset.branches:
+                measured_env = make_success_env(env, given if dataset.given else own)
         return evaluate_within(measured_env, config, policy, processors, episodes, SELECTION_SEED)
 
     if isinstance(env, WorldModelVectorEnv):

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.envs import make_env_pre_post_processors
+from lerobot.envs import make_env, make_env_pre_post_processors
 from lerobot.envs.configs import EnvConfig
 from lerobot.scripts.lerobot_eval import rollout
 from lerobot.utils.constants import ACTION, DEFAULT_FEATURES, OBS_IMAGE, OBS_STATE, PRETRAINED_MODEL_DIR
@@ -33,8 +33,8 @@ from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.rl.observations import to_bytes
 
-DERIVED = ("features", "features_map", "cameras")
-"""Settings of an environment that are derived from others, or that the caller passes itself."""
+DERIVED = ("features", "features_map")
+"""Settings of an environment that are derived from others."""
 
 Observation = dict[str, Any]
 
@@ -140,7 +140,7 @@ class RolloutRecorder:
         self.hold = env.done_frames if isinstance(env, WorldModelEnv) else 1
         self.policy, self.processors = load_policy(policy).eval(), load_processors(policy)
         self.env_processors = make_env_pre_post_processors(env, policy)
-        made = env.create_envs(num_envs, use_async_envs=False)
+        made = make_env(env, num_envs, use_async_envs=False)
         self.envs = [each for tasks in made.values() for each in tasks.values()]
         self.robot = robot or robot_of(env, self.envs[0], like)
 

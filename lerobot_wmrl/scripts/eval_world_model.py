@@ -28,6 +28,7 @@ from lerobot_wmrl.data.episodes import DatasetSource
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 
 if TYPE_CHECKING:
+    from lerobot_wmrl.data.episodes import EpisodeTable
     from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
     from lerobot_wmrl.evaluation.agreement import Agreement
     from lerobot_wmrl.evaluation.replay import Recording
@@ -126,7 +127,7 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     table = read_episodes(cfg.dataset.open())
     check_dataset(model.config, table.dataset.meta)
     text_model = load_text_model(cfg, model)
-    imagination = policies_imagination(cfg) if cfg.policies else None
+    imagination = policies_imagination(cfg, table) if cfg.policies else None
     scenes = scene_splits(table.column(START_SCENE), cfg.split)
     episodes = choose_episodes(table, cfg.split, cfg.max_episodes, scenes)
     claim_output_dir(cfg.output_dir, draccus.encode(cfg))
@@ -197,14 +198,24 @@ def load_text_model(
     return text_model
 
 
-def policies_imagination(cfg: EvalWorldModelConfig) -> "WorldModelEnv":
-    """Return the world model as `policies` are evaluated in it. FieldError if none can be."""
+def policies_imagination(cfg: EvalWorldModelConfig, table: "EpisodeTable") -> "WorldModelEnv":
+    """Return the world model as `policies` are evaluated in it, from starts of the environment's task.
+
+    Raises:
+        FieldError: nothing can be evaluated in it, or the dataset has too few starts.
+    """
+    from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
     from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
+    from lerobot_wmrl.envs.start_frames import chosen_episodes
 
     longest = getattr(cfg.real_env, "horizon", None) or getattr(cfg.real_env, "episode_length", None)
-    starts = StartFrames(cfg.dataset.root, cfg.dataset.repo_id, cfg.dataset.revision, split=cfg.split)
+    task = cfg.real_env.task if isinstance(cfg.real_env, WmrlManiSkillEnv) else None
+    starts = StartFrames(
+        **vars(cfg.dataset), split=cfg.split, tasks=[task] if task else None, max_starts=cfg.policy_episodes
+    )
+    longest = getattr(cfg.real_env, "horizon", None) or getattr(cfg.real_env, "episode_length", None)
     try:
-        return WorldModelEnv(
+        imagination = WorldModelEnv(
             world_model_path=cfg.model.path, reward=GeneralConfig(alpha=1.0), device=cfg.device,
             episode_length=longest, dataset=starts,
             done_threshold=cfg.done_threshold, done_frames=cfg.done_frames,
@@ -212,6 +223,14 @@ def policies_imagination(cfg: EvalWorldModelConfig) -> "WorldModelEnv":
     except FieldError as error:
         field = "model.path" if error.field == "world_model_path" else error.field
         raise FieldError(field, error.value, error.problem, error.remedy) from error
+    found = len(chosen_episodes(table, starts))
+    if found < cfg.policy_episodes:
+        raise FieldError(
+            "policy_episodes", cfg.policy_episodes,
+            f"the dataset has {found} starts, and an episode that is repeated says nothing new",
+            f"set it to at most {found}, or choose another `split`",
+        )  # fmt: skip
+    return imagination
 
 
 def policy_agreement(cfg: EvalWorldModelConfig, imagination: "WorldModelEnv") -> "Agreement":

@@ -17,6 +17,7 @@ Running the same command again continues from the last checkpoint. `--preset=dem
 `lerobot-eval --policy.path=outputs/rl/checkpoints/best/pretrained_model …` evaluates the result.
 """
 
+import logging
 import shlex
 import shutil
 from dataclasses import dataclass, field
@@ -143,6 +144,11 @@ def check_config(cfg: TrainConfig) -> None:
     if cfg.env is None:
         raise FieldError("env.type", None, "is missing", "choose world_model, or another environment")
     require_at_least(cfg, 1, "num_envs", "iterations", "save_freq", "log_freq")
+    if isinstance(cfg.algorithm, PPOConfig) and cfg.algorithm.value_iterations >= cfg.iterations:
+        logging.warning(
+            "iterations=%d: the policy stays as it is, because the value function alone learns in the first "
+            "%d (algorithm.value_iterations)", cfg.iterations, cfg.algorithm.value_iterations,
+        )  # fmt: skip
     if isinstance(cfg.algorithm, GRPOConfig):
         cfg.algorithm.check_num_envs(cfg.num_envs)
     if isinstance(cfg.algorithm, DistillationConfig):
@@ -208,13 +214,15 @@ def train_policy(cfg: TrainConfig) -> None:
     from accelerate import PartialState
     from lerobot.utils.random_utils import set_seed
 
-    from lerobot_wmrl.common.policies import load_policy, load_processors
+    from lerobot_wmrl.common.policies import load_policy, load_processors, require_single_observations
     from lerobot_wmrl.envs.lerobot_env import make_tensor_env
     from lerobot_wmrl.rl.budget import check_data
 
     check_config(cfg)
     check_data(cfg, cfg.env)
     config = load_config(cfg)
+    if isinstance(cfg.algorithm, DistillationConfig):
+        require_single_observations(config)
     PartialState(cpu=config.device == "cpu", timeout=LONGEST_WAIT)
     done = finished(cfg)
     wait_for_all()  # no process has written anything before all have looked

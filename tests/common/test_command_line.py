@@ -4,7 +4,13 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from lerobot_wmrl.common.command_line import RunConfig, near_flag, parse_flags, said_in_flags
+from lerobot_wmrl.common.command_line import (
+    RunConfig,
+    different_settings,
+    near_flag,
+    parse_flags,
+    said_in_flags,
+)
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.settings import settings_of
 from lerobot_wmrl.scripts.train import TrainConfig
@@ -103,3 +109,13 @@ def test_what_cannot_be_parsed_is_said_in_one_line(
         parse_flags(TrainConfig)
     assert message in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_a_setting_that_another_version_lacks_is_off_there():
+    """So a run that began before an option existed goes on, unless the option is used."""
+    stored = {"seed": 1, "env": {"length": 40, "gone": 0}}
+    assert different_settings(stored, {"seed": 1, "env": {"length": 40, "new": None}}, ()) == []
+    assert different_settings(stored, {"seed": 2, "env": {"length": 40, "new": 3}}, ["seed"]) == [
+        "env.new None → 3"
+    ]
+    assert different_settings({"real": None}, {"real": {"type": "pusht"}}, ()) == ["real.type None → 'pusht'"]

@@ -57,14 +57,19 @@ def test_actions_out_of_range_are_counted_and_nan_is_refused(env: LeRobotTensorE
         env.step(torch.tensor([[0.0, 0.0], [torch.nan, 0.0]]))
 
 
-def test_ppo_trains_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ppo_trains_in_it_and_the_best_policy_is_selected_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     policy = save_untrained_policy(tmp_path / "policy", OBS_IMAGE, size=96, actions=2, constant=250.0)
     flags = [
         f"--policy.path={policy}", "--env.type=pusht", f"--env.episode_length={STEPS}",
         "--algorithm.type=ppo", "--algorithm.value_iterations=1", f"--num_envs={B}", "--iterations=1",
-        f"--output_dir={tmp_path / 'rl'}",
+        "--selection.freq=1", "--selection.n_episodes=1", f"--output_dir={tmp_path / 'rl'}",
     ]  # fmt: skip
     monkeypatch.setattr(sys, "argv", ["lerobot-wmrl-train", *flags])
     main()
     line = read_metrics(tmp_path / "rl")[-1]
     assert (line["step"], line["episode_length"]) == (1, STEPS)
+    assert (line["selection/real/k"], line["selection/real/n"]) == (0, 1)
+    assert (tmp_path / "rl" / "checkpoints" / "best").exists()
+    assert "the policy stays as it is, because the value function alone learns in the first 1" in caplog.text

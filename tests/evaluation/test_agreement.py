@@ -10,7 +10,7 @@ import pytest
 from lerobot_wmrl.common.checkpoints import resolve_checkpoint
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.statistics import Proportion
-from lerobot_wmrl.data.episodes import DatasetSource
+from lerobot_wmrl.data.episodes import DatasetSource, read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.evaluation.agreement import Agreement, policy_checkpoints, policy_outcomes
@@ -72,12 +72,18 @@ def test_the_evaluation_reports_policies_beside_reality(imagination, small_datas
     assert (cfg.output_dir / "policies.png").is_file()
 
 
-def test_imagined_episodes_are_as_long_as_real_ones(imagination):
+def test_imagined_episodes_are_as_long_as_real_ones_and_none_is_repeated(imagination, small_dataset):
     """Those of a simulator's task, or of another environment."""
-    for real in (WmrlManiSkillEnv(task="pick_place"), imagination):
-        model = Checkpoint(imagination.world_model_path)
-        cfg = EvalWorldModelConfig(model=model, policies=["policy"], real_env=real, device="cpu")
-        assert policies_imagination(cfg).episode_length == real.horizon
+    for real in (WmrlManiSkillEnv(task="push"), imagination):
+        cfg = EvalWorldModelConfig(
+            model=Checkpoint(imagination.world_model_path), dataset=DatasetSource(str(small_dataset.root)),
+            policies=["policy"], policy_episodes=2, real_env=real, device="cpu",
+        )  # fmt: skip
+        table = read_episodes(cfg.dataset.open())
+        assert policies_imagination(cfg, table).episode_length == real.horizon
+        cfg.policy_episodes = 7
+        with pytest.raises(ValueError, match=r"^policy_episodes=7: the dataset has \d starts"):
+            policies_imagination(cfg, table)
 
 
 def test_a_world_model_without_a_known_success_is_refused_by_the_commands_own_flag_before_anything_is_made(

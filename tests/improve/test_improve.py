@@ -40,7 +40,7 @@ def test_with_a_real_environment_its_rollouts_are_learnt_from_and_success_is_mea
     first, folder = run(tmp_path, demonstrations, *real), tmp_path / "improve"
     assert first.returncode == 0, first.stdout[-3000:] + first.stderr[-3000:]
     assert "observation.image 96x96" in first.stdout
-    assert "size tiny: about a minute on two cores, beside what pusht takes" in first.stdout
+    assert "size tiny: about a minute on two cores, plus the time in pusht" in first.stdout
     assert "failures: 0. The world model will hardly tell them" in first.stdout
     report = (folder / "report.md").read_text()
     assert "Success in pusht: 0 % (0 of 2" in report
@@ -50,7 +50,7 @@ def test_with_a_real_environment_its_rollouts_are_learnt_from_and_success_is_mea
     assert trained["tokenizer"]["frame_sizes"] == [[96, 96]]
     assert (folder / "rl" / last).exists()
     again = run(tmp_path, demonstrations, *real)
-    assert "[6/6] Compare it with what it was: done in" in again.stdout
+    assert "[6/6] Compare the policy before and after: done in" in again.stdout
 
 
 def test_without_one_the_report_says_that_it_is_a_belief(demonstrations: Path, tmp_path: Path) -> None:

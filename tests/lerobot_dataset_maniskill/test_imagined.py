@@ -136,7 +136,10 @@ def test_what_a_world_model_cannot_do_is_refused(config, make_synthetic_dataset,
     config.depth = True
     with pytest.raises(ValueError, match="depth=True: can be chosen in ManiSkill alone"):
         record(config)
-    config.depth, config.policy = False, None
+    config.depth, config.env.dataset.branches = False, 1
+    with pytest.raises(ValueError, match=r"env\.dataset\.branches=1: recorded episodes begin with first"):
+        record(config)
+    config.env.dataset.branches, config.policy = 0, None
     with pytest.raises(
         ValueError, match=r"env\.type=world_model: needs a policy; give `policy\.path`, or a planner"
     ):

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 from safetensors.torch import load_file
 from torch import Tensor
 
@@ -124,7 +125,7 @@ def test_nothing_is_labelled_after_an_episode_has_ended(
 @pytest.mark.parametrize("chunk", [0, 3])
 def test_recorded_successes_are_labels_as_they_were_recorded(small_dataset: LeRobotDataset, chunk: int):
     camera = "observation.images.third_view"
-    source = StartFrames(root=str(small_dataset.root), max_starts=1)
+    source = StartFrames(root=str(small_dataset.root), max_starts=1, branches=2)
     (part,) = recorded_successes(source, [camera], state_size=8, chunk=chunk)
     table = read_episodes(small_dataset)
     episodes = table.success.nonzero()[0]
@@ -198,6 +199,20 @@ def test_what_cannot_be_is_refused_by_its_flag(
             monkeypatch, f"--policy.path={policy}", *FAST, *given, *flags, f"--output_dir={tmp_path / 'rl'}"
         )
     assert named in capsys.readouterr().err
+    assert not (tmp_path / "rl").exists()
+
+
+def test_policies_of_several_observations_are_refused_before_anything_is_made(
+    imagined: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A diffusion policy learns from two."""
+    DiffusionConfig(device="cpu").save_pretrained(tmp_path / "diffusion")
+    flags = [f"--policy.path={tmp_path / 'diffusion'}", *FAST, *imagined, f"--output_dir={tmp_path / 'rl'}"]
+    with pytest.raises(SystemExit):
+        train(monkeypatch, *flags)
+    assert "diffusion learns from 2 observations at once, and distillation gives it one" in (
+        capsys.readouterr().err
+    )
     assert not (tmp_path / "rl").exists()
 
 

@@ -107,4 +107,5 @@ def test_the_recorder_gets_what_is_not_as_by_default() -> None:
     env = WmrlManiSkillEnv(task="pull", scenes=[0, 2], image_size=64, cameras=["wrist"])
     assert env_flags(env) == {
         "env.type": "wmrl_maniskill", "env.task": "pull", "env.scenes": [0, 2], "env.image_size": 64,
+        "env.cameras": ["wrist"],
     }  # fmt: skip
