@@ -58,7 +58,7 @@ def test_actions_out_of_range_are_counted_and_nan_is_refused(env: LeRobotTensorE
 
 
 def test_ppo_trains_in_it_and_the_best_policy_is_selected_there(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     policy = save_untrained_policy(tmp_path / "policy", OBS_IMAGE, size=96, actions=2, constant=250.0)
     flags = [
@@ -72,4 +72,5 @@ def test_ppo_trains_in_it_and_the_best_policy_is_selected_there(
     assert (line["step"], line["episode_length"]) == (1, STEPS)
     assert (line["selection/real/k"], line["selection/real/n"]) == (0, 1)
     assert (tmp_path / "rl" / "checkpoints" / "best").exists()
-    assert "the policy stays as it is, because the value function alone learns in the first 1" in caplog.text
+    said = capfd.readouterr().err
+    assert "the policy stays as it is, because the value function alone learns in the first 1" in said
