@@ -16,17 +16,17 @@ from lerobot_wmrl.common.statistics import PairedChange, RunsMean
 from lerobot_wmrl.demo.report.figures import COLOURS, tidy
 
 TITLES: Final = {
-    "cloning": "cloning of the demonstrations",
-    "filtered": "cloning of demonstrations and successful rollouts",
-    "iterated": "filtered cloning, with rollouts in three rounds",
-    "weighted": "advantage-weighted cloning (RA-BC)",
-    "conditioned": "advantage-conditioned cloning (RECAP)",
+    "cloning": "BC of the demonstrations",
+    "filtered": "filtered BC: demonstrations and successful rollouts",
+    "iterated": "filtered BC, rollouts in three rounds",
+    "weighted": "advantage-weighted BC (RA-BC)",
+    "conditioned": "advantage-conditioned BC (RECAP)",
     "simulated_ppo": "PPO in ManiSkill, as many steps as the rollouts",
     "imagined_ppo": "PPO in imagination",
     "planned": "PPO in imagination, then planning in it at test time",
     "dyna": "PPO in imagination, with rollouts in three rounds (Dyna)",
-    "iterated_ppo": "filtered cloning, with rollouts in three rounds, then PPO in imagination",
-    "imagined_cloning": "cloning of recorded and imagined successes",
+    "iterated_ppo": "filtered BC, rollouts in three rounds, then PPO in imagination",
+    "imagined_cloning": "BC of recorded and imagined successes",
     "distilled": "planner distilled in imagination",
     "distilled_ppo": "planner distilled, then PPO in imagination",
 }
@@ -40,7 +40,7 @@ IMAGINED: Final = (
 CONTROLLED: Final = ("imagined_ppo", "planned")
 """Those that controls are made for."""
 
-RIVALS: Final = tuple(method for method in TITLES if method not in IMAGINED)
+BASELINES: Final = tuple(method for method in TITLES if method not in IMAGINED)
 """Methods that use none."""
 
 UNCHANGED: Final = "all episodes"
@@ -119,10 +119,10 @@ def measured(cells: Sequence[Cell], methods: Iterable[str]) -> list[str]:
     return [method for method in methods if any(method in cell["methods"] for cell in cells)]
 
 
-def gain(cells: Sequence[Cell], method: str, rival: str, domain: str) -> RunsMean:
-    """Return how much more often a method succeeds than a rival on the same data and starts."""
-    both = [cell for cell in cells if {method, rival} <= cell["methods"].keys()]
-    pairs = zip(outcomes(both, method, domain), outcomes(both, rival, domain), strict=True)
+def gain(cells: Sequence[Cell], method: str, baseline: str, domain: str) -> RunsMean:
+    """Return how much more often a method succeeds than a baseline on the same data and starts."""
+    both = [cell for cell in cells if {method, baseline} <= cell["methods"].keys()]
+    pairs = zip(outcomes(both, method, domain), outcomes(both, baseline, domain), strict=True)
     return RunsMean.over([[a - b for a, b in zip(*pair, strict=True)] for pair in pairs])
 
 
@@ -147,7 +147,7 @@ Planning changes what PPO's policy would do, and plans anew after eight actions.
 {planned:.1f} s on one core, simulator included, one of the policy {policy:.1f} s.
 
 Both rules were chosen after a first run of seed 0's cells, on its models and other starts
-([pilot](reinforcement_learning.md#against-cloning-on-the-same-data)). There planning adds to PPO in five of
+([pilot](pilots.md#where-ppo-begins-and-planning-after-it)). There planning adds to PPO in five of
 six rates; in the cells of other seeds it may not, as the table shows.
 
 RECAP and the distilled planner were moved into a [study of their own](#value_others) after a first run of two
@@ -180,7 +180,7 @@ The policy that PPO begins from succeeds from {imagined:.0f} % of the recorded s
 
 In unseen scenes all methods mostly fail: 50 demonstrations in three scenes teach grasping in these. Not
 compared: PPO in ManiSkill where the table has no row of it, and planning at test time, which failed in a
-[pilot](reinforcement_learning.md#against-cloning-on-the-same-data), on whose episodes the done threshold was
+[pilot](pilots.md#pick-and-place), on whose episodes the done threshold was
 chosen too."""
 
 
@@ -189,9 +189,11 @@ def comparison(found: Groups) -> str:
     answers, rows = [], []
     for (demonstrations, rollouts), cells in found.items():
         for domain in ("ind", "ood"):
-            ours, rival = (best(cells, methods, domain) for methods in (IMAGINED, RIVALS))
-            gained = points(asdict(gain(cells, ours, rival, domain)))
-            answers.append([demonstrations, rollouts, DOMAINS[domain], TITLES[rival], TITLES[ours], gained])
+            ours, baseline = (best(cells, methods, domain) for methods in (IMAGINED, BASELINES))
+            gained = points(asdict(gain(cells, ours, baseline, domain)))
+            answers.append(
+                [demonstrations, rollouts, DOMAINS[domain], TITLES[baseline], TITLES[ours], gained]
+            )
         rows += [
             [demonstrations, rollouts, title, *(shares(cells, method, domain) for domain in ("ind", "ood")),
              minutes(cells, method)]

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from experiments.tables import loader
-from experiments.value_sections import RIVALS, best, groups, outcomes
+from experiments.value_sections import BASELINES, best, groups, outcomes
 from lerobot_wmrl.common.statistics import RunsMean
 from lerobot_wmrl.common.stored_help import FOLDER
 from tests.experiments.typed import ROOT, check
@@ -79,8 +79,8 @@ def test_the_readme_says_what_was_measured() -> None:
     text, results = (ROOT / "README.md").read_text(), ROOT / "docs" / "results"
     budgets = groups(loader(ROOT / "docs")).values()
     rows = {
-        "cloned from the demonstrations": ("cloning",),
-        "best rival": RIVALS,
+        "BC of the demonstrations": ("cloning",),
+        "best baseline": BASELINES,
         "PPO in imagination": ("imagined_ppo",),
         "PPO, then planning": ("planned",),
     }

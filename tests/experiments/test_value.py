@@ -47,7 +47,7 @@ def made_up_cell(demonstrations: int, seed: int) -> dict[str, Any]:
 @pytest.fixture
 def docs(tmp_path: Path) -> Path:
     """Two seeds of one budget are published, of nine cells."""
-    for cell in read_cells(STUDY, ["demonstrations=8", "seed=[0,100000]"]):
+    for cell in read_cells(STUDY, ["demonstrations=8", "rollouts=300", "seed=[0,100000]"]):
         content = made_up_cell(8, cell.variables["seed"])
         write_json(tmp_path / "results" / "value_push" / f"{cell.variables['cell']}.json", content)
     return tmp_path
@@ -70,7 +70,7 @@ def test_the_section_compares_the_best_with_and_without_a_world_model(docs: Path
 
 
 def test_rounds_stand_in_the_same_table_for_the_seeds_that_have_them(docs: Path) -> None:
-    (cell,) = read_cells(STUDY, ["demonstrations=8", "seed=0"])
+    (cell,) = read_cells(STUDY, ["demonstrations=8", "rollouts=300", "seed=0"])
     content = made_up_cell(8, 0)
     content["methods"] = {"iterated": content["methods"]["planned"]}
     write_json(docs / "results" / "value_iterated" / f"{cell.variables['cell']}.json", content)
@@ -98,7 +98,7 @@ def test_controls_are_compared_with_the_policy_that_they_begin_from(docs: Path) 
 
 
 def test_ppo_without_a_reward_is_compared_with_the_policy_before_it(docs: Path) -> None:
-    (cell,) = read_cells(STUDY, ["demonstrations=8", "seed=0"])
+    (cell,) = read_cells(STUDY, ["demonstrations=8", "rollouts=300", "seed=0"])
     others = {"methods": {name: {"ind": FAILING, "ood": FAILING} for name in ("distilled", "unrewarded")}}
     write_json(docs / "results" / "value_others" / f"{cell.variables['cell']}.json", others)
     lines = value_others(loader(docs)).splitlines()
@@ -116,7 +116,7 @@ MAY_DIFFER = {
 
 def test_a_control_differs_from_the_study_in_nothing_but_the_world_model() -> None:
     """Its PPO and its planner have the settings of the rows that they are compared with."""
-    (cell,) = read_cells(STUDY, ["demonstrations=8", "seed=0"])
+    (cell,) = read_cells(STUDY, ["demonstrations=8", "rollouts=300", "seed=0"])
     control, *_ = read_cells(ROOT / "experiments" / "value_controls.yaml", ["demonstrations=8", "seed=0"])
     run = control.variables["run"]
     assert run == str(cell.folder)
@@ -144,7 +144,7 @@ def test_nothing_is_drawn_without_a_cell(tmp_path: Path) -> None:
 
 
 def test_a_cell_keeps_outcomes_and_minutes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    study = read_cells(STUDY, ["demonstrations=8", "seed=0", f"output_dir={tmp_path}"])[0]
+    study = read_cells(STUDY, ["demonstrations=8", "rollouts=300", "seed=0", f"output_dir={tmp_path}"])[0]
     for name, k in SUCCESSES.items():
         for domain in ("ind", "ood"):
             task = {"metrics": {"successes": [True] * k + [False] * (10 - k)}}
