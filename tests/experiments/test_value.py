@@ -62,7 +62,7 @@ def test_the_section_compares_the_best_with_and_without_a_world_model(docs: Path
     assert change.low < 0.2 < change.high
     text = value_push(loader(docs))
     assert (
-        "| 8 | 300 | known | cloning of demonstrations and successful rollouts | "
+        "| 8 | 300 | known | filtered BC: demonstrations and successful rollouts | "
         f"{TITLES['planned']} | +20.0 points" in text
     )
     assert "from the demonstrations alone in 0 of 2 cells" in text
