@@ -24,7 +24,7 @@ from torch import Tensor
 from imagined_env import add_world_models, world_model_env
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
-from lerobot_wmrl.envs.start_frames import read_first_frames
+from lerobot_wmrl.envs.start_frames import read_start_images
 from lerobot_wmrl.envs.world_model_env import WorldModels, WorldModelVectorEnv, load_world_models, make_env_at
 from lerobot_wmrl.maniskill.embodiment import ACTION_LOW
 from lerobot_wmrl.rewards.configuration_rewards import EmbeddingConfig, GeneralConfig, ProxyConfig
@@ -53,7 +53,7 @@ def learned_rewards(model: ActionWorldModelRewardModel) -> dict[str, PreTrainedR
 
 def environments(config: WorldModelEnv, models: WorldModels, count: int) -> dict[str, WorldModelVectorEnv]:
     """One of each reward."""
-    frames = read_first_frames(config.dataset, models.model.config)
+    frames = read_start_images(config.dataset, models.model.config)
     device = models.model.state_mean.device.type
     goalless = models._replace(text_model=None)
     sparse = goalless._replace(reward=GeneralRewardModel(GeneralConfig(device=device, alpha=1.0)))

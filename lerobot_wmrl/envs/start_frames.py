@@ -1,6 +1,6 @@
 """Where imagined episodes begin, and the goal frame of each.
 
-First frames are read from a dataset's episodes, from a file or from ManiSkill's resets (`FirstFrames`). A
+Frames are read from a dataset's episodes, from a file or from ManiSkill's resets (`StartImages`). A
 world model then tokenises them (`Starts`), and the text world model imagines their goal frames (`Goals`).
 K is the number of starts, N the number of cameras.
 """
@@ -51,23 +51,23 @@ INSTRUCTION = "task"
 """Name of the instructions in a file of saved frames."""
 
 
-class FirstFrames(NamedTuple):
+class StartImages(NamedTuple):
     """The frames in which K imagined episodes begin.
 
-    images (K, N, H, W, 3) uint8; beginning, of the same shape: the first frame of the recorded episode that
-    each is taken from; state (K, P); K instructions; tasks (K,), indices into `TASKS`, −1 where unknown;
+    images (K, N, H, W, 3) uint8; first_images, of the same shape: the first frame of the recorded episode
+    that each is taken from; state (K, P); K instructions; tasks (K,), indices into `TASKS`, −1 where unknown;
     depth, a function of a world model that returns (K, S) in metres, or None if the model does not look at
     depth.
     """
 
     images: np.ndarray
-    beginning: np.ndarray
+    first_images: np.ndarray
     state: np.ndarray
     instructions: list[str]
     tasks: np.ndarray
     depth: Callable[[WorldModelRewardModel], Tensor | None]
 
-    def of_task(self, task: int) -> "FirstFrames":
+    def of_task(self, task: int) -> "StartImages":
         """Return the starts of one task, an index into `TASKS`."""
         rows = np.flatnonzero(self.tasks == task)
 
@@ -76,8 +76,13 @@ class FirstFrames(NamedTuple):
             return every if every is None else every[torch.from_numpy(rows).to(every.device)]
 
         instructions = [self.instructions[row] for row in rows]
-        return FirstFrames(
-            self.images[rows], self.beginning[rows], self.state[rows], instructions, self.tasks[rows], depth
+        return StartImages(
+            self.images[rows],
+            self.first_images[rows],
+            self.state[rows],
+            instructions,
+            self.tasks[rows],
+            depth,
         )
 
 
@@ -103,8 +108,8 @@ class Goals(NamedTuple):
     reached: Tensor
 
 
-def read_first_frames(source: StartFrames, config: WorldModelConfig) -> FirstFrames:
-    """Read the first frames that a world model of this configuration can begin in.
+def read_start_images(source: StartFrames, config: WorldModelConfig) -> StartImages:
+    """Read the frames that a world model of this configuration can begin in.
 
     Raises:
         ValueError: `source` asks for frames that are not there or do not fit the world model.
@@ -186,7 +191,7 @@ def branch_frames(table: EpisodeTable, episodes: np.ndarray, branches: int) -> n
     return np.unique(table.start[episodes, None] + offsets)
 
 
-def read_dataset_frames(source: StartFrames, config: WorldModelConfig) -> FirstFrames:
+def read_dataset_frames(source: StartFrames, config: WorldModelConfig) -> StartImages:
     """Read frames of a LeRobotDataset's episodes: the first ones, and those of the branches."""
     sizes = config.tokenizer
     assert sizes is not None, "a trained world model knows its tokenizer"
@@ -207,7 +212,7 @@ def read_dataset_frames(source: StartFrames, config: WorldModelConfig) -> FirstF
         check_dataset(model.config, table.dataset.meta)
         return model.recorded_depth(table.dataset, rows)
 
-    return FirstFrames(
+    return StartImages(
         images[rows],
         images[table.start[episodes]],
         table.state[rows],
@@ -217,7 +222,7 @@ def read_dataset_frames(source: StartFrames, config: WorldModelConfig) -> FirstF
     )
 
 
-def read_saved_frames(path: Path, max_starts: int, config: WorldModelConfig) -> FirstFrames:
+def read_saved_frames(path: Path, max_starts: int, config: WorldModelConfig) -> StartImages:
     """Read first frames from a file written by `numpy.savez`.
 
     Args:
@@ -250,7 +255,7 @@ def read_saved_frames(path: Path, max_starts: int, config: WorldModelConfig) -> 
     instructions = [str(text) for text in found[INSTRUCTION][rows]]
     state = found[OBS_STATE][rows].astype(np.float32)
     squares = np.stack([_squares(found[name][rows], side) for name in shapes], 1)
-    return FirstFrames(squares, squares, state, instructions, np.full(len(rows), -1), _no_depth)
+    return StartImages(squares, squares, state, instructions, np.full(len(rows), -1), _no_depth)
 
 
 def _squares(images: np.ndarray, side: int) -> np.ndarray:
@@ -269,7 +274,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         ) from error
 
 
-def simulate_first_frames(source: StartFrames, config: WorldModelConfig) -> FirstFrames:
+def simulate_first_frames(source: StartFrames, config: WorldModelConfig) -> StartImages:
     """Render the first frames of ManiSkill's resets with seeds 0, 1, …
 
     Consecutive seeds visit the scenes in turn, then the next task.
@@ -293,7 +298,7 @@ def simulate_first_frames(source: StartFrames, config: WorldModelConfig) -> Firs
     views = ([frame.images[camera] for frame in frames] for camera in sizes.cameras)
     images = np.stack([_squares(np.stack(view), sizes.image_size) for view in views], 1)
     state = np.stack([frame.state for frame in frames])
-    return FirstFrames(images, images, state, instructions, np.array(indices), _no_depth)
+    return StartImages(images, images, state, instructions, np.array(indices), _no_depth)
 
 
 def resets_side(sizes: TokenizerConfig) -> int:
@@ -322,13 +327,13 @@ def _no_depth(model: WorldModelRewardModel) -> None:
 
 @torch.no_grad()
 def load_starts(
-    frames: FirstFrames, model: ActionWorldModelRewardModel, text_model: TextWorldModelRewardModel | None,
+    frames: StartImages, model: ActionWorldModelRewardModel, text_model: TextWorldModelRewardModel | None,
     measure: Similarity,
 ) -> tuple[Starts, Goals | None]:  # fmt: skip
-    """Tokenise first frames and, with a text model, imagine each one's goal frame once (eq. 6)."""
+    """Tokenise the starts and, with a text model, imagine each one's goal frame once (eq. 6)."""
     device = model.state_mean.device
     state = torch.from_numpy(frames.state).to(device)
-    context = model.tokenizer.context(frames_to_tensor(frames.beginning).to(device))
+    context = model.tokenizer.context(frames_to_tensor(frames.first_images).to(device))
     tokens = model.tokenizer.encode(frames_to_tensor(frames.images).to(device), context)
     begin = Frames(tokens, state[:, : model.config.state_size], context, frames.depth(model))
     decoded = model.tokenizer.decode_with_features(tokens, context)

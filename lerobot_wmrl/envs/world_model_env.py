@@ -14,7 +14,7 @@ from torch import Tensor
 
 from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
-from lerobot_wmrl.envs.start_frames import FirstFrames, Goals, Starts, load_starts, read_first_frames
+from lerobot_wmrl.envs.start_frames import Goals, StartImages, Starts, load_starts, read_start_images
 from lerobot_wmrl.envs.uncertainty import entropies
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rewards.general import consecutive_count, is_done
@@ -263,7 +263,7 @@ def make_world_model_env(config: WorldModelEnv, n_envs: int, device: str | None)
     """Return one environment for all start frames."""
     models = load_world_models(config, device)
     warn_of_long_episodes(config, models.model.config)
-    return make_env_at(read_first_frames(config.dataset, models.model.config), models, config, n_envs)
+    return make_env_at(read_start_images(config.dataset, models.model.config), models, config, n_envs)
 
 
 def warn_of_long_episodes(config: WorldModelEnv, model: ActionWorldModelConfig) -> None:
@@ -279,13 +279,13 @@ def warn_of_long_episodes(config: WorldModelEnv, model: ActionWorldModelConfig) 
 def make_task_envs(config: WorldModelEnv, n_envs: int, device: str | None) -> dict[int, WorldModelVectorEnv]:
     """Return one environment for each task among the start frames, by its index; one if tasks are unknown."""
     models = load_world_models(config, device)
-    frames = read_first_frames(config.dataset, models.model.config)
+    frames = read_start_images(config.dataset, models.model.config)
     tasks = np.unique(frames.tasks).tolist()
     return {max(task, 0): make_env_at(frames.of_task(task), models, config, n_envs) for task in tasks}
 
 
 def make_env_at(
-    frames: FirstFrames, models: WorldModels, config: WorldModelEnv, n_envs: int
+    frames: StartImages, models: WorldModels, config: WorldModelEnv, n_envs: int
 ) -> WorldModelVectorEnv:
     """Return an environment whose episodes begin in these frames."""
     starts, goals = load_starts(frames, models.model, models.text_model, models.measure)
@@ -297,4 +297,4 @@ def make_success_env(env: WorldModelVectorEnv, source: StartFrames) -> WorldMode
     starts, success as the reward and no goals."""
     reward = make_reward_model(GeneralConfig(alpha=1.0, device=env.device.type))
     models = WorldModels(env.model, None, make_similarity("tokenizer", env.device), reward)
-    return make_env_at(read_first_frames(source, env.model.config), models, env.config, env.num_envs)
+    return make_env_at(read_start_images(source, env.model.config), models, env.config, env.num_envs)

@@ -43,7 +43,7 @@ def verdict(improvement: Improvement) -> str:
     )
     if real is None:
         said += (
-            "\n\nThis is what the world model believes, and shows nothing about the real world. Run both "
+            "\n\nThis is what the world model predicts, and shows nothing about the real world. Run both "
             "policies there, label what they did, and run the command again on all episodes."
         )
     return said
@@ -59,10 +59,10 @@ def trust(improvement: Improvement) -> str:
             f"Unknown: of the {kind} {wins} succeed and {losses} fail, and both are needed. Record more: "
             f"every twentieth episode is held out."
         )
+    false, recall = Proportion(found["false_positives"], losses), Proportion(found["true_positives"], wins)
     said = (
-        f"Of {wins + losses} {kind} it takes {Proportion(found['false_positives'], losses)} of the failures "
-        f"for successes, and recognises {Proportion(found['true_positives'], wins)} of the successes. A "
-        f"success scores higher than a failure with probability {found['auc']:.2f} (AUC; 0.5 is chance)."
+        f"On {wins + losses} {kind}: false positives {false}, recall {recall}, AUC {found['auc']:.2f} (the "
+        "probability that a success scores higher than a failure; 0.5 is chance)."
     )
     if found["auc"] < DOUBTFUL_AUC:
         said += " That is not enough to trust its reward: record more episodes, failures above all."

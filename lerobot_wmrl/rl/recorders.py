@@ -166,11 +166,11 @@ class RolloutRecorder:
             assert dataset is not None, "there is no seed"
             dataset.finalize()
 
-    def _roll_out(self, env: Any, seeds: Sequence[int]) -> tuple["Witness", dict[str, Tensor]]:
+    def _roll_out(self, env: Any, seeds: Sequence[int]) -> tuple["RecordingProcessors", dict[str, Tensor]]:
         """Return what the policy saw and did from these seeds, and LeRobot's record of the outcome."""
         spare = [seeds[-1]] * (env.num_envs - len(seeds))
         noises = [ExplorationNoise(self.exploration, seed, self._scale()) for seed in [*seeds, *spare]]
-        seen = Witness(*self.processors, noises, self.robot)
+        seen = RecordingProcessors(*self.processors, noises, self.robot)
         taken = rollout(
             env, self.policy, *self.env_processors, seen.preprocess, seen.postprocess, seeds=[*seeds, *spare]
         )
@@ -200,7 +200,12 @@ class RolloutRecorder:
         )  # fmt: skip
 
     def _add_episode(
-        self, dataset: LeRobotDataset, seen: "Witness", taken: dict[str, Tensor], row: int, seed: int
+        self,
+        dataset: LeRobotDataset,
+        seen: "RecordingProcessors",
+        taken: dict[str, Tensor],
+        row: int,
+        seed: int,
     ) -> bool:
         """Add the episode of one environment of a rollout. Return whether it succeeds."""
         length = int(taken["done"][row].int().argmax()) + 1
@@ -301,8 +306,8 @@ def robot_of(config: EnvConfig, env: Any, like: Any | None) -> Embodiment:
 
 
 @dataclass
-class Witness:
-    """Stands beside a policy's processors, keeps what the policy saw and did, and adds noise to it.
+class RecordingProcessors:
+    """Wrap a policy's processors: keep observations and actions, and add exploration noise to the actions.
 
     Args:
         before, after: the policy's pre- and postprocessor.

@@ -6,7 +6,7 @@ import pytest
 from lerobot_wmrl.common.constants import TASKS
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
-from lerobot_wmrl.envs.start_frames import read_first_frames
+from lerobot_wmrl.envs.start_frames import read_start_images
 from lerobot_wmrl.maniskill.scenes import SCENES
 from lerobot_wmrl.maniskill.tasks import task_of
 from lerobot_wmrl.world_models.autoregressive.configuration import AutoregressiveConfig
@@ -20,7 +20,7 @@ def test_they_are_what_the_simulator_shows(recwarn):
         tokenizer=TokenizerConfig(["side_view", "third_view"], image_size=32), device="cpu"
     )
     source = StartFrames(resets=4, tasks=["push", "pull"], scenes=[0, 2], split="ind")
-    found = read_first_frames(source, config)
+    found = read_start_images(source, config)
     assert found.images.shape == (4, 2, 32, 32, 3)
     assert found.tasks.tolist() == [TASKS.index(task) for task in ("push", "push", "pull", "pull")]
     env = WmrlManiSkillEnv(task="pull", scenes=[0, 2], cameras=["third_view"], image_size=32)

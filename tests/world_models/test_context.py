@@ -10,7 +10,7 @@ from lerobot_wmrl.data.episodes import DatasetSource, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames, cached_tokens, frames_to_tensor
 from lerobot_wmrl.data.frames import NO_CONTEXT
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
-from lerobot_wmrl.envs.start_frames import read_first_frames
+from lerobot_wmrl.envs.start_frames import read_start_images
 from lerobot_wmrl.evaluation.pictures import side_by_side, to_uint8
 from lerobot_wmrl.evaluation.replay import Recording, replay_episodes
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
@@ -178,7 +178,7 @@ def test_imagined_episodes_branch_off_from_recorded_ones_before_their_success(mo
     starts = StartFrames(root=str(Path(small_dataset.root)), branches=2)
     path = str(models["action_world_model"])
     env = WorldModelEnv(world_model_path=path, dataset=starts, reward=GeneralConfig(alpha=1.0))
-    frames = read_first_frames(starts, read_config(path, "action_world_model"))
+    frames = read_start_images(starts, read_config(path, "action_world_model"))
     expected = []
     for start, length in zip(table.start, table.length, strict=True):
         solved = np.flatnonzero(table.done[start : start + length])
@@ -198,7 +198,7 @@ def test_imagined_episodes_branch_off_from_recorded_ones_before_their_success(mo
 def test_branches_need_a_world_model_that_knows_how_the_episode_began(trained_models, small_dataset):
     starts = StartFrames(root=str(Path(small_dataset.root)), branches=1)
     with pytest.raises(ValueError, match=r"^dataset\.branches=1: .* `model.tokenizer.context=true`"):
-        read_first_frames(starts, read_config(trained_models["action_world_model"], "action_world_model"))
+        read_start_images(starts, read_config(trained_models["action_world_model"], "action_world_model"))
 
 
 def test_evaluation_decodes_beside_the_start_and_runs_whole(models, small_dataset, table, frames, tmp_path):
