@@ -175,6 +175,17 @@ def check_distillation(algorithm: DistillationConfig, env: EnvConfig) -> None:
         )  # fmt: skip
 
 
+def require_one_task(cfg: TrainConfig, env: Any) -> None:
+    """Raise FieldError for GRPO where neighbouring environments have different tasks."""
+    tasks = getattr(env, "tasks", 1)
+    if isinstance(cfg.algorithm, GRPOConfig) and tasks > 1:
+        raise FieldError(
+            "algorithm.type", cfg.algorithm.type,
+            f"compares episodes from the same start, and the environment has {tasks} tasks",
+            "choose one task, or ppo",
+        )  # fmt: skip
+
+
 def rollout_length(cfg: TrainConfig, longest: int) -> int:
     """Return the number of steps of a rollout. FieldError if the longest episodes do not fit in it."""
     steps = cfg.rollout_steps or longest
@@ -273,6 +284,7 @@ def train_in(
     from lerobot_wmrl.rl.rollout import RolloutBuffer
     from lerobot_wmrl.rl.trainer import Schedule, make_algorithm, train
 
+    require_one_task(cfg, env)
     config, settings = policy.config, draccus.encode(cfg)
     observation = env.reset(seed=cfg.seed)[0]
     shown = {name: tuple(value.shape[1:]) for name, value in observation.items() if hasattr(value, "shape")}

@@ -2,6 +2,7 @@
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -10,7 +11,8 @@ from lerobot.utils.constants import OBS_IMAGE, OBS_STATE
 
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.envs.lerobot_env import LeRobotTensorEnv, make_tensor_env
-from lerobot_wmrl.scripts.train import main
+from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
+from lerobot_wmrl.scripts.train import TrainConfig, main, require_one_task
 from tests.rl.checkpoints import save_untrained_policy
 
 B, STEPS = 2, 3
@@ -55,6 +57,26 @@ def test_actions_out_of_range_are_counted_and_nan_is_refused(env: LeRobotTensorE
     assert info["reward_parts"]["clipped"].tolist() == [0.0, 0.5]
     with pytest.raises(ValueError, match=r"NaN in environments \[1\]"):
         env.step(torch.tensor([[0.0, 0.0], [torch.nan, 0.0]]))
+
+
+class TwoTasks(PushtEnv):
+    """PushT twice, the second time with longer episodes."""
+
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, Any]]:
+        longer = PushtEnv(episode_length=2 * STEPS)
+        return {
+            "pusht": {0: super().create_envs(n_envs)["pusht"][0], 1: longer.create_envs(n_envs)["pusht"][0]}
+        }
+
+
+def test_several_tasks_are_shared_out_and_the_longest_episode_counts() -> None:
+    env = LeRobotTensorEnv(TwoTasks(episode_length=STEPS), 3, "cpu")
+    assert [int(each.call("_max_episode_steps")[0]) for each in env.envs] == [STEPS, 2 * STEPS, STEPS]
+    assert env.max_episode_steps == 2 * STEPS
+    require_one_task(TrainConfig(), env)
+    with pytest.raises(ValueError, match=r"^algorithm\.type=grpo: .*the environment has 2 tasks; choose one"):
+        require_one_task(TrainConfig(algorithm=GRPOConfig()), env)
+    env.close()
 
 
 def test_ppo_trains_in_it_and_the_best_policy_is_selected_there(
