@@ -1,12 +1,13 @@
 """Environments of LeRobot's own for RL, with PushT."""
 
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from lerobot.envs.configs import PushtEnv
+from lerobot.envs.configs import EnvConfig, PushtEnv
 from lerobot.utils.constants import OBS_IMAGE, OBS_STATE
 
 from lerobot_wmrl.common.tracking import read_metrics
@@ -59,6 +60,8 @@ def test_actions_out_of_range_are_counted_and_nan_is_refused(env: LeRobotTensorE
         env.step(torch.tensor([[0.0, 0.0], [torch.nan, 0.0]]))
 
 
+@EnvConfig.register_subclass("two_tasks")
+@dataclass
 class TwoTasks(PushtEnv):
     """PushT twice, the second time with longer episodes."""
 
