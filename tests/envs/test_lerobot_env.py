@@ -66,10 +66,9 @@ class TwoTasks(PushtEnv):
     """PushT twice, the second time with longer episodes."""
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, Any]]:
-        longer = PushtEnv(episode_length=2 * STEPS)
-        return {
-            "pusht": {0: super().create_envs(n_envs)["pusht"][0], 1: longer.create_envs(n_envs)["pusht"][0]}
-        }
+        lengths = (self.episode_length, 2 * self.episode_length)
+        made = [PushtEnv(episode_length=length).create_envs(n_envs)["pusht"][0] for length in lengths]
+        return {"pusht": dict(enumerate(made))}
 
 
 def test_several_tasks_are_shared_out_and_the_longest_episode_counts() -> None:
