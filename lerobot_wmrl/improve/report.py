@@ -36,7 +36,7 @@ def verdict(improvement: Improvement) -> str:
     found = read(improvement.out / "comparison" / "comparison.json")
     before, after = (Proportion(each["k"], each["n"]) for each in found["policies"].values())
     (pair,), real = found["pairs"], improvement.config.real_env
-    where = "in imagination, from first frames of the dataset" if real is None else f"in {real.type}"
+    where = "in imagination, from frames of the dataset" if real is None else f"in {real.type}"
     said = (
         f"Success {where}: {before} before, {after} after; {pair['gained']} starts gained, "
         f"{pair['lost']} lost, p = {pair['p_value']:.2g}.\n\nThe improved policy: `{improvement.improved}`"

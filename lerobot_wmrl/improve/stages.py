@@ -45,6 +45,10 @@ ALGORITHMS: Final[dict[str, Flags]] = {
 OTHERS: Final[Flags] = {"algorithm.type": "distillation"}
 """How all others are: they are fitted to a planner in the world model."""
 
+LONGEST_IMAGINATION: Final = 98
+"""Frames of an imagined episode at most. Where recorded episodes are longer, imagination also begins in their
+middle: every part of the task is imagined, and no prediction looks further ahead than this."""
+
 DONE_FRAMES: Final = 2
 """Consecutive done frames that make an imagined success, if the data shows that many."""
 
@@ -167,6 +171,11 @@ class Improvement:
         """Whether the dataset is large enough for held-out episodes."""
         return self.found.episodes >= VALIDATION_EVERY
 
+    @property
+    def length(self) -> int:
+        """Frames of an imagined episode."""
+        return min(self.found.longest, LONGEST_IMAGINATION)
+
     def _side(self) -> int:
         """Return the side of imagined frames in pixels."""
         return max(SIDE_STEP, min(SIDES[self.config.preset], self.found.frame_side) // SIDE_STEP * SIDE_STEP)
@@ -189,8 +198,9 @@ class Improvement:
         return {
             "env.type": "world_model", "env.world_model_path": str(self.out / "world_model"),
             **{f"env.{name}": value for name, value in self.config.dataset.flags().items()},
-            "env.dataset.max_starts": 1024, "env.reward.type": "general", "env.reward.alpha": 1,
-            "env.episode_length": self.found.longest, **self._done("env."),
+            "env.dataset.max_starts": 1024, "env.dataset.branches": (self.found.longest - 1) // self.length,
+            "env.reward.type": "general", "env.reward.alpha": 1, "env.episode_length": self.length,
+            **self._done("env."),
         }  # fmt: skip
 
     def _command(self, program: str, flags: Flags) -> list[str]:
@@ -221,7 +231,7 @@ class Improvement:
 
     def _world_model(self) -> list[str]:
         return self._learn("action_world_model", {
-            "model.tokenizer_path": str(self.out / "tokenizer"), "model.clip_length": self.found.longest + 2,
+            "model.tokenizer_path": str(self.out / "tokenizer"), "model.clip_length": self.length + 2,
         }, "world_model")  # fmt: skip
 
     def _check(self) -> list[str]:

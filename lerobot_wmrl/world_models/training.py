@@ -148,7 +148,7 @@ def make_clip_sampler(
     """Make a sampler of clips from these episodes, with what else the model looks at or predicts."""
     config, tokenizer, dataset = model.config, model.tokenizer, table.dataset
     longer, longest = table.length[episodes] > config.clip_length, int(table.length[episodes].max())
-    if 2 * longer.sum() > len(episodes):
+    if 2 * longer.sum() > len(episodes) and not config.context_channels:
         logging.warning(
             "%s: %d of %d episodes are longer than the clips that are learnt from, clip_length=%d frames "
             "(%.1f s): success is learnt up to there alone. --model.clip_length=%d holds the longest",

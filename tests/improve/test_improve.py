@@ -8,6 +8,10 @@ from pathlib import Path
 import pytest
 from lerobot.utils.constants import OBS_IMAGE
 
+from lerobot_policy_cnn.configuration_cnn import CnnConfig
+from lerobot_wmrl.data.episodes import DatasetSource
+from lerobot_wmrl.improve.findings import Findings
+from lerobot_wmrl.improve.stages import ImproveConfig, Improvement
 from tests.pusht import record_pusht
 from tests.rl.checkpoints import save_untrained_policy
 
@@ -74,3 +78,17 @@ def test_bad_settings_are_named_and_nothing_is_made(
     assert refused.returncode != 0
     assert message in refused.stderr
     assert not (tmp_path / "improve").exists()
+
+
+@pytest.mark.parametrize(("longest", "clip", "length", "branches"), [(40, 42, 40, 0), (300, 100, 98, 3)])
+def test_long_episodes_are_imagined_in_parts(
+    longest: int, clip: int, length: int, branches: int, tmp_path: Path
+) -> None:
+    """From frames all over them, as many as it takes to cover them."""
+    policy = CnnConfig(device="cpu", pretrained_path=tmp_path)
+    found = Findings([], [], ["top"], frame_side=96, episodes=40, fewest=40, longest=longest, held=2)
+    improvement = Improvement(ImproveConfig(policy=policy, dataset=DatasetSource("data")), found)
+    commands = {stage.name: stage.command() for stage in improvement.stages()}
+    assert f"--model.clip_length={clip}" in commands["world_model"]
+    for stage in ("rl", "comparison"):
+        assert {f"--env.episode_length={length}", f"--env.dataset.branches={branches}"} <= {*commands[stage]}
