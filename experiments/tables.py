@@ -93,18 +93,23 @@ def results_page(docs: Path = DOCS) -> str:
     """Return docs/results.md."""
 
     load = loader(docs)
-    parts, chapter = [INTRODUCTION], ""
+    parts, chapter, missing = [INTRODUCTION], "", []
     for name, (title, section) in SECTIONS.items():
-        if title != chapter:
-            chapter = title
-            parts.append(f"## {chapter}\n")
         cells = read_cells(STUDIES / f"{name}.yaml")
         results = [each for cell in cells for each in cell.results if each.endswith(".json")]
         published = [result for result in results if (docs / result).exists()]
-        text = joined(section(load)) if published or not results else "Not run yet."
-        parts.append(
-            f'### {cells[0].question}<a id="{name}"></a>\n\n{text}\n\n{origin(name, published, load)}\n'
-        )
+        if results and not published:
+            missing.append(
+                f"- [{name}.yaml](../experiments/{name}.yaml): {' '.join(cells[0].question.split())}"
+            )
+            continue
+        if title != chapter:
+            chapter = title
+            parts.append(f"## {chapter}\n")
+        heading = f'### {cells[0].question}<a id="{name}"></a>'
+        parts.append(f"{heading}\n\n{joined(section(load))}\n\n{origin(name, published, load)}\n")
+    if missing:
+        parts.append("## Not run yet\n\n" + "\n".join(missing) + "\n")
     return "\n".join(parts)
 
 
@@ -119,9 +124,10 @@ def origin(study: str, results: Sequence[str], load: Load) -> str:
     sources = [
         load(result.removeprefix("results/").removesuffix(".json"))["provenance"] for result in results
     ]
-    commits = ", ".join(dict.fromkeys(source["commit"] for source in sources))
+    named = (commit for source in sources for commit in source["commit"].split(", "))
+    commits = ", ".join(dict.fromkeys(named))
     machines = "; ".join(dict.fromkeys(source["machine"] for source in sources if "machine" in source))
-    where = f", {machines}" if machines else ""
+    where = f", {machines}".replace(", 1 cores", ", 1 core") if machines else ""
     where += "".join(f". {source['note']}" for source in sources if "note" in source).removesuffix(".")
     parts = [f"Commit {commits}{where}"] if sources else []
     parts += [", ".join(f"[{Path(result).name}]({result})" for result in results)] if results else []
