@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Container, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -55,7 +55,7 @@ class DatasetSource:
         """The folder, or the name on the hub, for messages and file names."""
         return self.root or self.repo_id or ""
 
-    def flags(self) -> dict[str, str]:
+    def flags(self) -> dict[str, Any]:
         """Return the flags that name the dataset on a command line."""
         named = {"root": self.root} if self.root else {"repo_id": self.repo_id, "revision": self.revision}
         return {f"dataset.{name}": value for name, value in named.items() if value}
@@ -72,17 +72,29 @@ class DatasetSource:
 
 
 @dataclass
-class TrainingData(DatasetSource):
+class ChosenEpisodes(DatasetSource):
+    """Episodes of a LeRobotDataset.
+
+    Args:
+        episodes: indices of the episodes to use, as in lerobot-train; by default all. Every twentieth episode
+            of the whole dataset is held out from training, chosen or not.
+    """
+
+    episodes: list[int] | None = None
+
+    def flags(self) -> dict[str, Any]:
+        return super().flags() | ({} if self.episodes is None else {"dataset.episodes": self.episodes})
+
+
+@dataclass
+class TrainingData(ChosenEpisodes):
     """A dataset to learn from.
 
     Args:
-        episodes: indices of the episodes to learn from, as in lerobot-train; by default all. Episodes that
-            are held out stay held out.
         more: folders of further datasets. Every second batch comes from one of them, in turn, so that half of
             the batches are old and half new (Ball et al. 2023).
     """
 
-    episodes: list[int] | None = None
     more: list[str] = field(default_factory=list)
 
 
@@ -133,6 +145,14 @@ class EpisodeTable:
     def validation(self) -> np.ndarray:
         """Held-out episodes. (E,)"""
         return np.arange(len(self.start)) % VALIDATION_EVERY == VALIDATION_EVERY - 1
+
+    def subset(self, episodes: np.ndarray) -> "EpisodeTable":
+        """Return some of the episodes, a mask (E,) or indices; `validation` means nothing in the result."""
+        columns = {name: values[episodes] for name, values in self.columns.items()}
+        return replace(
+            self, start=self.start[episodes], length=self.length[episodes], columns=columns,
+            instructions=np.array(self.instructions, object)[episodes].tolist(),
+        )  # fmt: skip
 
     def among(self, chosen: Sequence[int] | None) -> np.ndarray:
         """Mark the episodes that are `chosen`, all if None. FieldError names one that does not exist. (E,)"""

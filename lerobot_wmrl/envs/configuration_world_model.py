@@ -13,13 +13,13 @@ from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 from lerobot_wmrl.common.constants import TASKS
 from lerobot_wmrl.common.errors import FieldError, require_at_least
 from lerobot_wmrl.common.images import camera_key
-from lerobot_wmrl.data.episodes import DatasetSource
+from lerobot_wmrl.data.episodes import ChosenEpisodes
 from lerobot_wmrl.envs.uncertainty import Uncertainty
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 
 
 @dataclass
-class StartFrames(DatasetSource):
+class StartFrames(ChosenEpisodes):
     """Where imagined episodes begin: in the first frames of a dataset's episodes (`root` or `repo_id`), in
     saved frames (`frames`) or in ManiSkill's resets (`resets`).
 

@@ -128,7 +128,7 @@ def chosen_episodes(table: EpisodeTable, source: StartFrames) -> np.ndarray:
     Raises:
         ValueError: there is no such episode.
     """
-    wanted, scene = np.ones(len(table.start), bool), table.column(START_SCENE)
+    wanted, scene = table.among(source.episodes), table.column(START_SCENE)
     for name, column, values in (
         ("tasks", table.column(START_TASK), [TASKS.index(task) for task in source.tasks or ()]),
         ("scenes", scene, source.scenes or ()),

@@ -1,5 +1,6 @@
 """What a dataset offers to a policy that is to be improved, and what it lacks."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +27,7 @@ class Findings:
         cameras: names of the cameras that the policy looks at.
         frame_side: the shorter side of their frames in pixels.
         episodes: how many there are.
+        held_out: how many of them are held out from training.
         fewest: how many there are of the task that has the fewest.
         longest: frames of the longest episode.
         held: frames in which success holds in a successful episode, the median.
@@ -36,6 +38,7 @@ class Findings:
     cameras: list[str]
     frame_side: int
     episodes: int
+    held_out: int
     fewest: int
     longest: int
     held: int
@@ -44,12 +47,14 @@ class Findings:
         return "\n".join([*(f"  {line}" for line in self.lines), *(f"  ! {line}" for line in self.missing)])
 
 
-def look(table: EpisodeTable, policy: PreTrainedConfig) -> Findings:
-    """Describe a dataset, and check that a policy can be improved with it.
+def look(table: EpisodeTable, policy: PreTrainedConfig, episodes: Sequence[int] | None) -> Findings:
+    """Describe the chosen episodes of a dataset, and check that a policy can be improved with them.
 
     Raises:
         FieldError: the policy cannot be improved with it.
     """
+    chosen = table.among(episodes)
+    held_out, table = int((table.validation & chosen).sum()), table.subset(chosen)
     features, root, success = table.dataset.features, table.dataset.root, table.success
     keys = [key for key in policy.image_features if key.startswith(OBS_IMAGE)]
     sizes = {key: frame_size(features[key]) for key in keys if key in features}
@@ -81,7 +86,7 @@ def look(table: EpisodeTable, policy: PreTrainedConfig) -> Findings:
     return Findings(
         lines=lines, missing=missing(table), cameras=camera_names(keys),
         frame_side=min(map(min, sizes.values())), episodes=len(success),
-        fewest=int(tasks.min()), longest=int(table.length.max()),
+        held_out=held_out, fewest=int(tasks.min()), longest=int(table.length.max()),
         held=int(np.median(np.array(done)[success])),
     )  # fmt: skip
 

@@ -16,7 +16,7 @@ from lerobot_wmrl.common.errors import FieldError, require_at_least, require_cho
 from lerobot_wmrl.common.policies import read_policy_config, require_single_observations, require_trained
 from lerobot_wmrl.common.presets import Flags, format_flags
 from lerobot_wmrl.common.stages import Stage
-from lerobot_wmrl.data.episodes import VALIDATION_EVERY, DatasetSource
+from lerobot_wmrl.data.episodes import ChosenEpisodes, DatasetSource
 from lerobot_wmrl.improve.findings import Findings
 from lerobot_wmrl.rl.recorders import env_flags
 
@@ -84,7 +84,7 @@ class ImproveConfig(RunConfig):
     path_fields: ClassVar[list[str]] = ["policy"]
 
     policy: PreTrainedConfig | None = None
-    dataset: DatasetSource = field(default_factory=DatasetSource)
+    dataset: ChosenEpisodes = field(default_factory=ChosenEpisodes)
     real_env: EnvConfig | None = None
     rollouts: int = 0
     exploration: float = 0.2
@@ -168,8 +168,8 @@ class Improvement:
 
     @property
     def holds_out(self) -> bool:
-        """Whether the dataset is large enough for held-out episodes."""
-        return self.found.episodes >= VALIDATION_EVERY
+        """Whether some of the episodes are held out from training."""
+        return self.found.held_out > 0
 
     @property
     def length(self) -> int:
@@ -207,7 +207,8 @@ class Improvement:
         return [program, f"--preset={self.config.preset}", *format_flags(flags)]
 
     def _rollouts(self) -> list[str]:
-        like = {name.replace("dataset.", "like."): each for name, each in self.config.dataset.flags().items()}
+        whole = DatasetSource.flags(self.config.dataset)
+        like = {name.replace("dataset.", "like."): each for name, each in whole.items()}
         simulator = self.config.real_env is not None and self.config.real_env.type == "wmrl_maniskill"
         flags: Flags = {
             "policy.path": self.policy, **self._real_env("env"), **({} if simulator else like),

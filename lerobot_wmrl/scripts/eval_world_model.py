@@ -24,7 +24,7 @@ from lerobot_wmrl.common.command_line import RunConfig, claim_output_dir, run_co
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import FieldError, require_at_least
 from lerobot_wmrl.common.presets import expand_preset
-from lerobot_wmrl.data.episodes import DatasetSource
+from lerobot_wmrl.data.episodes import ChosenEpisodes
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ class EvalWorldModelConfig(RunConfig):
 
     model: Checkpoint = field(default_factory=Checkpoint)
     text_model: Checkpoint = field(default_factory=Checkpoint)
-    dataset: DatasetSource = field(default_factory=DatasetSource)
+    dataset: ChosenEpisodes = field(default_factory=ChosenEpisodes)
     split: str = "all"
     max_episodes: int = 200
     done_threshold: float = 0.5
@@ -129,7 +129,8 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     text_model = load_text_model(cfg, model)
     imagination = policies_imagination(cfg, table) if cfg.policies else None
     scenes = scene_splits(table.column(START_SCENE), cfg.split)
-    episodes = choose_episodes(table, cfg.split, cfg.max_episodes, scenes)
+    chosen = table.among(cfg.dataset.episodes)
+    episodes = choose_episodes(table, cfg.split, cfg.max_episodes, scenes, chosen)
     claim_output_dir(cfg.output_dir, draccus.encode(cfg))
     recording = Recording.read(table, model)
     evaluation = evaluate(model, recording, episodes)

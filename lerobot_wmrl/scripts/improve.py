@@ -31,7 +31,8 @@ def improve(cfg: ImproveConfig) -> None:
 
     cfg.check()
     assert cfg.policy is not None
-    improvement = Improvement(cfg, look(read_episodes(cfg.dataset.open()), cfg.policy))
+    table = read_episodes(cfg.dataset.open())
+    improvement = Improvement(cfg, look(table, cfg.policy, cfg.dataset.episodes))
     print(f"{cfg.dataset.name}:\n{improvement.found}\n  {improvement.duration}")
     stages = improvement.stages()
     with claimed(cfg.output_dir, settings(cfg)):

@@ -12,7 +12,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.tracking import read_metrics
-from lerobot_wmrl.data.episodes import DatasetSource
+from lerobot_wmrl.data.episodes import ChosenEpisodes
 from lerobot_wmrl.data.frame_cache import cached_depth, token_depth
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.maniskill.embodiment import FPS
@@ -116,7 +116,7 @@ def test_replays_measure_depth_on_the_tokens_grid(deep_dataset, models, tmp_path
         EvalWorldModelConfig(
             model=Checkpoint(str(models["action_world_model"])),
             text_model=Checkpoint(str(models["text_world_model"])),
-            dataset=DatasetSource(str(Path(deep_dataset.root))), output_dir=tmp_path / "replay",
+            dataset=ChosenEpisodes(str(Path(deep_dataset.root))), output_dir=tmp_path / "replay",
         )
     )  # fmt: skip
     metrics = json.loads((tmp_path / "replay" / "metrics.json").read_text())

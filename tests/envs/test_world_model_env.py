@@ -8,7 +8,7 @@ import torch
 from gymnasium.vector import AutoresetMode
 
 from lerobot_wmrl.common.constants import TASKS
-from lerobot_wmrl.data.episodes import DatasetSource
+from lerobot_wmrl.data.episodes import ChosenEpisodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
 from lerobot_wmrl.envs.uncertainty import Uncertainty
@@ -180,6 +180,9 @@ def test_starts_can_be_chosen_by_task_and_scene(config):
     assert count() == 6
     assert count(scenes=[1], tasks=[TASKS[0]]) == 3
     assert count(split="train,ind", scenes=[0]) == 3
+    assert count(episodes=[4, 0, 5]) == 3
+    with pytest.raises(ValueError, match=r"^dataset\.episodes=\[9\]: there is no episode 9"):
+        count(episodes=[9])
     with pytest.raises(ValueError, match=r"^dataset\.scenes=\[7\]: no episode"):
         count(scenes=[7])
     with pytest.raises(ValueError, match=rf"^dataset\.tasks=\['{TASKS[1]}'\]: no episode"):
@@ -342,7 +345,7 @@ def test_models_that_do_not_fit_together_are_refused(config, small_dataset, trai
         replace(config, text_world_model_path=str(text)).create_tensor_env(1)
     evaluation = EvalWorldModelConfig(
         model=Checkpoint(str(trained_models["action_world_model"])), text_model=Checkpoint(str(text)),
-        dataset=DatasetSource(str(root)), output_dir=tmp_path / "evaluation",
+        dataset=ChosenEpisodes(str(root)), output_dir=tmp_path / "evaluation",
     )  # fmt: skip
     with pytest.raises(ValueError, match="another tokenizer"):
         eval_world_model(evaluation)

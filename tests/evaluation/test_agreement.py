@@ -10,7 +10,7 @@ import pytest
 from lerobot_wmrl.common.checkpoints import resolve_checkpoint
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.statistics import Proportion
-from lerobot_wmrl.data.episodes import DatasetSource, read_episodes
+from lerobot_wmrl.data.episodes import ChosenEpisodes, read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.evaluation.agreement import Agreement, policy_checkpoints, policy_outcomes
@@ -55,7 +55,7 @@ def test_the_evaluation_reports_policies_beside_reality(imagination, small_datas
     """Reality is a world model here too, so that the test needs no simulator."""
     policy = save_untrained_policy(tmp_path / "policy", actions=7)
     cfg = EvalWorldModelConfig(
-        model=Checkpoint(imagination.world_model_path), dataset=DatasetSource(str(Path(small_dataset.root))),
+        model=Checkpoint(imagination.world_model_path), dataset=ChosenEpisodes(str(Path(small_dataset.root))),
         output_dir=tmp_path / "check", device="cpu", policies=[str(policy)], policy_episodes=4,
         done_threshold=0.0001, done_frames=1,
     )  # fmt: skip
@@ -76,7 +76,7 @@ def test_imagined_episodes_are_as_long_as_real_ones_and_none_is_repeated(imagina
     """Those of a simulator's task, or of another environment."""
     for real in (WmrlManiSkillEnv(task="push"), imagination):
         cfg = EvalWorldModelConfig(
-            model=Checkpoint(imagination.world_model_path), dataset=DatasetSource(str(small_dataset.root)),
+            model=Checkpoint(imagination.world_model_path), dataset=ChosenEpisodes(str(small_dataset.root)),
             policies=["policy"], policy_episodes=2, real_env=real, device="cpu",
         )  # fmt: skip
         table = read_episodes(cfg.dataset.open())
@@ -94,7 +94,7 @@ def test_a_world_model_without_a_known_success_is_refused_by_the_commands_own_fl
     config = json.loads((root / "config.json").read_text())
     (root / "config.json").write_text(json.dumps({**config, "learnt_successes": 0}))
     cfg = EvalWorldModelConfig(
-        model=Checkpoint(str(root)), dataset=DatasetSource(str(Path(small_dataset.root))),
+        model=Checkpoint(str(root)), dataset=ChosenEpisodes(str(Path(small_dataset.root))),
         policies=["policy"], real_env=imagination, output_dir=tmp_path / "check",
     )  # fmt: skip
     with pytest.raises(

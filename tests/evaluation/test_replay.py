@@ -11,7 +11,7 @@ import torch
 
 from lerobot_wmrl.common.constants import KINDS
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.episodes import DatasetSource, choose_episodes, open_dataset, read_episodes
+from lerobot_wmrl.data.episodes import ChosenEpisodes, choose_episodes, open_dataset, read_episodes
 from lerobot_wmrl.data.frames import NO_CONTEXT
 from lerobot_wmrl.evaluation import replay as replay_module
 from lerobot_wmrl.evaluation.accuracy import (
@@ -210,7 +210,7 @@ def test_an_episode_that_ends_without_success_is_a_failure(small_dataset, model,
 def test_episodes_of_which_nobody_knows_the_outcome_are_no_failures(small_dataset, trained_models, tmp_path):
     root = relabelled(Path(small_dataset.root), tmp_path / "unlabelled", UNLABELLED)
     config = EvalWorldModelConfig(
-        model=Checkpoint(str(trained_models["action_world_model"])), dataset=DatasetSource(str(root)),
+        model=Checkpoint(str(trained_models["action_world_model"])), dataset=ChosenEpisodes(str(root)),
         output_dir=tmp_path / "check",
     )  # fmt: skip
     eval_world_model(config)
@@ -225,7 +225,7 @@ def test_the_command_writes_figures_and_pictures(small_dataset, trained_models, 
     config = EvalWorldModelConfig(
         model=Checkpoint(str(trained_models["action_world_model"])),
         text_model=Checkpoint(str(trained_models["text_world_model"])),
-        dataset=DatasetSource(str(Path(small_dataset.root))),
+        dataset=ChosenEpisodes(str(Path(small_dataset.root))),
         split="train,ind",
         output_dir=folder,
     )

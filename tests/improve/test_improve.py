@@ -9,7 +9,7 @@ import pytest
 from lerobot.utils.constants import OBS_IMAGE
 
 from lerobot_policy_cnn.configuration_cnn import CnnConfig
-from lerobot_wmrl.data.episodes import DatasetSource
+from lerobot_wmrl.data.episodes import ChosenEpisodes
 from lerobot_wmrl.improve.findings import Findings
 from lerobot_wmrl.improve.stages import ImproveConfig, Improvement
 from tests.pusht import record_pusht
@@ -58,12 +58,14 @@ def test_with_a_real_environment_its_rollouts_are_learnt_from_and_success_is_mea
 
 
 def test_without_one_the_report_says_that_it_is_a_belief(demonstrations: Path, tmp_path: Path) -> None:
-    done = run(tmp_path, demonstrations)
+    done = run(tmp_path, demonstrations, "--dataset.episodes=[0,2]")
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     report = (tmp_path / "improve" / "report.md").read_text()
     assert "Success in imagination" in report
     assert "shows nothing about the real world" in report
     assert "from which it has learnt" in report
+    assert "2 episodes, " in done.stdout
+    assert report.count("dataset.episodes=[0,2]") == 5
 
 
 @pytest.mark.parametrize(("flags", "message"), [
@@ -86,8 +88,10 @@ def test_long_episodes_are_imagined_in_parts(
 ) -> None:
     """From frames all over them, as many as it takes to cover them."""
     policy = CnnConfig(device="cpu", pretrained_path=tmp_path)
-    found = Findings([], [], ["top"], frame_side=96, episodes=40, fewest=40, longest=longest, held=2)
-    improvement = Improvement(ImproveConfig(policy=policy, dataset=DatasetSource("data")), found)
+    found = Findings(
+        [], [], ["top"], frame_side=96, episodes=40, held_out=2, fewest=40, longest=longest, held=2
+    )
+    improvement = Improvement(ImproveConfig(policy=policy, dataset=ChosenEpisodes("data")), found)
     commands = {stage.name: stage.command() for stage in improvement.stages()}
     assert f"--model.clip_length={clip}" in commands["world_model"]
     for stage in ("rl", "comparison"):

@@ -21,7 +21,7 @@ from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.tracking import read_metrics
-from lerobot_wmrl.data.episodes import DatasetSource, camera_names, open_dataset
+from lerobot_wmrl.data.episodes import ChosenEpisodes, camera_names, open_dataset
 from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
 from lerobot_wmrl.world_models.checkpoint import read_config
 from tests.scripts.test_train import improve
@@ -163,7 +163,7 @@ def test_a_world_model_and_a_policy_learn_from_it(
     root = record(tmp_path / "data", WORKS[name])
     world_model = learn(root, tmp_path)
     eval_world_model(EvalWorldModelConfig(
-        model=Checkpoint(str(world_model)), dataset=DatasetSource(str(root)), output_dir=tmp_path / "check"
+        model=Checkpoint(str(world_model)), dataset=ChosenEpisodes(str(root)), output_dir=tmp_path / "check"
     ))  # fmt: skip
     metrics = reinforce(monkeypatch, root, world_model, tmp_path)
     assert metrics["step"] == 1

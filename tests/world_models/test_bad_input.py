@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.episodes import DatasetSource, choose_episodes, read_episodes
+from lerobot_wmrl.data.episodes import ChosenEpisodes, choose_episodes, read_episodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
@@ -45,7 +45,7 @@ def test_another_dataset_than_the_tokenizers_is_named(make_synthetic_dataset, tr
     message = r"no observation\.images\.third_view \(its cameras: observation\.images\.top\)"
     with pytest.raises(ValueError, match=message):
         run_training(action_config(trained_models["frame_tokenizer"]), root, tmp_path / "out")
-    source, model = DatasetSource(str(root)), Checkpoint(str(trained_models["action_world_model"]))
+    source, model = ChosenEpisodes(str(root)), Checkpoint(str(trained_models["action_world_model"]))
     with pytest.raises(ValueError, match=message):
         eval_world_model(EvalWorldModelConfig(model=model, dataset=source, output_dir=tmp_path / "out"))
     env = WorldModelEnv(

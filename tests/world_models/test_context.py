@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_wmrl.data.episodes import DatasetSource, read_episodes
+from lerobot_wmrl.data.episodes import ChosenEpisodes, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames, cached_tokens, frames_to_tensor
 from lerobot_wmrl.data.frames import NO_CONTEXT
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
@@ -212,7 +212,7 @@ def test_evaluation_decodes_beside_the_start_and_runs_whole(models, small_datase
         EvalWorldModelConfig(
             model=Checkpoint(str(models["action_world_model"])),
             text_model=Checkpoint(str(models["text_world_model"])),
-            dataset=DatasetSource(str(small_dataset.root)), output_dir=tmp_path / "evaluation",
+            dataset=ChosenEpisodes(str(small_dataset.root)), output_dir=tmp_path / "evaluation",
         )
     )  # fmt: skip
     assert (tmp_path / "evaluation" / "goal_frames.png").is_file()

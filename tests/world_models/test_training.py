@@ -15,7 +15,7 @@ from lerobot_wmrl.common.presets import PRESETS, preset_flags
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data.clips import ClipSampler, InTurn
 from lerobot_wmrl.data.episodes import (
-    DatasetSource,
+    ChosenEpisodes,
     TrainingData,
     open_dataset,
     read_episodes,
@@ -214,7 +214,7 @@ def test_a_world_model_does_without_proprioception(small_dataset, trained_models
     eval_world_model(
         EvalWorldModelConfig(
             model=Checkpoint(str(action)), text_model=Checkpoint(str(text)),
-            dataset=DatasetSource(str(root)), output_dir=tmp_path / "replay",
+            dataset=ChosenEpisodes(str(root)), output_dir=tmp_path / "replay",
         )
     )  # fmt: skip
     assert "tcp_error_mm_by_step" not in json.loads((tmp_path / "replay" / "metrics.json").read_text())
