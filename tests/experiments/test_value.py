@@ -66,7 +66,7 @@ def test_the_section_compares_the_best_with_and_without_a_world_model(docs: Path
         f"{TITLES['planned']} | +20.0 points" in text
     )
     assert "from the demonstrations alone in 0 of 2 cells" in text
-    assert "| 8 | 300 | cloning of the demonstrations | 50, 60 → 55 %" in text
+    assert "| 8 | 300 | BC of the demonstrations | 50, 60 → 55 %" in text
 
 
 def test_rounds_stand_in_the_same_table_for_the_seeds_that_have_them(docs: Path) -> None:
