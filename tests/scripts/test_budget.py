@@ -142,7 +142,7 @@ def test_what_the_budget_knows_is_learnt_from(run: Any, paths: dict[str, Any]) -
     out = run(train_world_model, "--budget={budget}", *TOKENIZER, "--dataset.episodes=[0,1]")
     assert (out / "checkpoints" / "last").exists()
     shutil.rmtree(out)
-    starts = ["--env.dataset.root={data}", "--env.dataset.max_starts=1", UNCHECKED]
+    starts = ["--env.dataset.root={data}", "--env.dataset.episodes=[0,1]", UNCHECKED]
     assert (run(train, "--budget={budget}", *IMAGINED, *starts) / "checkpoints" / "last").exists()
 
 
