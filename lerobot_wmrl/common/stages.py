@@ -26,6 +26,7 @@ from typing import Any, BinaryIO
 import huggingface_hub.constants
 import psutil
 
+from lerobot_wmrl.common.command_line import different_settings
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.files import foreign_files, write_json
 from lerobot_wmrl.common.precision import keep_freed_memory
@@ -84,13 +85,12 @@ def claimed(output_dir: Path, settings: Mapping[str, Any]) -> Iterator[None]:
 
 
 def check_settings(output_dir: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
-    """Raise FieldError for a setting that differs from the one the folder was begun with."""
-    for name, value in wanted.items():
-        if found.get(name) != value:
-            raise FieldError(
-                name, value, f"{output_dir} was started with {found.get(name)}",
-                "give that value to continue, or another `output_dir`",
-            )  # fmt: skip
+    """Raise FieldError for settings that differ from those that the folder was begun with."""
+    if differing := different_settings(found, wanted, ()):
+        raise FieldError(
+            "output_dir", output_dir, f"was started with other settings ({'; '.join(differing)})",
+            "repeat the first ones to continue, or choose another folder",
+        )  # fmt: skip
 
 
 def run_stages(

@@ -118,7 +118,7 @@ def test_other_settings_are_refused_by_name(tmp_path: Path) -> None:
     with claimed(tmp_path, {"seed": 1}):
         pass
     with (
-        pytest.raises(ValueError, match=r"seed=2: .* was started with 1"),
+        pytest.raises(ValueError, match=r"^output_dir=.* was started with other settings \(seed 1 → 2\)"),
         claimed(tmp_path, {"seed": 2}),
     ):
         pass
