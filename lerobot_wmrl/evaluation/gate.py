@@ -107,7 +107,7 @@ class Outcomes:
 
         As in the environment, `frames` consecutive frames must reach `threshold`; it is the first of them.
         """
-        return first_run(self.lasting(frames) >= threshold, frames)
+        return first_run(self.padded_probability(frames) >= threshold, frames)
 
     def cut_short(self, frames: int) -> np.ndarray:
         """Mark episodes that end with a success that has held for fewer than `frames` frames. (E,)"""
@@ -119,10 +119,11 @@ class Outcomes:
         assert self.held is not None
         return self.held < frames
 
-    def lasting(self, frames: int) -> np.ndarray:
-        """Return the predicted probabilities. Where episodes end at success, last frames last longer. (E, T')
+    def padded_probability(self, frames: int) -> np.ndarray:
+        """Return the predicted probabilities. (E, T')
 
-        The prediction for the last frame, of failures as well, then counts for as long as `frames` needs.
+        Where episodes end at success, the prediction for the last frame is repeated, in failures as well, so
+        that it can hold for `frames` frames.
         """
         if not self.ends_at_success(frames):
             return self.probability
@@ -133,7 +134,7 @@ class Outcomes:
 
     def scores(self, frames: int) -> np.ndarray:
         """Return the highest threshold at which the model predicts success for `frames` frames. (E,)"""
-        probability = np.nan_to_num(self.lasting(frames))
+        probability = np.nan_to_num(self.padded_probability(frames))
         if probability.shape[1] < frames:
             return np.zeros(len(probability))
         return np.lib.stride_tricks.sliding_window_view(probability, frames, axis=1).min(-1).max(1)
@@ -160,8 +161,8 @@ class Gate:
         false_positives: of the recorded failures, those predicted as successes.
         recall: of the recorded successes, those predicted as successes.
         cut_short: episodes that end before their success has held for `frames` frames.
-        lasting: whether last frames count as if they lasted, `Outcomes.lasting`; if not, no model can predict
-            the successes that are cut short.
+        repeats_last: whether the prediction for the last frame is repeated (`Outcomes.padded_probability`);
+            if not, no model can predict the successes that are cut short.
         auc: area under the ROC curve over all thresholds, `Outcomes.auc`.
     """
 
@@ -170,7 +171,7 @@ class Gate:
     false_positives: Proportion
     recall: Proportion
     cut_short: int
-    lasting: bool
+    repeats_last: bool
     auc: float
 
     @property
@@ -185,7 +186,7 @@ class Gate:
             "false_positive_rate": self.false_positives.as_json(),
             "recall": self.recall.as_json(),
             "successes_cut_short": self.cut_short,
-            "last_frames_last": self.lasting,
+            "repeats_last_frame": self.repeats_last,
             "auc": None if math.isnan(self.auc) else self.auc,
             "passed": self.passed,
         }
@@ -273,7 +274,7 @@ def best_operating_point(gates: Sequence[Gate]) -> Gate | None:
     """
 
     def merit(gate: Gate) -> tuple[float, ...]:
-        return gate.recall.k, -gate.false_positives.k, not gate.lasting, gate.threshold, gate.frames
+        return gate.recall.k, -gate.false_positives.k, not gate.repeats_last, gate.threshold, gate.frames
 
     allowed = [
         gate for gate in gates if gate.false_positives.share <= MAX_FALSE_POSITIVE_RATE and gate.recall.k

@@ -222,13 +222,13 @@ def gate_lines(gate: Gate, best: Gate | None) -> str:
         lines.append(
             f"{gate.cut_short} of the successes end before they have held for {gate.frames} frames. "
             + (
-                "As most do, the last frame of every episode counts as if it lasted."
-                if gate.lasting
+                "As most do, the prediction for the last frame of every episode is repeated."
+                if gate.repeats_last
                 else "They cannot be predicted; lower done_frames, or record on after success."
             )
         )
     if best is None:
-        lines.append("No operating point recognises a success with at most 5 % false positives.")
+        lines.append("No operating point has any recall with at most 5 % false positives.")
     else:
         lines.append(
             f"Best with at most 5 % false positives: done_threshold={best.threshold} and "

@@ -72,7 +72,7 @@ def test_where_episodes_end_at_success_their_last_frames_count_as_lasting():
     at_success = Outcomes(np.arange(3), probability, done)
     gate = gate_at(at_success, 0.5, 3)
     assert (gate.recall.k, gate.false_positives.k) == (1, 1)
-    assert "As most do, the last frame of every episode counts" in gate_lines(gate, None)
+    assert "As most do, the prediction for the last frame" in gate_lines(gate, None)
     assert at_success.scores(3).tolist() == [0.9, 0.9, 0.1]
     assert done_delay(at_success, 0.5, 3)[0] == 0
     parts = [at_success.where(np.array(kept)) for kept in ([True, False, True], [False, True, False])]
