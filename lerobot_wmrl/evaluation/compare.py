@@ -103,16 +103,25 @@ def load_policies(configs: Mapping[str, PreTrainedConfig]) -> list[LoadedPolicy]
 
 
 @contextmanager
-def opened(config: EnvConfig, n_envs: int, trust_remote_code: bool) -> Iterator[Envs]:
-    """Make the environment for `n_envs` episodes at once, and close it in the end."""
-    envs = make_env(config, n_envs, use_async_envs=is_own(config), trust_remote_code=trust_remote_code)
+def opened(config: EnvConfig, n_envs: int, trust_remote_code: bool, policies: int) -> Iterator[list[Envs]]:
+    """Make the environments of that many policies, for `n_envs` episodes at once; close them in the end.
+
+    This project's own are shared. LeRobot's are not: in LIBERO the number of resets so far, and not the seed,
+    chooses the start.
+    """
+    own = is_own(config)
+    made = [
+        make_env(config, n_envs, use_async_envs=own, trust_remote_code=trust_remote_code)
+        for _ in range(1 if own else policies)
+    ]
     try:
-        yield envs
+        yield made * policies if own else made
     finally:
-        for env in _flat(envs):
-            if hasattr(env, "results"):
-                env.results.episodes.clear()  # ManiSkill's table by scene counts a seed for one policy only
-        close_envs(envs)
+        for envs in made:
+            for env in _flat(envs):
+                if hasattr(env, "results"):
+                    env.results.episodes.clear()  # the table by scene counts a seed for one policy
+            close_envs(envs)
 
 
 def _flat(envs: Envs) -> list[Any]:
@@ -133,12 +142,13 @@ def require_new_starts(envs: Envs, config: EnvConfig, n_episodes: int) -> None:
 
 
 def run_comparison(
-    comparison: Comparison, envs: Envs, config: EnvConfig, policies: Sequence[LoadedPolicy],
+    comparison: Comparison, envs: Sequence[Envs], config: EnvConfig, policies: Sequence[LoadedPolicy],
     batch_size: int, seed: int, save: Callable[[], None],
 ) -> None:  # fmt: skip
     """Add blocks of `batch_size` starts of each task until the comparison is finished.
 
     Args:
+        envs: those of each policy.
         seed: of the first start of each task; each further one adds one.
         save: called after every block.
     """
@@ -153,16 +163,16 @@ def run_comparison(
 
 @torch.no_grad()
 def run_block(
-    envs: Envs, config: EnvConfig, policies: Sequence[LoadedPolicy], count: int, seed: int
+    envs: Sequence[Envs], config: EnvConfig, policies: Sequence[LoadedPolicy], count: int, seed: int
 ) -> list[Episode]:
     """Run every policy from the same `count` starts of each task."""
     outcomes: list[dict[tuple[str, int, int], bool]] = []
-    for loaded in policies:
+    for loaded, own_envs in zip(policies, envs, strict=True):
         set_seed(seed)  # a comparison that is continued draws the same random actions
         processors = *make_env_pre_post_processors(config, loaded.config), *loaded.processors
         outcomes.append({
             (suite, task, episode["seed"]): bool(episode["success"])
-            for suite, tasks in envs.items()
+            for suite, tasks in own_envs.items()
             for task, env in tasks.items()
             for episode in eval_policy(
                 env, loaded.policy, *processors, n_episodes=count, start_seed=seed

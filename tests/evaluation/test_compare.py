@@ -11,7 +11,7 @@ import pytest
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from lerobot.configs.types import FeatureType, PolicyFeature
-from lerobot.envs.configs import EnvConfig
+from lerobot.envs.configs import EnvConfig, PushtEnv
 from lerobot.policies.factory import make_pre_post_processors
 
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
@@ -22,7 +22,7 @@ from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.evaluation import compare as running
-from lerobot_wmrl.evaluation.compare import checkpoint_name
+from lerobot_wmrl.evaluation.compare import checkpoint_name, opened
 from lerobot_wmrl.evaluation.comparison import Comparison, Episode
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.scripts.compare import CompareConfig, compare
@@ -283,3 +283,10 @@ def test_policies_are_compared_in_maniskill(tmp_path, caplog):
     found = results_of(CompareConfig(policies, env, n_episodes=2, batch_size=1, output_dir=tmp_path / "out"))
     assert [episode["successes"] for episode in found["episodes"]] == [[False, False]] * 2
     assert "Success by scene" not in caplog.text
+
+
+def test_each_policy_has_environments_of_its_own_where_resets_may_be_counted(imagination: WorldModelEnv):
+    with opened(PushtEnv(episode_length=2), 1, False, policies=2) as (first, second):
+        assert first["pusht"][0] is not second["pusht"][0]
+    with opened(imagination, 1, False, policies=2) as (first, second):
+        assert first is second
