@@ -173,12 +173,10 @@ def check_starts(source: StartFrames, ledger: Ledger | None) -> None:
         ledger.require_known(table, episodes)
 
 
-def undecided_frames(table: EpisodeTable) -> np.ndarray:
-    """Return the number of frames before each episode's first success, all of them if there is none. (E,)"""
-    return np.array([
-        np.flatnonzero([*table.done[start : start + length], True])[0]
-        for start, length in zip(table.start, table.length, strict=True)
-    ])  # fmt: skip
+def undecided_frames(table: EpisodeTable, episodes: np.ndarray) -> np.ndarray:
+    """Return the number of frames before the first success of K episodes, all if there is none. (K,)"""
+    start, solved = table.start[episodes], np.append(np.flatnonzero(table.done), len(table.done))
+    return np.minimum(solved[np.searchsorted(solved, start)] - start, table.length[episodes])
 
 
 def branch_frames(table: EpisodeTable, episodes: np.ndarray, branches: int) -> np.ndarray:
@@ -186,7 +184,7 @@ def branch_frames(table: EpisodeTable, episodes: np.ndarray, branches: int) -> n
 
     They are spread evenly over the frames before its success, and before its last frame.
     """
-    last = np.minimum(undecided_frames(table)[episodes], table.length[episodes] - 1)
+    last = np.minimum(undecided_frames(table, episodes), table.length[episodes] - 1)
     offsets = np.maximum(last, 1)[:, None] * np.arange(1 + branches) // (1 + branches)
     return np.unique(table.start[episodes, None] + offsets)
 

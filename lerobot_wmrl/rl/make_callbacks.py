@@ -81,10 +81,10 @@ def make_measures(settings: CallbackSettings, trained: Trained) -> dict[str, Mea
             return evaluate_policy(config, policy, processors, episodes, SELECTION_SEED, num_envs=1)
         measured_env = env
         if isinstance(env, WorldModelVectorEnv):
-            own = replace(env.config.dataset, branches=0)
-            given = StartFrames(dataset.root, dataset.repo_id, dataset.revision)
-            if dataset.given or env.config.dataset.branches:
-                measured_env = make_success_env(env, given if dataset.given else own)
+            own = env.config.dataset
+            source = StartFrames(**vars(dataset)) if dataset.given else replace(own, branches=0)
+            if source != own:
+                measured_env = make_success_env(env, source)
         return evaluate_within(measured_env, config, policy, processors, episodes, SELECTION_SEED)
 
     if isinstance(env, WorldModelVectorEnv):
