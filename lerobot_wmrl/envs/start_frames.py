@@ -182,11 +182,14 @@ def undecided_frames(table: EpisodeTable, episodes: np.ndarray) -> np.ndarray:
 def branch_frames(table: EpisodeTable, episodes: np.ndarray, branches: int) -> np.ndarray:
     """Return the rows of each episode's first frame and `branches` later ones. (K,), without repetitions
 
-    They are spread evenly over the frames before its success, and before its last frame.
+    They are spread evenly over the frames before its success, and before its last frame. All first frames
+    come before the later ones, so that the first N starts are of as many episodes as there are.
     """
     last = np.minimum(undecided_frames(table, episodes), table.length[episodes] - 1)
     offsets = np.maximum(last, 1)[:, None] * np.arange(1 + branches) // (1 + branches)
-    return np.unique(table.start[episodes, None] + offsets)
+    rows = (table.start[episodes, None] + offsets).T.flatten()
+    _, first = np.unique(rows, return_index=True)
+    return rows[np.sort(first)]
 
 
 def read_dataset_frames(source: StartFrames, config: WorldModelConfig) -> StartImages:
