@@ -12,6 +12,7 @@ demo: setup  ## the whole loop, then outputs/demo/report.html
 	.venv/bin/lerobot-wmrl-demo --preset=demo --output_dir=outputs/demo $(DEMO_FLAGS)
 
 test: setup
+	@tools/ensure_browser.sh
 	OMP_NUM_THREADS=1 .venv/bin/python -m pytest $(PYTEST_FLAGS)
 
 lint: setup

@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,17 @@ LAST_CHECKPOINT = f"{CHECKPOINTS_DIR}/{LAST_CHECKPOINT_LINK}"
 
 BEST_CHECKPOINT_LINK = "best"
 """Beside LeRobot's `last`: the checkpoint of a policy that succeeded most often on the selection seeds."""
+
+
+@dataclass
+class Checkpoint:
+    """A trained model.
+
+    Args:
+        path: output folder of its training, or one of its checkpoints.
+    """
+
+    path: str = ""
 
 
 def resolve_checkpoint(path: str | Path) -> Path:

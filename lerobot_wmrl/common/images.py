@@ -12,6 +12,11 @@ def camera_key(camera: str) -> str:
     return camera if camera.startswith("observation.") else f"{OBS_IMAGES}.{camera}"
 
 
+def to_bytes(images: Tensor) -> Tensor:
+    """Convert images from [0, 1] to uint8."""
+    return (images * 255).round().byte()
+
+
 def stretch(images: Tensor, height: int, width: int) -> Tensor:
     """Stretch images to a size, each axis by itself: (…, C, h, w) → (…, C, height, width).
 

@@ -127,14 +127,7 @@ class WorldModelEnv(EnvConfig):
                 "fps", self.fps, f"the world model has learnt {model.embodiment.fps} frames a second",
                 "leave it out",
             )  # fmt: skip
-        success_alone = isinstance(self.reward, GeneralConfig) and not self.reward.needs_goal
-        if model.learnt_successes == 0 and success_alone:
-            raise FieldError(
-                "world_model_path", self.world_model_path,
-                "has learnt from no episode that is known to succeed, so it would never reward",
-                "label the episodes with lerobot-wmrl-label and train it again, or choose another reward "
-                "(`reward.type`)",
-            )  # fmt: skip
+        self._check_rewarding(model)
         self.fps, self.episode_length = model.embodiment.fps, self.episode_length or model.clip_length
         self._check_length()
         self.features[ACTION] = PolicyFeature(type=FeatureType.ACTION, shape=(model.action_size,))
@@ -157,6 +150,17 @@ class WorldModelEnv(EnvConfig):
         if unknown:
             raise FieldError("dataset.tasks", unknown, f"choose from {', '.join(TASKS)}")
         self.uncertainty.check()
+
+    def _check_rewarding(self, model: Any) -> None:
+        """Raise FieldError if the world model would never reward."""
+        success_alone = isinstance(self.reward, GeneralConfig) and not self.reward.needs_goal
+        if model.learnt_successes == 0 and success_alone:
+            raise FieldError(
+                "world_model_path", self.world_model_path,
+                "has learnt from no episode that is known to succeed, so it would never reward",
+                "label the episodes with lerobot-wmrl-label and train it again, or choose another reward "
+                "(`reward.type`)",
+            )  # fmt: skip
 
     def _check_length(self) -> None:
         if self.episode_length is None:

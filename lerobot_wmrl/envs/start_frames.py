@@ -5,10 +5,10 @@ world model then tokenises them (`Starts`), and the text world model imagines th
 K is the number of starts, N the number of cameras.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from zipfile import BadZipFile
 
 import numpy as np
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from lerobot_wmrl.common.constants import START_SCENE, START_TASK, TASKS
 from lerobot_wmrl.common.errors import FieldError, within
-from lerobot_wmrl.common.images import stretch
+from lerobot_wmrl.common.images import stretch, to_bytes
 from lerobot_wmrl.data.budget import Ledger
 from lerobot_wmrl.data.episodes import (
     EpisodeTable,
@@ -38,6 +38,7 @@ from lerobot_wmrl.world_models.checkpoint import check_dataset
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 from lerobot_wmrl.world_models.configuration_world_model import WorldModelConfig
 from lerobot_wmrl.world_models.goal import imagine_goal
+from lerobot_wmrl.world_models.modeling_frame_tokenizer import stack_cameras
 from lerobot_wmrl.world_models.modeling_world_model import (
     ActionWorldModelRewardModel,
     TextWorldModelRewardModel,
@@ -204,8 +205,13 @@ def read_dataset_frames(source: StartFrames, config: WorldModelConfig) -> StartI
             "the world model is not shown how an episode began, so it cannot tell success from its middle on",
             "train its tokenizer with `model.tokenizer.context=true`, or leave `branches` out",
         )  # fmt: skip
-    episodes = chosen_episodes(table, source)
-    rows = branch_frames(table, episodes, source.branches)
+    return recorded_frames(
+        table, branch_frames(table, chosen_episodes(table, source), source.branches), sizes
+    )
+
+
+def recorded_frames(table: EpisodeTable, rows: np.ndarray, sizes: TokenizerConfig) -> StartImages:
+    """Read these rows (K,) of a dataset as a tokenizer of these sizes sees them."""
     episodes = np.searchsorted(table.start, rows, side="right") - 1
     images = cached_frames(table.dataset, sizes.camera_keys, sizes.image_size)
 
@@ -221,6 +227,19 @@ def read_dataset_frames(source: StartFrames, config: WorldModelConfig) -> StartI
         table.column(START_TASK)[episodes],
         depth,
     )
+
+
+def observed_frame(observation: Mapping[str, Any], sizes: TokenizerConfig) -> StartImages:
+    """Take what an environment shows, in LeRobot's names and batches of one, as the start of an episode.
+
+    Raises:
+        ValueError: it lacks a camera of the tokenizer.
+    """
+    seen = {name: value.cpu() for name, value in observation.items() if isinstance(value, Tensor)}
+    images = to_bytes(stack_cameras(seen, sizes.camera_keys, sizes.image_size)).movedim(-3, -1).numpy()
+    state = seen.get(OBS_STATE, torch.zeros(len(images), 0)).float().numpy()
+    unknown = np.full(len(images), -1)
+    return StartImages(images, images, state, list(observation["task"]), unknown, without_depth)
 
 
 def read_saved_frames(path: Path, max_starts: int, config: WorldModelConfig) -> StartImages:
@@ -256,7 +275,7 @@ def read_saved_frames(path: Path, max_starts: int, config: WorldModelConfig) -> 
     instructions = [str(text) for text in found[INSTRUCTION][rows]]
     state = found[OBS_STATE][rows].astype(np.float32)
     squares = np.stack([_squares(found[name][rows], side) for name in shapes], 1)
-    return StartImages(squares, squares, state, instructions, np.full(len(rows), -1), _no_depth)
+    return StartImages(squares, squares, state, instructions, np.full(len(rows), -1), without_depth)
 
 
 def _squares(images: np.ndarray, side: int) -> np.ndarray:
@@ -299,7 +318,7 @@ def simulate_first_frames(source: StartFrames, config: WorldModelConfig) -> Star
     views = ([frame.images[camera] for frame in frames] for camera in sizes.cameras)
     images = np.stack([_squares(np.stack(view), sizes.image_size) for view in views], 1)
     state = np.stack([frame.state for frame in frames])
-    return StartImages(images, images, state, instructions, np.array(indices), _no_depth)
+    return StartImages(images, images, state, instructions, np.array(indices), without_depth)
 
 
 def resets_side(sizes: TokenizerConfig) -> int:
@@ -317,7 +336,7 @@ def resets_side(sizes: TokenizerConfig) -> int:
     return sides.pop()
 
 
-def _no_depth(model: WorldModelRewardModel) -> None:
+def without_depth(model: WorldModelRewardModel) -> None:
     """Raise FieldError if the model looks at depth."""
     if model.config.depth:
         raise FieldError(

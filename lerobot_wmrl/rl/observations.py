@@ -6,6 +6,7 @@ import torch
 from lerobot.utils.constants import OBS_IMAGE
 from torch import Tensor
 
+from lerobot_wmrl.common.images import to_bytes
 from lerobot_wmrl.rl.protocol import Observation
 
 TASK = "task"
@@ -64,11 +65,6 @@ def decoded(stored: dict[str, Tensor], instructions: Sequence[str]) -> Observati
         else value
         for name, value in stored.items()
     }  # fmt: skip
-
-
-def to_bytes(image: Tensor) -> Tensor:
-    """Convert an image from [0, 1] to uint8."""
-    return (image * 255).round().byte()
 
 
 def as_read_back(observation: Observation) -> Observation:

@@ -23,6 +23,7 @@ from lerobot_wmrl.common.constants import KINDS, POLICY, START_KIND, START_SEED
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.exploration import ExplorationNoise
 from lerobot_wmrl.common.files import whole_folder
+from lerobot_wmrl.common.images import to_bytes
 from lerobot_wmrl.common.policies import load_policy, load_processors, read_policy_config
 from lerobot_wmrl.common.presets import Flags, format_flags
 from lerobot_wmrl.common.processes import run_subcommand
@@ -31,7 +32,6 @@ from lerobot_wmrl.data.embodiment import HIGH, LOW, Embodiment, read_embodiment,
 from lerobot_wmrl.data.episodes import open_dataset, read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
-from lerobot_wmrl.rl.observations import to_bytes
 
 DERIVED = ("features", "features_map")
 """Settings of an environment that are derived from others."""
@@ -181,16 +181,9 @@ class RolloutRecorder:
 
     def _create(self, folder: Path, observation: Observation) -> LeRobotDataset:
         """Create an empty dataset for what this observation shows."""
-        flag, whole = ({"dtype": kind, "shape": (1,), "names": None} for kind in ("bool", "int64"))
+        whole = {"dtype": "int64", "shape": (1,), "names": None}
         own = {
-            **observation_features(observation, self.robot.state_names, "video" if self.video else "image"),
-            ACTION: {
-                "dtype": "float32", "shape": (len(self.robot.action_names),),
-                "names": self.robot.action_names,
-                "info": {LOW: self.robot.action_low, HIGH: self.robot.action_high},
-            },
-            "next.reward": {"dtype": "float32", "shape": (1,), "names": None},
-            "next.success": flag, "next.done": flag,
+            **episode_features(observation, self.robot, "video" if self.video else "image"),
             START_SEED: whole, START_KIND: whole,
         }  # fmt: skip
         features = own if self.like is None else matched(own, self.like.features)
@@ -212,13 +205,7 @@ class RolloutRecorder:
         success = bool(taken["success"][row, length - 1])
         for step in range(length):
             observation = seen.observations[step]
-            frame: dict[str, Any] = {
-                key: to_bytes(value[row]).permute(1, 2, 0).cpu().numpy()
-                if key.startswith(OBS_IMAGE)
-                else value[row].cpu().numpy().astype(np.float32)
-                for key, value in observation.items()
-                if isinstance(value, Tensor)
-            }
+            frame: dict[str, Any] = observation_row(observation, row)
             solved = bool(taken["success"][row, step]) or (success and step >= length - self.hold)
             frame |= {
                 ACTION: seen.actions[step][row],
@@ -230,6 +217,33 @@ class RolloutRecorder:
             dataset.add_frame({**kept, "task": (observation.get("task") or [""])[row]})
         dataset.save_episode()
         return success
+
+
+def episode_features(observation: Observation, robot: Embodiment, camera: str) -> dict[str, dict[str, Any]]:
+    """Describe the columns of what a robot does: a batch of its observations, actions, reward and success.
+
+    camera: how images are stored, image or video.
+    """
+    flag, number = ({"dtype": kind, "shape": (1,), "names": None} for kind in ("bool", "float32"))
+    return {
+        **observation_features(observation, robot.state_names, camera),
+        ACTION: {
+            "dtype": "float32", "shape": (len(robot.action_names),), "names": robot.action_names,
+            "info": {LOW: robot.action_low, HIGH: robot.action_high},
+        },
+        "next.reward": number, "next.success": flag, "next.done": flag,
+    }  # fmt: skip
+
+
+def observation_row(observation: Observation, row: int) -> dict[str, np.ndarray]:
+    """Return one row of a batch of observations as a dataset holds it: images (H, W, 3) uint8."""
+    return {
+        key: to_bytes(value[row]).permute(1, 2, 0).cpu().numpy()
+        if key.startswith(OBS_IMAGE)
+        else value[row].cpu().numpy().astype(np.float32)
+        for key, value in observation.items()
+        if isinstance(value, Tensor)
+    }
 
 
 def observation_features(

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 import draccus
 from lerobot.envs.configs import EnvConfig
 
+from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.command_line import RunConfig, claim_output_dir, run_command
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import FieldError, require_at_least
@@ -41,17 +42,6 @@ if TYPE_CHECKING:
 
 IMAGINED_AT_ONCE, REAL_AT_ONCE = 50, 2
 """Episodes of a policy that run at once."""
-
-
-@dataclass
-class Checkpoint:
-    """A trained model.
-
-    Args:
-        path: output folder of its training, or one of its checkpoints.
-    """
-
-    path: str = ""
 
 
 @dataclass

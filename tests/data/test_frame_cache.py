@@ -10,13 +10,14 @@ import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data.episodes import ChosenEpisodes
 from lerobot_wmrl.data.frame_cache import cached_depth, token_depth
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.maniskill.embodiment import FPS
-from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
+from lerobot_wmrl.scripts.eval_world_model import EvalWorldModelConfig, eval_world_model
 from lerobot_wmrl.world_models.autoregressive.depth import metres
 from lerobot_wmrl.world_models.checkpoint import load_model
 from tests.trained import action_config, run_training, text_config

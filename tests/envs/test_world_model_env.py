@@ -7,6 +7,7 @@ import pytest
 import torch
 from gymnasium.vector import AutoresetMode
 
+from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.constants import TASKS
 from lerobot_wmrl.data.episodes import ChosenEpisodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
@@ -16,7 +17,7 @@ from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH
 from lerobot_wmrl.rewards.configuration_rewards import EmbeddingConfig, GeneralConfig, ProxyConfig
 from lerobot_wmrl.rewards.modeling_rewards import EmbeddingRewardModel, ProxyRewardModel
 from lerobot_wmrl.rewards.similarity import TokenizerSimilarity
-from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
+from lerobot_wmrl.scripts.eval_world_model import EvalWorldModelConfig, eval_world_model
 from lerobot_wmrl.world_models.frame_tokenizer import Decoded
 from tests.read_backs import fetched
 from tests.trained import CLIP_LENGTH, action_config, run_training

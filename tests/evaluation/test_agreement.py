@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lerobot_wmrl.common.checkpoints import resolve_checkpoint
+from lerobot_wmrl.common.checkpoints import Checkpoint, resolve_checkpoint
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.data.episodes import ChosenEpisodes, read_episodes
@@ -17,7 +17,6 @@ from lerobot_wmrl.evaluation.agreement import Agreement, policy_checkpoints, pol
 from lerobot_wmrl.evaluation.report import agreement_table
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.scripts.eval_world_model import (
-    Checkpoint,
     EvalWorldModelConfig,
     eval_world_model,
     policies_imagination,

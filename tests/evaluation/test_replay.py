@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.constants import KINDS
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.episodes import ChosenEpisodes, choose_episodes, open_dataset, read_episodes
@@ -27,7 +28,7 @@ from lerobot_wmrl.evaluation.gate import Outcomes, gate_at, success_gate
 from lerobot_wmrl.evaluation.replay import EpisodeReplay, Recording, replay_episodes
 from lerobot_wmrl.evaluation.report import evaluate
 from lerobot_wmrl.maniskill.recordings import scene_splits
-from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
+from lerobot_wmrl.scripts.eval_world_model import EvalWorldModelConfig, eval_world_model
 from lerobot_wmrl.world_models.checkpoint import load_model
 from tests.relabelled import UNLABELLED, relabelled
 

@@ -19,10 +19,11 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
+from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data.episodes import ChosenEpisodes, camera_names, open_dataset
-from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
+from lerobot_wmrl.scripts.eval_world_model import EvalWorldModelConfig, eval_world_model
 from lerobot_wmrl.world_models.checkpoint import read_config
 from tests.scripts.test_train import improve
 from tests.trained import action_config, run_training, tokenizer_config

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.data.episodes import ChosenEpisodes, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames, cached_tokens, frames_to_tensor
 from lerobot_wmrl.data.frames import NO_CONTEXT
@@ -14,7 +15,7 @@ from lerobot_wmrl.envs.start_frames import read_start_images
 from lerobot_wmrl.evaluation.pictures import side_by_side, to_uint8
 from lerobot_wmrl.evaluation.replay import Recording, replay_episodes
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
-from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
+from lerobot_wmrl.scripts.eval_world_model import EvalWorldModelConfig, eval_world_model
 from lerobot_wmrl.world_models.autoencoder import Fusion
 from lerobot_wmrl.world_models.checkpoint import load_model, read_config
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer

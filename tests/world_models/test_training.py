@@ -11,6 +11,7 @@ from lerobot.configs.rewards import RewardModelConfig
 from lerobot.rewards.factory import make_reward_model
 from safetensors.torch import load_file
 
+from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.presets import PRESETS, preset_flags
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data.clips import ClipSampler, InTurn
@@ -22,7 +23,7 @@ from lerobot_wmrl.data.episodes import (
 )
 from lerobot_wmrl.data.frame_cache import cached_frames, cached_tokens
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
-from lerobot_wmrl.scripts.eval_world_model import Checkpoint, EvalWorldModelConfig, eval_world_model
+from lerobot_wmrl.scripts.eval_world_model import EvalWorldModelConfig, eval_world_model
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.layers import ClipMemory

@@ -1,0 +1,147 @@
+"""How long the page of lerobot-wmrl-play waits for the next frame, from a key to a picture to show.
+
+    python benchmarks/play.py --world_model=outputs/demo/action_world_model \\
+        --dataset.root=outputs/demo/dataset --maniskill
+
+The steps of one visitor, over the page's socket on this machine, as fast as they come: from the message until
+the picture is decoded, without the browser itself. Beside it, in turns: a step of the environment alone, the
+floor, and with `--maniskill` a step of ManiSkill with the same cameras. Writes docs/results/play_speed.json.
+"""
+
+import argparse
+import asyncio
+import base64
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final
+
+import aiohttp
+import cv2
+import numpy as np
+import torch
+from aiohttp.test_utils import TestServer
+from lerobot.utils.import_utils import register_third_party_plugins
+
+from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.common.precision import keep_freed_memory
+from lerobot_wmrl.data.episodes import DatasetSource
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.play.saving import SavedEpisodes
+from lerobot_wmrl.play.server import PlayServer
+from lerobot_wmrl.play.world import DrivenEnv, World, load_world
+from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
+
+RESULTS: Final = Path(__file__).parents[1] / "docs" / "results" / "play_speed.json"
+BLOCK: Final = 50
+"""Steps of one kind before it is another one's turn."""
+
+
+def milliseconds(step: Callable[[], object], count: int) -> list[float]:
+    """Return the duration of each of `count` steps."""
+    found = []
+    for _ in range(count):
+        began = time.perf_counter()
+        step()
+        found.append(1000 * (time.perf_counter() - began))
+    return found
+
+
+def summary(durations: list[float]) -> dict[str, float]:
+    """Return quantiles in milliseconds, and frames a second."""
+    p50, p99 = np.quantile(durations, [0.5, 0.99])
+    return {
+        "p50_ms": round(float(p50), 1), "p99_ms": round(float(p99), 1),
+        "frames_per_s": round(1000 / float(np.mean(durations)), 1),
+    }  # fmt: skip
+
+
+async def page_steps(socket: aiohttp.ClientWebSocketResponse, actions: int, count: int) -> list[float]:
+    """Return the duration of each step of a page that then begins again."""
+    message = {"do": "step", "driver": "you", "action": [0.0] * actions}
+    found = []
+    for _ in range(count):
+        began = time.perf_counter()
+        await socket.send_json(message)
+        view = (await socket.receive_json())["view"]
+        for image in view["images"]:
+            coded = np.frombuffer(base64.b64decode(image.partition(",")[2]), np.uint8)
+            assert cv2.imdecode(coded, cv2.IMREAD_COLOR) is not None
+        found.append(1000 * (time.perf_counter() - began))
+    await socket.send_json({"do": "rewind", "frame": 0})
+    await socket.receive_json()
+    return found
+
+
+async def measure(world: World, maniskill: bool, steps: int) -> dict[str, Any]:
+    """Measure everything in turns."""
+    count = len(world.model.embodiment.action_names)
+    alone = world.begin({"episode": 0, "frame": 0}, None)
+    action = torch.zeros(1, count)
+    works = {"environment": lambda: alone.env.step(action)}
+    if maniskill:
+        simulator = WmrlManiSkillEnv(task="push", cameras=list(world.sizes.cameras)).create_tensor_env(
+            1, "cpu"
+        )
+        simulator.reset(seed=[0])
+        works["maniskill"] = lambda: simulator.step(action)
+    found: dict[str, list[float]] = {"page": [], **{name: [] for name in works}}
+    with TemporaryDirectory() as folder:
+        saved = SavedEpisodes(Path(folder) / "driven", world.model.embodiment, 3)
+        server = TestServer(PlayServer(world, saved, "127.0.0.1").application())
+        await server.start_server()
+        async with (
+            aiohttp.ClientSession() as session,
+            session.ws_connect(server.make_url("/drive?visit=benchmark")) as socket,
+        ):
+            await socket.send_json({"do": "begin", "episode": 0, "frame": 0})
+            await socket.receive_json()
+            await page_steps(socket, count, BLOCK)
+            for work in works.values():
+                milliseconds(work, BLOCK)
+            for _ in range(steps // BLOCK):
+                found["page"] += await page_steps(socket, count, BLOCK)
+                for name, work in works.items():
+                    found[name] += milliseconds(work, BLOCK)
+        await server.close()
+    return {name: summary(durations) for name, durations in found.items()}
+
+
+def make_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--world_model", required=True, help="an action world model")
+    parser.add_argument(
+        "--dataset.root", dest="root", required=True, help="a dataset that it has learnt from"
+    )
+    parser.add_argument("--steps", type=int, default=500, help="steps of each kind")
+    parser.add_argument("--maniskill", action="store_true", help="measure ManiSkill too")
+    parser.add_argument("--output", type=Path, default=RESULTS, help="JSON file")
+    return parser
+
+
+def main() -> None:
+    """Measure everything, print it, write it."""
+    keep_freed_memory()
+    register_third_party_plugins()
+    given = make_parser().parse_args()
+    env = DrivenEnv(
+        world_model_path=given.world_model, reward=GeneralConfig(alpha=1.0), episode_length=10_000,
+        done_frames=10_000,
+    )  # fmt: skip
+    world = load_world(env, DatasetSource(given.root), None, None)
+    figures = {
+        "threads": torch.get_num_threads(),
+        "image_size": world.sizes.image_size,
+        "cameras": len(world.sizes.cameras),
+        **asyncio.run(measure(world, given.maniskill, given.steps)),
+    }
+    print(json.dumps(figures, indent=2))
+    write_json(given.output, figures)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,219 @@
+"""The page's server: static files, a socket for each visitor, and uploads.
+
+Everything that computes runs in one thread, in the order in which it was asked for: the models are shared,
+and a simulator belongs to the thread that made it.
+"""
+
+import asyncio
+import json
+import logging
+import secrets
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import IO, Any, Final
+
+from aiohttp import WSCloseCode, WSMsgType, web
+from PIL import Image, UnidentifiedImageError
+
+from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.play.saving import SavedEpisodes
+from lerobot_wmrl.play.visit import Visit
+from lerobot_wmrl.play.world import LARGEST_SIDE, World, text
+
+PAGE: Final = Path(__file__).with_name("page")
+LOOPBACK: Final = ("127.0.0.1", "localhost", "::1")
+TOKEN: Final = "token"
+
+POLICY: Final = "default-src 'self'; img-src 'self' data: blob:; connect-src 'self' data: ws: wss:"
+"""Where the page may load from; its frames come as data."""
+
+MOST_VISITORS: Final = 8
+"""Visitors whose drives are kept; the one who has been away longest makes room for the next."""
+
+MOST_UPLOADS: Final = 16
+LARGEST_MESSAGE: Final = 64 * 1024
+LARGEST_UPLOAD: Final = 16 * 1024**2
+FORMATS: Final = ("PNG", "JPEG", "WEBP")
+
+
+class PlayServer:
+    """Serves the page.
+
+    Args:
+        world: what all visitors share.
+        saved: where episodes are saved.
+        host: address to listen at. Beyond this machine, visitors need the token.
+    """
+
+    def __init__(self, world: World, saved: SavedEpisodes, host: str) -> None:
+        self.world, self.saved = world, saved
+        self.token = "" if host in LOOPBACK else secrets.token_urlsafe(16)
+        self.visits: dict[str, Visit] = {}
+        self.sockets: dict[str, web.WebSocketResponse] = {}
+        self.worker = ThreadPoolExecutor(1, "drive")
+
+    def application(self) -> web.Application:
+        """Return the web application."""
+        app = web.Application(client_max_size=LARGEST_UPLOAD, middlewares=[self._guard])
+        app.router.add_get("/", self._page)
+        app.router.add_get("/world", self._describe)
+        app.router.add_get("/drive", self._drive)
+        app.router.add_post("/picture", self._picture)
+        app.router.add_static("/static", PAGE)
+        app.on_shutdown.append(self._disconnect)
+        app.on_cleanup.append(self._close)
+        return app
+
+    async def _compute[Result](self, function: Callable[..., Result], *arguments: Any) -> Result:
+        return await asyncio.get_running_loop().run_in_executor(self.worker, function, *arguments)
+
+    async def _disconnect(self, app: web.Application) -> None:
+        """Close the sockets, which would hold up the end of the server otherwise."""
+        for socket in list(self.sockets.values()):
+            await socket.close(code=WSCloseCode.GOING_AWAY)
+
+    async def _close(self, app: web.Application) -> None:
+        for visit in self.visits.values():
+            await self._compute(visit.close)
+        self.worker.shutdown()
+
+    @web.middleware
+    async def _guard(self, request: web.Request, handler: Any) -> web.StreamResponse:
+        """Refuse visitors without the token, and pages of other sites.
+
+        On the loopback, where there is no token, a foreign page could reach this server under a name of its
+        own that leads here (DNS rebinding), so the host must be this machine's.
+        """
+        if self.token:
+            given = request.query.get(TOKEN) or request.cookies.get(TOKEN, "")
+            if not secrets.compare_digest(given.encode(), self.token.encode()):
+                raise web.HTTPUnauthorized(text="open the address with ?token=… that the command has printed")
+        elif host_name(request.host) not in LOOPBACK:
+            raise web.HTTPForbidden(text=f"the host {request.host} is not this machine")
+        origin = request.headers.get("Origin")
+        if origin is not None and origin.partition("://")[2] != request.host:
+            raise web.HTTPForbidden(text=f"{origin} is another site")
+        response: web.StreamResponse = await handler(request)
+        return response
+
+    async def _page(self, request: web.Request) -> web.Response:
+        page = web.Response(text=(PAGE / "index.html").read_text(), content_type="text/html")
+        page.headers["Cache-Control"] = "no-store"
+        page.headers["Content-Security-Policy"] = POLICY
+        if self.token:
+            page.set_cookie(TOKEN, self.token, httponly=True, samesite="Strict")
+        return page
+
+    async def _describe(self, request: web.Request) -> web.Response:
+        return web.json_response(self.world.description())
+
+    async def _drive(self, request: web.Request) -> web.WebSocketResponse:
+        """Answer a visitor's messages. Under the same name they find their drive again."""
+        name = request.query.get("visit", "")
+        if not (name.isalnum() and 8 <= len(name) <= 64):
+            raise web.HTTPBadRequest(text="visit: must be 8 to 64 letters and digits")
+        socket = web.WebSocketResponse(max_msg_size=LARGEST_MESSAGE, heartbeat=30)
+        await socket.prepare(request)
+        visit = await self._visit(name)
+        self.sockets[name] = socket
+        try:
+            async for received in socket:
+                if received.type is WSMsgType.TEXT:
+                    await socket.send_json(await self._answer(visit, received.data))
+        finally:
+            if self.sockets.get(name) is socket:
+                del self.sockets[name]
+        return socket
+
+    async def _visit(self, name: str) -> Visit:
+        """Return a visitor's visit, a new one if they have not been here."""
+        visit = self.visits.pop(name, None)
+        if visit is None:
+            away = [each for each in self.visits if each not in self.sockets]
+            if len(self.visits) >= MOST_VISITORS and away:
+                await self._compute(self.visits.pop(away[0]).close)
+            visit = await self._compute(Visit, self.world, self.saved)
+        self.visits[name] = visit
+        return visit
+
+    async def _answer(self, visit: Visit, data: str) -> dict[str, Any]:
+        """Return the answer to a message, or what is wrong with it."""
+        message: Any = None
+        try:
+            message = json.loads(data)
+            if not isinstance(message, dict):
+                raise FieldError("message", data[:80], "must be a JSON object")
+            answer = await self._compute(visit.answer, message)
+        except ValueError as error:
+            answer = {"error": str(error)}
+        except Exception as error:  # a policy's or an environment's own
+            logging.exception("a message could not be answered")
+            answer = {"error": f"{type(error).__name__}: {error}"}
+        sent = message.get("sent") if isinstance(message, dict) else None
+        return {**answer, "sent": sent}
+
+    async def _picture(self, request: web.Request) -> web.Response:
+        """Take pictures, one for each camera, with `state` and `instruction`. → the name of the place."""
+        if not request.content_type.startswith("multipart/"):
+            raise web.HTTPUnsupportedMediaType(text="send a form (multipart/form-data)")
+        try:
+            form = await request.post()
+            images = {
+                name: read_image(name, part.file)
+                for name, part in form.items()
+                if isinstance(part, web.FileField)
+            }
+            state = json.loads(str(form["state"])) if "state" in form else None
+            instruction = text(str(form.get("instruction", "")))
+            name = secrets.token_hex(8)
+            await self._compute(self.world.upload, name, images, state, instruction)
+        except ValueError as error:
+            raise web.HTTPBadRequest(text=str(error)) from error
+        while len(self.world.uploads) > MOST_UPLOADS:
+            self.world.uploads.pop(next(iter(self.world.uploads)))
+        return web.json_response({"picture": name})
+
+
+def host_name(host: str) -> str:
+    """Return the name in a Host header, without the port."""
+    return host.partition("]")[0].strip("[") if host.startswith("[") else host.partition(":")[0]
+
+
+def read_image(name: str, file: IO[bytes]) -> Image.Image:
+    """Read an uploaded picture. FieldError if it is none, or too large to be decoded."""
+    try:
+        image = Image.open(file, formats=FORMATS)
+        if max(image.size) > LARGEST_SIDE:
+            raise FieldError(
+                "picture", name, f"has {image.size} pixels", f"send at most {LARGEST_SIDE} a side"
+            )
+        image.load()
+    except (UnidentifiedImageError, OSError, Image.DecompressionBombError) as error:
+        raise FieldError("picture", name, "cannot be read", f"send {', '.join(FORMATS)}") from error
+    return image
+
+
+def serve(app: web.Application, host: str, port: int, ready: Callable[[int], None]) -> None:
+    """Serve until interrupted. OSError if the address is taken.
+
+    ready: is given the port when the page can be opened there.
+    """
+
+    async def run() -> None:
+        runner = web.AppRunner(app, access_log=None)
+        await runner.setup()
+        try:
+            await web.TCPSite(runner, host, port).start()
+            ready(runner.addresses[0][1])
+            await asyncio.Event().wait()
+        finally:
+            await runner.cleanup()
+
+    asyncio.run(run())
+
+
+def address(host: str, port: int, token: str) -> str:
+    """Return the page's address."""
+    shown = f"[{host}]" if ":" in host else host
+    return f"http://{shown}:{port}/" + (f"?{TOKEN}={token}" if token else "")

@@ -1,0 +1,279 @@
+"""What all visitors share: the world models, who can act, and where an episode can begin."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
+
+import numpy as np
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.envs.configs import EnvConfig
+from lerobot.utils.constants import OBS_STATE
+from PIL import Image
+
+from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.data.episodes import DatasetSource, EpisodeTable, read_episodes
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
+from lerobot_wmrl.envs.lerobot_env import make_tensor_env
+from lerobot_wmrl.envs.start_frames import StartImages, observed_frame, recorded_frames, resets_side
+from lerobot_wmrl.envs.world_model_env import WorldModels, load_world_models
+from lerobot_wmrl.play.drive import Drive, RealEpisode, Recorded
+from lerobot_wmrl.play.drivers import Driver, LoadedPolicy, PlannerDriver, PolicyDriver, RecordedDriver
+from lerobot_wmrl.world_models.checkpoint import check_dataset
+from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
+from lerobot_wmrl.world_models.configuration_planner import PlannerSettings
+from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig
+
+LARGEST_SEED: Final = 2**31 - 1
+LARGEST_SIDE: Final = 4096
+"""Pixels of a side of an uploaded picture."""
+
+CENTRED: Final = 0.05
+"""An action's component springs back to 0 if the middle of its range is no farther from 0 than this share of
+the range: it is then likely to be a velocity or a displacement."""
+
+
+class DrivenEnv(WorldModelEnv):
+    """Imagined episodes that somebody drives. They need no reward."""
+
+    def _check_rewarding(self, model: Any) -> None:
+        """Accept world models that know no success."""
+
+
+@dataclass
+class World:
+    """What all visitors share.
+
+    Args:
+        models: the world models.
+        config: of the imagined episodes.
+        table: of the dataset in whose frames episodes can begin.
+        policy: that can act.
+        real_env: that takes the same actions, and whose resets episodes can begin in.
+    """
+
+    models: WorldModels
+    config: WorldModelEnv
+    table: EpisodeTable | None = None
+    policy: LoadedPolicy | None = None
+    real_env: EnvConfig | None = None
+    uploads: dict[str, StartImages] = field(default_factory=dict)
+
+    @property
+    def model(self) -> ActionWorldModelConfig:
+        """Configuration of the action world model."""
+        config: ActionWorldModelConfig = self.models.model.config
+        return config
+
+    @property
+    def sizes(self) -> TokenizerConfig:
+        """Cameras of the world model and sizes of their images."""
+        found = self.model.tokenizer
+        assert found is not None, "a trained world model knows its tokenizer"
+        return found
+
+    def description(self) -> dict[str, Any]:
+        """Return what the page needs to know, as JSON."""
+        sizes, table = self.sizes, self.table
+        episodes: list[dict[str, Any]] = []
+        if table is not None:
+            rows = zip(table.length.tolist(), table.success.tolist(), table.instructions, strict=True)
+            episodes = [
+                {"length": length, "success": success if table.done_known else None, "task": task}
+                for length, success, task in rows
+            ]
+        return {
+            "cameras": list(sizes.cameras),
+            "sizes": [list(shape[1:]) for shape in sizes.frame_shapes.values()],
+            "fps": self.model.embodiment.fps,
+            "axes": self.axes(),
+            "state": self.model.embodiment.state_names,
+            "clip_length": self.model.clip_length,
+            "done_threshold": self.config.done_threshold,
+            "done_frames": self.config.done_frames,
+            "drivers": list(self.drivers()),
+            "policy": self.policy.config.type if self.policy else "",
+            "episodes": episodes,
+            "real": self.real_env.type if self.real_env else "",
+            "goal": self.models.text_model is not None,
+            "knows_success": self.model.learnt_successes != 0,
+        }
+
+    def axes(self) -> list[dict[str, Any]]:
+        """Return the components of an action: name, range, value to begin with, and whether it is held there
+        when nobody touches it or springs back."""
+        robot, means = self.model.embodiment, self.models.model.action_mean.tolist()
+        axes = []
+        for name, low, high, mean in zip(
+            robot.action_names, robot.action_low, robot.action_high, means, strict=True
+        ):
+            centred = abs(low + high) / 2 <= CENTRED * (high - low) and "gripper" not in name.lower()
+            rest = 0.0 if centred else min(max(mean, low), high)
+            axes.append({"name": name, "low": low, "high": high, "rest": rest, "springs": centred})
+        return axes
+
+    def drivers(self) -> dict[str, Driver]:
+        """Return a visitor's own drivers by name, besides themselves."""
+        found: dict[str, Driver] = {}
+        if self.policy is not None:
+            found["policy"] = PolicyDriver(self.policy.copy())
+        if self.model.learnt_successes != 0:
+            proposing = self.policy and self.policy.copy()
+            found["planner"] = PlannerDriver(planner_settings(self.model.clip_length), proposing)
+        if self.table is not None:
+            found["recorded"] = RecordedDriver()
+        return found
+
+    def make_real_env(self) -> Any:
+        """Return a visitor's own real environment, None if there is none."""
+        if self.real_env is None:
+            return None
+        env = make_tensor_env(self.real_env, 1, "cpu")
+        count, wanted = env.single_action_space.shape[0], len(self.model.embodiment.action_names)
+        if count != wanted:
+            raise FieldError(
+                "real_env.type", self.real_env.type,
+                f"takes actions of {count} components, the world model has learnt {wanted}",
+                "give the environment that its dataset is from",
+            )  # fmt: skip
+        return env
+
+    def begin(self, place: Mapping[str, Any], real_env: Any) -> Drive:
+        """Begin a drive.
+
+        Args:
+            place: where: `episode` and `frame` of the dataset; `seed` of the real environment; or `picture`,
+                the name of an upload. With `instruction`, in place of the recorded one.
+            real_env: the visitor's.
+
+        Raises:
+            FieldError: there is no such place.
+        """
+        recorded, real = None, None
+        if "episode" in place:
+            start, recorded = self._recorded(place)
+        elif "seed" in place:
+            if real_env is None or self.real_env is None:
+                raise FieldError(
+                    "seed", place["seed"], "there is no real environment", "give `real_env.type`"
+                )
+            real = RealEpisode(self.real_env.type, real_env, whole_number(place, "seed", LARGEST_SEED))
+            start = observed_frame(real.observation, self.sizes)
+        else:
+            start = self._uploaded(place)
+        if instruction := place.get("instruction"):
+            start = start._replace(instructions=[text(instruction)])
+        return Drive(start, self.models, self.config, recorded, real)
+
+    def upload(self, name: str, images: Mapping[str, Image.Image], state: Any, instruction: str) -> None:
+        """Keep pictures, one for each camera, as a place to begin.
+
+        Args:
+            name: of the place.
+            images: by camera.
+            state: (P,) in the dataset's units, None for zeros where the world model predicts no state.
+            instruction: the task.
+
+        Raises:
+            FieldError: a camera is missing or unknown, or the state has another length.
+        """
+        sizes, count = self.sizes, self.model.state_size
+        if {*images} != {*sizes.cameras}:
+            raise FieldError(
+                "picture", sorted(images), f"the world model sees the cameras {', '.join(sizes.cameras)}",
+                "give one picture for each",
+            )  # fmt: skip
+        values = [] if state is None else state
+        if not is_numbers(values) or len(values) != count:
+            raise FieldError(
+                "state",
+                state,
+                f"must be {count} finite numbers: {', '.join(self.model.embodiment.state_names)}",
+            )
+        side = sizes.image_size
+        squares = [
+            np.asarray(images[camera].convert("RGB").resize((side, side), Image.Resampling.BILINEAR))
+            for camera in sizes.cameras
+        ]
+        shown = {
+            key: torch.from_numpy(square).permute(2, 0, 1)[None] / 255
+            for key, square in zip(sizes.camera_keys, squares, strict=True)
+        }
+        shown[OBS_STATE] = torch.tensor([values], dtype=torch.float32).reshape(1, count)
+        self.uploads[name] = observed_frame({**shown, "task": [instruction]}, sizes)
+
+    def _recorded(self, place: Mapping[str, Any]) -> tuple[StartImages, Recorded]:
+        """Return a frame of the dataset, and what followed it."""
+        if self.table is None:
+            raise FieldError("episode", place["episode"], "there is no dataset", "give `dataset.root`")
+        episode = whole_number(place, "episode", len(self.table.start) - 1)
+        frame = whole_number(place, "frame", int(self.table.length[episode]) - 1)
+        begin = int(self.table.start[episode])
+        first, end = begin + frame, begin + int(self.table.length[episode])
+        images = recorded_frames(self.table, np.arange(first, end), self.sizes).images
+        actions = self.table.action[first:end].astype(np.float32)
+        return recorded_frames(self.table, np.array([first]), self.sizes), Recorded(actions, images)
+
+    def _uploaded(self, place: Mapping[str, Any]) -> StartImages:
+        name = place.get("picture")
+        if not isinstance(name, str) or name not in self.uploads:
+            raise FieldError("picture", name, "is no picture that was uploaded", "upload it (again)")
+        return self.uploads[name]
+
+
+def load_world(
+    config: WorldModelEnv, dataset: DatasetSource, policy: PreTrainedConfig | None, real_env: EnvConfig | None
+) -> World:
+    """Load what `config` names, and check that dataset, policy and environment fit the world model.
+
+    Raises:
+        FieldError: one of them does not.
+    """
+    models = load_world_models(config, config.device)
+    world = World(models, config)
+    if isinstance(real_env, WmrlManiSkillEnv):
+        side = resets_side(world.sizes)
+        real_env = replace(real_env, cameras=list(world.sizes.cameras), image_size=side)
+    world.real_env = real_env
+    if dataset.given:
+        world.table = read_episodes(dataset.open())
+        check_dataset(world.model, world.table.dataset.meta)
+    if policy is not None:
+        shown: dict[str, tuple[int, ...]] = {**world.sizes.frame_shapes}
+        if world.model.state_size:
+            shown[OBS_STATE] = (world.model.state_size,)
+        names, (low, high) = world.model.embodiment.action_names, models.model.action_range()
+        world.policy = LoadedPolicy(policy, shown, names, low, high)
+    return world
+
+
+def planner_settings(clip_length: int) -> PlannerSettings:
+    """Return a planner's settings for a world model that has learnt from clips of this length."""
+    default = PlannerSettings()
+    horizon = min(default.horizon, clip_length)
+    return PlannerSettings(
+        horizon=horizon, execute=min(default.execute, horizon), knots=min(default.knots, horizon)
+    )
+
+
+def whole_number(message: Mapping[str, Any], name: str, most: int) -> int:
+    """Return a field of a message. FieldError unless it is a whole number from 0 to `most`."""
+    value = message.get(name)
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= most:
+        raise FieldError(name, value, f"must be a whole number from 0 to {most}")
+    return value
+
+
+def is_numbers(values: Any) -> bool:
+    """Return whether this is a list of finite numbers."""
+    return isinstance(values, list) and all(
+        isinstance(each, int | float) and not isinstance(each, bool) and np.isfinite(each) for each in values
+    )
+
+
+def text(value: Any) -> str:
+    """Return an instruction. FieldError unless it is a text of at most 500 characters."""
+    if not isinstance(value, str) or len(value) > 500:
+        raise FieldError("instruction", value, "must be a text of at most 500 characters")
+    return value

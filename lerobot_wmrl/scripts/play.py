@@ -1,0 +1,131 @@
+"""lerobot-wmrl-play: drive a world model in the browser.
+
+    lerobot-wmrl-play --world_model.path=outputs/action_world_model --dataset.root=data/episodes
+    lerobot-wmrl-play --world_model.path=outputs/action_world_model --dataset.repo_id=user/episodes \\
+        --policy.path=outputs/policy
+    lerobot-wmrl-play --world_model.path=outputs/action_world_model --real_env.type=wmrl_maniskill \\
+        --real_env.task=push
+
+It serves one page and prints its address. There you, a policy, the planner or a recorded episode act, in turn
+if you like, and the world model answers with the next frame, its probability of success and its uncertainty.
+You can go back to any frame and do something else. An environment given by `--real_env.type` takes the same
+actions, and is shown beside.
+
+What was driven can be saved, as episodes of a LeRobotDataset in `--output_dir`, from which policies and world
+models learn like from any other.
+
+The page is served to this machine alone. With another `--host`, visitors need the token in the address that
+is printed.
+"""
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import ClassVar
+
+from lerobot.configs import PreTrainedConfig, parser
+from lerobot.envs.configs import EnvConfig
+
+from lerobot_wmrl.common.checkpoints import Checkpoint
+from lerobot_wmrl.common.command_line import RunConfig, run_command
+from lerobot_wmrl.common.errors import FieldError, require_at_least
+from lerobot_wmrl.common.policies import check_weights, read_policy_config
+from lerobot_wmrl.data.episodes import DatasetSource
+from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
+
+
+@dataclass
+class PlayConfig(RunConfig):
+    """Drive a world model in the browser.
+
+    Needed are `--world_model.path`, and frames to begin in: `--dataset.root`, `--dataset.repo_id` or
+    `--real_env.type`.
+
+    Args:
+        world_model: the action world model.
+        text_world_model: a text world model, for goal frames and how similar the imagined ones are to them;
+            may be left out.
+        dataset: episodes in whose frames a drive can begin.
+        policy: a policy that can act, `--policy.path=…`.
+        real_env: an environment that takes the same actions, and in whose resets a drive can begin. ManiSkill
+            shows the world model's cameras.
+        done_threshold: predicted success probability at which a frame counts as done.
+        done_frames: consecutive done frames that make a success.
+        episode_length: frames after which a drive ends.
+        host: address at which the page is served.
+        port: port at which the page is served; 0 for any that is free.
+        device: device of the models; by default the best one of this machine.
+        output_dir: folder of the dataset of saved episodes. If it holds some, more are added.
+    """
+
+    path_fields: ClassVar[list[str]] = ["policy"]
+    other_names: ClassVar[dict[str, str]] = {"model.path": "world_model.path"}
+
+    world_model: Checkpoint = field(default_factory=Checkpoint)
+    text_world_model: Checkpoint = field(default_factory=Checkpoint)
+    dataset: DatasetSource = field(default_factory=DatasetSource)
+    policy: PreTrainedConfig | None = None
+    real_env: EnvConfig | None = None
+    done_threshold: float = 0.5
+    done_frames: int = 3
+    episode_length: int = 1000
+    host: str = "127.0.0.1"
+    port: int = 8000
+    device: str | None = None
+    output_dir: Path = Path("outputs/driven")
+
+    def check(self) -> None:
+        """Read the policy's configuration. FieldError for a setting that cannot be."""
+        path = parser.get_path_arg("policy")
+        if path:
+            self.policy = read_policy_config(path, parser.get_cli_overrides("policy") or [])
+            check_weights(self.policy)
+        if not self.world_model.path:
+            raise FieldError("world_model.path", "", "is missing", "give the action world model to drive")
+        if not self.dataset.given and self.real_env is None:
+            raise FieldError(
+                "dataset.root", "", "is missing: a drive begins in a frame",
+                "give the world model's dataset, `dataset.repo_id`, or an environment, `real_env.type`",
+            )  # fmt: skip
+        require_at_least(self, 0, "port")
+
+
+def play(cfg: PlayConfig) -> None:
+    """Load the models and serve the page until interrupted."""
+    from lerobot_wmrl.play.saving import SavedEpisodes
+    from lerobot_wmrl.play.server import PlayServer, address, serve
+    from lerobot_wmrl.play.world import DrivenEnv, load_world
+
+    cfg.check()
+    env = DrivenEnv(
+        world_model_path=cfg.world_model.path, text_world_model_path=cfg.text_world_model.path,
+        reward=GeneralConfig() if cfg.text_world_model.path else GeneralConfig(alpha=1.0),
+        episode_length=cfg.episode_length, done_threshold=cfg.done_threshold, done_frames=cfg.done_frames,
+        device=cfg.device,
+    )  # fmt: skip
+    world = load_world(env, cfg.dataset, cfg.policy, cfg.real_env)
+    saved = SavedEpisodes(cfg.output_dir, world.model.embodiment, cfg.done_frames)
+    server = PlayServer(world, saved, cfg.host)
+
+    def ready(port: int) -> None:
+        print(f"open {address(cfg.host, port, server.token)} in a browser; Ctrl-C ends it", flush=True)
+
+    try:
+        serve(server.application(), cfg.host, cfg.port, ready)
+    except OSError as error:
+        raise FieldError("port", cfg.port, f"cannot be served ({error})", "choose another") from error
+    finally:
+        if saved.count:
+            print(f"\n{saved.count} episodes are in {cfg.output_dir}")
+
+
+def main() -> None:
+    """Run the console command."""
+    try:
+        run_command(play, PlayConfig, list)
+    except KeyboardInterrupt:
+        sys.exit(0)
+
+
+if __name__ == "__main__":
+    main()

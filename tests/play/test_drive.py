@@ -1,0 +1,208 @@
+"""A drive is its start and its actions: what is seen, going back, replaying, and who acts."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.data.episodes import read_episodes
+from lerobot_wmrl.play.drive import Drive
+from lerobot_wmrl.play.visit import Visit
+
+IMAGE = "observation.images.third_view"
+
+
+def some_actions(count: int) -> list[torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    return [0.03 * torch.randn(1, 7, generator=generator).clamp(-1, 1) for _ in range(count)]
+
+
+@pytest.fixture
+def drive(world) -> Drive:
+    return world.begin({"episode": 1, "frame": 4}, None)
+
+
+def test_a_drive_begins_in_the_frame_that_is_asked_for(drive, small_dataset):
+    table = read_episodes(small_dataset)
+    np.testing.assert_allclose(drive.observation["observation.state"][0], table.state[table.start[1] + 4])
+    assert drive.instruction == table.instructions[1]
+    assert len(drive.recorded.actions) == table.length[1] - 4
+
+
+def test_going_back_and_doing_the_same_again_gives_the_same_frames(drive):
+    actions = some_actions(8)
+    first = [drive.step(action, "you") for action in actions]
+    drive.rewind(3)
+    assert drive.frame == 3
+    assert [drive.step(action, "you") for action in actions[3:]] == first[3:]
+
+
+def test_a_branch_leaves_the_frames_before_it_as_they_were(drive):
+    views = [drive.step(action, "you") for action in some_actions(5)]
+    drive.rewind(2)
+    other = drive.step(torch.full((1, 7), 0.05), "you")
+    assert drive.views[1:3] == views[:2]
+    assert other["measured"] != views[2]["measured"]
+
+
+def test_replaying_yields_what_was_seen_and_moves_nothing(drive):
+    for action in some_actions(4):
+        drive.step(action, "you")
+    seen, views = drive.observation, list(drive.views)
+    steps = list(drive.replay())
+    assert [torch.from_numpy(step.action) for step in steps][2].equal(some_actions(4)[2][0])
+    assert drive.views == views
+    torch.testing.assert_close(drive.observation[IMAGE], seen[IMAGE], rtol=0, atol=0)
+    following = drive.step(some_actions(5)[4], "you")
+    drive.rewind(4)
+    assert drive.step(some_actions(5)[4], "you") == following
+
+
+def test_recorded_frames_are_beside_as_long_as_the_recorded_actions_are_taken(drive):
+    assert drive.views[0]["beside"]["name"] == "recorded"
+    taken = drive.step(torch.from_numpy(drive.recorded.actions[0])[None], "recorded")
+    assert "beside" in taken
+    assert "beside" not in drive.step(torch.zeros(1, 7), "you")
+
+
+def test_an_episode_ends_with_success_and_is_not_driven_on(make_world):
+    drive = make_world(done_frames=2).begin({"episode": 0, "frame": 0}, None)
+    step = drive.env.model.step
+    drive.env.model.step = lambda *args: step(*args)._replace(done_logit=torch.tensor([20.0]))
+    try:
+        views = [drive.step(action, "you") for action in some_actions(2)]
+    finally:
+        drive.env.model.step = step
+    assert [view["ended"] for view in views] == ["", "success"]
+    with pytest.raises(FieldError, match=r"step=2: the episode has ended \(success\); go back or restart"):
+        drive.step(torch.zeros(1, 7), "you")
+    drive.rewind(0)
+    drive.step(torch.zeros(1, 7), "you")
+
+
+@pytest.mark.parametrize("action", [[math.nan] * 7, [0.0] * 6])
+def test_an_action_that_cannot_be_is_refused_and_changes_nothing(drive, action):
+    with pytest.raises(FieldError, match=r"^action=.*must be 7 finite numbers"):
+        drive.step(torch.tensor([action]), "you")
+    assert drive.frame == 0
+
+
+def test_goal_frames_and_similarity_are_shown_where_there_is_a_text_world_model(make_world):
+    drive = make_world(text=True).begin({"episode": 0, "frame": 0, "instruction": "pull it back"}, None)
+    assert drive.instruction == "pull it back"
+    assert len(drive.goal) == 1
+    assert 0 <= drive.step(torch.zeros(1, 7), "you")["measured"]["similarity"] <= 1
+
+
+def test_every_driver_acts_and_the_recorded_one_as_recorded(world, saved, small_dataset):
+    visit = Visit(world, saved)
+    assert [*visit.drivers] == ["policy", "planner", "recorded"]
+    visit.answer({"do": "begin", "episode": 2, "frame": 1})
+    row = world.table.start[2] + 1
+    view = visit.answer({"do": "step", "driver": "recorded"})["view"]
+    np.testing.assert_allclose(view["action"], world.table.action[row])
+    seen = visit.drive.observation
+    expected = world.policy.copy().action(seen)
+    view = visit.answer({"do": "step", "driver": "policy"})["view"]
+    np.testing.assert_allclose(view["action"], expected[0], rtol=1e-5)
+    assert visit.answer({"do": "step", "driver": "planner"})["view"]["driver"] == "planner"
+
+
+def test_a_plan_is_made_anew_after_somebody_else_has_acted(world, saved):
+    visit = Visit(world, saved)
+    visit.answer({"do": "begin", "episode": 0, "frame": 0})
+    visit.answer({"do": "step", "driver": "planner"})
+    planned = len(visit.drivers["planner"].plan)
+    visit.answer({"do": "step", "driver": "you", "action": [0.04] * 7})
+    visit.answer({"do": "step", "driver": "planner"})
+    assert len(visit.drivers["planner"].plan) == planned
+
+
+def test_the_recorded_episode_ends(world, saved):
+    visit = Visit(world, saved)
+    visit.answer({"do": "begin", "episode": 0, "frame": 10})
+    visit.answer({"do": "step", "driver": "recorded"})
+    with pytest.raises(FieldError, match="the recorded episode is over"):
+        visit.answer({"do": "step", "driver": "recorded"})
+
+
+def test_copies_of_a_policy_share_their_weights_and_nothing_else(world):
+    policy = world.policy
+    other = policy.copy()
+    pairs = zip(policy.policy.parameters(), other.policy.parameters(), strict=True)
+    assert all(a is b for a, b in pairs)
+    assert other.policy is not policy.policy
+    assert other.pipeline.prepare is not policy.pipeline.prepare
+
+
+def test_saved_episodes_are_a_dataset_that_grows(world, saved, small_dataset):
+    """Across visits and restarts; what was driven is in it, and success only where it was."""
+    for index, success in enumerate([True, False]):
+        place = type(saved)(saved.folder, saved.robot, 3)
+        visit = Visit(world, place)
+        visit.answer({"do": "begin", "episode": index, "frame": 0})
+        for action in some_actions(5):
+            visit.answer({"do": "step", "driver": "you", "action": action[0].tolist()})
+        assert visit.answer({"do": "save", "success": success})["saved"] == index
+    dataset = LeRobotDataset("local/driven", root=saved.folder)
+    table = read_episodes(dataset)
+    assert table.length.tolist() == [5, 5]
+    assert table.success.tolist() == [True, False]
+    assert table.done.sum() == 3
+    np.testing.assert_allclose(table.action[:5], torch.cat(some_actions(5)), rtol=1e-6)
+    assert dataset[5]["task"] == read_episodes(small_dataset).instructions[1]
+    first = world.begin({"episode": 1, "frame": 0}, None).observation[IMAGE][0]
+    torch.testing.assert_close(dataset[5][IMAGE], first, atol=0.6 / 255, rtol=0)
+    assert dataset.fps == 25
+
+
+def test_nothing_is_saved_of_nothing(world, saved):
+    visit = Visit(world, saved)
+    with pytest.raises(FieldError, match="nothing has begun; begin first"):
+        visit.answer({"do": "save"})
+    visit.answer({"do": "begin", "episode": 0, "frame": 0})
+    with pytest.raises(FieldError, match="nothing has been driven yet"):
+        visit.answer({"do": "save"})
+    assert not saved.folder.exists()
+
+
+def test_a_save_that_is_interrupted_loses_no_episode(world, saved, monkeypatch):
+    visit = Visit(world, saved)
+    visit.answer({"do": "begin", "episode": 0, "frame": 0})
+    visit.answer({"do": "step", "driver": "you", "action": [0.0] * 7})
+    visit.answer({"do": "save", "success": True})
+    monkeypatch.setattr(LeRobotDataset, "finalize", lambda self: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        visit.answer({"do": "save", "success": True})
+    monkeypatch.undo()
+    assert type(saved)(saved.folder, saved.robot, 3).count == 1
+    visit.answer({"do": "save", "success": False})
+    assert read_episodes(LeRobotDataset("local/driven", root=saved.folder)).success.tolist() == [True, False]
+
+
+def test_a_replacement_that_was_cut_between_its_two_moves_is_put_back(world, saved):
+    visit = Visit(world, saved)
+    visit.answer({"do": "begin", "episode": 0, "frame": 0})
+    visit.answer({"do": "step", "driver": "you", "action": [0.0] * 7})
+    visit.answer({"do": "save", "success": True})
+    saved.folder.replace(saved.folder.with_name(".driven.old"))
+    assert type(saved)(saved.folder, saved.robot, 3).count == 1
+
+
+def test_a_folder_with_other_columns_is_refused_and_kept(world, saved, make_synthetic_dataset):
+    make_synthetic_dataset(saved.folder, episodes=1)
+    visit = Visit(world, type(saved)(saved.folder, saved.robot, 3))
+    visit.answer({"do": "begin", "episode": 0, "frame": 0})
+    visit.answer({"do": "step", "driver": "you", "action": [0.0] * 7})
+    with pytest.raises(FieldError, match=r"^output_dir=.*; choose a new folder"):
+        visit.answer({"do": "save"})
+    assert read_episodes(LeRobotDataset("local/synthetic", root=saved.folder)).length.tolist() == [11]
+
+
+def test_axes_spring_back_where_their_range_is_centred_and_grippers_stay(world):
+    axes = world.axes()
+    assert [axis["name"] for axis in axes if axis["springs"]] == ["dx", "dy", "dz", "droll", "dpitch", "dyaw"]
+    assert all(axis["low"] <= axis["rest"] <= axis["high"] for axis in axes)
