@@ -303,6 +303,7 @@ def speed(load: Load) -> str:
         load("environment_speed")["by_number"][-1],
         load("planning_speed")["by_searches"][-1],
     )
+    page = load("play_speed")
     return f"""On two CPU cores 64 imaginations are {faster["stock meshes"]["64"]:.0f} times as fast as one
 process of ManiSkill with its own robot meshes, {faster["light meshes"]["64"]:.0f} times as fast as with our
 light ones.
@@ -326,4 +327,9 @@ Planning for {planning["searches"]} imaginations at once, on one core and in the
 {planning["times_faster_than_frame_by_frame"]:.0f} times as many as frame by frame and
 {100 * planning["share_of_floor"]:.0f} % of what the core's matrix products allow. From what a policy would do
 it plans {planning["episodes_per_s"]:.1f} episodes a second, without the policy itself and the episodes' own
-frames."""
+frames.
+
+The page of `lerobot-wmrl-play` shows up to {page["page"]["frames_per_s"]:.0f} frames a second with
+{page["cameras"]} cameras of {page["image_size"]} pixels: {page["page"]["p50_ms"]:.0f} ms from a key to the
+decoded picture (99 %: {page["page"]["p99_ms"]:.0f} ms), without the browser itself. The imagined step alone
+takes {page["environment"]["p50_ms"]:.0f} ms, one of ManiSkill {page["maniskill"]["p50_ms"]:.0f} ms."""
