@@ -29,9 +29,10 @@ from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.precision import keep_freed_memory
 from lerobot_wmrl.data.episodes import DatasetSource
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.envs.configuration_world_model import DrivenEnv
 from lerobot_wmrl.play.saving import SavedEpisodes
 from lerobot_wmrl.play.server import PlayServer
-from lerobot_wmrl.play.world import DrivenEnv, World, load_world
+from lerobot_wmrl.play.world import World, load_world
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 
 RESULTS: Final = Path(__file__).parents[1] / "docs" / "results" / "play_speed.json"

@@ -28,6 +28,7 @@ CONFIGURATIONS = (
     "lerobot_policy_cnn.configuration_cnn",
     "lerobot_policy_openvla.configuration_openvla",
     "lerobot_policy_wm_mpc.configuration_wm_mpc",
+    "lerobot_robot_imagined.config_imagined",
 )
 
 for _module in CONFIGURATIONS:

@@ -47,7 +47,7 @@ def test_ppo_in_a_world_model_runs_without_a_simulator(
         f"--env.dataset.root={small_dataset.root}", "--algorithm.type=ppo", "--algorithm.value_iterations=0",
         "--num_envs=2", "--iterations=2", "--gate.action=off", f"--output_dir={tmp_path / 'rl'}",
     ]  # fmt: skip
-    folders = os.pathsep.join(str(ROOT / folder) for folder in ("", "policies", "datasets"))
+    folders = os.pathsep.join(str(ROOT / folder) for folder in ("", "policies", "datasets", "robots"))
     result = subprocess.run(
         [sys.executable, "-c", TRAIN_WITHOUT_SIMULATOR, *flags], env={**os.environ, "PYTHONPATH": folders},
         capture_output=True, text=True,

@@ -34,13 +34,6 @@ CENTRED: Final = 0.05
 the range: it is then likely to be a velocity or a displacement."""
 
 
-class DrivenEnv(WorldModelEnv):
-    """Imagined episodes that somebody drives. They need no reward."""
-
-    def _check_rewarding(self, model: Any) -> None:
-        """Accept world models that know no success."""
-
-
 @dataclass
 class World:
     """What all visitors share.

@@ -92,9 +92,10 @@ class PlayConfig(RunConfig):
 
 def play(cfg: PlayConfig) -> None:
     """Load the models and serve the page until interrupted."""
+    from lerobot_wmrl.envs.configuration_world_model import DrivenEnv
     from lerobot_wmrl.play.saving import SavedEpisodes
     from lerobot_wmrl.play.server import PlayServer, address, serve
-    from lerobot_wmrl.play.world import DrivenEnv, load_world
+    from lerobot_wmrl.play.world import load_world
 
     cfg.check()
     env = DrivenEnv(

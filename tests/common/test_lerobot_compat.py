@@ -18,7 +18,7 @@ from lerobot_wmrl.common.lerobot_compat import (
 )
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = ("lerobot_wmrl", "policies", "datasets")
+PACKAGES = ("lerobot_wmrl", "policies", "datasets", "robots")
 
 DOCUMENTED = {
     "lerobot.configs", "lerobot.configs.policies", "lerobot.configs.rewards", "lerobot.configs.types",

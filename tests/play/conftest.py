@@ -13,9 +13,10 @@ from lerobot.configs import PreTrainedConfig
 from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.data.episodes import DatasetSource
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.envs.configuration_world_model import DrivenEnv
 from lerobot_wmrl.play.saving import SavedEpisodes
 from lerobot_wmrl.play.server import PlayServer
-from lerobot_wmrl.play.world import DrivenEnv, World, load_world
+from lerobot_wmrl.play.world import World, load_world
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from tests.rl.checkpoints import save_untrained_policy
 

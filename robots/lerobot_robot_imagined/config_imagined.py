@@ -1,0 +1,50 @@
+"""Configuration of the imagined robot, `--robot.type=imagined`."""
+
+from dataclasses import dataclass, field
+
+from lerobot.robots.config import RobotConfig
+
+from lerobot_wmrl.common.errors import FieldError, require_positive
+from lerobot_wmrl.envs.configuration_world_model import StartFrames
+
+
+@RobotConfig.register_subclass("imagined")
+@dataclass(kw_only=True)
+class ImaginedRobotConfig(RobotConfig):
+    """A robot whose cameras and state a world model imagines, for lerobot-teleoperate, lerobot-record,
+    lerobot-replay and lerobot-rollout.
+
+    LeRobot's commands do not tell a robot that an episode is over. This one begins the next episode when
+    somebody presses the right arrow, which ends an episode in these commands too, and `episode_time_s` after
+    it began. After a success it stands still until then.
+
+    Args:
+        world_model_path: the action world model, a checkpoint or the output folder of its training.
+        dataset: in whose frames episodes begin, one after the other.
+        first_start: number of the frame in which the first episode begins.
+        episode_time_s: seconds after which the next episode begins: `dataset.episode_time_s` and
+            `dataset.reset_time_s` of the command together. None for the right arrow alone.
+        done_threshold: predicted success probability at which a frame counts as done.
+        done_frames: consecutive done frames that make a success.
+        suffix: what is added to the names of states and actions. lerobot-rollout needs `.pos` where the
+            dataset's names do not end so, since it passes no others on.
+        device: device of the world model; by default the best one of this machine.
+    """
+
+    world_model_path: str = ""
+    dataset: StartFrames = field(default_factory=StartFrames)
+    first_start: int = 0
+    episode_time_s: float | None = None
+    done_threshold: float = 0.5
+    done_frames: int = 3
+    suffix: str = ""
+    device: str | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.world_model_path:
+            raise FieldError(
+                "robot.world_model_path", "", "is missing", "give the action world model that imagines"
+            )
+        if self.episode_time_s is not None:
+            require_positive(self, "episode_time_s")

@@ -1,0 +1,179 @@
+"""A robot that a world model imagines."""
+
+import logging
+import time
+from collections.abc import Mapping
+from typing import Any, Final
+
+import torch
+from lerobot.lerobot_types import RobotAction, RobotObservation
+from lerobot.robots.robot import Robot
+from lerobot.utils.constants import OBS_STATE
+from lerobot.utils.keyboard_input import init_keyboard_listener
+
+from lerobot_robot_imagined.config_imagined import ImaginedRobotConfig
+from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.images import to_bytes
+from lerobot_wmrl.envs.configuration_world_model import DrivenEnv
+from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
+from lerobot_wmrl.world_models.checkpoint import read_config
+
+LONGEST: Final = 1_000_000
+"""Frames of an episode at most: LeRobot's commands end it, not the world model."""
+
+DISPLACEMENTS: Final = {"delta_x": ("dx", "x"), "delta_y": ("dy", "y"), "delta_z": ("dz", "z")}
+"""Actions of LeRobot's keyboard and gamepad, each in [−1, 1], and the components that they move."""
+
+GRIPPER: Final = "gripper"
+
+
+class ImaginedRobot(Robot):
+    """Camera images and state as a world model imagines them after each action.
+
+    Observations are named as in the world model's dataset: a number for each component of the state, and an
+    image (H, W, 3) uint8 for each camera. Actions are a number for each component, in the dataset's units, or
+    what LeRobot's keyboard and gamepad send (`delta_x`, `delta_y`, `delta_z`, `gripper`).
+    """
+
+    config_class = ImaginedRobotConfig
+    name = "imagined"
+
+    def __init__(self, config: ImaginedRobotConfig) -> None:
+        super().__init__(config)
+        self.config = config
+        self.model: Any = read_config(config.world_model_path, "action_world_model")
+        self.env: Any = None
+        self.succeeded = False
+
+    @property
+    def cameras(self) -> dict[str, tuple[int, int, int]]:
+        """Image shapes (H, W, 3) by camera."""
+        sizes = self.model.tokenizer
+        shapes = zip(sizes.cameras, sizes.frame_shapes.values(), strict=True)
+        return {camera.rpartition(".")[2]: (height, width, 3) for camera, (_, height, width) in shapes}
+
+    @property
+    def observation_features(self) -> dict[str, Any]:
+        return {**dict.fromkeys(self._names("state"), float), **self.cameras}
+
+    @property
+    def action_features(self) -> dict[str, type]:
+        return dict.fromkeys(self._names("action"), float)
+
+    @property
+    def is_connected(self) -> bool:
+        return self.env is not None
+
+    @property
+    def is_calibrated(self) -> bool:
+        return True
+
+    def calibrate(self) -> None:
+        """Do nothing."""
+
+    def configure(self) -> None:
+        """Do nothing."""
+
+    def connect(self, calibrate: bool = True) -> None:
+        """Load the world model and begin the first episode."""
+        config = self.config
+        env = DrivenEnv(
+            world_model_path=config.world_model_path, dataset=config.dataset, reward=GeneralConfig(alpha=1.0),
+            episode_length=LONGEST, done_threshold=config.done_threshold, done_frames=config.done_frames,
+            device=config.device,
+        )  # fmt: skip
+        self.env = env.create_tensor_env(1)
+        self.listener, self.events = init_keyboard_listener()
+        self.start = config.first_start - 1
+        self._begin()
+        logging.info(
+            "the world model has learnt %d frames a second: use this as the command's fps",
+            self.model.embodiment.fps,
+        )
+
+    def disconnect(self) -> None:
+        """Forget the world model."""
+        self.env = None
+        if self.listener is not None:
+            self.listener.stop()
+
+    def get_observation(self) -> RobotObservation:
+        """Return the newest frame, that of the next episode if this one is over."""
+        if not self.is_connected:
+            raise ConnectionError("the imagined robot is not connected")
+        if self._is_over():
+            self._begin()
+        state = self.observation[OBS_STATE][0].tolist() if OBS_STATE in self.observation else []
+        images = (
+            to_bytes(self.observation[key][0]).permute(1, 2, 0).cpu().numpy()
+            for key in self.model.tokenizer.camera_keys
+        )
+        return dict(zip(self.observation_features, [*state, *images], strict=True))
+
+    def send_action(self, action: RobotAction) -> RobotAction:
+        """Imagine the next frame; after a success the robot stands still.
+
+        Returns:
+            The action in the dataset's units, within its range.
+
+        Raises:
+            FieldError: it lacks a component.
+        """
+        if not self.is_connected:
+            raise ConnectionError("the imagined robot is not connected")
+        given = {name.removesuffix(self.config.suffix): float(value) for name, value in action.items()}
+        if "delta_x" in given:
+            given = self._displaced(given)
+        names = self.model.embodiment.action_names
+        if missing := [name for name in names if name not in given]:
+            raise FieldError(
+                "teleop.type", ", ".join(action), f"the world model's actions need {', '.join(missing)} too",
+                f"use a teleoperator whose actions are {', '.join(names)}, or keyboard_ee or gamepad",
+            )  # fmt: skip
+        wanted = torch.tensor([[given[name] for name in names]], dtype=torch.float32)
+        self.last = wanted.clamp(self.env.action_low.cpu(), self.env.action_high.cpu())
+        if not self.succeeded:
+            observation, _, terminated, _, info = self.env.step(self.last)
+            self.observation = info.get("final_obs", observation)
+            self.succeeded = bool(terminated[0])
+        return dict(zip(self.action_features, self.last[0].tolist(), strict=True))
+
+    def _names(self, kind: str) -> list[str]:
+        """Return the names of the components of `state` or `action`, as LeRobot's commands see them."""
+        return [f"{name}{self.config.suffix}" for name in getattr(self.model.embodiment, f"{kind}_names")]
+
+    def _begin(self) -> None:
+        """Begin the next episode."""
+        self.start += 1
+        self.observation, _ = self.env.reset(seed=[self.start])
+        self.began, self.succeeded = time.perf_counter(), False
+        self.last = self.env.model.action_mean[None].cpu()
+
+    def _is_over(self) -> bool:
+        """Return whether the right arrow was pressed since the last observation, or time is up."""
+        pressed, self.events["exit_early"] = self.events["exit_early"], False
+        limit = self.config.episode_time_s
+        return pressed or (limit is not None and time.perf_counter() - self.began >= limit)
+
+    def _displaced(self, sent: Mapping[str, float]) -> dict[str, float]:
+        """Return the action that a keyboard's or gamepad's displacement stands for.
+
+        Displacements are shares of half the range. A gripper's 0 closes it, 2 opens it, and 1 leaves it as it
+        is. What else there is stays at rest: at 0 where its range has it, else at the dataset's mean.
+        """
+        names = self.model.embodiment.action_names
+        ends = (self.env.action_low, self.env.action_high, self.env.model.action_mean, self.last[0])
+        low, high, mean, last = (dict(zip(names, each.tolist(), strict=True)) for each in ends)
+        action = {name: 0.0 if low[name] <= 0 <= high[name] else mean[name] for name in names}
+        for key, candidates in DISPLACEMENTS.items():
+            found = next((name for name in candidates if name in names), None)
+            if found is None:
+                raise FieldError(
+                    "teleop.type", key, f"the world model's actions have no {' or '.join(candidates)}",
+                    f"use a teleoperator whose actions are {', '.join(names)}",
+                )  # fmt: skip
+            action[found] += sent.get(key, 0.0) * (high[found] - low[found]) / 2
+        if GRIPPER in names:
+            gripper = {0.0: low[GRIPPER], 2.0: high[GRIPPER]}
+            action[GRIPPER] = gripper.get(sent.get(GRIPPER, 1.0), last[GRIPPER])
+        return action
