@@ -26,6 +26,7 @@ TYPES: Final = {
         ["--success.type=first_frames"],
         ["--success.type=column"],
         ["--success.type=reward_model"],
+        ["--success.type=by_hand"],
     ),
     "lerobot-wmrl-train": (["--env.type=world_model"], ["--algorithm.type=grpo"]),
 }

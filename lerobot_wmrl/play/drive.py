@@ -213,7 +213,10 @@ def encode_observation(observation: Observation, cameras: Sequence[str] = ()) ->
 
 
 def encode_images(images: Sequence[np.ndarray] | np.ndarray) -> list[str]:
-    """Encode images (H, W, 3) uint8 as the addresses of JPEG data that a browser shows."""
-    quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
-    coded = (cv2.imencode(".jpg", image[..., ::-1], quality)[1] for image in images)
-    return [f"data:image/jpeg;base64,{base64.b64encode(each).decode()}" for each in coded]
+    """Encode images (H, W, 3) uint8 as addresses of data, which a browser shows."""
+    return [f"data:image/jpeg;base64,{base64.b64encode(jpeg(each)).decode()}" for each in images]
+
+
+def jpeg(image: np.ndarray) -> bytes:
+    """Encode an image (H, W, 3) uint8."""
+    return cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()

@@ -10,7 +10,6 @@ import logging
 import secrets
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import IO, Any, Final
 
 from aiohttp import WSCloseCode, WSMsgType, web
@@ -19,14 +18,8 @@ from PIL import Image, UnidentifiedImageError
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.play.saving import SavedEpisodes
 from lerobot_wmrl.play.visit import Visit
+from lerobot_wmrl.play.web import PAGES, Access
 from lerobot_wmrl.play.world import LARGEST_SIDE, World, text
-
-PAGE: Final = Path(__file__).with_name("page")
-LOOPBACK: Final = ("127.0.0.1", "localhost", "::1")
-TOKEN: Final = "token"
-
-POLICY: Final = "default-src 'self'; img-src 'self' data: blob:; connect-src 'self' data: ws: wss:"
-"""Where the page may load from; its frames come as data."""
 
 MOST_VISITORS: Final = 8
 """Visitors whose drives are kept; the one who has been away longest makes room for the next."""
@@ -47,20 +40,19 @@ class PlayServer:
     """
 
     def __init__(self, world: World, saved: SavedEpisodes, host: str) -> None:
-        self.world, self.saved = world, saved
-        self.token = "" if host in LOOPBACK else secrets.token_urlsafe(16)
+        self.world, self.saved, self.access = world, saved, Access(host)
         self.visits: dict[str, Visit] = {}
         self.sockets: dict[str, web.WebSocketResponse] = {}
         self.worker = ThreadPoolExecutor(1, "drive")
 
     def application(self) -> web.Application:
         """Return the web application."""
-        app = web.Application(client_max_size=LARGEST_UPLOAD, middlewares=[self._guard])
+        app = web.Application(client_max_size=LARGEST_UPLOAD, middlewares=[self.access.guard])
         app.router.add_get("/", self._page)
         app.router.add_get("/world", self._describe)
         app.router.add_get("/drive", self._drive)
         app.router.add_post("/picture", self._picture)
-        app.router.add_static("/static", PAGE)
+        app.router.add_static("/static", PAGES)
         app.on_shutdown.append(self._disconnect)
         app.on_cleanup.append(self._close)
         return app
@@ -78,32 +70,8 @@ class PlayServer:
             await self._compute(visit.close)
         self.worker.shutdown()
 
-    @web.middleware
-    async def _guard(self, request: web.Request, handler: Any) -> web.StreamResponse:
-        """Refuse visitors without the token, and pages of other sites.
-
-        On the loopback, where there is no token, a foreign page could reach this server under a name of its
-        own that leads here (DNS rebinding), so the host must be this machine's.
-        """
-        if self.token:
-            given = request.query.get(TOKEN) or request.cookies.get(TOKEN, "")
-            if not secrets.compare_digest(given.encode(), self.token.encode()):
-                raise web.HTTPUnauthorized(text="open the address with ?token=… that the command has printed")
-        elif host_name(request.host) not in LOOPBACK:
-            raise web.HTTPForbidden(text=f"the host {request.host} is not this machine")
-        origin = request.headers.get("Origin")
-        if origin is not None and origin.partition("://")[2] != request.host:
-            raise web.HTTPForbidden(text=f"{origin} is another site")
-        response: web.StreamResponse = await handler(request)
-        return response
-
     async def _page(self, request: web.Request) -> web.Response:
-        page = web.Response(text=(PAGE / "index.html").read_text(), content_type="text/html")
-        page.headers["Cache-Control"] = "no-store"
-        page.headers["Content-Security-Policy"] = POLICY
-        if self.token:
-            page.set_cookie(TOKEN, self.token, httponly=True, samesite="Strict")
-        return page
+        return self.access.page("index.html")
 
     async def _describe(self, request: web.Request) -> web.Response:
         return web.json_response(self.world.description())
@@ -175,11 +143,6 @@ class PlayServer:
         return web.json_response({"picture": name})
 
 
-def host_name(host: str) -> str:
-    """Return the name in a Host header, without the port."""
-    return host.partition("]")[0].strip("[") if host.startswith("[") else host.partition(":")[0]
-
-
 def read_image(name: str, file: IO[bytes]) -> Image.Image:
     """Read an uploaded picture. FieldError if it is none, or too large to be decoded."""
     try:
@@ -192,28 +155,3 @@ def read_image(name: str, file: IO[bytes]) -> Image.Image:
     except (UnidentifiedImageError, OSError, Image.DecompressionBombError) as error:
         raise FieldError("picture", name, "cannot be read", f"send {', '.join(FORMATS)}") from error
     return image
-
-
-def serve(app: web.Application, host: str, port: int, ready: Callable[[int], None]) -> None:
-    """Serve until interrupted. OSError if the address is taken.
-
-    ready: is given the port when the page can be opened there.
-    """
-
-    async def run() -> None:
-        runner = web.AppRunner(app, access_log=None)
-        await runner.setup()
-        try:
-            await web.TCPSite(runner, host, port).start()
-            ready(runner.addresses[0][1])
-            await asyncio.Event().wait()
-        finally:
-            await runner.cleanup()
-
-    asyncio.run(run())
-
-
-def address(host: str, port: int, token: str) -> str:
-    """Return the page's address."""
-    shown = f"[{host}]" if ":" in host else host
-    return f"http://{shown}:{port}/" + (f"?{TOKEN}={token}" if token else "")

@@ -9,6 +9,7 @@
         --success.threshold=0.95 --output_dir=data/labelled
     lerobot-wmrl-label --dataset.root=data/rollouts --success.type=reward_model \\
         --success.path=user/classifier --output_dir=data/labelled
+    lerobot-wmrl-label --dataset.root=data/rollouts --success.type=by_hand --output_dir=data/labelled
 
 World models learn from this column when an imagined episode succeeds. The dataset itself stays as it is. The
 command says how many episodes succeed and for how long, and what cannot be learnt from such labels.
@@ -26,6 +27,7 @@ from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.files import whole_folder, writing
 from lerobot_wmrl.data.episodes import SUCCESS_COLUMNS, DatasetSource
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
+from lerobot_wmrl.play import labels  # noqa: F401 (registers `by_hand`)
 from lerobot_wmrl.rewards.success_rules import EndsRule, SuccessRule, rows_of
 
 if TYPE_CHECKING:

@@ -94,7 +94,8 @@ def play(cfg: PlayConfig) -> None:
     """Load the models and serve the page until interrupted."""
     from lerobot_wmrl.envs.configuration_world_model import DrivenEnv
     from lerobot_wmrl.play.saving import SavedEpisodes
-    from lerobot_wmrl.play.server import PlayServer, address, serve
+    from lerobot_wmrl.play.server import PlayServer
+    from lerobot_wmrl.play.web import serve
     from lerobot_wmrl.play.world import load_world
 
     cfg.check()
@@ -109,7 +110,7 @@ def play(cfg: PlayConfig) -> None:
     server = PlayServer(world, saved, cfg.host)
 
     def ready(port: int) -> None:
-        print(f"open {address(cfg.host, port, server.token)} in a browser; Ctrl-C ends it", flush=True)
+        print(f"open {server.access.address(port)} in a browser; Ctrl-C ends it", flush=True)
 
     try:
         serve(server.application(), cfg.host, cfg.port, ready)

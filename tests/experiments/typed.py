@@ -14,7 +14,10 @@ import draccus
 from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.scripts.lerobot_edit_dataset import EditDatasetConfig
+from lerobot.scripts.lerobot_record import RecordConfig
+from lerobot.scripts.lerobot_replay import ReplayConfig
 from lerobot.scripts.lerobot_rollout import RolloutConfig
+from lerobot.scripts.lerobot_teleoperate import TeleoperateConfig
 from lerobot.utils.import_utils import register_third_party_plugins
 
 import lerobot_env_wmrl  # noqa: F401 (registers what LeRobot is to know)
@@ -28,9 +31,12 @@ LEROBOT: dict[str, type[Any]] = {
     "lerobot-train": TrainPipelineConfig,
     "lerobot-eval": EvalPipelineConfig,
     "lerobot-edit-dataset": EditDatasetConfig,
+    "lerobot-record": RecordConfig,
+    "lerobot-replay": ReplayConfig,
     "lerobot-rollout": RolloutConfig,
+    "lerobot-teleoperate": TeleoperateConfig,
 }
-SHELL = {"cp", "ln", "source", "pip", "make", "hf", "apt", "lerobot-record", ".uv/bin/uv"}
+SHELL = {"cp", "ln", "source", "pip", "make", "hf", "apt", ".uv/bin/uv"}
 
 
 class Stopped(BaseException):

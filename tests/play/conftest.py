@@ -1,6 +1,7 @@
 """The page's server over small trained models, in a thread with an event loop of its own."""
 
 import asyncio
+import shutil
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -9,6 +10,8 @@ from typing import Any
 import pytest
 from aiohttp.test_utils import TestServer
 from lerobot.configs import PreTrainedConfig
+from selenium import webdriver
+from selenium.webdriver.remote.webdriver import WebDriver
 
 from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.data.episodes import DatasetSource
@@ -99,3 +102,27 @@ def serve() -> Iterator[Callable[..., Served]]:
 def folder(saved) -> Path:
     """Where driven episodes are saved."""
     return saved.folder
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[WebDriver]:
+    """Chromium, without a window on the screen."""
+    options = webdriver.ChromeOptions()
+    for flag in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--window-size=1300,1000"):
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    driver = webdriver.Chrome(options, webdriver.ChromeService(shutil.which("chromedriver")))
+    yield driver
+    driver.quit()
+
+
+@pytest.fixture
+def chromium(browser) -> Iterator[WebDriver]:
+    """The browser, whose windows are closed after the test."""
+    first = browser.current_window_handle
+    yield browser
+    for window in browser.window_handles:
+        if window != first:
+            browser.switch_to.window(window)
+            browser.close()
+    browser.switch_to.window(first)

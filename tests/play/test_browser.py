@@ -1,12 +1,10 @@
 """The page in Chromium: driving by keys, pad and policy, going back, saving, losing the connection."""
 
-import shutil
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
-from selenium import webdriver
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
@@ -16,17 +14,6 @@ from lerobot_wmrl.data.episodes import open_dataset, read_episodes
 from tests.trained import run_training, tokenizer_config
 
 SECONDS = 60
-
-
-@pytest.fixture(scope="module")
-def chromium() -> Iterator[WebDriver]:
-    options = webdriver.ChromeOptions()
-    for flag in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--window-size=1300,1000"):
-        options.add_argument(flag)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    driver = webdriver.Chrome(options, webdriver.ChromeService(shutil.which("chromedriver")))
-    yield driver
-    driver.quit()
 
 
 class Page:

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from lerobot_wmrl.play.server import MOST_VISITORS, PlayServer, address
+from lerobot_wmrl.play.server import MOST_VISITORS
+from lerobot_wmrl.play.web import Access
 
 VISIT = "visitor01"
 STATE = json.dumps([0.0] * 8)
@@ -184,7 +185,7 @@ def test_an_uploaded_picture_is_a_place_to_begin(served):
 
 def test_beyond_this_machine_a_token_is_needed(world, saved, serve):
     served = serve(world, saved, host="0.0.0.0")
-    token = served.server.token
+    token = served.server.access.token
     for path in ("", "world", "static/play.js", "drive?visit=visitor01", "world?token=wrong"):
         assert served.run(fetch(served, "GET", path))[0] == 401
     status, _, headers = served.run(fetch(served, "GET", f"?token={token}"))
@@ -193,10 +194,10 @@ def test_beyond_this_machine_a_token_is_needed(world, saved, serve):
     assert served.run(fetch(served, "GET", f"world?token={token}"))[0] == 200
     assert served.run(fetch(served, "GET", "world", headers={"Cookie": f"token={token}"}))[0] == 200
     assert served.run(talk(served, BEGIN, visit=f"{VISIT}&token={token}"))[0]["begun"]
-    assert token in address("0.0.0.0", 80, token)
+    assert token in served.server.access.address(80)
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "::1"])
-def test_this_machine_needs_no_token(world, saved, host):
-    assert PlayServer(world, saved, host).token == ""
-    assert "token" not in address(host, 8000, "")
+def test_this_machine_needs_no_token(host):
+    assert Access(host).token == ""
+    assert "token" not in Access(host).address(8000)

@@ -1,0 +1,202 @@
+"""Labels by hand, in Chromium and by requests."""
+
+import json
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from urllib.error import HTTPError
+from urllib.request import Request, urlopen
+
+import cv2
+import numpy as np
+import pytest
+from lerobot.datasets.dataset_tools import remove_feature
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from selenium.webdriver.common.action_chains import ActionChains
+from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
+from selenium.webdriver.remote.webdriver import WebDriver
+
+from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.data.episodes import DatasetSource, open_dataset, read_episodes
+from lerobot_wmrl.play.labels import ByHandRule, LabelPage
+from lerobot_wmrl.scripts.label import LabelConfig, label
+
+CAMERA = "observation.images.third_view"
+
+
+@pytest.fixture(scope="module")
+def unlabelled(small_dataset, tmp_path_factory) -> LeRobotDataset:
+    """Six episodes that do not say where they succeed."""
+    root = tmp_path_factory.mktemp("by_hand") / "unlabelled"
+    remove_feature(small_dataset, ["next.success", "next.done"], output_dir=root, repo_id="local/unlabelled")
+    return open_dataset(root)
+
+
+@pytest.fixture
+def rule(tmp_path) -> ByHandRule:
+    return ByHandRule(file=tmp_path / "labels.json", port=0)
+
+
+@pytest.fixture
+def address(unlabelled, rule, tmp_path, monkeypatch) -> Iterator[str]:
+    """Runs the command in a thread until its labels are complete; yields the page's address."""
+    said: list[str] = []
+    monkeypatch.setattr("builtins.print", lambda *texts, **options: said.append(" ".join(map(str, texts))))
+    config = LabelConfig(DatasetSource(str(unlabelled.root)), rule, tmp_path / "labelled")
+    command = threading.Thread(target=label, args=(config,), daemon=True)
+    command.start()
+    wait(lambda: said)
+    address = said[0].split()[1]
+    yield address
+    for episode in range(6):
+        post(f"{address}label", {"episode": episode, "first": None})
+    post(f"{address}finish", {})
+    command.join(60)
+
+
+def wait(condition: Callable[[], Any]) -> None:
+    last = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < last
+        time.sleep(0.02)
+
+
+def post(url: str, content: Any, **headers: str) -> tuple[int, str]:
+    """Return status and text of the answer."""
+    body = content if isinstance(content, bytes) else json.dumps(content).encode()
+    request = Request(url, body, {"Content-Type": "application/json", **headers})
+    try:
+        with urlopen(request, timeout=60) as response:
+            return response.status, response.read().decode()
+    except HTTPError as error:
+        return error.code, error.read().decode()
+
+
+def get(url: str) -> tuple[int, bytes]:
+    try:
+        with urlopen(url, timeout=60) as response:
+            return response.status, response.read()
+    except HTTPError as error:
+        return error.code, error.read()
+
+
+def test_somebody_labels_by_keys_and_the_dataset_is_written(
+    chromium: WebDriver, unlabelled, rule, tmp_path, monkeypatch
+):
+    said: list[str] = []
+    monkeypatch.setattr("builtins.print", lambda *texts, **options: said.append(" ".join(map(str, texts))))
+    config = LabelConfig(DatasetSource(str(unlabelled.root)), rule, tmp_path / "labelled")
+    command = threading.Thread(target=label, args=(config,), daemon=True)
+    command.start()
+    wait(lambda: said)
+    chromium.switch_to.new_window("window")
+    chromium.get(said[0].split()[1])
+
+    def text(name: str) -> str:
+        return str(chromium.find_element(By.ID, name).text)
+
+    wait(lambda: text("status") == "ready")
+
+    def press(key: str, *, then: str) -> None:
+        ActionChains(chromium).send_keys(key).perform()
+        wait(
+            lambda: then in f"{text('episode-title')}; {text('label')}; {text('progress')}; {text('counter')}"
+        )
+
+    press("s", then="Episode 1;")
+    press("f", then="Episode 2;")
+    press("u", then="Episode 1; no label yet; 1 of 6")  # and back again
+    press("f", then="Episode 2;")
+    press(Keys.ARROW_RIGHT, then="frame 1 of")
+    press(Keys.ARROW_RIGHT, then="frame 2 of")
+    press("m", then="Episode 3;")
+    press(Keys.ARROW_UP, then="a success from frame 2 on")
+    press(Keys.ARROW_DOWN, then="Episode 3;")
+    finish = chromium.find_element(By.ID, "finish")
+    assert not finish.is_enabled()
+    for episode in (4, 5):
+        press("f", then=f"Episode {episode};")
+    press("s", then="6 of 6 have a label: 3 successes, 3 failures")
+    image = chromium.find_element(By.CSS_SELECTOR, "#views img")
+    assert chromium.execute_script("return arguments[0].naturalWidth", image) == 32
+    finish.click()
+    command.join(60)
+    assert not command.is_alive()
+    table = read_episodes(open_dataset(tmp_path / "labelled"))
+    ends = [table.done[a : a + n] for a, n in zip(table.start, table.length, strict=True)]
+    assert [int(each.sum()) for each in ends] == [3, 0, int(table.length[2]) - 2, 0, 0, 3]
+    assert all(each[-1] for each in (ends[0], ends[2], ends[5]))
+
+
+def test_labels_are_kept_while_they_are_made(address, rule, unlabelled):
+    assert post(f"{address}label", {"episode": 3, "first": 5})[0] == 200
+    assert post(f"{address}label", {"episode": 1, "first": None})[0] == 200
+    assert post(f"{address}label", {"episode": 1, "first": "none"})[0] == 200
+    assert LabelPage(rule, unlabelled).labels == {3: 5}
+    assert json.loads(get(f"{address}dataset")[1])["labels"] == {"3": 5}
+
+
+def test_frames_are_those_of_the_dataset(address, unlabelled):
+    status, body = get(f"{address}frame?episode=2&frame=4&camera={CAMERA}")
+    assert status == 200
+    image = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    row = unlabelled.meta.episodes[2]["dataset_from_index"] + 4
+    expected = (unlabelled[row][CAMERA].permute(1, 2, 0).numpy() * 255).round()
+    assert np.abs(image - expected).mean() < 6
+
+
+@pytest.mark.parametrize(
+    ("path", "content", "status", "said"),
+    [
+        ("label", {"episode": 6, "first": 0}, 400, "episode=6: must be from 0 to 5"),
+        ("label", {"episode": "1", "first": 0}, 400, "must be from 0 to 5"),
+        ("label", {"episode": 0, "first": 99}, 400, "first=99: must be from 0 to"),
+        ("label", {"episode": 0}, 400, "must have an episode and a first frame"),
+        ("label", [], 400, "must have an episode"),
+        ("label", b"{", 400, "Expecting"),
+        ("finish", {}, 409, "6 episodes have no label"),
+        ("nothing", {}, 404, ""),
+    ],
+)
+def test_what_cannot_be_is_refused(address, rule, path, content, status, said):
+    found = post(f"{address}{path}", content)
+    assert found[0] == status
+    assert said in found[1]
+    assert not rule.file.exists()
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        "",
+        "episode=0&frame=0",
+        f"episode=9&frame=0&camera={CAMERA}",
+        f"episode=0&frame=-1&camera={CAMERA}",
+        "episode=0&frame=0&camera=../x",
+    ],
+)
+def test_frames_that_are_not_there_are_not_found(address, query):
+    assert get(f"{address}frame?{query}")[0] == 404
+
+
+def test_another_site_cannot_label(address):
+    assert post(f"{address}label", {"episode": 0, "first": 0}, Origin="http://evil.example")[0] == 403
+
+
+def test_labels_of_another_dataset_are_refused(rule, unlabelled, small_dataset):
+    LabelPage(rule, unlabelled).label(0, 1)
+    with pytest.raises(FieldError, match=r"^file=.*: holds the labels of .*; choose another file"):
+        LabelPage(rule, small_dataset)
+
+
+def test_complete_labels_need_no_page(rule, unlabelled):
+    page = LabelPage(rule, unlabelled)
+    for episode in range(6):
+        page.label(episode, None if episode else 4)
+    solved = rule.frames(unlabelled)
+    table = read_episodes(unlabelled)
+    assert solved.sum() == table.length[0] - 4
+    assert Path(rule.file).is_file()
