@@ -318,3 +318,17 @@ def replay(config: DemoConfig, dataset: str, name: str) -> list[str]:
         "output_dir": str(out / f"replay_{name}"),
     }
     return preset_command(config, "lerobot-wmrl-eval-world-model", flags)
+
+
+def drive(config: DemoConfig) -> list[str]:
+    """Return the command that shows the world model in the browser, beside ManiSkill."""
+    out = config.output_dir
+    flags: Flags = {
+        "world_model.path": str(out / "action_world_model"),
+        "dataset.root": str(out / "dataset"),
+        "policy.path": str(out / "rl"),
+        "real_env.type": "wmrl_maniskill",
+    }
+    criterion = preset_flags(config.stage_preset, "eval-world-model")
+    done = [flag for flag in criterion if flag.startswith("--done_")]
+    return ["lerobot-wmrl-play", *format_flags(flags), *done]

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,8 +15,9 @@ from lerobot_wmrl.common.tracking import append_metrics
 from lerobot_wmrl.demo.report import figures
 from lerobot_wmrl.demo.report.page import conclusion, verdict, write_report
 from lerobot_wmrl.demo.report.results import lerobot_train_curve, metric_curves, success_rate
-from lerobot_wmrl.demo.stages import DemoConfig, demo_stages, successful
+from lerobot_wmrl.demo.stages import DemoConfig, demo_stages, drive, successful
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
+from tests.experiments.typed import check
 from tests.recorded import write_recording
 
 SUCCESSES = {
@@ -83,6 +85,13 @@ def test_the_demo_ends_by_saying_what_came_of_it(finished: DemoConfig) -> None:
 
 
 @pytest.mark.usefixtures("without_drawing")
+def test_the_command_that_drives_the_world_model_takes_its_flags(finished: DemoConfig) -> None:
+    command = shlex.join(drive(finished))
+    assert command in conclusion(finished, Path("report.html"))
+    assert "--done_threshold=0.95" in command
+    check(command)
+
+
 def test_the_gates_last_warning_is_shown_in_red(finished: DemoConfig) -> None:
     stages, gate = [stage.name for stage in demo_stages(finished)], finished.output_dir / "rl" / "gate"
     shown = '<p class="warning">'

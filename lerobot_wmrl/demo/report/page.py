@@ -1,6 +1,7 @@
 """The demo's page: `summary.json` and a self-contained `report.html` from a finished output folder."""
 
 import math
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from lerobot_wmrl.common.files import write_json, write_text
 from lerobot_wmrl.common.statistics import PairedChange, Proportion
 from lerobot_wmrl.demo.report import figures, results
 from lerobot_wmrl.demo.report.results import BASELINE, EPISODES, PPO_POLICY, Rates, Summary
-from lerobot_wmrl.demo.stages import MEASURED, WHERE, DemoConfig
+from lerobot_wmrl.demo.stages import MEASURED, WHERE, DemoConfig, drive
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
 SIGNIFICANCE = 0.05
@@ -98,6 +99,7 @@ def render(
             figures.curves(lines, title, xlabel="iteration" if title.startswith("PPO") else "step")
             for title, lines in results.training_curves(config.output_dir).items()
         ],
+        drive=shlex.join(drive(config)),
         runs=results.other_seeds(config),
         kinds=kind_rows(table),
         stages=records,
@@ -142,7 +144,8 @@ def conclusion(config: DemoConfig, page: Path) -> str:
         "(recall).",
         f"Report: {page}",
         "Next: open the report; it ends with every command, to change and run by hand. Run the demo with "
-        "--seed=1 and an --output_dir beside this one, and its report compares both.",
+        "--seed=1 and an --output_dir beside this one, and its report compares both. Drive the world model:",
+        shlex.join(drive(config)),
     ]
     return "\n".join(lines)
 
