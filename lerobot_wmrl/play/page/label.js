@@ -56,7 +56,7 @@ function open(index) {
 
 function look(at) {
   frame = Math.min(dataset.lengths[episode] - 1, Math.max(0, at));
-  [...$("views").querySelectorAll("img")].forEach((image, index) => {
+  [...$("frames").querySelectorAll("img")].forEach((image, index) => {
     image.src = `frame?${query({ episode, frame, camera: dataset.cameras[index] })}`;
   });
   $("timeline").value = frame;
@@ -95,7 +95,7 @@ async function play() {
     if (!playing) { await sleep(20); continue; }
     const due = performance.now() + 1000 / dataset.fps;
     look(frame + 1);
-    await Promise.all([...$("views").querySelectorAll("img")].map((image) => image.decode().catch(() => {})));
+    await Promise.all([...$("frames").querySelectorAll("img")].map((image) => image.decode().catch(() => {})));
     if (frame === dataset.lengths[episode] - 1) { playing = false; draw(); }
     await sleep(Math.max(0, due - performance.now()));
   }
@@ -149,7 +149,7 @@ async function main() {
     const figure = document.createElement("figure"), caption = document.createElement("figcaption");
     caption.textContent = camera;
     figure.append(Object.assign(document.createElement("img"), { alt: "" }), caption);
-    $("views").append(figure);
+    $("frames").append(figure);
   }
   dataset.lengths.forEach((_, index) => {
     const button = document.createElement("button");
