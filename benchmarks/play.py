@@ -90,7 +90,7 @@ async def measure(world: World, maniskill: bool, steps: int) -> dict[str, Any]:
         works["maniskill"] = lambda: simulator.step(action)
     found: dict[str, list[float]] = {"page": [], **{name: [] for name in works}}
     with TemporaryDirectory() as folder:
-        saved = SavedEpisodes(Path(folder) / "driven", world.model.embodiment, 3)
+        saved = SavedEpisodes(Path(folder) / "driven", world.model.embodiment)
         server = TestServer(PlayServer(world, saved, "127.0.0.1").application())
         await server.start_server()
         async with (

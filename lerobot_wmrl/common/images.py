@@ -1,10 +1,16 @@
 """Functions of images that policies and world models share. B batch, C channels, H height, W width."""
 
+from typing import Final
+
+import cv2
+import numpy as np
 import torch
 from lerobot.utils.constants import OBS_IMAGES
 from torch import Tensor
 from torch.nn import functional as F
 from torchvision.transforms.v2 import functional as transforms
+
+JPEG_QUALITY: Final = 92
 
 
 def camera_key(camera: str) -> str:
@@ -15,6 +21,11 @@ def camera_key(camera: str) -> str:
 def to_bytes(images: Tensor) -> Tensor:
     """Convert images from [0, 1] to uint8."""
     return (images * 255).round().byte()
+
+
+def jpeg(image: np.ndarray) -> bytes:
+    """Encode an image (H, W, 3) uint8."""
+    return cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
 
 
 def stretch(images: Tensor, height: int, width: int) -> Tensor:

@@ -18,24 +18,20 @@ from lerobot.utils.constants import OBS_IMAGE
 from torch import Tensor
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.images import to_bytes
+from lerobot_wmrl.common.images import jpeg, to_bytes
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.envs.start_frames import StartImages
 from lerobot_wmrl.envs.world_model_env import Observation, WorldModels, WorldModelVectorEnv, make_env_at
 from lerobot_wmrl.world_models.goal import imagine_goal
 from lerobot_wmrl.world_models.modeling_frame_tokenizer import split_cameras
 
-JPEG_QUALITY = 92
-
 
 class Step(NamedTuple):
-    """What an action (A,) led to: the observation before it (batch of one), the reward, and whether the
-    episode has succeeded."""
+    """An action (A,), the observation before it (batch of one), and the reward after it."""
 
     before: Observation
     action: np.ndarray
     reward: float
-    success: bool
 
 
 class Recorded(NamedTuple):
@@ -96,7 +92,9 @@ class Drive:
         self.goal = self._goal_images(start)
         self.actions: list[Tensor] = []
         self.views: list[dict[str, Any]] = []
-        self._begin()
+        self.in_step = True
+        self._reset()
+        self.views.append(self._view(""))
 
     @property
     def frame(self) -> int:
@@ -112,50 +110,70 @@ class Drive:
         Raises:
             FieldError: the episode has ended, or the action is none of A finite numbers.
         """
-        if self.ended:
-            raise FieldError(
-                "step", self.frame, f"the episode has ended ({self.ended})", "go back or restart"
-            )
+        self.require_running()
         if tuple(action.shape) != self.env.action_space.shape or not bool(action.isfinite().all()):
             raise FieldError(
                 "action", action.flatten().tolist(),
                 f"must be {self.env.single_action_space.shape[0]} finite numbers",
             )  # fmt: skip
+        self._catch_up()
+        self.in_step = False
         self._advance(action)
         if self.real is not None:
             self.real.step(action)
         self.actions.append(action)
         self.views.append(self._view(driver))
+        self.in_step = True
         return self.views[-1]
+
+    def require_running(self) -> None:
+        """Raise FieldError if the episode has ended."""
+        if self.ended:
+            raise FieldError(
+                "step", self.frame, f"the episode has ended ({self.ended})", "go back or restart"
+            )
 
     def rewind(self, frame: int) -> None:
         """Go back to a frame: imagine its past anew, and repeat it in the real environment."""
         if not 0 <= frame <= self.frame:
             raise FieldError("frame", frame, f"must be from 0 to {self.frame}")
-        kept, views = self.actions[:frame], self.views[: frame + 1]
-        self._begin()
-        for action in kept:
-            self._advance(action)
-            if self.real is not None:
-                self.real.step(action)
-        self.actions, self.views = kept, views
+        self.in_step = False
+        self.actions, self.views = self.actions[:frame], self.views[: frame + 1]
+        self._catch_up()
 
     def replay(self) -> Iterator[Step]:
         """Imagine the episode once more, and yield its steps. The drive ends up where it was."""
-        actions, views, real, self.real = self.actions, self.views, self.real, None
-        self._begin()
-        for action in actions:
+        self.in_step = False
+        self._reset()
+        for action in self.actions:
             before = self.observation
             self._advance(action)
-            yield Step(before, action[0].numpy(), self.measured["reward"], self.ended == "success")
-        self.actions, self.views, self.real = actions, views, real
+            yield Step(before, action[0].numpy(), self.measured["reward"])
+        self.in_step = True  # and the real environment has stayed where it was
 
-    def _begin(self) -> None:
-        self.observation, _ = self.env.reset(seed=[0])
-        self.ended, self.measured = "", dict[str, float]()
+    def succeeds(self, threshold: float, frames: int) -> bool:
+        """Return whether the last `frames` frames are done, with a probability of at least `threshold`."""
+        last = self.views[1:][-frames:]
+        return len(last) == frames and all(
+            view["measured"].get("done_probability", 0.0) >= threshold for view in last
+        )
+
+    def _catch_up(self) -> None:
+        """Take all actions again if the environments are not where the drive is."""
+        if self.in_step:
+            return
+        self._reset()
         if self.real is not None:
             self.real.reset()
-        self.actions, self.views = [], [self._view("")]
+        for action in self.actions:
+            self._advance(action)
+            if self.real is not None:
+                self.real.step(action)
+        self.in_step = True
+
+    def _reset(self) -> None:
+        self.observation, _ = self.env.reset(seed=[0])
+        self.ended, self.measured = "", dict[str, float]()
 
     def _advance(self, action: Tensor) -> None:
         observation, reward, terminated, truncated, info = self.env.step(action)
@@ -181,7 +199,7 @@ class Drive:
             view["beside"] = {"name": self.real.name, "images": images, "ended": self.real.ended}
         elif self._follows_recording():
             assert self.recorded is not None
-            images = encode_images(self.recorded.images[self.frame])
+            images = encode_images(self._in_frame_sizes(self.recorded.images[self.frame]))
             view["beside"] = {"name": "recorded", "images": images, "ended": ""}
         return view
 
@@ -192,6 +210,12 @@ class Drive:
             and self.frame < len(self.recorded.images)
             and all(map(np.array_equal, (each[0] for each in self.actions), self.recorded.actions))
         )
+
+    def _in_frame_sizes(self, squares: np.ndarray) -> list[np.ndarray]:
+        """Stretch a recorded frame (N, S, S, 3) to the sizes of the dataset's frames."""
+        shapes = self.env.model.config.tokenizer.frame_shapes.values()
+        pairs = zip(squares, shapes, strict=True)
+        return [cv2.resize(np.ascontiguousarray(each), (width, height)) for each, (_, height, width) in pairs]
 
     def _goal_images(self, start: StartImages) -> list[str]:
         """Return the goal frame that the text world model imagines, encoded; empty without one."""
@@ -215,8 +239,3 @@ def encode_observation(observation: Observation, cameras: Sequence[str] = ()) ->
 def encode_images(images: Sequence[np.ndarray] | np.ndarray) -> list[str]:
     """Encode images (H, W, 3) uint8 as addresses of data, which a browser shows."""
     return [f"data:image/jpeg;base64,{base64.b64encode(jpeg(each)).decode()}" for each in images]
-
-
-def jpeg(image: np.ndarray) -> bytes:
-    """Encode an image (H, W, 3) uint8."""
-    return cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()

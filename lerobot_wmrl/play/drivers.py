@@ -61,7 +61,8 @@ class LoadedPolicy:
 
     def reset(self) -> None:
         """Forget the episode."""
-        self.policy.reset()
+        for part in (self.policy, *self.processors):
+            part.reset()
 
     @torch.no_grad()
     def action(self, observation: Observation) -> Tensor:
@@ -88,11 +89,12 @@ class PlannerDriver:
 
     Args:
         settings: of the search.
+        done_frames: consecutive done frames that make a success.
         policy: whose actions it changes, if there is one.
     """
 
-    def __init__(self, settings: PlannerSettings, policy: LoadedPolicy | None) -> None:
-        self.settings, self.policy = settings, policy
+    def __init__(self, settings: PlannerSettings, done_frames: int, policy: LoadedPolicy | None) -> None:
+        self.settings, self.done_frames, self.policy = settings, done_frames, policy
         self.reset()
 
     def reset(self) -> None:
@@ -108,7 +110,7 @@ class PlannerDriver:
         """Return planned actions. (1, T, A)"""
         env = drive.env
         self.planner = self.planner or Planner(
-            env.model, None, self.settings, min(env.config.done_frames, self.settings.horizon),
+            env.model, None, self.settings, min(self.done_frames, self.settings.horizon),
             averaged=False, low=env.action_low, high=env.action_high, seed=PLANNER_SEED,
         )  # fmt: skip
         proposed = None

@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -21,6 +21,9 @@ from lerobot_wmrl.rewards.success_rules import SuccessRule, rows_of
 if TYPE_CHECKING:
     from aiohttp import web
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+KEPT_FRAMES: Final = 2048
+"""Frames that stay encoded in memory, for going to and fro."""
 
 Labels = dict[int, int | None]
 """Episode → the first frame in which the task is solved, None for a failure. What is missing has no label."""
@@ -78,19 +81,16 @@ class LabelPage:
     """
 
     def __init__(self, rule: ByHandRule, dataset: "LeRobotDataset") -> None:
-        from lerobot_wmrl.data.frame_cache import decode_episode
         from lerobot_wmrl.play.web import Access
 
         self.rule, self.dataset, self.access = rule, dataset, Access(rule.host)
-        self.about = {"dataset": str(dataset.root), "frames": dataset.num_frames}
+        self.lengths = [int(row["length"]) for row in dataset.meta.episodes]
+        self.about = {"dataset": str(Path(dataset.root).resolve()), "lengths": self.lengths}
         self.labels = self._read()
         self.done = asyncio.Event()
         self.worker = ThreadPoolExecutor(1, "frames")
-        self.lengths = [int(row["length"]) for row in dataset.meta.episodes]
         self.cameras = [key for key in dataset.meta.camera_keys if key not in dataset.meta.depth_keys]
-        self.decode = lru_cache(2 * len(self.cameras))(
-            lambda episode, camera: decode_episode(dataset, episode, camera).permute(0, 2, 3, 1).numpy()
-        )
+        self.pictures = lru_cache(KEPT_FRAMES)(self._pictures)
 
     @property
     def complete(self) -> bool:
@@ -145,15 +145,13 @@ class LabelPage:
         tasks = [", ".join(row["tasks"]) for row in self.dataset.meta.episodes]
         return web.json_response(
             {
-                "name": str(self.dataset.root), "fps": self.dataset.fps, "cameras": self.cameras,
+                "fps": self.dataset.fps, "cameras": self.cameras,
                 "lengths": self.lengths, "tasks": tasks, "labels": self.labels, "last": self.rule.last,
             }
         )  # fmt: skip
 
     async def _frame(self, request: "web.Request") -> "web.Response":
         from aiohttp import web
-
-        from lerobot_wmrl.play.drive import jpeg
 
         camera = request.query.get("camera", "")
         numbers = [request.query.get(name, "") for name in ("episode", "frame")]
@@ -163,8 +161,18 @@ class LabelPage:
         if not is_index(frame, self.lengths[episode]):
             raise web.HTTPNotFound(text=f"frame: episode {episode} has {self.lengths[episode]} frames")
         loop = asyncio.get_running_loop()
-        images = await loop.run_in_executor(self.worker, self.decode, episode, camera)
-        return web.Response(body=jpeg(images[frame]), content_type="image/jpeg")
+        row = int(self.dataset.meta.episodes[episode]["dataset_from_index"]) + frame
+        pictures = await loop.run_in_executor(self.worker, self.pictures, row)
+        return web.Response(body=pictures[camera], content_type="image/jpeg")
+
+    def _pictures(self, row: int) -> dict[str, bytes]:
+        """Return the pictures of a row of the dataset by camera, as JPEG."""
+        from lerobot_wmrl.common.images import jpeg, to_bytes
+
+        found = self.dataset[row]
+        return {
+            camera: jpeg(to_bytes(found[camera].float()).permute(1, 2, 0).numpy()) for camera in self.cameras
+        }
 
     async def _label(self, request: "web.Request") -> "web.Response":
         from aiohttp import web
@@ -190,12 +198,18 @@ class LabelPage:
     def _read(self) -> Labels:
         if not self.rule.file.is_file():
             return {}
-        found = json.loads(self.rule.file.read_text())
-        if {name: found.get(name) for name in self.about} != self.about:
+        try:
+            found = json.loads(self.rule.file.read_text())
+            labels = {int(episode): first for episode, first in found["labels"].items()}
+            own = {name: found[name] for name in self.about} == self.about
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise FieldError("file", self.rule.file, "holds no labels", "choose another file") from error
+        if not own:
             raise FieldError(
-                "file", self.rule.file, f"holds the labels of {found.get('dataset')}", "choose another file"
-            )
-        return {int(episode): first for episode, first in found["labels"].items()}
+                "file", self.rule.file, f"holds the labels of {found['dataset']}, as it was then",
+                "choose another file",
+            )  # fmt: skip
+        return labels
 
 
 def is_index(value: Any, count: int) -> bool:

@@ -2,20 +2,24 @@
 
 import os
 import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import ACTION, DEFAULT_FEATURES
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.embodiment import Embodiment
+from lerobot_wmrl.data.embodiment import Embodiment, check_same_robot
 from lerobot_wmrl.data.episodes import open_dataset
+from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.play.drive import Step
 from lerobot_wmrl.rl.recorders import episode_features, observation_row
+
+SUCCESS_FRAMES: Final = WorldModelEnv.done_frames
+"""Frames at the end of a successful episode in which success holds."""
 
 
 class SavedEpisodes:
@@ -24,46 +28,55 @@ class SavedEpisodes:
     Args:
         folder: of the dataset, which is new or has been written by this class.
         robot: whose actions and states these are.
-        success_frames: number of frames at the end of a successful episode in which success holds.
+
+    Raises:
+        FieldError: the folder holds something else, or episodes of another robot.
     """
 
-    def __init__(self, folder: Path, robot: Embodiment, success_frames: int) -> None:
-        self.folder, self.robot, self.success_frames = folder, robot, success_frames
+    def __init__(self, folder: Path, robot: Embodiment) -> None:
+        self.folder, self.robot = folder.resolve(), robot
         self.name = f"local/{folder.name}"
-        recover(folder)
-        self.count = open_dataset(folder).num_episodes if folder.is_dir() else 0
+        recover(self.folder)
+        self.count = 0
+        if self.folder.is_dir() and any(self.folder.iterdir()):
+            try:
+                meta = open_dataset(self.folder).meta
+                check_same_robot(robot, meta)
+            except FieldError as error:
+                raise FieldError("output_dir", folder, error.problem, "choose a new folder") from error
+            self.count = meta.total_episodes
 
-    def add(self, steps: Sequence[Step], instruction: str, success: bool) -> int:
+    def add(self, steps: Iterable[Step], count: int, instruction: str, success: bool) -> int:
         """Add an episode. Return its index.
 
         Args:
             steps: of the drive.
+            count: how many there are.
             instruction: the task.
             success: whether it succeeds at its end.
 
         Raises:
             FieldError: there is no step, or the dataset has other columns.
         """
-        if not steps:
+        if not count:
             raise FieldError("save", 0, "nothing has been driven yet", "drive first")
-        features = episode_features(steps[0].before, self.robot, "image")
         with replacing(self.folder) as folder:
-            self._write(self._open(folder, features), steps, instruction, success)
+            dataset = None
+            for index, step in enumerate(steps):
+                if dataset is None:
+                    dataset = self._open(folder, episode_features(step.before, self.robot, "image"))
+                solved = success and index >= count - SUCCESS_FRAMES
+                frame: dict[str, Any] = {
+                    **observation_row(step.before, 0), ACTION: step.action, "task": instruction,
+                    "next.reward": np.array([step.reward], np.float32),
+                    "next.success": np.array([solved]), "next.done": np.array([index == count - 1]),
+                }  # fmt: skip
+                dataset.add_frame(frame)
+            assert dataset is not None, "there are steps"
+            dataset.save_episode()
+            dataset.finalize()
         self.count += 1
         return self.count - 1
-
-    def _write(self, dataset: LeRobotDataset, steps: Sequence[Step], instruction: str, success: bool) -> None:
-        for index, step in enumerate(steps):
-            last = index == len(steps) - 1
-            solved = success and index >= len(steps) - self.success_frames
-            frame: dict[str, Any] = {
-                **observation_row(step.before, 0), ACTION: step.action, "task": instruction,
-                "next.reward": np.array([step.reward], np.float32),
-                "next.success": np.array([solved]), "next.done": np.array([last]),
-            }  # fmt: skip
-            dataset.add_frame(frame)
-        dataset.save_episode()
-        dataset.finalize()
 
     def _open(self, folder: Path, features: dict[str, Any]) -> LeRobotDataset:
         """Return the dataset in `folder`, ready to be added to; a new one if there is none."""
@@ -91,7 +104,7 @@ def replacing(folder: Path) -> Iterator[Path]:
     partial, old = beside(folder)
     shutil.rmtree(partial, ignore_errors=True)
     partial.parent.mkdir(parents=True, exist_ok=True)
-    if folder.is_dir():
+    if folder.is_dir() and any(folder.iterdir()):
         shutil.copytree(folder, partial, copy_function=link_or_copy)
     yield partial
     if folder.is_dir():
@@ -101,11 +114,12 @@ def replacing(folder: Path) -> Iterator[Path]:
 
 
 def link_or_copy(source: str, target: str) -> None:
-    """Link a file of episodes, copy any other."""
+    """Link a file of episodes, where the file system can; copy any other."""
     if Path(source).name.startswith("file-"):
-        os.link(source, target)
-    else:
-        shutil.copy2(source, target)
+        with suppress(OSError):
+            os.link(source, target)
+            return
+    shutil.copy2(source, target)
 
 
 def recover(folder: Path) -> None:

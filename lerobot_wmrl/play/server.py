@@ -24,6 +24,9 @@ from lerobot_wmrl.play.world import LARGEST_SIDE, World, text
 MOST_VISITORS: Final = 8
 """Visitors whose drives are kept; the one who has been away longest makes room for the next."""
 
+ELSEWHERE: Final = 4000
+"""Code with which a socket is closed when its visitor has opened the page once more."""
+
 MOST_UPLOADS: Final = 16
 LARGEST_MESSAGE: Final = 64 * 1024
 LARGEST_UPLOAD: Final = 16 * 1024**2
@@ -43,6 +46,7 @@ class PlayServer:
         self.world, self.saved, self.access = world, saved, Access(host)
         self.visits: dict[str, Visit] = {}
         self.sockets: dict[str, web.WebSocketResponse] = {}
+        self.entering = asyncio.Lock()
         self.worker = ThreadPoolExecutor(1, "drive")
 
     def application(self) -> web.Application:
@@ -81,10 +85,15 @@ class PlayServer:
         name = request.query.get("visit", "")
         if not (name.isalnum() and 8 <= len(name) <= 64):
             raise web.HTTPBadRequest(text="visit: must be 8 to 64 letters and digits")
+        if name not in self.sockets and len(self.sockets) >= MOST_VISITORS:
+            raise web.HTTPServiceUnavailable(text=f"{MOST_VISITORS} visitors are here already")
         socket = web.WebSocketResponse(max_msg_size=LARGEST_MESSAGE, heartbeat=30)
         await socket.prepare(request)
-        visit = await self._visit(name)
-        self.sockets[name] = socket
+        before, self.sockets[name] = self.sockets.get(name), socket
+        if before is not None:
+            await before.close(code=ELSEWHERE)
+        async with self.entering:
+            visit = await self._visit(name)
         try:
             async for received in socket:
                 if received.type is WSMsgType.TEXT:
@@ -107,19 +116,16 @@ class PlayServer:
 
     async def _answer(self, visit: Visit, data: str) -> dict[str, Any]:
         """Return the answer to a message, or what is wrong with it."""
-        message: Any = None
         try:
             message = json.loads(data)
             if not isinstance(message, dict):
                 raise FieldError("message", data[:80], "must be a JSON object")
-            answer = await self._compute(visit.answer, message)
+            return await self._compute(visit.answer, message)
         except ValueError as error:
-            answer = {"error": str(error)}
+            return {"error": str(error)}
         except Exception as error:  # a policy's or an environment's own
             logging.exception("a message could not be answered")
-            answer = {"error": f"{type(error).__name__}: {error}"}
-        sent = message.get("sent") if isinstance(message, dict) else None
-        return {**answer, "sent": sent}
+            return {"error": f"{type(error).__name__}: {error}"}
 
     async def _picture(self, request: web.Request) -> web.Response:
         """Take pictures, one for each camera, with `state` and `instruction`. → the name of the place."""
@@ -127,11 +133,14 @@ class PlayServer:
             raise web.HTTPUnsupportedMediaType(text="send a form (multipart/form-data)")
         try:
             form = await request.post()
-            images = {
-                name: read_image(name, part.file)
-                for name, part in form.items()
-                if isinstance(part, web.FileField)
-            }
+            files = {name: part.file for name, part in form.items() if isinstance(part, web.FileField)}
+            cameras = self.world.sizes.cameras
+            if len(form.getall(next(iter(files), ""), [])) > 1 or {*files} != {*cameras}:
+                raise FieldError(
+                    "picture", sorted(files), f"the world model sees the cameras {', '.join(cameras)}",
+                    "give one picture for each",
+                )  # fmt: skip
+            images = {name: read_image(name, file) for name, file in files.items()}
             state = json.loads(str(form["state"])) if "state" in form else None
             instruction = text(str(form.get("instruction", "")))
             name = secrets.token_hex(8)

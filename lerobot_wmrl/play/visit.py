@@ -23,7 +23,8 @@ class Visit:
     """
 
     def __init__(self, world: World, saved: SavedEpisodes) -> None:
-        self.world, self.saved, self.drivers = world, saved, world.drivers()
+        self.world, self.saved = world, saved
+        self.drivers = {name: world.driver(name) for name in world.driver_names()}
         self.real_env: Any = None
         self.drive: Drive | None = None
         self.place: dict[str, Any] = {}
@@ -62,7 +63,7 @@ class Visit:
             self.real_env = self.world.make_real_env()
         self.drive = self.world.begin(message, self.real_env)
         self.driver = ""
-        self.place = {name: message[name] for name in message if name not in ("do", "sent")}
+        self.place = {name: message[name] for name in message if name != "do"}
         return self._resume(message)
 
     def _resume(self, message: Mapping[str, Any]) -> dict[str, Any]:
@@ -80,7 +81,8 @@ class Visit:
         return {"begun": begun, "views": self.drive.views}
 
     def _step(self, message: Mapping[str, Any]) -> dict[str, Any]:
-        drive, name = self._driving(), message.get("driver")
+        drive, name = self._driving(message), message.get("driver")
+        drive.require_running()
         if name == YOU:
             given = message.get("action")
             if not is_numbers(given):
@@ -97,21 +99,21 @@ class Visit:
         return {"view": view}
 
     def _rewind(self, message: Mapping[str, Any]) -> dict[str, Any]:
-        drive = self._driving()
+        drive = self._driving(message)
         drive.rewind(whole_number(message, "frame", drive.frame))
         self.driver = ""
         return {"rewound": drive.frame}
 
     def _save(self, message: Mapping[str, Any]) -> dict[str, Any]:
-        drive, success = self._driving(), message.get("success")
+        drive, success = self._driving(message), message.get("success")
         if success is None:
-            success = drive.ended == "success"
+            success = drive.succeeds(self.world.config.done_threshold, self.world.done_frames)
         if not isinstance(success, bool):
             raise FieldError("success", success, "must be true or false")
-        episode = self.saved.add(list(drive.replay()), drive.instruction, success)
+        episode = self.saved.add(drive.replay(), drive.frame, drive.instruction, success)
         return {"saved": episode, "success": success, "folder": str(self.saved.folder)}
 
-    def _driving(self) -> Drive:
+    def _driving(self, message: Mapping[str, Any]) -> Drive:
         if self.drive is None:
-            raise FieldError("do", "step", "nothing has begun", "begin first")
+            raise FieldError("do", message["do"], "nothing has begun", "begin first")
         return self.drive

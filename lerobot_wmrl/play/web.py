@@ -11,8 +11,13 @@ from aiohttp import web
 PAGES: Final = Path(__file__).with_name("page")
 LOOPBACK: Final = ("127.0.0.1", "localhost", "::1")
 TOKEN: Final = "token"
-POLICY: Final = "default-src 'self'; img-src 'self' data: blob:; connect-src 'self' data: ws: wss:"
-"""Where a page may load from; frames come as data."""
+SOURCES: Final = (
+    "default-src 'self'",
+    "img-src 'self' data: blob:",
+    "connect-src 'self' data: ws: wss:",
+    "frame-ancestors 'none'",
+)
+"""Where a page may load from, and that no other page shows it; frames come as data."""
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -50,7 +55,7 @@ class Access:
         """Return a page, by the name of its file."""
         page = web.Response(text=(PAGES / name).read_text(), content_type="text/html")
         page.headers["Cache-Control"] = "no-store"
-        page.headers["Content-Security-Policy"] = POLICY
+        page.headers["Content-Security-Policy"] = "; ".join(SOURCES)
         if self.token:
             page.set_cookie(TOKEN, self.token, httponly=True, samesite="Strict")
         return page

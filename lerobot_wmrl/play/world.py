@@ -9,10 +9,11 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import OBS_STATE
-from PIL import Image
+from PIL import Image, ImageOps
 
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.episodes import DatasetSource, EpisodeTable, read_episodes
+from lerobot_wmrl.data.frame_cache import cached_frames
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.envs.lerobot_env import make_tensor_env
@@ -31,7 +32,8 @@ LARGEST_SIDE: Final = 4096
 
 CENTRED: Final = 0.05
 """An action's component springs back to 0 if the middle of its range is no farther from 0 than this share of
-the range: it is then likely to be a velocity or a displacement."""
+the range: it is then likely to be a velocity or a displacement. Grippers, and what is named like a position
+or a state, stay where they are."""
 
 
 @dataclass
@@ -41,6 +43,8 @@ class World:
     Args:
         models: the world models.
         config: of the imagined episodes.
+        done_frames: consecutive done frames that make a success, by which an episode is judged even where it
+            does not end.
         table: of the dataset in whose frames episodes can begin.
         policy: that can act.
         real_env: that takes the same actions, and whose resets episodes can begin in.
@@ -48,6 +52,7 @@ class World:
 
     models: WorldModels
     config: WorldModelEnv
+    done_frames: int
     table: EpisodeTable | None = None
     policy: LoadedPolicy | None = None
     real_env: EnvConfig | None = None
@@ -84,8 +89,8 @@ class World:
             "state": self.model.embodiment.state_names,
             "clip_length": self.model.clip_length,
             "done_threshold": self.config.done_threshold,
-            "done_frames": self.config.done_frames,
-            "drivers": list(self.drivers()),
+            "done_frames": self.done_frames,
+            "drivers": self.driver_names(),
             "policy": self.policy.config.type if self.policy else "",
             "episodes": episodes,
             "real": self.real_env.type if self.real_env else "",
@@ -101,22 +106,27 @@ class World:
         for name, low, high, mean in zip(
             robot.action_names, robot.action_low, robot.action_high, means, strict=True
         ):
-            centred = abs(low + high) / 2 <= CENTRED * (high - low) and "gripper" not in name.lower()
+            position = "gripper" in name.lower() or name.endswith(".pos") or name in robot.state_names
+            centred = abs(low + high) / 2 <= CENTRED * (high - low) and not position
             rest = 0.0 if centred else min(max(mean, low), high)
             axes.append({"name": name, "low": low, "high": high, "rest": rest, "springs": centred})
         return axes
 
-    def drivers(self) -> dict[str, Driver]:
-        """Return a visitor's own drivers by name, besides themselves."""
-        found: dict[str, Driver] = {}
-        if self.policy is not None:
-            found["policy"] = PolicyDriver(self.policy.copy())
-        if self.model.learnt_successes != 0:
-            proposing = self.policy and self.policy.copy()
-            found["planner"] = PlannerDriver(planner_settings(self.model.clip_length), proposing)
-        if self.table is not None:
-            found["recorded"] = RecordedDriver()
-        return found
+    def driver_names(self) -> list[str]:
+        """Return who can act besides the visitor."""
+        there = {
+            "policy": self.policy is not None,
+            "planner": self.model.learnt_successes != 0,
+            "recorded": self.table is not None,
+        }
+        return [name for name, found in there.items() if found]
+
+    def driver(self, name: str) -> Driver:
+        """Return a visitor's own driver of one of `driver_names`."""
+        policy = self.policy and self.policy.copy()
+        if name == "planner":
+            return PlannerDriver(planner_settings(self.model.clip_length), self.done_frames, policy)
+        return RecordedDriver() if policy is None or name == "recorded" else PolicyDriver(policy)
 
     def make_real_env(self) -> Any:
         """Return a visitor's own real environment, None if there is none."""
@@ -125,6 +135,7 @@ class World:
         env = make_tensor_env(self.real_env, 1, "cpu")
         count, wanted = env.single_action_space.shape[0], len(self.model.embodiment.action_names)
         if count != wanted:
+            env.close()
             raise FieldError(
                 "real_env.type", self.real_env.type,
                 f"takes actions of {count} components, the world model has learnt {wanted}",
@@ -143,7 +154,7 @@ class World:
         Raises:
             FieldError: there is no such place.
         """
-        recorded, real = None, None
+        recorded, real, instruction = None, None, text(place.get("instruction", ""))
         if "episode" in place:
             start, recorded = self._recorded(place)
         elif "seed" in place:
@@ -155,8 +166,8 @@ class World:
             start = observed_frame(real.observation, self.sizes)
         else:
             start = self._uploaded(place)
-        if instruction := place.get("instruction"):
-            start = start._replace(instructions=[text(instruction)])
+        if instruction:
+            start = start._replace(instructions=[instruction])
         return Drive(start, self.models, self.config, recorded, real)
 
     def upload(self, name: str, images: Mapping[str, Image.Image], state: Any, instruction: str) -> None:
@@ -165,18 +176,13 @@ class World:
         Args:
             name: of the place.
             images: by camera.
-            state: (P,) in the dataset's units, None for zeros where the world model predicts no state.
+            state: (P,) in the dataset's units; None for a world model that predicts no state.
             instruction: the task.
 
         Raises:
             FieldError: a camera is missing or unknown, or the state has another length.
         """
         sizes, count = self.sizes, self.model.state_size
-        if {*images} != {*sizes.cameras}:
-            raise FieldError(
-                "picture", sorted(images), f"the world model sees the cameras {', '.join(sizes.cameras)}",
-                "give one picture for each",
-            )  # fmt: skip
         values = [] if state is None else state
         if not is_numbers(values) or len(values) != count:
             raise FieldError(
@@ -184,17 +190,22 @@ class World:
                 state,
                 f"must be {count} finite numbers: {', '.join(self.model.embodiment.state_names)}",
             )
-        side = sizes.image_size
-        squares = [
-            np.asarray(images[camera].convert("RGB").resize((side, side), Image.Resampling.BILINEAR))
-            for camera in sizes.cameras
-        ]
+        try:
+            squares = [self._square(images[camera]) for camera in sizes.cameras]
+        except OSError as error:
+            raise FieldError("picture", sorted(images), f"cannot be decoded ({error})") from error
         shown = {
             key: torch.from_numpy(square).permute(2, 0, 1)[None] / 255
             for key, square in zip(sizes.camera_keys, squares, strict=True)
         }
         shown[OBS_STATE] = torch.tensor([values], dtype=torch.float32).reshape(1, count)
         self.uploads[name] = observed_frame({**shown, "task": [instruction]}, sizes)
+
+    def _square(self, image: Image.Image) -> np.ndarray:
+        """Decode a picture, upright, and stretch it to what the tokenizer sees. → (S, S, 3) uint8"""
+        side = self.sizes.image_size
+        upright = ImageOps.exif_transpose(image).convert("RGB")
+        return np.asarray(upright.resize((side, side), Image.Resampling.BILINEAR))
 
     def _recorded(self, place: Mapping[str, Any]) -> tuple[StartImages, Recorded]:
         """Return a frame of the dataset, and what followed it."""
@@ -204,7 +215,7 @@ class World:
         frame = whole_number(place, "frame", int(self.table.length[episode]) - 1)
         begin = int(self.table.start[episode])
         first, end = begin + frame, begin + int(self.table.length[episode])
-        images = recorded_frames(self.table, np.arange(first, end), self.sizes).images
+        images = cached_frames(self.table.dataset, self.sizes.camera_keys, self.sizes.image_size)[first:end]
         actions = self.table.action[first:end].astype(np.float32)
         return recorded_frames(self.table, np.array([first]), self.sizes), Recorded(actions, images)
 
@@ -216,15 +227,24 @@ class World:
 
 
 def load_world(
-    config: WorldModelEnv, dataset: DatasetSource, policy: PreTrainedConfig | None, real_env: EnvConfig | None
-) -> World:
-    """Load what `config` names, and check that dataset, policy and environment fit the world model.
+    config: WorldModelEnv, dataset: DatasetSource, policy: PreTrainedConfig | None,
+    real_env: EnvConfig | None, end_at_success: bool = True,
+) -> World:  # fmt: skip
+    """Load what `config` names, and check that dataset and policy fit the world model.
+
+    Args:
+        config: of the imagined episodes.
+        dataset: in whose frames they can begin, if it is given.
+        policy: that can act.
+        real_env: that takes the same actions.
+        end_at_success: whether an episode ends when it succeeds.
 
     Raises:
-        FieldError: one of them does not.
+        FieldError: one of them does not fit.
     """
     models = load_world_models(config, config.device)
-    world = World(models, config)
+    driven = config if end_at_success else replace(config, done_frames=config.horizon)
+    world = World(models, driven, config.done_frames)
     if isinstance(real_env, WmrlManiSkillEnv):
         side = resets_side(world.sizes)
         real_env = replace(real_env, cameras=list(world.sizes.cameras), image_size=side)

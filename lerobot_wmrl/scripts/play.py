@@ -21,17 +21,19 @@ is printed.
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, Final
 
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.command_line import RunConfig, run_command
-from lerobot_wmrl.common.errors import FieldError, require_at_least
-from lerobot_wmrl.common.policies import check_weights, read_policy_config
+from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.policies import check_weights, read_policy_config, require_trained
 from lerobot_wmrl.data.episodes import DatasetSource
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
+
+LAST_PORT: Final = 65535
 
 
 @dataclass
@@ -51,6 +53,7 @@ class PlayConfig(RunConfig):
             shows the world model's cameras.
         done_threshold: predicted success probability at which a frame counts as done.
         done_frames: consecutive done frames that make a success.
+        end_at_success: end a drive when it succeeds; otherwise it goes on.
         episode_length: frames after which a drive ends.
         host: address at which the page is served.
         port: port at which the page is served; 0 for any that is free.
@@ -68,6 +71,7 @@ class PlayConfig(RunConfig):
     real_env: EnvConfig | None = None
     done_threshold: float = 0.5
     done_frames: int = 3
+    end_at_success: bool = True
     episode_length: int = 1000
     host: str = "127.0.0.1"
     port: int = 8000
@@ -80,6 +84,8 @@ class PlayConfig(RunConfig):
         if path:
             self.policy = read_policy_config(path, parser.get_cli_overrides("policy") or [])
             check_weights(self.policy)
+        if self.policy is not None:
+            require_trained(self.policy)
         if not self.world_model.path:
             raise FieldError("world_model.path", "", "is missing", "give the action world model to drive")
         if not self.dataset.given and self.real_env is None:
@@ -87,7 +93,8 @@ class PlayConfig(RunConfig):
                 "dataset.root", "", "is missing: a drive begins in a frame",
                 "give the world model's dataset, `dataset.repo_id`, or an environment, `real_env.type`",
             )  # fmt: skip
-        require_at_least(self, 0, "port")
+        if not 0 <= self.port <= LAST_PORT:
+            raise FieldError("port", self.port, f"must be from 0 to {LAST_PORT}")
 
 
 def play(cfg: PlayConfig) -> None:
@@ -105,8 +112,8 @@ def play(cfg: PlayConfig) -> None:
         episode_length=cfg.episode_length, done_threshold=cfg.done_threshold, done_frames=cfg.done_frames,
         device=cfg.device,
     )  # fmt: skip
-    world = load_world(env, cfg.dataset, cfg.policy, cfg.real_env)
-    saved = SavedEpisodes(cfg.output_dir, world.model.embodiment, cfg.done_frames)
+    world = load_world(env, cfg.dataset, cfg.policy, cfg.real_env, cfg.end_at_success)
+    saved = SavedEpisodes(cfg.output_dir, world.model.embodiment)
     server = PlayServer(world, saved, cfg.host)
 
     def ready(port: int) -> None:
@@ -115,7 +122,9 @@ def play(cfg: PlayConfig) -> None:
     try:
         serve(server.application(), cfg.host, cfg.port, ready)
     except OSError as error:
-        raise FieldError("port", cfg.port, f"cannot be served ({error})", "choose another") from error
+        raise FieldError(
+            "port", cfg.port, f"cannot be served at {cfg.host} ({error})", "choose another port, or `host`"
+        ) from error
     finally:
         if saved.count:
             print(f"\n{saved.count} episodes are in {cfg.output_dir}")

@@ -9,12 +9,14 @@ import torch
 from lerobot.lerobot_types import RobotAction, RobotObservation
 from lerobot.robots.robot import Robot
 from lerobot.utils.constants import OBS_STATE
-from lerobot.utils.keyboard_input import init_keyboard_listener
+from lerobot.utils.keyboard_input import init_keyboard_listener, pynput_can_capture
 
 from lerobot_robot_imagined.config_imagined import ImaginedRobotConfig
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.images import to_bytes
 from lerobot_wmrl.envs.configuration_world_model import DrivenEnv
+from lerobot_wmrl.envs.start_frames import read_start_images
+from lerobot_wmrl.envs.world_model_env import load_world_models, make_env_at
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.world_models.checkpoint import read_config
 
@@ -43,7 +45,10 @@ class ImaginedRobot(Robot):
         self.config = config
         self.model: Any = read_config(config.world_model_path, "action_world_model")
         self.env: Any = None
+        self.listener: Any = None
+        self.events = {"exit_early": False}
         self.succeeded = False
+        self.began: float | None = None
 
     @property
     def cameras(self) -> dict[str, tuple[int, int, int]]:
@@ -82,8 +87,10 @@ class ImaginedRobot(Robot):
             episode_length=LONGEST, done_threshold=config.done_threshold, done_frames=config.done_frames,
             device=config.device,
         )  # fmt: skip
-        self.env = env.create_tensor_env(1)
-        self.listener, self.events = init_keyboard_listener()
+        if config.right_arrow:
+            self._listen()
+        models = load_world_models(env, env.device)
+        self.env = make_env_at(read_start_images(config.dataset, models.model.config), models, env, 1)
         self.start = config.first_start - 1
         self._begin()
         logging.info(
@@ -96,6 +103,7 @@ class ImaginedRobot(Robot):
         self.env = None
         if self.listener is not None:
             self.listener.stop()
+            self.listener = None
 
     def get_observation(self) -> RobotObservation:
         """Return the newest frame, that of the next episode if this one is over."""
@@ -103,6 +111,7 @@ class ImaginedRobot(Robot):
             raise ConnectionError("the imagined robot is not connected")
         if self._is_over():
             self._begin()
+        self.began = self.began or time.perf_counter()
         state = self.observation[OBS_STATE][0].tolist() if OBS_STATE in self.observation else []
         images = (
             to_bytes(self.observation[key][0]).permute(1, 2, 0).cpu().numpy()
@@ -139,21 +148,34 @@ class ImaginedRobot(Robot):
         return dict(zip(self.action_features, self.last[0].tolist(), strict=True))
 
     def _names(self, kind: str) -> list[str]:
-        """Return the names of the components of `state` or `action`, as LeRobot's commands see them."""
+        """Return the names of the components of `state`, if it is imagined, or of `action`."""
+        if kind == "state" and not self.model.state_size:
+            return []
         return [f"{name}{self.config.suffix}" for name in getattr(self.model.embodiment, f"{kind}_names")]
 
     def _begin(self) -> None:
         """Begin the next episode."""
         self.start += 1
         self.observation, _ = self.env.reset(seed=[self.start])
-        self.began, self.succeeded = time.perf_counter(), False
+        self.began, self.succeeded = None, False
         self.last = self.env.model.action_mean[None].cpu()
 
     def _is_over(self) -> bool:
         """Return whether the right arrow was pressed since the last observation, or time is up."""
         pressed, self.events["exit_early"] = self.events["exit_early"], False
         limit = self.config.episode_time_s
-        return pressed or (limit is not None and time.perf_counter() - self.began >= limit)
+        if limit is None or self.began is None:
+            return pressed
+        return pressed or time.perf_counter() - self.began >= limit
+
+    def _listen(self) -> None:
+        """Watch the keyboard. FieldError where keys would be taken from LeRobot's command."""
+        if not pynput_can_capture():
+            raise FieldError(
+                "robot.right_arrow", True, "keys can be watched only with pynput, on a screen",
+                "leave it out, and set `robot.episode_time_s`",
+            )  # fmt: skip
+        self.listener, self.events = init_keyboard_listener()
 
     def _displaced(self, sent: Mapping[str, float]) -> dict[str, float]:
         """Return the action that a keyboard's or gamepad's displacement stands for.

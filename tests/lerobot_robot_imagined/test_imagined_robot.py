@@ -1,6 +1,7 @@
 """The imagined robot in LeRobot's own commands: recording, replaying, a policy's rollouts."""
 
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -93,14 +94,9 @@ def recording(folder: Path, seconds: float, episodes: int) -> list[str]:
 
 def run(command: Callable[[], Any], monkeypatch: pytest.MonkeyPatch, *given: str) -> None:
     monkeypatch.setattr(sys, "argv", ["command", *given])
-    monkeypatch.setattr("lerobot_robot_imagined.imagined.init_keyboard_listener", silent)
     for module in ("lerobot_record", "lerobot_teleoperate"):
         monkeypatch.setattr(f"lerobot.scripts.{module}.make_teleoperator_from_config", ScriptedTeleop)
     command()
-
-
-def silent() -> tuple[None, dict[str, bool]]:
-    return None, {"exit_early": False}
 
 
 def test_lerobot_knows_the_robot_and_makes_it(make_robot):
@@ -198,18 +194,29 @@ def test_lerobot_rollout_runs_a_policy_in_it(flags, tmp_path, monkeypatch):
     assert dataset.features["action"]["names"] == [f"{name}.pos" for name in ACTION_NAMES]
 
 
-def test_the_right_arrow_and_time_begin_the_next_episode(make_robot, monkeypatch):
-    robot = make_robot()
+def test_time_begins_the_next_episode_from_the_first_frame_that_was_shown_on(make_robot):
+    robot = make_robot(episode_time_s=0.2)
+    time.sleep(0.25)
     first = robot.get_observation()
     robot.send_action(dict.fromkeys(ACTION_NAMES, 0.05))
     assert robot.get_observation()["tcp_x"] != first["tcp_x"]
     assert robot.start == 0
-    robot.events["exit_early"] = True
+    time.sleep(0.25)
     robot.get_observation()
-    assert (robot.start, robot.events["exit_early"]) == (1, False)
-    robot.config.episode_time_s = 1e-9
+    assert robot.start == 1
+
+
+def test_the_right_arrow_begins_the_next_episode_where_keys_can_be_watched(make_robot, monkeypatch):
+    with pytest.raises(FieldError, match=r"^robot\.right_arrow=True: keys can be watched only with pynput"):
+        make_robot(right_arrow=True)
+    events = {"exit_early": False}
+    monkeypatch.setattr("lerobot_robot_imagined.imagined.pynput_can_capture", lambda: True)
+    monkeypatch.setattr("lerobot_robot_imagined.imagined.init_keyboard_listener", lambda: (None, events))
+    robot = make_robot(right_arrow=True)
     robot.get_observation()
-    assert robot.start == 2
+    events["exit_early"] = True
+    robot.get_observation()
+    assert (robot.start, events["exit_early"]) == (1, False)
 
 
 def test_it_stands_still_after_a_success(make_robot):
@@ -245,6 +252,7 @@ def test_what_cannot_be_is_refused(make_robot, trained_models):
     robot = make_robot()
     with pytest.raises(FieldError, match=r"need dy, dz, .* too; use a teleoperator whose actions are dx, dy"):
         robot.send_action({"dx": 0.0})
+    robot.disconnect()
     robot.disconnect()
     with pytest.raises(ConnectionError, match="not connected"):
         robot.get_observation()

@@ -35,15 +35,15 @@ def play_policy(tmp_path_factory) -> PreTrainedConfig:
 def make_world(small_dataset, trained_models, play_policy) -> Callable[..., World]:
     """Loads the small models, with a dataset, a policy and ManiSkill as a real environment."""
 
-    def make(real: bool = False, text: bool = False, **settings: Any) -> World:
+    def make(real: bool = False, text: bool = False, end: bool = False, **settings: Any) -> World:
         env = DrivenEnv(
             world_model_path=str(trained_models["action_world_model"]),
             text_world_model_path=str(trained_models["text_world_model"]) if text else "",
             reward=GeneralConfig() if text else GeneralConfig(alpha=1.0),
-            **{"episode_length": 300, "done_frames": 300, "device": "cpu", **settings},
+            **{"episode_length": 300, "device": "cpu", **settings},
         )
         simulator = WmrlManiSkillEnv(task="push") if real else None
-        return load_world(env, DatasetSource(str(small_dataset.root)), play_policy, simulator)
+        return load_world(env, DatasetSource(str(small_dataset.root)), play_policy, simulator, end)
 
     return make
 
@@ -57,7 +57,7 @@ def world(make_world) -> World:
 @pytest.fixture
 def saved(world, tmp_path) -> SavedEpisodes:
     """A place for episodes."""
-    return SavedEpisodes(tmp_path / "driven", world.model.embodiment, success_frames=3)
+    return SavedEpisodes(tmp_path / "driven", world.model.embodiment)
 
 
 class Served:

@@ -168,6 +168,25 @@ def test_the_pad_moves_the_axes_that_are_chosen_for_it(page):
     page.pause()
 
 
+def test_held_axes_go_on_from_where_somebody_else_has_left_them(page):
+    """The gripper, of which the recorded episode has closed what was open."""
+    slider = "document.querySelectorAll('#axes input[type=range]')[6]"
+    page.hold("h", 12)
+    mine = float(page.state(f"{slider}.value"))
+    page["restart"].click()
+    page.wait(lambda: page.frame == 0)
+    page.driver.execute_script(f"{slider}.value = 1; {slider}.dispatchEvent(new Event('input'))")
+    page.choose("recorded")
+    page["next"].click()
+    page.wait(lambda: page.frame == 1)
+    recorded = float(page.state(f"{slider}.value"))
+    page.choose("you")
+    page["next"].click()
+    page.wait(lambda: page.frame == 2)
+    assert float(page.state(f"{slider}.value")) == recorded != 1
+    assert mine > recorded
+
+
 def test_keys_can_be_chosen(page):
     page.driver.find_element(By.CSS_SELECTOR, '#axes kbd[data-key="2,1"]').click()
     page.press("x")
@@ -216,6 +235,7 @@ def test_maniskill_takes_the_same_actions_beside(make_world, saved, serve, chrom
     page.hold(Keys.ARROW_UP, 8)
     moved, frame = page.state(real), page.frame
     assert moved != first
+    assert not page["strip-difference"].is_displayed()
     page["difference"].click()
     assert page["strip-difference"].is_displayed()
     page["restart"].click()

@@ -1,6 +1,7 @@
 """A drive is its start and its actions: what is seen, going back, replaying, and who acts."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -69,7 +70,7 @@ def test_recorded_frames_are_beside_as_long_as_the_recorded_actions_are_taken(dr
 
 
 def test_an_episode_ends_with_success_and_is_not_driven_on(make_world):
-    drive = make_world(done_frames=2).begin({"episode": 0, "frame": 0}, None)
+    drive = make_world(end=True, done_frames=2).begin({"episode": 0, "frame": 0}, None)
     step = drive.env.model.step
     drive.env.model.step = lambda *args: step(*args)._replace(done_logit=torch.tensor([20.0]))
     try:
@@ -141,7 +142,7 @@ def test_copies_of_a_policy_share_their_weights_and_nothing_else(world):
 def test_saved_episodes_are_a_dataset_that_grows(world, saved, small_dataset):
     """Across visits and restarts; what was driven is in it, and success only where it was."""
     for index, success in enumerate([True, False]):
-        place = type(saved)(saved.folder, saved.robot, 3)
+        place = type(saved)(saved.folder, saved.robot)
         visit = Visit(world, place)
         visit.answer({"do": "begin", "episode": index, "frame": 0})
         for action in some_actions(5):
@@ -161,7 +162,7 @@ def test_saved_episodes_are_a_dataset_that_grows(world, saved, small_dataset):
 
 def test_nothing_is_saved_of_nothing(world, saved):
     visit = Visit(world, saved)
-    with pytest.raises(FieldError, match="nothing has begun; begin first"):
+    with pytest.raises(FieldError, match="do=save: nothing has begun; begin first"):
         visit.answer({"do": "save"})
     visit.answer({"do": "begin", "episode": 0, "frame": 0})
     with pytest.raises(FieldError, match="nothing has been driven yet"):
@@ -178,7 +179,7 @@ def test_a_save_that_is_interrupted_loses_no_episode(world, saved, monkeypatch):
     with pytest.raises(ZeroDivisionError):
         visit.answer({"do": "save", "success": True})
     monkeypatch.undo()
-    assert type(saved)(saved.folder, saved.robot, 3).count == 1
+    assert type(saved)(saved.folder, saved.robot).count == 1
     visit.answer({"do": "save", "success": False})
     assert read_episodes(LeRobotDataset("local/driven", root=saved.folder)).success.tolist() == [True, False]
 
@@ -189,17 +190,81 @@ def test_a_replacement_that_was_cut_between_its_two_moves_is_put_back(world, sav
     visit.answer({"do": "step", "driver": "you", "action": [0.0] * 7})
     visit.answer({"do": "save", "success": True})
     saved.folder.replace(saved.folder.with_name(".driven.old"))
-    assert type(saved)(saved.folder, saved.robot, 3).count == 1
+    assert type(saved)(saved.folder, saved.robot).count == 1
 
 
 def test_a_folder_with_other_columns_is_refused_and_kept(world, saved, make_synthetic_dataset):
     make_synthetic_dataset(saved.folder, episodes=1)
-    visit = Visit(world, type(saved)(saved.folder, saved.robot, 3))
+    visit = Visit(world, type(saved)(saved.folder, saved.robot))
     visit.answer({"do": "begin", "episode": 0, "frame": 0})
     visit.answer({"do": "step", "driver": "you", "action": [0.0] * 7})
     with pytest.raises(FieldError, match=r"^output_dir=.*; choose a new folder"):
         visit.answer({"do": "save"})
     assert read_episodes(LeRobotDataset("local/synthetic", root=saved.folder)).length.tolist() == [11]
+
+
+def test_episodes_of_another_robot_are_not_mixed(world, saved, make_synthetic_dataset):
+    make_synthetic_dataset(saved.folder, episodes=1)
+    with pytest.raises(FieldError, match=r"^output_dir=.*has learnt 10, use|^output_dir=.*frames a second"):
+        type(saved)(saved.folder, replace(saved.robot, fps=10))
+
+
+def test_an_empty_folder_and_a_link_hold_episodes_like_any_other(world, saved, tmp_path):
+    real = tmp_path / "elsewhere"
+    real.mkdir()
+    saved.folder.symlink_to(real)
+    place = type(saved)(saved.folder, saved.robot)
+    visit = Visit(world, place)
+    visit.answer({"do": "begin", "episode": 0, "frame": 0})
+    visit.answer({"do": "step", "driver": "you", "action": [0.0] * 7})
+    for index in range(2):
+        assert visit.answer({"do": "save", "success": True})["saved"] == index
+    assert saved.folder.is_symlink()
+    assert type(saved)(saved.folder, saved.robot).count == 2
+
+
+@pytest.mark.parametrize("at", [1, 4])
+@pytest.mark.parametrize("act", ["rewind", "replay", "step"])
+def test_an_error_midway_loses_nothing(drive, act, at, monkeypatch):
+    """The drive is imagined anew the next time."""
+    actions = some_actions(6)
+    views = [drive.step(action, "you") for action in actions[:5]]
+    step, left = drive.env.model.step, [1 if act == "step" else at]
+
+    def failing(*given):
+        left[0] -= 1
+        if left[0] == 0:
+            raise RuntimeError("out of memory")
+        return step(*given)
+
+    monkeypatch.setattr(drive.env.model, "step", failing)
+    with pytest.raises(RuntimeError, match="out of memory"):
+        {
+            "rewind": lambda: drive.rewind(5), "replay": lambda: list(drive.replay()),
+            "step": lambda: drive.step(actions[5], "you"),
+        }[act]()  # fmt: skip
+    assert drive.views[1:] == views
+    following = drive.step(actions[5], "you")
+    drive.rewind(0)
+    assert [drive.step(action, "you") for action in actions] == [*views, following]
+
+
+def test_success_is_judged_by_the_last_frames_where_the_episode_goes_on(make_world, saved):
+    """And labelled in them alone."""
+    world = make_world(done_frames=2)
+    visit = Visit(world, saved)
+    visit.answer({"do": "begin", "episode": 0, "frame": 0})
+    step = world.models.model.step
+    logits = iter([-20.0, -20.0, 20.0, 20.0, 20.0])
+    world.models.model.step = lambda *args: step(*args)._replace(done_logit=torch.tensor([next(logits)]))
+    try:
+        for _ in range(5):
+            assert not visit.answer({"do": "step", "driver": "you", "action": [0.0] * 7})["view"]["ended"]
+    finally:
+        world.models.model.step = step
+    assert visit.answer({"do": "save"})["success"]
+    table = read_episodes(LeRobotDataset("local/driven", root=saved.folder))
+    assert table.done.tolist() == [False, False, True, True, True]
 
 
 def test_axes_spring_back_where_their_range_is_centred_and_grippers_stay(world):

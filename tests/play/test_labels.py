@@ -4,7 +4,6 @@ import json
 import threading
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
@@ -192,11 +191,25 @@ def test_labels_of_another_dataset_are_refused(rule, unlabelled, small_dataset):
         LabelPage(rule, small_dataset)
 
 
-def test_complete_labels_need_no_page(rule, unlabelled):
-    page = LabelPage(rule, unlabelled)
-    for episode in range(6):
-        page.label(episode, None if episode else 4)
-    solved = rule.frames(unlabelled)
-    table = read_episodes(unlabelled)
-    assert solved.sum() == table.length[0] - 4
-    assert Path(rule.file).is_file()
+def test_a_file_that_holds_no_labels_is_refused(rule, unlabelled):
+    rule.file.write_text("[1, 2]")
+    with pytest.raises(FieldError, match=r"^file=.*: holds no labels"):
+        LabelPage(rule, unlabelled)
+
+
+def test_a_key_that_is_held_down_and_a_slow_server_label_what_was_seen(address, chromium, rule, unlabelled):
+    chromium.switch_to.new_window("window")
+    chromium.get(address)
+    wait(lambda: chromium.find_element(By.ID, "status").text == "ready")
+    chromium.execute_script(
+        """
+        const send = window.fetch;
+        const later = () => new Promise((done) => setTimeout(done, 150));
+        window.fetch = async (...given) => { await later(); return send(...given); };
+        const press = (code, repeat) => dispatchEvent(new KeyboardEvent("keydown", { code, repeat }));
+        press("KeyS", false); press("KeyS", true); press("KeyS", true); press("KeyF", false);
+        """
+    )
+    wait(lambda: len(LabelPage(rule, unlabelled).labels) == 2)
+    labels = LabelPage(rule, unlabelled).labels
+    assert labels == {0: int(read_episodes(unlabelled).length[0]) - 3, 1: None}

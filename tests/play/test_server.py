@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from lerobot_wmrl.play.server import MOST_VISITORS
+from lerobot_wmrl.play.server import ELSEWHERE, MOST_VISITORS
 from lerobot_wmrl.play.web import Access
 
 VISIT = "visitor01"
@@ -75,11 +75,10 @@ def test_the_page_and_what_it_needs(served):
 
 
 def test_a_drive_from_begin_to_save(served, folder):
-    answers = served.run(talk(served, BEGIN, STEP, {**STEP, "sent": 5}, {"do": "save", "success": True}))
+    answers = served.run(talk(served, BEGIN, STEP, STEP, {"do": "save", "success": True}))
     assert answers[0]["begun"]["place"] == {"episode": 0, "frame": 0}
     assert answers[0]["views"][0]["images"][0].startswith("data:image/jpeg;base64,")
     assert [answer["view"]["frame"] for answer in answers[1:3]] == [1, 2]
-    assert answers[2]["sent"] == 5
     assert answers[3]["saved"] == 0
     assert folder.is_dir()
 
@@ -108,6 +107,37 @@ def test_who_has_been_away_longest_makes_room(served):
     assert served.run(talk(served, {"do": "resume"}, visit=names[0]))[0]["begun"] is None
 
 
+def test_no_more_visitors_come_than_there_is_room_for(served):
+    async def crowd() -> int:
+        async with aiohttp.ClientSession() as session:
+            here = [
+                await session.ws_connect(f"{served.address}drive?visit=visitor{index:02d}")
+                for index in range(MOST_VISITORS)
+            ]
+            assert not any(socket.closed for socket in here)
+            with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
+                await session.ws_connect(f"{served.address}drive?visit=onetoomany")
+            return refused.value.status
+
+    assert served.run(crowd()) == 503
+
+
+def test_a_drive_goes_on_in_the_tab_that_opened_it_last(served):
+    async def tabs() -> tuple[int, dict[str, Any]]:
+        async with aiohttp.ClientSession() as session:
+            first = await session.ws_connect(f"{served.address}drive?visit={VISIT}")
+            await first.send_json(BEGIN)
+            await first.receive_json()
+            second = await session.ws_connect(f"{served.address}drive?visit={VISIT}")
+            closed = await first.receive()
+            await second.send_json(STEP)
+            return closed.data, await second.receive_json()
+
+    code, answer = served.run(tabs())
+    assert code == ELSEWHERE
+    assert answer["view"]["frame"] == 1
+
+
 @pytest.mark.parametrize(
     ("message", "error"),
     [
@@ -121,6 +151,7 @@ def test_who_has_been_away_longest_makes_room(served):
         ({"do": "begin", "episode": 0, "frame": True}, "frame=True: must be a whole number"),
         ({"do": "begin", "seed": 3}, "seed=3: there is no real environment; give real_env.type"),
         ({**BEGIN, "instruction": 5}, "instruction=5: must be a text"),
+        ({"do": "begin", "seed": 1, "instruction": 5}, "instruction=5: must be a text"),
         ({"do": "step", "driver": "nobody"}, "driver=nobody: choose one of you, policy, planner, recorded"),
         ({"do": "step", "driver": "you"}, "action=None: must be a list of finite numbers"),
         ({"do": "step", "driver": "you", "action": [1] * 6}, "must be 7 finite numbers"),
@@ -157,6 +188,7 @@ def test_a_message_that_cannot_be_is_refused_and_the_drive_goes_on(served, messa
         ),
         ("POST", "picture", {"data": {"third_view": b"no picture", "state": STATE}}, 400, "cannot be read"),
         ("POST", "picture", {"data": {"third_view": picture((5000, 2))}}, 400, "at most 4096"),
+        ("POST", "picture", {"data": {"third_view": picture()[:-40], "state": STATE}}, 400, "picture"),
         ("POST", "picture", {"data": {"third_view": picture(), "state": "[1, 2]"}}, 400, "8 finite numbers"),
         ("POST", "picture", {"data": {"third_view": picture(), "state": "{"}}, 400, "Expecting"),
         ("POST", "picture", {"data": {"third_view": bytes(17 * 1024**2)}}, 413, ""),

@@ -26,24 +26,35 @@ async function post(path, content) {
 
 const labelOf = (index) => (labels.has(index) ? labels.get(index) : NONE);
 
-async function put(index, first) {
-  await post("label", { episode: index, first });
+let sending = Promise.resolve();
+
+// Labels are shown at once and sent one after the other; one that is refused is taken back.
+function put(index, first) {
+  const before = labelOf(index);
+  set(index, first);
+  sending = sending.then(() => post("label", { episode: index, first })).catch((error) => {
+    set(index, before);
+    open(index);
+    say(error);
+  });
+}
+
+function set(index, first) {
   if (first === NONE) labels.delete(index); else labels.set(index, first);
 }
 
-async function mark(first) {
-  const index = episode;
+function mark(first) {
+  const index = episode, count = dataset.lengths.length;
   past.push([index, labelOf(index)]);
-  await put(index, first);
-  const count = dataset.lengths.length;
+  put(index, first);
   const following = [...Array(count).keys()].map((step) => (index + 1 + step) % count);
   open(following.find((each) => !labels.has(each)) ?? index);
 }
 
-async function undo() {
+function undo() {
   if (!past.length) return;
   const [index, before] = past.pop();
-  await put(index, before);
+  put(index, before);
   open(index);
 }
 
@@ -123,7 +134,9 @@ function listen() {
   on("from-here", acts.KeyM);
   on("failure", acts.KeyF);
   on("undo", undo);
+  addEventListener("click", (event) => { if (event.detail) event.target.closest?.("button")?.blur(); });
   on("finish", async () => {
+    await sending;
     await post("finish", {});
     say("The labels are complete; the command writes the dataset. This page can be closed.");
   });
@@ -133,9 +146,10 @@ function listen() {
   addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey || event.target.type === "number") return;
     const act = acts[event.code];
-    if (!act) return;
+    if (!act || (event.code === "Space" && event.target.type === "submit")) return;
     event.preventDefault();
-    Promise.resolve(act()).catch(say);
+    if (event.repeat && !event.code.startsWith("Arrow")) return; // a key held down labels once
+    act();
   });
 }
 

@@ -1,5 +1,6 @@
 // The page's clock runs here: each step is one message to the server and one answer. The server keeps the
-// drive, so that a page that was reloaded, or had lost its connection, finds it again.
+// drive, so that a page that was reloaded, or had lost its connection, finds it again. What changes the drive
+// goes through `inTurn`, one after the other.
 
 const $ = (id) => document.getElementById(id);
 const sleep = (milliseconds) => new Promise((done) => setTimeout(done, milliseconds));
@@ -29,21 +30,34 @@ const token = new URLSearchParams(location.search).get("token");
 const query = (fields) => new URLSearchParams(token ? { ...fields, token } : fields).toString();
 const visit = sessionStorage.visit ??= Array.from(
   crypto.getRandomValues(new Uint8Array(12)), (byte) => byte.toString(16).padStart(2, "0")).join("");
+const ELSEWHERE = 4000; // the code of a socket that is closed because the visitor has come once more
 let socket, waiting = [];
+let turn = Promise.resolve();
+
+function inTurn(act) {
+  const done = turn.then(act);
+  turn = done.catch(() => {});
+  return done;
+}
 
 function connect() {
   const scheme = location.protocol === "https:" ? "wss:" : "ws:";
   socket = new WebSocket(`${scheme}//${location.host}/drive?${query({ visit })}`);
-  socket.onopen = () => restore().catch(say);
+  socket.onopen = () => inTurn(restore).catch(say);
   socket.onmessage = (event) => {
     const answer = JSON.parse(event.data);
     const { done, failed } = waiting.shift();
     answer.error ? failed(new Error(answer.error)) : done(answer);
   };
-  socket.onclose = async () => {
+  socket.onclose = async (event) => {
     const lost = waiting;
     waiting = [];
     lost.forEach(({ failed }) => failed(new Error("the connection was lost")));
+    await sleep(0);
+    if (event.code === ELSEWHERE) {
+      say(new Error("this drive was opened in another tab; reload to go on here"));
+      return;
+    }
     say(new Error("no connection; trying again…"));
     await sleep(1000);
     connect();
@@ -70,8 +84,8 @@ function say(message) {
 async function restore() {
   const answer = await ask({ do: "resume" });
   if (answer.begun) adopt(answer);
-  else if (location.hash.length > 1) await replay(JSON.parse(atob(location.hash.slice(1))));
   else if (begun) await replay({ place: begun.place, actions: views.slice(1).map((view) => view.action) });
+  else if (location.hash.length > 1) await replay(linked());
   else await begin(firstPlace());
   say("ready");
 }
@@ -87,9 +101,11 @@ function adopt(answer) {
 async function begin(place) {
   setPlaying(false);
   say("beginning…");
-  adopt(await ask({ do: "begin", ...place }));
+  adopt(await ask({ ...place, do: "begin" }));
   say("ready");
 }
+
+const linked = () => JSON.parse(decodeURIComponent(location.hash.slice(1)));
 
 async function replay({ place, actions }) {
   await begin(place);
@@ -106,12 +122,13 @@ async function replay({ place, actions }) {
 
 async function step() {
   if (shown < views.length - 1) await rewind(shown);
-  const sent = performance.now();
-  const message = { do: "step", driver, sent };
+  const sent = performance.now(), at = shown;
+  const message = { do: "step", driver };
   if (driver === YOU) message.action = nextAction();
   const answer = await ask(message);
   views.push(answer.view);
-  shown = views.length - 1;
+  if (message.driver !== YOU) follow(answer.view.action);
+  if (shown === at) shown = views.length - 1; // else somebody has looked elsewhere meanwhile
   draw();
   rates.push([performance.now(), performance.now() - sent]);
   rates = rates.slice(-30);
@@ -129,7 +146,7 @@ async function run() {
   let due = performance.now();
   for (;;) {
     if (!playing) { await sleep(15); due = performance.now(); continue; }
-    try { await step(); } catch (error) { say(error); }
+    try { await inTurn(step); } catch (error) { say(error); }
     due = Math.max(due + 1000 / world.fps, performance.now() - 100);
     await sleep(Math.max(0, due - performance.now()));
   }
@@ -164,10 +181,17 @@ function resetAxes() {
   drawAxes();
 }
 
+// Axes that are held go on from where somebody else has left them.
+function follow(action) {
+  axes.forEach((axis, index) => { if (!axis.springs) axis.value = action[index]; });
+  drawAxes();
+}
+
 function nextAction() {
   const speed = Number($("speed").value);
   const pads = [[$("pad-x").value, pad.x], [$("pad-y").value, pad.y]];
-  const sticks = [...(navigator.getGamepads?.() ?? [])].find((each) => each)?.axes ?? [];
+  const sticks = [...([...(navigator.getGamepads?.() ?? [])].find((each) => each)?.axes ?? [])];
+  [1, 3].forEach((up) => { sticks[up] = -(sticks[up] ?? 0); }); // a stick that is pushed away is negative
   axes.forEach((axis, index) => {
     const stick = index < 4 && Math.abs(sticks[index] ?? 0) > 0.15 ? sticks[index] : 0;
     let push = (down.has(axis.keys[1]) - down.has(axis.keys[0])) * speed + stick;
@@ -175,7 +199,8 @@ function nextAction() {
     const half = (axis.high - axis.low) / 2;
     if (axis.springs) {
       if (dragged) push = dragged[1];
-      axis.value = axis.rest + push * half;
+      axis.value = axis.slid ?? axis.rest + push * half;
+      if (!axis.sliding) axis.slid = null;
     } else if (dragged) {
       axis.value = axis.low + half + dragged[1] * half;
     } else {
@@ -195,7 +220,9 @@ function takeOver() {
 
 function onKey(event) {
   if (event.ctrlKey || event.metaKey || event.altKey) return;
-  if (/^(text|number)$/.test(event.target.type ?? "")) return;
+  const target = event.target;
+  if (/^(text|number|select-one)$/.test(target.type ?? "")) return;
+  if (event.code === "Space" && /^(button|submit|checkbox)$/.test(target.type ?? "")) return; // its own
   const rebinding = document.querySelector("kbd.waiting");
   if (rebinding) { rebind(rebinding, event.code); event.preventDefault(); return; }
   if (axes.some((axis) => axis.keys.includes(event.code))) {
@@ -207,11 +234,11 @@ function onKey(event) {
   }
   const act = {
     Space: () => setPlaying(!playing), Period: oneStep, Comma: () => look(shown - 1), KeyR: restart,
-    KeyS: () => save(true), KeyF: () => save(false),
+    KeyS: () => inTurn(() => save(true)), KeyF: () => inTurn(() => save(false)),
   }[event.code] ?? chosenDriver(event.code);
-  if (!act || event.repeat) return;
+  if (!act) return;
   event.preventDefault();
-  Promise.resolve(act()).catch(say);
+  if (!event.repeat) Promise.resolve(act()).catch(say);
 }
 
 function chosenDriver(code) {
@@ -227,8 +254,8 @@ function rebind(key, code) {
   drawKeys();
 }
 
-const oneStep = async () => { setPlaying(false); await step(); };
-const restart = async () => { setPlaying(false); await rewind(0); draw(); };
+const oneStep = () => { setPlaying(false); return inTurn(step); };
+const restart = () => { setPlaying(false); return inTurn(async () => { await rewind(0); draw(); }); };
 
 function look(frame) {
   setPlaying(false);
@@ -239,6 +266,7 @@ function look(frame) {
 // ---- what is shown -----------------------------------------------------------------------------------------
 
 function build() {
+  $("views").classList.toggle("single", world.cameras.length === 1);
   const rows = [["imagined", "imagined"], ["beside", ""], ["difference", "difference"]];
   for (const [kind, title] of rows) {
     const strip = element("div", { className: "strip", id: `strip-${kind}` });
@@ -264,7 +292,9 @@ function build() {
   axes.forEach((axis, index) => {
     const slider = element("input", { type: "range", min: axis.low, max: axis.high, step: "any" });
     slider.setAttribute("aria-label", axis.name);
-    slider.oninput = () => { axis.value = Number(slider.value); setDriver(YOU); };
+    slider.onpointerdown = () => { axis.sliding = true; };
+    slider.onpointerup = slider.onpointercancel = () => { axis.sliding = false; };
+    slider.oninput = () => { axis.value = axis.slid = Number(slider.value); setDriver(YOU); };
     const holds = element("input", { type: "checkbox", checked: !axis.springs });
     holds.onchange = () => { axis.springs = !holds.checked; };
     const keys = [0, 1].map((end) => {
@@ -366,6 +396,7 @@ function drawDifference() {
   const load = async (source) => createImageBitmap(await (await fetch(source)).blob());
   [...strip.querySelectorAll("canvas")].forEach(async (canvas, index) => {
     const [imagined, real] = await Promise.all([load(view.images[index]), load(view.beside.images[index])]);
+    if (views[shown] !== view) return;
     Object.assign(canvas, { width: imagined.width, height: imagined.height });
     const context = canvas.getContext("2d");
     context.drawImage(imagined, 0, 0);
@@ -441,9 +472,9 @@ function listen() {
   on("back", () => look(shown - 1));
   on("next", oneStep);
   on("restart", restart);
-  on("save-success", () => save(true));
-  on("save-failure", () => save(false));
-  on("save", () => save(null));
+  on("save-success", () => inTurn(() => save(true)));
+  on("save-failure", () => inTurn(() => save(false)));
+  on("save", () => inTurn(() => save(null)));
   on("link", copyLink);
   $("timeline").oninput = () => look(Number($("timeline").value));
   $("difference").onchange = drawDifference;
@@ -453,6 +484,9 @@ function listen() {
   submit("place-seed", () => begin(withTask({ seed: Number($("seed").value) })));
   submit("place-picture", upload);
   addEventListener("keydown", onKey);
+  // A button that was clicked by the mouse would take the keys from then on.
+  addEventListener("click", (event) => { if (event.detail) event.target.closest?.("button")?.blur(); });
+  addEventListener("hashchange", () => { if (location.hash.length > 1) inTurn(() => replay(linked())).catch(say); });
   addEventListener("keyup", (event) => { down.delete(event.code); drawKeys(); });
   addEventListener("blur", () => { down.clear(); drawKeys(); });
   addEventListener("resize", drawCurve);
@@ -465,7 +499,7 @@ function listen() {
 }
 
 function submit(id, act) {
-  $(id).onsubmit = (event) => { event.preventDefault(); Promise.resolve(act()).catch(say); };
+  $(id).onsubmit = (event) => { event.preventDefault(); inTurn(act).catch(say); };
 }
 
 const withTask = (place) => {
@@ -493,7 +527,7 @@ async function upload() {
 async function copyLink() {
   const actions = views.slice(1, shown + 1).map((view) => view.action.map((each) => Number(each.toPrecision(9))));
   const url = new URL(location.href);
-  url.hash = btoa(JSON.stringify({ place: begun.place, actions }));
+  url.hash = encodeURIComponent(JSON.stringify({ place: begun.place, actions }));
   history.replaceState(null, "", url);
   await navigator.clipboard?.writeText(url.href).catch(() => {});
   $("saved").textContent = "The link is in the address bar and, where the browser allows it, in the clipboard.";
