@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 
-from lerobot.robots.config import RobotConfig
+from lerobot.robots import RobotConfig
 
 from lerobot_wmrl.common.errors import FieldError, require_positive
 from lerobot_wmrl.envs.configuration_world_model import StartFrames

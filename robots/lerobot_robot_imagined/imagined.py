@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 import torch
-from lerobot.lerobot_types import RobotAction, RobotObservation
-from lerobot.robots.robot import Robot
+from lerobot.robots import Robot
 from lerobot.utils.constants import OBS_STATE
 from lerobot.utils.keyboard_input import init_keyboard_listener, pynput_can_capture
 
@@ -105,7 +104,7 @@ class ImaginedRobot(Robot):
             self.listener.stop()
             self.listener = None
 
-    def get_observation(self) -> RobotObservation:
+    def get_observation(self) -> dict[str, Any]:
         """Return the newest frame, that of the next episode if this one is over."""
         if not self.is_connected:
             raise ConnectionError("the imagined robot is not connected")
@@ -119,7 +118,7 @@ class ImaginedRobot(Robot):
         )
         return dict(zip(self.observation_features, [*state, *images], strict=True))
 
-    def send_action(self, action: RobotAction) -> RobotAction:
+    def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
         """Imagine the next frame; after a success the robot stands still.
 
         Returns:

@@ -23,10 +23,11 @@ PACKAGES = ("lerobot_wmrl", "policies", "datasets", "robots")
 DOCUMENTED = {
     "lerobot.configs", "lerobot.configs.policies", "lerobot.configs.rewards", "lerobot.configs.types",
     "lerobot.datasets.lerobot_dataset", "lerobot.envs", "lerobot.envs.configs", "lerobot.optim",
-    "lerobot.policies.pretrained", "lerobot.processor", "lerobot.rewards.pretrained",
+    "lerobot.policies.pretrained", "lerobot.processor", "lerobot.rewards.pretrained", "lerobot.robots",
     "lerobot.utils.constants",
 }  # fmt: skip
-"""Modules that LeRobot's guides to policies, environments, processors and datasets tell plugins to import."""
+"""Modules that LeRobot's guides to policies, environments, processors, datasets and robots tell plugins to
+import."""
 
 UNDOCUMENTED = {
     "lerobot.common.wandb_utils": {"WandBLogger"},
@@ -53,6 +54,7 @@ UNDOCUMENTED = {
     "lerobot.rl.algorithms.configs": {"RLAlgorithmConfig", "TrainingStats"},
     "lerobot.scripts.lerobot_eval": {"eval_policy", "eval_policy_all", "rollout"},
     "lerobot.utils.import_utils": {"register_third_party_plugins"},
+    "lerobot.utils.keyboard_input": {"init_keyboard_listener", "pynput_can_capture"},
     "lerobot.utils.logging_utils": {"MetricsTracker"},
     "lerobot.utils.random_utils": {
         "deserialize_rng_state", "get_rng_state", "serialize_rng_state", "set_rng_state", "set_seed",
