@@ -92,7 +92,7 @@ class Drive:
         self.goal = self._goal_images(start)
         self.actions: list[Tensor] = []
         self.views: list[dict[str, Any]] = []
-        self.in_step = True
+        self.synchronized = True
         self._reset()
         self.views.append(self._view(""))
 
@@ -116,18 +116,18 @@ class Drive:
                 "action", action.flatten().tolist(),
                 f"must be {self.env.single_action_space.shape[0]} finite numbers",
             )  # fmt: skip
-        self._catch_up()
-        self.in_step = False
+        self.synchronized = False
         self._advance(action)
         if self.real is not None:
             self.real.step(action)
         self.actions.append(action)
         self.views.append(self._view(driver))
-        self.in_step = True
+        self.synchronized = True
         return self.views[-1]
 
     def require_running(self) -> None:
         """Raise FieldError if the episode has ended."""
+        self._catch_up()
         if self.ended:
             raise FieldError(
                 "step", self.frame, f"the episode has ended ({self.ended})", "go back or restart"
@@ -137,19 +137,19 @@ class Drive:
         """Go back to a frame: imagine its past anew, and repeat it in the real environment."""
         if not 0 <= frame <= self.frame:
             raise FieldError("frame", frame, f"must be from 0 to {self.frame}")
-        self.in_step = False
+        self.synchronized = False
         self.actions, self.views = self.actions[:frame], self.views[: frame + 1]
         self._catch_up()
 
     def replay(self) -> Iterator[Step]:
         """Imagine the episode once more, and yield its steps. The drive ends up where it was."""
-        self.in_step = False
+        self.synchronized = False
         self._reset()
         for action in self.actions:
             before = self.observation
             self._advance(action)
             yield Step(before, action[0].numpy(), self.measured["reward"])
-        self.in_step = True  # and the real environment has stayed where it was
+        self.synchronized = True  # and the real environment has stayed where it was
 
     def succeeds(self, threshold: float, frames: int) -> bool:
         """Return whether the last `frames` frames are done, with a probability of at least `threshold`."""
@@ -159,8 +159,8 @@ class Drive:
         )
 
     def _catch_up(self) -> None:
-        """Take all actions again if the environments are not where the drive is."""
-        if self.in_step:
+        """Take all actions again unless the environments are where the drive is, as after an error."""
+        if self.synchronized:
             return
         self._reset()
         if self.real is not None:
@@ -169,7 +169,7 @@ class Drive:
             self._advance(action)
             if self.real is not None:
                 self.real.step(action)
-        self.in_step = True
+        self.synchronized = True
 
     def _reset(self) -> None:
         self.observation, _ = self.env.reset(seed=[0])
