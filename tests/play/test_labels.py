@@ -120,7 +120,7 @@ def test_somebody_labels_by_keys_and_the_dataset_is_written(
         press("f", then=f"Episode {episode};")
     press("s", then="6 of 6 have a label: 3 successes, 3 failures")
     image = chromium.find_element(By.CSS_SELECTOR, "#frames img")
-    assert chromium.execute_script("return arguments[0].naturalWidth", image) == 32
+    wait(lambda: chromium.execute_script("return arguments[0].naturalWidth", image) == 32)
     finish.click()
     command.join(60)
     assert not command.is_alive()

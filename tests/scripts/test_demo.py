@@ -25,10 +25,9 @@ HEADINGS = (
     "Recorded beside imagined",
     "Goal frames",
     "The reward along recorded episodes",
-    "Training",
-    "Time and memory",
-    "The commands",
+    "Drive it",
 )
+FOLDED = ("Training", "The data", "Time and memory", "The commands")
 
 
 def start_demo(folder: Path) -> subprocess.Popen[str]:
@@ -155,6 +154,8 @@ def test_the_page_stands_alone_and_shows_every_part(outputs: tuple[Path, str]) -
     assert not re.findall(r"""(?:src|href)=["'](?!data:)""", page), "the page needs other files"
     for heading in HEADINGS:
         assert f"<h2>{heading}</h2>" in page
+    for heading in FOLDED:
+        assert f"<summary>{heading}</summary>" in page
     assert page.count("data:image/") >= 12
     for name in STAGES:
         assert str(stage_record(demo, name)["title"]) in page
