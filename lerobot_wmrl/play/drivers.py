@@ -42,11 +42,8 @@ class LoadedPolicy:
         high: Tensor,
     ) -> None:  # fmt: skip
         fit_to_environment(config, shown, len(names))
-        self.config, self.policy, self.processors = (
-            config,
-            load_policy(config).eval(),
-            load_processors(config),
-        )
+        self.config, self.processors = config, load_processors(config)
+        self.policy = load_policy(config).eval()
         check_units(config, self.processors[1], names, low, high)
         self.pipeline = make_pipeline(config, *self.processors)
 

@@ -153,14 +153,13 @@ class PlayServer:
 
 
 def read_image(name: str, file: IO[bytes]) -> Image.Image:
-    """Read an uploaded picture. FieldError if it is none, or too large to be decoded."""
+    """Open an uploaded picture, which is not decoded here. FieldError if it is none, or too large."""
     try:
         image = Image.open(file, formats=FORMATS)
         if max(image.size) > LARGEST_SIDE:
             raise FieldError(
                 "picture", name, f"has {image.size} pixels", f"send at most {LARGEST_SIDE} a side"
             )
-        image.load()
     except (UnidentifiedImageError, OSError, Image.DecompressionBombError) as error:
         raise FieldError("picture", name, "cannot be read", f"send {', '.join(FORMATS)}") from error
     return image

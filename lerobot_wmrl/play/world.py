@@ -123,10 +123,12 @@ class World:
 
     def driver(self, name: str) -> Driver:
         """Return a visitor's own driver of one of `driver_names`."""
+        if name == "recorded":
+            return RecordedDriver()
         policy = self.policy and self.policy.copy()
-        if name == "planner":
-            return PlannerDriver(planner_settings(self.model.clip_length), self.done_frames, policy)
-        return RecordedDriver() if policy is None or name == "recorded" else PolicyDriver(policy)
+        if name == "policy" and policy is not None:
+            return PolicyDriver(policy)
+        return PlannerDriver(planner_settings(self.model.clip_length), self.done_frames, policy)
 
     def make_real_env(self) -> Any:
         """Return a visitor's own real environment, None if there is none."""

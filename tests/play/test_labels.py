@@ -40,15 +40,21 @@ def rule(tmp_path) -> ByHandRule:
 
 
 @pytest.fixture
-def address(unlabelled, rule, tmp_path, monkeypatch) -> Iterator[str]:
-    """Runs the command in a thread until its labels are complete; yields the page's address."""
+def labelling(unlabelled, rule, tmp_path, monkeypatch) -> tuple[threading.Thread, str]:
+    """The command, in a thread, and the address of its page."""
     said: list[str] = []
     monkeypatch.setattr("builtins.print", lambda *texts, **options: said.append(" ".join(map(str, texts))))
     config = LabelConfig(DatasetSource(str(unlabelled.root)), rule, tmp_path / "labelled")
     command = threading.Thread(target=label, args=(config,), daemon=True)
     command.start()
     wait(lambda: said)
-    address = said[0].split()[1]
+    return command, said[0].split()[1]
+
+
+@pytest.fixture
+def address(labelling) -> Iterator[str]:
+    """The page's address; the command ends after the test."""
+    command, address = labelling
     yield address
     for episode in range(6):
         post(f"{address}label", {"episode": episode, "first": None})
@@ -82,17 +88,10 @@ def get(url: str) -> tuple[int, bytes]:
         return error.code, error.read()
 
 
-def test_somebody_labels_by_keys_and_the_dataset_is_written(
-    chromium: WebDriver, unlabelled, rule, tmp_path, monkeypatch
-):
-    said: list[str] = []
-    monkeypatch.setattr("builtins.print", lambda *texts, **options: said.append(" ".join(map(str, texts))))
-    config = LabelConfig(DatasetSource(str(unlabelled.root)), rule, tmp_path / "labelled")
-    command = threading.Thread(target=label, args=(config,), daemon=True)
-    command.start()
-    wait(lambda: said)
+def test_somebody_labels_by_keys_and_the_dataset_is_written(chromium: WebDriver, labelling, tmp_path):
+    command, address = labelling
     chromium.switch_to.new_window("window")
-    chromium.get(said[0].split()[1])
+    chromium.get(address)
 
     def text(name: str) -> str:
         return str(chromium.find_element(By.ID, name).text)
