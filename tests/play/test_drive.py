@@ -226,18 +226,18 @@ def test_an_empty_folder_and_a_link_hold_episodes_like_any_other(world, saved, t
 @pytest.mark.parametrize("at", [1, 4])
 @pytest.mark.parametrize("act", ["rewind", "replay", "step"])
 def test_an_error_midway_loses_nothing(drive, act, at, monkeypatch):
-    """The drive is imagined anew the next time."""
+    """The drive is imagined anew the next time: when the picture fails, imagination has moved on already."""
     actions = some_actions(6)
     views = [drive.step(action, "you") for action in actions[:5]]
-    step, left = drive.env.model.step, [1 if act == "step" else at]
+    decode, left = drive.env.model.decode, [1 if act == "step" else at]
 
     def failing(*given):
         left[0] -= 1
         if left[0] == 0:
             raise RuntimeError("out of memory")
-        return step(*given)
+        return decode(*given)
 
-    monkeypatch.setattr(drive.env.model, "step", failing)
+    monkeypatch.setattr(drive.env.model, "decode", failing)
     with pytest.raises(RuntimeError, match="out of memory"):
         {
             "rewind": lambda: drive.rewind(5), "replay": lambda: list(drive.replay()),
