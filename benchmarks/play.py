@@ -33,7 +33,6 @@ from lerobot_wmrl.envs.configuration_world_model import DrivenEnv
 from lerobot_wmrl.play.saving import SavedEpisodes
 from lerobot_wmrl.play.server import PlayServer
 from lerobot_wmrl.play.world import World, load_world
-from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 
 RESULTS: Final = Path(__file__).parents[1] / "docs" / "results" / "play_speed.json"
 BLOCK: Final = 50
@@ -130,7 +129,7 @@ def main() -> None:
     register_third_party_plugins()
     given = make_parser().parse_args()
     env = DrivenEnv(
-        world_model_path=given.world_model, reward=GeneralConfig(alpha=1.0), episode_length=10_000,
+        world_model_path=given.world_model, episode_length=10_000,
         done_frames=10_000,
     )  # fmt: skip
     world = load_world(env, DatasetSource(given.root), None, None)

@@ -204,8 +204,11 @@ class WorldModelEnv(EnvConfig):
         return {self.type: {task: EvaluationAdapter(env) for task, env in envs.items()}}
 
 
+@dataclass
 class DrivenEnv(WorldModelEnv):
-    """Imagined episodes that somebody drives. They need no reward."""
+    """Imagined episodes that somebody drives: their reward is success, where the world model knows any."""
+
+    reward: RewardModelConfig = field(default_factory=lambda: GeneralConfig(alpha=1.0))
 
     def _check_rewarding(self, model: Any) -> None:
         """Accept world models that know no success."""

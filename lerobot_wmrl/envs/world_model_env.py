@@ -25,7 +25,6 @@ from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModel
 from lerobot_wmrl.world_models.dynamics import Imagined
 from lerobot_wmrl.world_models.frame_tokenizer import Decoded
 from lerobot_wmrl.world_models.goal import select_features
-from lerobot_wmrl.world_models.modeling_frame_tokenizer import split_cameras
 from lerobot_wmrl.world_models.modeling_world_model import (
     ActionWorldModelRewardModel,
     TextWorldModelRewardModel,
@@ -68,14 +67,13 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         self.generator.seed()
 
     def _observation_space(self) -> gym.spaces.Dict:
-        config = self.model.config
-        spaces: dict[str, gym.Space] = {
-            key: gym.spaces.Box(0.0, 1.0, shape, np.float32)
-            for key, shape in config.tokenizer.frame_shapes.items()
-        }
-        if config.state_size:
-            spaces[OBS_STATE] = gym.spaces.Box(-np.inf, np.inf, (config.state_size,), np.float32)
-        return gym.spaces.Dict(spaces)
+        bounds = {True: (-np.inf, np.inf), False: (0.0, 1.0)}
+        return gym.spaces.Dict(
+            {
+                key: gym.spaces.Box(*bounds[key == OBS_STATE], shape, np.float32)
+                for key, shape in self.model.config.observation_shapes.items()
+            }
+        )
 
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
@@ -231,11 +229,9 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
     def _observe(
         self, images: Tensor, state: Tensor, instructions: Sequence[str] | None = None
     ) -> Observation:
-        observation: Observation = {**split_cameras(images, self.model.config.tokenizer.frame_shapes)}
-        if self.model.config.state_size:
-            observation[OBS_STATE] = state
-        observation["task"] = list(self._instructions if instructions is None else instructions)
-        return observation
+        return self.model.observation(
+            images, state, self._instructions if instructions is None else instructions
+        )
 
 
 class WorldModels(NamedTuple):

@@ -5,6 +5,7 @@
 
 import asyncio
 import json
+import sys
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ import numpy as np
 
 from lerobot_wmrl.common.errors import FieldError, require_at_least
 from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.play.checks import LAST_PORT, whole_number
 from lerobot_wmrl.rewards.success_rules import SuccessRule, rows_of
 
 if TYPE_CHECKING:
@@ -49,23 +51,19 @@ class ByHandRule(SuccessRule):
 
     def __post_init__(self) -> None:
         require_at_least(self, 1, "last")
-        require_at_least(self, 0, "port")
+        whole_number("port", self.port, LAST_PORT)
 
     def frames(self, dataset: "LeRobotDataset") -> np.ndarray:
         from lerobot_wmrl.play.web import serve
 
         page = LabelPage(self, dataset)
-
-        def ready(port: int) -> None:
-            print(f"open {page.access.address(port)} in a browser; its button goes on", flush=True)
-
-        if not page.complete:
-            try:
-                serve(page.application(), self.host, self.port, ready, page.finished)
-            except OSError as error:
-                raise FieldError(
-                    "port", self.port, f"cannot be served ({error})", "choose another"
-                ) from error
+        try:
+            serve(page.application(), page.access, self.port, "its button goes on", page.finished)
+        except KeyboardInterrupt:
+            sys.exit(
+                f"\n{len(page.labels)} of {len(page.lengths)} episodes have a label, kept in {self.file}; "
+                "the same command goes on"
+            )
         return solved_frames(page.labels, dataset)
 
 
@@ -105,16 +103,10 @@ class LabelPage:
         """Return the web application."""
         from aiohttp import web
 
-        from lerobot_wmrl.play.web import PAGES
-
-        app = web.Application(middlewares=[self.access.guard])
-        app.router.add_get("/", self._page)
-        app.router.add_get("/dataset", self._describe)
-        app.router.add_get("/frame", self._frame)
-        app.router.add_post("/label", self._label)
-        app.router.add_post("/finish", self._finish)
-        app.router.add_static("/static", PAGES)
-        return app
+        return self.access.application(
+            "label.html", web.get("/dataset", self._describe), web.get("/frame", self._frame),
+            web.post("/label", self._label), web.post("/finish", self._finish),
+        )  # fmt: skip
 
     def label(self, episode: Any, first: Any) -> None:
         """Label an episode, and write the file.
@@ -126,18 +118,14 @@ class LabelPage:
         Raises:
             FieldError: there is no such episode or frame.
         """
-        if not is_index(episode, len(self.lengths)):
-            raise FieldError("episode", episode, f"must be from 0 to {len(self.lengths) - 1}")
+        index = whole_number("episode", episode, len(self.lengths) - 1)
         if first == "none":
-            self.labels.pop(episode, None)
-        elif first is None or is_index(first, self.lengths[episode]):
-            self.labels[episode] = first
+            self.labels.pop(index, None)
+        elif first is None:
+            self.labels[index] = None
         else:
-            raise FieldError("first", first, f"must be from 0 to {self.lengths[episode] - 1}, or null")
+            self.labels[index] = whole_number("first", first, self.lengths[index] - 1)
         write_json(self.rule.file, {**self.about, "labels": self.labels})
-
-    async def _page(self, request: "web.Request") -> "web.Response":
-        return self.access.page("label.html")
 
     async def _describe(self, request: "web.Request") -> "web.Response":
         from aiohttp import web
@@ -154,12 +142,15 @@ class LabelPage:
         from aiohttp import web
 
         camera = request.query.get("camera", "")
-        numbers = [request.query.get(name, "") for name in ("episode", "frame")]
-        episode, frame = (int(each) if each.isdecimal() else -1 for each in numbers)
-        if camera not in self.cameras or not is_index(episode, len(self.lengths)):
-            raise web.HTTPNotFound(text=f"there is no camera {camera!r} or no episode {numbers[0]!r}")
-        if not is_index(frame, self.lengths[episode]):
-            raise web.HTTPNotFound(text=f"frame: episode {episode} has {self.lengths[episode]} frames")
+        asked = (request.query.get(name, "") for name in ("episode", "frame"))
+        numbers = [int(each) if each.isdecimal() else each for each in asked]
+        if camera not in self.cameras:
+            raise web.HTTPNotFound(text=f"there is no camera {camera!r}")
+        try:
+            episode = whole_number("episode", numbers[0], len(self.lengths) - 1)
+            frame = whole_number("frame", numbers[1], self.lengths[episode] - 1)
+        except FieldError as error:
+            raise web.HTTPNotFound(text=str(error)) from error
         loop = asyncio.get_running_loop()
         row = int(self.dataset.meta.episodes[episode]["dataset_from_index"]) + frame
         pictures = await loop.run_in_executor(self.worker, self.pictures, row)
@@ -210,11 +201,6 @@ class LabelPage:
                 "choose another file",
             )  # fmt: skip
         return labels
-
-
-def is_index(value: Any, count: int) -> bool:
-    """Return whether this is a whole number from 0 to below `count`."""
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < count
 
 
 def solved_frames(labels: Mapping[int, int | None], dataset: "LeRobotDataset") -> np.ndarray:

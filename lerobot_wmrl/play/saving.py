@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from filelock import FileLock
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import ACTION, DEFAULT_FEATURES
 
@@ -23,7 +24,8 @@ SUCCESS_FRAMES: Final = WorldModelEnv.done_frames
 
 
 class SavedEpisodes:
-    """A dataset to which driven episodes are added. It is whole on disk after each of them.
+    """A dataset to which driven episodes are added. It is whole on disk after each of them, also if several
+    servers add to it.
 
     Args:
         folder: of the dataset, which is new or has been written by this class.
@@ -75,7 +77,7 @@ class SavedEpisodes:
             assert dataset is not None, "there are steps"
             dataset.save_episode()
             dataset.finalize()
-        self.count += 1
+            self.count = dataset.meta.total_episodes
         return self.count - 1
 
     def _open(self, folder: Path, features: dict[str, Any]) -> LeRobotDataset:
@@ -99,18 +101,20 @@ class SavedEpisodes:
 def replacing(folder: Path) -> Iterator[Path]:
     """Give a copy of a dataset's folder to add to, which then takes its place.
 
-    LeRobot adds new files of episodes and never changes old ones, so these are not copied but linked.
+    LeRobot adds new files of episodes and never changes old ones, so these are not copied but linked. Others
+    who replace the same folder wait.
     """
     partial, old = beside(folder)
-    shutil.rmtree(partial, ignore_errors=True)
     partial.parent.mkdir(parents=True, exist_ok=True)
-    if folder.is_dir() and any(folder.iterdir()):
-        shutil.copytree(folder, partial, copy_function=link_or_copy)
-    yield partial
-    if folder.is_dir():
-        folder.replace(old)
-    partial.replace(folder)
-    shutil.rmtree(old, ignore_errors=True)
+    with FileLock(lock_of(folder)):
+        shutil.rmtree(partial, ignore_errors=True)
+        if folder.is_dir() and any(folder.iterdir()):
+            shutil.copytree(folder, partial, copy_function=link_or_copy)
+        yield partial
+        if folder.is_dir():
+            folder.replace(old)
+        partial.replace(folder)
+        shutil.rmtree(old, ignore_errors=True)
 
 
 def link_or_copy(source: str, target: str) -> None:
@@ -125,10 +129,18 @@ def link_or_copy(source: str, target: str) -> None:
 def recover(folder: Path) -> None:
     """Put back a folder whose replacement was interrupted."""
     partial, old = beside(folder)
-    if old.is_dir() and not folder.exists():
-        old.replace(folder)
-    for leftover in (partial, old):
-        shutil.rmtree(leftover, ignore_errors=True)
+    if not (partial.exists() or old.exists()):
+        return
+    with FileLock(lock_of(folder)):
+        if old.is_dir() and not folder.exists():
+            old.replace(folder)
+        for leftover in (partial, old):
+            shutil.rmtree(leftover, ignore_errors=True)
+
+
+def lock_of(folder: Path) -> Path:
+    """Return the file that is locked while a dataset is replaced."""
+    return folder.with_name(f".{folder.name}.lock")
 
 
 def beside(folder: Path) -> tuple[Path, Path]:

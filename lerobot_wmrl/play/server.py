@@ -16,10 +16,11 @@ from aiohttp import WSCloseCode, WSMsgType, web
 from PIL import Image, UnidentifiedImageError
 
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.play.checks import instruction
 from lerobot_wmrl.play.saving import SavedEpisodes
 from lerobot_wmrl.play.visit import Visit
-from lerobot_wmrl.play.web import PAGES, Access
-from lerobot_wmrl.play.world import LARGEST_SIDE, World, text
+from lerobot_wmrl.play.web import Access
+from lerobot_wmrl.play.world import LARGEST_SIDE, World
 
 MOST_VISITORS: Final = 8
 """Visitors whose drives are kept; the one who has been away longest makes room for the next."""
@@ -51,12 +52,10 @@ class PlayServer:
 
     def application(self) -> web.Application:
         """Return the web application."""
-        app = web.Application(client_max_size=LARGEST_UPLOAD, middlewares=[self.access.guard])
-        app.router.add_get("/", self._page)
-        app.router.add_get("/world", self._describe)
-        app.router.add_get("/drive", self._drive)
-        app.router.add_post("/picture", self._picture)
-        app.router.add_static("/static", PAGES)
+        app = self.access.application(
+            "index.html", web.get("/world", self._describe), web.get("/drive", self._drive),
+            web.post("/picture", self._picture), largest=LARGEST_UPLOAD,
+        )  # fmt: skip
         app.on_shutdown.append(self._disconnect)
         app.on_cleanup.append(self._close)
         return app
@@ -73,9 +72,6 @@ class PlayServer:
         for visit in self.visits.values():
             await self._compute(visit.close)
         self.worker.shutdown()
-
-    async def _page(self, request: web.Request) -> web.Response:
-        return self.access.page("index.html")
 
     async def _describe(self, request: web.Request) -> web.Response:
         return web.json_response(self.world.description())
@@ -142,9 +138,9 @@ class PlayServer:
                 )  # fmt: skip
             images = {name: read_image(name, file) for name, file in files.items()}
             state = json.loads(str(form["state"])) if "state" in form else None
-            instruction = text(str(form.get("instruction", "")))
+            task = instruction(str(form.get("instruction", "")))
             name = secrets.token_hex(8)
-            await self._compute(self.world.upload, name, images, state, instruction)
+            await self._compute(self.world.upload, name, images, state, task)
         except ValueError as error:
             raise web.HTTPBadRequest(text=str(error)) from error
         while len(self.world.uploads) > MOST_UPLOADS:

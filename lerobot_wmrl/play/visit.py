@@ -6,9 +6,10 @@ from typing import Any, Final
 import torch
 
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.play.checks import is_numbers, whole_number
 from lerobot_wmrl.play.drive import Drive
 from lerobot_wmrl.play.saving import SavedEpisodes
-from lerobot_wmrl.play.world import World, is_numbers, whole_number
+from lerobot_wmrl.play.world import World
 
 YOU: Final = "you"
 """The driver whose actions come with the messages."""
@@ -100,7 +101,7 @@ class Visit:
 
     def _rewind(self, message: Mapping[str, Any]) -> dict[str, Any]:
         drive = self._driving(message)
-        drive.rewind(whole_number(message, "frame", drive.frame))
+        drive.rewind(whole_number("frame", message.get("frame"), drive.frame))
         self.driver = ""
         return {"rewound": drive.frame}
 

@@ -8,9 +8,12 @@ from typing import Any, Final
 
 from aiohttp import web
 
+from lerobot_wmrl.common.errors import FieldError
+
 PAGES: Final = Path(__file__).with_name("page")
 LOOPBACK: Final = ("127.0.0.1", "localhost", "::1")
 TOKEN: Final = "token"
+LARGEST: Final = 1024**2
 SOURCES: Final = (
     "default-src 'self'",
     "img-src 'self' data: blob:",
@@ -51,6 +54,22 @@ class Access:
             raise web.HTTPForbidden(text=f"{origin} is another site")
         return await handler(request)
 
+    def application(self, page: str, *routes: web.RouteDef, largest: int = LARGEST) -> web.Application:
+        """Return a guarded web application.
+
+        Args:
+            page: name of the file that is served as `/`.
+            routes: what else there is, beside the files of the pages.
+            largest: bytes of a request.
+        """
+
+        async def show(request: web.Request) -> web.Response:
+            return self.page(page)
+
+        app = web.Application(client_max_size=largest, middlewares=[self.guard])
+        app.add_routes([web.get("/", show), *routes, web.static("/static", PAGES)])
+        return app
+
     def page(self, name: str) -> web.Response:
         """Return a page, by the name of its file."""
         page = web.Response(text=(PAGES / name).read_text(), content_type="text/html")
@@ -77,24 +96,34 @@ async def forever() -> None:
 
 
 def serve(
-    app: web.Application, host: str, port: int, ready: Callable[[int], None],
+    app: web.Application, access: Access, port: int, until: str,
     finished: Callable[[], Awaitable[Any]] = forever,
 ) -> None:  # fmt: skip
-    """Serve until interrupted. OSError if the address is taken.
+    """Serve until interrupted, and print the address.
 
     Args:
         app: the web application.
-        host, port: where; port 0 for any that is free.
-        ready: is given the port when the page can be opened there.
+        access: says where.
+        port: 0 for any that is free.
+        until: what ends it, printed with the address.
         finished: is awaited, and ends the service.
+
+    Raises:
+        FieldError: nothing can be served there.
     """
 
     async def run() -> None:
         runner = web.AppRunner(app, access_log=None)
         await runner.setup()
         try:
-            await web.TCPSite(runner, host, port).start()
-            ready(runner.addresses[0][1])
+            try:
+                await web.TCPSite(runner, access.host, port).start()
+            except OSError as error:
+                raise FieldError(
+                    "port", port, f"cannot be served at {access.host} ({error})",
+                    "choose another port, or `host`",
+                ) from error  # fmt: skip
+            print(f"open {access.address(runner.addresses[0][1])} in a browser; {until}", flush=True)
             await finished()
         finally:
             await runner.cleanup()

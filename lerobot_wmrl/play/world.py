@@ -19,6 +19,7 @@ from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.envs.lerobot_env import make_tensor_env
 from lerobot_wmrl.envs.start_frames import StartImages, observed_frame, recorded_frames, resets_side
 from lerobot_wmrl.envs.world_model_env import WorldModels, load_world_models
+from lerobot_wmrl.play.checks import instruction, is_numbers, whole_number
 from lerobot_wmrl.play.drive import Drive, RealEpisode, Recorded
 from lerobot_wmrl.play.drivers import Driver, LoadedPolicy, PlannerDriver, PolicyDriver, RecordedDriver
 from lerobot_wmrl.world_models.checkpoint import check_dataset
@@ -73,7 +74,7 @@ class World:
 
     def description(self) -> dict[str, Any]:
         """Return what the page needs to know, as JSON."""
-        sizes, table = self.sizes, self.table
+        table = self.table
         episodes: list[dict[str, Any]] = []
         if table is not None:
             rows = zip(table.length.tolist(), table.success.tolist(), table.instructions, strict=True)
@@ -82,20 +83,21 @@ class World:
                 for length, success, task in rows
             ]
         return {
-            "cameras": list(sizes.cameras),
-            "sizes": [list(shape[1:]) for shape in sizes.frame_shapes.values()],
+            "cameras": list(self.sizes.cameras),
             "fps": self.model.embodiment.fps,
             "axes": self.axes(),
             "state": self.model.embodiment.state_names,
             "clip_length": self.model.clip_length,
             "done_threshold": self.config.done_threshold,
-            "done_frames": self.done_frames,
             "drivers": self.driver_names(),
             "policy": self.policy.config.type if self.policy else "",
             "episodes": episodes,
             "real": self.real_env.type if self.real_env else "",
             "goal": self.models.text_model is not None,
             "knows_success": self.model.learnt_successes != 0,
+            "compares": self.real_env is not None or table is not None,
+            "first_frames": False,
+            "saves": True,
         }
 
     def axes(self) -> list[dict[str, Any]]:
@@ -156,7 +158,7 @@ class World:
         Raises:
             FieldError: there is no such place.
         """
-        recorded, real, instruction = None, None, text(place.get("instruction", ""))
+        recorded, real, wanted = None, None, instruction(place.get("instruction", ""))
         if "episode" in place:
             start, recorded = self._recorded(place)
         elif "seed" in place:
@@ -164,22 +166,23 @@ class World:
                 raise FieldError(
                     "seed", place["seed"], "there is no real environment", "give `real_env.type`"
                 )
-            real = RealEpisode(self.real_env.type, real_env, whole_number(place, "seed", LARGEST_SEED))
+            seed = whole_number("seed", place["seed"], LARGEST_SEED)
+            real = RealEpisode(self.real_env.type, real_env, seed)
             start = observed_frame(real.observation, self.sizes)
         else:
             start = self._uploaded(place)
-        if instruction:
-            start = start._replace(instructions=[instruction])
+        if wanted:
+            start = start._replace(instructions=[wanted])
         return Drive(start, self.models, self.config, recorded, real)
 
-    def upload(self, name: str, images: Mapping[str, Image.Image], state: Any, instruction: str) -> None:
+    def upload(self, name: str, images: Mapping[str, Image.Image], state: Any, task: str) -> None:
         """Keep pictures, one for each camera, as a place to begin.
 
         Args:
             name: of the place.
             images: by camera.
             state: (P,) in the dataset's units; None for a world model that predicts no state.
-            instruction: the task.
+            task: the instruction.
 
         Raises:
             FieldError: a camera is missing or unknown, or the state has another length.
@@ -201,7 +204,7 @@ class World:
             for key, square in zip(sizes.camera_keys, squares, strict=True)
         }
         shown[OBS_STATE] = torch.tensor([values], dtype=torch.float32).reshape(1, count)
-        self.uploads[name] = observed_frame({**shown, "task": [instruction]}, sizes)
+        self.uploads[name] = observed_frame({**shown, "task": [task]}, sizes)
 
     def _square(self, image: Image.Image) -> np.ndarray:
         """Decode a picture, upright, and stretch it to what the tokenizer sees. → (S, S, 3) uint8"""
@@ -213,8 +216,8 @@ class World:
         """Return a frame of the dataset, and what followed it."""
         if self.table is None:
             raise FieldError("episode", place["episode"], "there is no dataset", "give `dataset.root`")
-        episode = whole_number(place, "episode", len(self.table.start) - 1)
-        frame = whole_number(place, "frame", int(self.table.length[episode]) - 1)
+        episode = whole_number("episode", place["episode"], len(self.table.start) - 1)
+        frame = whole_number("frame", place.get("frame"), int(self.table.length[episode]) - 1)
         begin = int(self.table.start[episode])
         first, end = begin + frame, begin + int(self.table.length[episode])
         images = cached_frames(self.table.dataset, self.sizes.camera_keys, self.sizes.image_size)[first:end]
@@ -255,9 +258,7 @@ def load_world(
         world.table = read_episodes(dataset.open())
         check_dataset(world.model, world.table.dataset.meta)
     if policy is not None:
-        shown: dict[str, tuple[int, ...]] = {**world.sizes.frame_shapes}
-        if world.model.state_size:
-            shown[OBS_STATE] = (world.model.state_size,)
+        shown = world.model.observation_shapes
         names, (low, high) = world.model.embodiment.action_names, models.model.action_range()
         world.policy = LoadedPolicy(policy, shown, names, low, high)
     return world
@@ -270,25 +271,3 @@ def planner_settings(clip_length: int) -> PlannerSettings:
     return PlannerSettings(
         horizon=horizon, execute=min(default.execute, horizon), knots=min(default.knots, horizon)
     )
-
-
-def whole_number(message: Mapping[str, Any], name: str, most: int) -> int:
-    """Return a field of a message. FieldError unless it is a whole number from 0 to `most`."""
-    value = message.get(name)
-    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= most:
-        raise FieldError(name, value, f"must be a whole number from 0 to {most}")
-    return value
-
-
-def is_numbers(values: Any) -> bool:
-    """Return whether this is a list of finite numbers."""
-    return isinstance(values, list) and all(
-        isinstance(each, int | float) and not isinstance(each, bool) and np.isfinite(each) for each in values
-    )
-
-
-def text(value: Any) -> str:
-    """Return an instruction. FieldError unless it is a text of at most 500 characters."""
-    if not isinstance(value, str) or len(value) > 500:
-        raise FieldError("instruction", value, "must be a text of at most 500 characters")
-    return value

@@ -14,26 +14,36 @@ actions, and is shown beside.
 What was driven can be saved, as episodes of a LeRobotDataset in `--output_dir`, from which policies and world
 models learn like from any other.
 
+    lerobot-wmrl-play --world_model.path=outputs/action_world_model --dataset.root=data/episodes \\
+        --export=outputs/page
+
+writes a page that needs no server, for any host of files. The world model runs in the visitor's browser, and
+you and the recorded episodes act.
+
 The page is served to this machine alone. With another `--host`, visitors need the token in the address that
 is printed.
 """
 
 import sys
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
-from typing import ClassVar, Final
+from typing import TYPE_CHECKING, ClassVar
 
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.command_line import RunConfig, run_command
-from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.errors import FieldError, require_at_least
+from lerobot_wmrl.common.files import writing
 from lerobot_wmrl.common.policies import check_weights, read_policy_config, require_trained
 from lerobot_wmrl.data.episodes import DatasetSource
+from lerobot_wmrl.play.checks import LAST_PORT, whole_number
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 
-LAST_PORT: Final = 65535
+if TYPE_CHECKING:
+    from lerobot_wmrl.play.world import World
 
 
 @dataclass
@@ -59,6 +69,9 @@ class PlayConfig(RunConfig):
         port: port at which the page is served; 0 for any that is free.
         device: device of the models; by default the best one of this machine.
         output_dir: folder of the dataset of saved episodes. If it holds some, more are added.
+        export: write the page into this new folder, and serve nothing. The world model then runs in the
+            visitor's browser. It needs `pip install "lerobot_env_wmrl[export]"` and npm.
+        export_starts: episodes of the dataset in whose first frames an exported page can begin.
     """
 
     path_fields: ClassVar[list[str]] = ["policy"]
@@ -77,6 +90,8 @@ class PlayConfig(RunConfig):
     port: int = 8000
     device: str | None = None
     output_dir: Path = Path("outputs/driven")
+    export: Path | None = None
+    export_starts: int = 64
 
     def check(self) -> None:
         """Read the policy's configuration. FieldError for a setting that cannot be."""
@@ -93,8 +108,24 @@ class PlayConfig(RunConfig):
                 "dataset.root", "", "is missing: a drive begins in a frame",
                 "give the world model's dataset, `dataset.repo_id`, or an environment, `real_env.type`",
             )  # fmt: skip
-        if not 0 <= self.port <= LAST_PORT:
-            raise FieldError("port", self.port, f"must be from 0 to {LAST_PORT}")
+        whole_number("port", self.port, LAST_PORT)
+        require_at_least(self, 1, "export_starts")
+        if self.export is not None:
+            self._check_export(self.export)
+
+    def _check_export(self, folder: Path) -> None:
+        """FieldError if no page can be exported."""
+        if not self.dataset.given:
+            raise FieldError(
+                "dataset.root", "", "is missing: an exported page begins in its frames", "give it"
+            )
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise FieldError("export", folder, "there is something already", "choose a new folder")
+        for package in ("onnx", "onnxscript", "onnxruntime"):
+            if find_spec(package) is None:
+                raise FieldError(
+                    "export", folder, f"needs the package {package}", 'pip install "lerobot_env_wmrl[export]"'
+                )
 
 
 def play(cfg: PlayConfig) -> None:
@@ -106,28 +137,35 @@ def play(cfg: PlayConfig) -> None:
     from lerobot_wmrl.play.world import load_world
 
     cfg.check()
+    reward = {"reward": GeneralConfig()} if cfg.text_world_model.path else {}
     env = DrivenEnv(
         world_model_path=cfg.world_model.path, text_world_model_path=cfg.text_world_model.path,
-        reward=GeneralConfig() if cfg.text_world_model.path else GeneralConfig(alpha=1.0),
         episode_length=cfg.episode_length, done_threshold=cfg.done_threshold, done_frames=cfg.done_frames,
-        device=cfg.device,
+        device=cfg.device, **reward,
     )  # fmt: skip
     world = load_world(env, cfg.dataset, cfg.policy, cfg.real_env, cfg.end_at_success)
+    if cfg.export is not None:
+        export(world, cfg.export, cfg.export_starts)
+        return
     saved = SavedEpisodes(cfg.output_dir, world.model.embodiment)
     server = PlayServer(world, saved, cfg.host)
-
-    def ready(port: int) -> None:
-        print(f"open {server.access.address(port)} in a browser; Ctrl-C ends it", flush=True)
-
     try:
-        serve(server.application(), cfg.host, cfg.port, ready)
-    except OSError as error:
-        raise FieldError(
-            "port", cfg.port, f"cannot be served at {cfg.host} ({error})", "choose another port, or `host`"
-        ) from error
+        serve(server.application(), server.access, cfg.port, "Ctrl-C ends it")
     finally:
         if saved.count:
             print(f"\n{saved.count} episodes are in {cfg.output_dir}")
+
+
+def export(world: "World", folder: Path, starts: int) -> None:
+    """Write the page that needs no server, and say how to look at it."""
+    from lerobot_wmrl.play.export import export_page
+
+    print("exporting the networks, which takes a minute or two", flush=True)
+    with writing("export", folder, resumes=False):
+        found = export_page(world, folder, starts)
+    size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+    print(f"{folder}: {size / 1e6:.1f} MB; {found}")
+    print(f"look at it: python -m http.server --directory {folder} --bind 127.0.0.1")
 
 
 def main() -> None:

@@ -89,8 +89,8 @@ class CodeBook(nn.Module):
 
     def entropy(self, logits: Tensor) -> Tensor:
         """Mean entropy of a factor's prediction in nats: logits (B, S, V) → (B,)."""
-        parts = [torch.special.entr(part.softmax(-1)).sum(-1) for part in logits.split(self.level_counts, -1)]
-        return torch.stack(parts).mean((0, 2))
+        logs = [part.log_softmax(-1) for part in logits.split(self.level_counts, -1)]
+        return torch.stack([-(each.exp() * each).sum(-1) for each in logs]).mean((0, 2))
 
     def most_likely(self, logits: Tensor) -> Tensor:
         """Return the most likely code of each factor: logits (…, V) → codes (…, C)."""

@@ -6,6 +6,7 @@ from draccus import ChoiceRegistry
 from lerobot.configs.rewards import RewardModelConfig
 from lerobot.optim.optimizers import AdamWConfig
 from lerobot.optim.schedulers import LRSchedulerConfig
+from lerobot.utils.constants import OBS_STATE
 
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_share
 from lerobot_wmrl.data.embodiment import Embodiment
@@ -150,6 +151,14 @@ class ActionWorldModelConfig(WorldModelConfig):
     embodiment: Embodiment = field(default_factory=Embodiment)
     learnt_successes: int | None = None
     learnt_failures: int | None = None
+
+    @property
+    def observation_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shapes of what a policy sees in imagination: images (3, H, W), and the state (P,) if it is
+        predicted."""
+        assert self.tokenizer is not None, "a trained world model knows its tokenizer"
+        state = {OBS_STATE: (self.state_size,)} if self.state_size else {}
+        return {**self.tokenizer.frame_shapes, **state}
 
 
 @RewardModelConfig.register_subclass("text_world_model")

@@ -42,7 +42,7 @@ from lerobot_wmrl.world_models.goal import imagine_goal, similarity_to_goal
 from lerobot_wmrl.world_models.hub_card import HubCard
 from lerobot_wmrl.world_models.imagination import ImaginationMixin
 from lerobot_wmrl.world_models.layers import Condition, FrameSizes, Prediction
-from lerobot_wmrl.world_models.modeling_frame_tokenizer import stack_cameras
+from lerobot_wmrl.world_models.modeling_frame_tokenizer import split_cameras, stack_cameras
 from lerobot_wmrl.world_models.text import CHECKPOINT_FOLDER, FrozenT5, check_one_each, make_text_encoder
 
 CONDITION_TOKENS: Final = 4
@@ -247,6 +247,21 @@ class ActionWorldModelRewardModel(WorldModelRewardModel):
         ends = embodiment.action_low, embodiment.action_high
         low, high = (torch.tensor(end, device=self.state_mean.device) for end in ends)
         return low, high
+
+    def observation(self, images: Tensor, state: Tensor, instructions: Sequence[str]) -> dict[str, Any]:
+        """Return B frames as a policy sees them.
+
+        Args:
+            images: (B, N, 3, S, S) in [0, 1], squares as the tokenizer has them; shown in the sizes of the
+                dataset's frames.
+            state: (B, P); left out if it is not predicted.
+            instructions: B of them, `task`.
+        """
+        assert self.config.tokenizer is not None, "a trained world model knows its tokenizer"
+        shown = {**split_cameras(images, self.config.tokenizer.frame_shapes)}
+        if self.config.state_size:
+            shown[OBS_STATE] = state
+        return {**shown, "task": list(instructions)}
 
     def encode_actions(self, actions: Tensor) -> Condition:
         if actions.shape[-1] != self.config.action_size:

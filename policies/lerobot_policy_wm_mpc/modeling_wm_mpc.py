@@ -18,7 +18,7 @@ from lerobot_wmrl.common.policies import (
 )
 from lerobot_wmrl.data.frames import Context, Frames
 from lerobot_wmrl.world_models.checkpoint import check_same_tokenizer, load_model
-from lerobot_wmrl.world_models.modeling_frame_tokenizer import split_cameras, stack_cameras
+from lerobot_wmrl.world_models.modeling_frame_tokenizer import stack_cameras
 from lerobot_wmrl.world_models.planning import Planner
 
 Observation = dict[str, Any]
@@ -108,13 +108,10 @@ class Proposal:
 
     def __init__(self, config: WmMpcConfig, model: Any, low: Tensor, high: Tensor) -> None:
         self.model, self.low, self.high = model, low, high
-        self.shapes, path = model.config.tokenizer.frame_shapes, config.proposal_path
-        shown: dict[str, tuple[int, ...]] = {**self.shapes}
-        if model.config.state_size:
-            shown[OBS_STATE] = (model.config.state_size,)
+        path = config.proposal_path
         try:
             policy_config = read_policy_config(path, [f"--device={config.device}"])
-            check_fit(policy_config, shown, len(low))
+            check_fit(policy_config, model.config.observation_shapes, len(low))
             self.preprocess, self.postprocess = load_processors(policy_config)
             names = model.config.embodiment.action_names
             check_units(policy_config, self.postprocess, names, low, high)
@@ -128,12 +125,8 @@ class Proposal:
         self.policy.reset()
 
         def act(images: Tensor, state: Tensor) -> Tensor:
-            seen: Observation = {**split_cameras(images, self.shapes)}
-            if self.model.config.state_size:
-                seen[OBS_STATE] = state
-            action: Tensor = self.postprocess(
-                self.policy.select_action(self.preprocess({**seen, "task": instructions}))
-            )
+            seen = self.model.observation(images, state, instructions)
+            action: Tensor = self.postprocess(self.policy.select_action(self.preprocess(seen)))
             return action.to(self.low.device).clamp(self.low, self.high)
 
         return self.model.policy_actions(frames, act, steps, images)

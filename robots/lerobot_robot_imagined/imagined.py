@@ -16,7 +16,6 @@ from lerobot_wmrl.common.images import to_bytes
 from lerobot_wmrl.envs.configuration_world_model import DrivenEnv
 from lerobot_wmrl.envs.start_frames import read_start_images
 from lerobot_wmrl.envs.world_model_env import load_world_models, make_env_at
-from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.world_models.checkpoint import read_config
 
 LONGEST: Final = 1_000_000
@@ -82,7 +81,7 @@ class ImaginedRobot(Robot):
         """Load the world model and begin the first episode."""
         config = self.config
         env = DrivenEnv(
-            world_model_path=config.world_model_path, dataset=config.dataset, reward=GeneralConfig(alpha=1.0),
+            world_model_path=config.world_model_path, dataset=config.dataset,
             episode_length=LONGEST, done_threshold=config.done_threshold, done_frames=config.done_frames,
             device=config.device,
         )  # fmt: skip

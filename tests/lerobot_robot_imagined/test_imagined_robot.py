@@ -26,7 +26,6 @@ from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.episodes import open_dataset, read_episodes
 from lerobot_wmrl.envs.configuration_world_model import DrivenEnv, StartFrames
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW, ACTION_NAMES, FPS, STATE_NAMES
-from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from tests.rl.checkpoints import save_untrained_policy
 
 FOLDER = "calibration"
@@ -158,7 +157,7 @@ def test_lerobot_replay_repeats_a_recorded_episode(flags, small_dataset, monkeyp
     actions = torch.from_numpy(table.action[start : start + length])
     imagined = DrivenEnv(
         world_model_path=str(trained_models["action_world_model"]),
-        dataset=StartFrames(root=str(small_dataset.root)), reward=GeneralConfig(alpha=1.0),
+        dataset=StartFrames(root=str(small_dataset.root)),
         episode_length=100, done_frames=100, device="cpu",
     ).create_tensor_env(1)  # fmt: skip
     imagined.reset(seed=[1])

@@ -36,10 +36,11 @@ def make_world(small_dataset, trained_models, play_policy) -> Callable[..., Worl
     """Loads the small models, with a dataset, a policy and ManiSkill as a real environment."""
 
     def make(real: bool = False, text: bool = False, end: bool = False, **settings: Any) -> World:
+        if text:
+            settings["reward"] = GeneralConfig()
         env = DrivenEnv(
             world_model_path=str(trained_models["action_world_model"]),
             text_world_model_path=str(trained_models["text_world_model"]) if text else "",
-            reward=GeneralConfig() if text else GeneralConfig(alpha=1.0),
             **{"episode_length": 300, "device": "cpu", **settings},
         )
         simulator = WmrlManiSkillEnv(task="push") if real else None

@@ -1,6 +1,7 @@
 """A drive is its start and its actions: what is seen, going back, replaying, and who acts."""
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -191,6 +192,17 @@ def test_a_replacement_that_was_cut_between_its_two_moves_is_put_back(world, sav
     visit.answer({"do": "save", "success": True})
     saved.folder.replace(saved.folder.with_name(".driven.old"))
     assert type(saved)(saved.folder, saved.robot).count == 1
+
+
+def test_two_servers_can_save_into_one_folder(world, saved):
+    visits = [Visit(world, each) for each in (saved, type(saved)(saved.folder, saved.robot))]
+    for visit in visits:
+        visit.answer({"do": "begin", "episode": 0, "frame": 0})
+        visit.answer({"do": "step", "driver": "you", "action": [0.0] * 7})
+    with ThreadPoolExecutor() as pool:
+        saves = [pool.submit(visit.answer, {"do": "save", "success": True}) for visit in visits * 2]
+        assert sorted(each.result()["saved"] for each in saves) == [0, 1, 2, 3]
+    assert read_episodes(LeRobotDataset("local/driven", root=saved.folder)).length.tolist() == [1] * 4
 
 
 def test_a_folder_with_other_columns_is_refused_and_kept(world, saved, make_synthetic_dataset):

@@ -1,6 +1,9 @@
 """Labels by hand, in Chromium and by requests."""
 
 import json
+import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -137,6 +140,34 @@ def test_labels_are_kept_while_they_are_made(address, rule, unlabelled):
     assert json.loads(get(f"{address}dataset")[1])["labels"] == {"3": 5}
 
 
+def test_ctrl_c_keeps_the_labels_and_says_so(unlabelled, rule, tmp_path):
+    LabelPage(rule, unlabelled).label(2, 4)
+    command = subprocess.Popen(
+        [sys.executable, "-m", "lerobot_wmrl.scripts.label", f"--dataset.root={unlabelled.root}",
+         "--success.type=by_hand", f"--success.file={rule.file}", "--success.port=0",
+         f"--output_dir={tmp_path / 'labelled'}"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert command.stdout is not None
+    assert next(line for line in command.stdout if line.startswith("open "))
+    command.send_signal(signal.SIGINT)
+    said = command.communicate(timeout=60)[1]
+    assert said.strip().splitlines()[-1] == (
+        f"1 of 6 episodes have a label, kept in {rule.file}; the same command goes on"
+    )
+    assert "Traceback" not in said
+    assert not (tmp_path / "labelled").exists()
+
+
+def test_complete_labels_can_still_be_changed(unlabelled, rule, request):
+    page = LabelPage(rule, unlabelled)
+    for episode in range(6):
+        page.label(episode, None)
+    address = request.getfixturevalue("address")
+    assert post(f"{address}label", {"episode": 4, "first": 2})[0] == 200
+    assert LabelPage(rule, unlabelled).labels == {**dict.fromkeys(range(6)), 4: 2}
+
+
 def test_frames_are_those_of_the_dataset(address, unlabelled):
     status, body = get(f"{address}frame?episode=2&frame=4&camera={CAMERA}")
     assert status == 200
@@ -149,9 +180,9 @@ def test_frames_are_those_of_the_dataset(address, unlabelled):
 @pytest.mark.parametrize(
     ("path", "content", "status", "said"),
     [
-        ("label", {"episode": 6, "first": 0}, 400, "episode=6: must be from 0 to 5"),
-        ("label", {"episode": "1", "first": 0}, 400, "must be from 0 to 5"),
-        ("label", {"episode": 0, "first": 99}, 400, "first=99: must be from 0 to"),
+        ("label", {"episode": 6, "first": 0}, 400, "episode=6: must be a whole number from 0 to 5"),
+        ("label", {"episode": "1", "first": 0}, 400, "must be a whole number from 0 to 5"),
+        ("label", {"episode": 0, "first": 99}, 400, "first=99: must be a whole number from 0 to"),
         ("label", {"episode": 0}, 400, "must have an episode and a first frame"),
         ("label", [], 400, "must have an episode"),
         ("label", b"{", 400, "Expecting"),

@@ -2,15 +2,19 @@
 
 import io
 import json
+import socket
 from typing import Any
 
 import aiohttp
 import numpy as np
 import pytest
+from aiohttp import web
 from PIL import Image
 
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.play.server import ELSEWHERE, MOST_VISITORS
 from lerobot_wmrl.play.web import Access
+from lerobot_wmrl.play.web import serve as serve_page
 
 VISIT = "visitor01"
 STATE = json.dumps([0.0] * 8)
@@ -25,12 +29,12 @@ async def talk(served: Any, *messages: Any, visit: str = VISIT) -> list[dict[str
     """Send messages as one visitor; return the answers."""
     async with (
         aiohttp.ClientSession() as session,
-        session.ws_connect(f"{served.address}drive?visit={visit}") as socket,
+        session.ws_connect(f"{served.address}drive?visit={visit}") as opened,
     ):
         answers = []
         for message in messages:
-            await socket.send_str(message if isinstance(message, str) else json.dumps(message))
-            answers.append(await socket.receive_json(timeout=60))
+            await opened.send_str(message if isinstance(message, str) else json.dumps(message))
+            answers.append(await opened.receive_json(timeout=60))
         return answers
 
 
@@ -233,3 +237,12 @@ def test_beyond_this_machine_a_token_is_needed(world, saved, serve):
 def test_this_machine_needs_no_token(host):
     assert Access(host).token == ""
     assert "token" not in Access(host).address(8000)
+
+
+def test_an_address_that_is_taken_is_named():
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        with pytest.raises(FieldError, match=rf"^port={port}: cannot be served at 127\.0\.0\.1"):
+            serve_page(web.Application(), Access("127.0.0.1"), port, "")

@@ -1,7 +1,8 @@
-// The page's clock runs here: each step is one message to the server and one answer. The server keeps the
-// drive, so that a page that was reloaded, or had lost its connection, finds it again. What changes the drive
-// goes through `inTurn`, one after the other.
+// The page's clock runs here: each step is one message to the world model and one answer. What changes the drive
+// goes through `inTurn`, one after the other. The world model runs in a server (server.js) or in this browser
+// (local.js).
 
+const { describe, connect, ask, upload } = await import(document.body.dataset.world);
 const $ = (id) => document.getElementById(id);
 const sleep = (milliseconds) => new Promise((done) => setTimeout(done, milliseconds));
 const YOU = "you";
@@ -24,52 +25,12 @@ let rates = []; // times of the last steps
 const down = new Set(); // keys held down
 const pad = { x: 0, y: 0, held: false };
 
-// ---- talking to the server ---------------------------------------------------------------------------------
-
-const token = new URLSearchParams(location.search).get("token");
-const query = (fields) => new URLSearchParams(token ? { ...fields, token } : fields).toString();
-const visit = sessionStorage.visit ??= Array.from(
-  crypto.getRandomValues(new Uint8Array(12)), (byte) => byte.toString(16).padStart(2, "0")).join("");
-const ELSEWHERE = 4000; // the code of a socket that is closed because the visitor has come once more
-let socket, waiting = [];
 let turn = Promise.resolve();
 
 function inTurn(act) {
   const done = turn.then(act);
   turn = done.catch(() => {});
   return done;
-}
-
-function connect() {
-  const scheme = location.protocol === "https:" ? "wss:" : "ws:";
-  socket = new WebSocket(`${scheme}//${location.host}/drive?${query({ visit })}`);
-  socket.onopen = () => inTurn(restore).catch(say);
-  socket.onmessage = (event) => {
-    const answer = JSON.parse(event.data);
-    const { done, failed } = waiting.shift();
-    answer.error ? failed(new Error(answer.error)) : done(answer);
-  };
-  socket.onclose = async (event) => {
-    const lost = waiting;
-    waiting = [];
-    lost.forEach(({ failed }) => failed(new Error("the connection was lost")));
-    await sleep(0);
-    if (event.code === ELSEWHERE) {
-      say(new Error("this drive was opened in another tab; reload to go on here"));
-      return;
-    }
-    say(new Error("no connection; trying again…"));
-    await sleep(1000);
-    connect();
-  };
-}
-
-function ask(message) {
-  return new Promise((done, failed) => {
-    if (socket.readyState !== WebSocket.OPEN) { failed(new Error("no connection")); return; }
-    waiting.push({ done, failed });
-    socket.send(JSON.stringify(message));
-  });
 }
 
 function say(message) {
@@ -234,7 +195,7 @@ function onKey(event) {
   }
   const act = {
     Space: () => setPlaying(!playing), Period: oneStep, Comma: () => look(shown - 1), KeyR: restart,
-    KeyS: () => inTurn(() => save(true)), KeyF: () => inTurn(() => save(false)),
+    ...(world.saves && { KeyS: () => inTurn(() => save(true)), KeyF: () => inTurn(() => save(false)) }),
   }[event.code] ?? chosenDriver(event.code);
   if (!act) return;
   event.preventDefault();
@@ -277,7 +238,10 @@ function build() {
     });
     $("views").append(strip);
   }
-  $("difference-field").hidden = !world.real && !world.episodes.length;
+  $("difference-field").hidden = !world.compares;
+  $("episode-frame").parentElement.hidden = world.first_frames;
+  for (const id of ["save-success", "save-failure", "save"]) $(id).hidden = !world.saves;
+  if (!world.saves) $("saved").textContent = "A link replays what was driven.";
 
   const drivers = [YOU, ...world.drivers];
   drivers.forEach((name, index) => {
@@ -482,7 +446,7 @@ function listen() {
   submit("place-episode", () => begin(
     withTask({ episode: Number($("episode").value), frame: Number($("episode-frame").value) })));
   submit("place-seed", () => begin(withTask({ seed: Number($("seed").value) })));
-  submit("place-picture", upload);
+  submit("place-picture", beginInPictures);
   addEventListener("keydown", onKey);
   // A button that was clicked by the mouse would take the keys from then on.
   addEventListener("click", (event) => { if (event.detail) event.target.closest?.("button")?.blur(); });
@@ -515,13 +479,11 @@ function drag(event) {
   $("pad").firstElementChild.style.translate = `${x * box.width / 2}px ${y * box.height / 2}px`;
 }
 
-async function upload() {
+async function beginInPictures() {
   const form = new FormData($("place-picture"));
   form.append("instruction", $("instruction").value);
   if (world.state.length) form.append("state", `[${$("picture-state").value}]`);
-  const response = await fetch(`picture?${query({})}`, { method: "POST", body: form });
-  if (!response.ok) throw new Error(await response.text());
-  await begin(await response.json());
+  await begin(await upload(form));
 }
 
 async function copyLink() {
@@ -534,12 +496,10 @@ async function copyLink() {
 }
 
 async function main() {
-  const response = await fetch(`world?${query({})}`);
-  if (!response.ok) throw new Error(await response.text());
-  world = await response.json();
+  world = await describe();
   build();
   listen();
-  connect();
+  connect(() => inTurn(restore).catch(say), say);
   run();
 }
 

@@ -1,0 +1,136 @@
+"""A folder with a page that needs no server: any host of files can show it."""
+
+import json
+import shutil
+import subprocess
+import tarfile
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from PIL import Image
+
+from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.files import whole_folder, write_text
+from lerobot_wmrl.data.episodes import EpisodeTable
+from lerobot_wmrl.data.frame_cache import cached_frames
+from lerobot_wmrl.data.frames import Frames
+from lerobot_wmrl.play.graphs import ExportedWorldModel, export_graphs
+from lerobot_wmrl.play.web import PAGES
+from lerobot_wmrl.play.world import World
+
+RUNTIME: Final = "onnxruntime-web@1.22.0"
+"""What runs the graphs in a browser, as npm names it (MIT licence)."""
+
+RUNTIME_FILES: Final = ("ort.wasm.min.mjs", "ort-wasm-simd-threaded.mjs", "ort-wasm-simd-threaded.wasm")
+PAGE_FILES: Final = ("play.js", "play.css", "local.js")
+
+
+def export_page(world: World, folder: Path, starts: int) -> str:
+    """Write the page; the folder is whole or absent. Return how well the exported networks agree.
+
+    Args:
+        world: with a dataset.
+        folder: is new.
+        starts: episodes of the dataset, spread evenly, in whose first frames a drive can begin.
+
+    Raises:
+        FieldError: there is no dataset, or the world model or the runtime cannot be had.
+    """
+    if world.table is None:
+        raise FieldError("dataset.root", "", "is missing: the page holds first frames", "give a dataset")
+    rows = np.unique(np.linspace(0, len(world.table.start) - 1, starts).round().astype(int))
+    with whole_folder(folder) as partial:
+        static, frames = partial / "static", partial / "frames"
+        static.mkdir(parents=True)
+        frames.mkdir()
+        fetch_runtime(static)
+        for name in PAGE_FILES:
+            shutil.copy2(PAGES / name, static)
+        page = (PAGES / "index.html").read_text().replace("./server.js", "./local.js")
+        write_text(partial / "index.html", page)
+        export_graphs(world.models.model, partial)
+        write_frames(world, world.table, rows, frames)
+        write_text(partial / "world.json", json.dumps(describe(world, world.table, rows)))
+        return compare(world, world.table, int(rows[0]), partial)
+
+
+def compare(world: World, table: EpisodeTable, row: int, folder: Path) -> str:
+    """Imagine a recorded episode with the exported networks and with the world model.
+
+    Returns:
+        How far the pictures and probabilities of success are apart.
+    """
+    model, exported = world.models.model, ExportedWorldModel(folder, world.model.clip_length)
+    first, end = int(table.start[row]), int(table.start[row] + table.length[row])
+    images = cached_frames(table.dataset, world.sizes.camera_keys, world.sizes.image_size)[first]
+    pictures = torch.from_numpy(np.array(images)).movedim(-1, 1)[None] / 255
+    state = torch.from_numpy(table.state[first, : world.model.state_size].astype(np.float32))[None]
+    context = model.tokenizer.context(pictures)
+    frames = Frames(model.tokenizer.encode(pictures, context), state, context)
+    exported.begin(pictures.numpy(), state.numpy())
+    colours, chances = [], []
+    actions = table.action[first:end].astype(np.float32)
+    for action, imagined in zip(actions, model.imagine(frames, torch.from_numpy(actions)[None]), strict=True):
+        found = exported.step(action[None])
+        shown = model.decode(imagined.tokens, context).images[0].movedim(1, -1).numpy() * 255
+        colours.append(np.abs(found["pixels"][..., :3] - shown).mean())
+        chances.append(np.abs(found["done_probability"] - imagined.done_logit.sigmoid().numpy()).max())
+    return (
+        f"along a recorded episode of {len(actions)} frames, its pictures are {np.mean(colours):.2f} of 255 "
+        f"away from the world model's on average, its probabilities of success at most {max(chances):.3f}"
+    )
+
+
+def describe(world: World, table: EpisodeTable, rows: np.ndarray) -> dict[str, Any]:
+    """Return what the page needs to know of the world model and of these episodes, as JSON."""
+    served = world.description()
+    return {
+        **served,
+        "drivers": ["recorded"], "policy": "", "real": "", "goal": False, "compares": False,
+        "first_frames": True, "saves": False,
+        "side": world.sizes.image_size,
+        "sizes": [[width, height] for _, height, width in world.sizes.frame_shapes.values()],
+        "window": world.model.clip_length,
+        "done_frames": world.done_frames,
+        "end_at_success": world.config.done_frames == world.done_frames,
+        "episode_length": world.config.horizon,
+        "episodes": [{**served["episodes"][row], **recorded(world, table, row)} for row in rows.tolist()],
+    }  # fmt: skip
+
+
+def recorded(world: World, table: EpisodeTable, row: int) -> Mapping[str, Any]:
+    """Return the state in which an episode begins, and its actions."""
+    first, end = int(table.start[row]), int(table.start[row] + table.length[row])
+    state = table.state[first, : world.model.state_size] if world.model.state_size else np.zeros(0)
+    return {"state": state.tolist(), "actions": table.action[first:end].tolist()}
+
+
+def write_frames(world: World, table: EpisodeTable, rows: np.ndarray, folder: Path) -> None:
+    """Write the first frames of these episodes as the tokenizer sees them, numbered anew."""
+    images = cached_frames(table.dataset, world.sizes.camera_keys, world.sizes.image_size)
+    for index, row in enumerate(rows.tolist()):
+        for camera, image in zip(world.sizes.cameras, images[int(table.start[row])], strict=True):
+            Image.fromarray(image).save(folder / f"{index}_{camera}.png")
+
+
+def fetch_runtime(folder: Path) -> None:
+    """Fetch what runs the graphs in a browser, by npm. FieldError if it cannot be had."""
+    with tempfile.TemporaryDirectory() as place:
+        command = ["npm", "pack", RUNTIME, "--prefer-offline", "--silent", f"--pack-destination={place}"]
+        try:
+            subprocess.run(command, check=True, capture_output=True, text=True, cwd=place)
+        except (OSError, subprocess.CalledProcessError) as error:
+            reason = getattr(error, "stderr", None) or error
+            raise FieldError(
+                "export", RUNTIME, f"npm cannot fetch it ({str(reason).strip()})",
+                "install npm, and let it reach a registry",
+            ) from error  # fmt: skip
+        with tarfile.open(next(Path(place).glob("*.tgz"))) as package:
+            for name in RUNTIME_FILES:
+                content = package.extractfile(f"package/dist/{name}")
+                assert content is not None, name
+                (folder / name).write_bytes(content.read())
