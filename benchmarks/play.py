@@ -1,19 +1,25 @@
 """How long the page of lerobot-wmrl-play waits for the next frame, from a key to a picture to show.
 
     python benchmarks/play.py --world_model=outputs/demo/action_world_model \\
-        --dataset.root=outputs/demo/dataset --maniskill
+        --dataset.root=outputs/demo/dataset --maniskill --exported=outputs/page
 
 The steps of one visitor, over the page's socket on this machine, as fast as they come: from the message until
 the picture is decoded, without the browser itself. Beside it, in turns: a step of the environment alone, the
-floor, and with `--maniskill` a step of ManiSkill with the same cameras. Writes docs/results/play_speed.json.
+floor; with `--maniskill` a step of ManiSkill with the same cameras; with `--exported` one of a page that was
+written by `lerobot-wmrl-play --export`, in Chromium without a window. Writes docs/results/play_speed.json.
 """
 
 import argparse
 import asyncio
 import base64
+import functools
 import json
+import shutil
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
@@ -24,6 +30,8 @@ import numpy as np
 import torch
 from aiohttp.test_utils import TestServer
 from lerobot.utils.import_utils import register_third_party_plugins
+from selenium import webdriver
+from selenium.webdriver.common.by import By
 
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.precision import keep_freed_memory
@@ -37,6 +45,22 @@ from lerobot_wmrl.play.world import World, load_world
 RESULTS: Final = Path(__file__).parents[1] / "docs" / "results" / "play_speed.json"
 BLOCK: Final = 50
 """Steps of one kind before it is another one's turn."""
+
+BROWSER_STEPS: Final = """
+    const [count, done] = arguments;
+    (async () => {
+      const { ask } = await import("/static/local.js");
+      const { begun } = await ask({ do: "begin", episode: 0, frame: 0 });
+      const action = begun.action.map(() => 0), found = [];
+      for (let step = 0; step < count; step += 1) {
+        const began = performance.now();
+        const { view } = await ask({ do: "step", driver: "you", action });
+        await Promise.all(view.images.map((src) => Object.assign(new Image(), { src }).decode()));
+        found.push(performance.now() - began);
+      }
+      return found;
+    })().then(done);
+"""
 
 
 def milliseconds(step: Callable[[], object], count: int) -> list[float]:
@@ -75,7 +99,32 @@ async def page_steps(socket: aiohttp.ClientWebSocketResponse, actions: int, coun
     return found
 
 
-async def measure(world: World, maniskill: bool, steps: int) -> dict[str, Any]:
+@contextmanager
+def browser(page: Path) -> Iterator[Callable[[int], list[float]]]:
+    """Open an exported page in Chromium. Give what returns the duration of each of some of its steps."""
+    handler = functools.partial(QuietHandler, directory=str(page))
+    options = webdriver.ChromeOptions()
+    for flag in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage"):
+        options.add_argument(flag)
+    driver = webdriver.Chrome(options, webdriver.ChromeService(shutil.which("chromedriver")))
+    driver.set_script_timeout(600)
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        driver.get(f"http://127.0.0.1:{server.server_port}/")
+        while driver.find_element(By.ID, "status").text != "ready":
+            time.sleep(0.1)
+        yield functools.partial(driver.execute_async_script, BROWSER_STEPS)
+        server.shutdown()
+    driver.quit()
+
+
+class QuietHandler(SimpleHTTPRequestHandler):
+    """Serves files and says nothing."""
+
+    def log_message(self, format: str, *given: object) -> None: ...
+
+
+async def measure(world: World, maniskill: bool, exported: Path | None, steps: int) -> dict[str, Any]:
     """Measure everything in turns."""
     count = len(world.model.embodiment.action_names)
     alone = world.begin({"episode": 0, "frame": 0}, None)
@@ -88,7 +137,8 @@ async def measure(world: World, maniskill: bool, steps: int) -> dict[str, Any]:
         simulator.reset(seed=[0])
         works["maniskill"] = lambda: simulator.step(action)
     found: dict[str, list[float]] = {"page": [], **{name: [] for name in works}}
-    with TemporaryDirectory() as folder:
+    with TemporaryDirectory() as folder, ExitStack() as stack:
+        local = None if exported is None else stack.enter_context(browser(exported))
         saved = SavedEpisodes(Path(folder) / "driven", world.model.embodiment)
         server = TestServer(PlayServer(world, saved, "127.0.0.1").application())
         await server.start_server()
@@ -101,10 +151,15 @@ async def measure(world: World, maniskill: bool, steps: int) -> dict[str, Any]:
             await page_steps(socket, count, BLOCK)
             for work in works.values():
                 milliseconds(work, BLOCK)
+            if local is not None:
+                local(BLOCK)
+                found["exported"] = []
             for _ in range(steps // BLOCK):
                 found["page"] += await page_steps(socket, count, BLOCK)
                 for name, work in works.items():
                     found[name] += milliseconds(work, BLOCK)
+                if local is not None:
+                    found["exported"] += local(BLOCK)
         await server.close()
     return {name: summary(durations) for name, durations in found.items()}
 
@@ -119,6 +174,7 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--steps", type=int, default=500, help="steps of each kind")
     parser.add_argument("--maniskill", action="store_true", help="measure ManiSkill too")
+    parser.add_argument("--exported", type=Path, help="an exported page")
     parser.add_argument("--output", type=Path, default=RESULTS, help="JSON file")
     return parser
 
@@ -137,7 +193,7 @@ def main() -> None:
         "threads": torch.get_num_threads(),
         "image_size": world.sizes.image_size,
         "cameras": len(world.sizes.cameras),
-        **asyncio.run(measure(world, given.maniskill, given.steps)),
+        **asyncio.run(measure(world, given.maniskill, given.exported, given.steps)),
     }
     print(json.dumps(figures, indent=2))
     write_json(given.output, figures)

@@ -37,6 +37,7 @@ SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     "value_imagined": ("Policies", partial(value.rows_above, ["imagined_cloning"])),
     "value_distilled_ppo": ("Policies", partial(value.rows_above, ["distilled_ppo"])),
     "value_controls": ("Policies", value.value_controls),
+    "driven": ("Policies", value.driven),
     "demo": ("Policies", policies.demo),
     "cloning_control": ("Policies", policies.cloning_control),
     "rl_comparison": ("Policies", policies.rl_comparison),

@@ -62,6 +62,15 @@ def control(study: Study) -> Results:
     return {study.variables["cell"]: {**settings, "methods": found}}
 
 
+def driven(study: Study) -> Results:
+    """Return the success of the policies cloned from driven and from planned demonstrations."""
+    settings = {
+        name: study.variables[name] for name in ("count", "demonstrations", "rollouts", "seed", "starts")
+    }
+    found = {name: success(study, name) for name in study.variables["methods"]}
+    return {study.variables["cell"]: {**settings, "methods": found}}
+
+
 def method(study: Study, name: str, steps: Sequence[str]) -> dict[str, Any]:
     """Return a method's success, the minutes of its steps, and the seconds that it takes for an episode."""
     minutes = sum(seconds(study, step) for step in steps) / 60

@@ -260,6 +260,39 @@ def value_controls(load: Load) -> str:
 {table([*BUDGET, "the world model learnt from", "method", "known scenes", "unseen scenes"], rows)}"""
 
 
+def driven(load: Load) -> str:
+    """Return the section: success of policies cloned from driven demonstrations, beside planned ones."""
+    rows = []
+    for each in read_cells(ROOT / "experiments" / "driven.yaml"):
+        cell = published(load, "driven", each.variables["cell"])
+        if not cell:
+            continue
+        reference = cell["methods"]["driven_cloning"]
+        for name, title in DRIVEN.items():
+            found = cell["methods"][name]
+            rates = [
+                f"{100 * found[domain]['share']:.0f} %" if name == "driven_cloning"
+                else against(found[domain], reference[domain])
+                for domain in ("ind", "ood")
+            ]  # fmt: skip
+            rows.append([cell["count"], title, cell["seed"], *rates])
+    return f"""Policies cloned from as many demonstrations of each kind, on the same starts. Changes are
+against the first row:
+
+{table(["episodes", "demonstrations", "seed", "known scenes", "unseen scenes"], rows)}
+
+A scripted person holds keys down for what a planner in the world model finds, and does again what fails.
+LeRobot's own `lerobot-record` records it in real time, without the simulator."""
+
+
+DRIVEN: Final = {
+    "driven_cloning": "driven by keys in the world model",
+    "optimal_cloning": "planned in ManiSkill",
+    "human_like_cloning": "planned in ManiSkill, with pauses and detours",
+}
+"""Method → what its policy is cloned from."""
+
+
 def improved(load: Load) -> Iterator[tuple[str, list[Any], Cell]]:
     """Yield the published cells of the study: name, budget and seed, success of the policy before PPO."""
     for each in read_cells(ROOT / "experiments" / f"{STUDY}.yaml"):

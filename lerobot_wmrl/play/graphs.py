@@ -8,6 +8,7 @@ What one graph returns and another needs has the same name in both. An output `n
 graph's next run.
 """
 
+import logging
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -195,6 +196,7 @@ def export_graphs(model: ActionWorldModelRewardModel, folder: Path) -> None:
     }
     look = Look(model)
     contexts = len(model.tokenizer.context(given["pictures"]).maps)
+    logging.getLogger("onnx_ir").setLevel(logging.ERROR)
     graphs = {"look": look, "scene": EncodeScene(model, contexts), "step": ImagineStep(model, contexts)}
     for name, graph in graphs.items():
         inputs = {read: given[read] for read in graph.reads}

@@ -12,6 +12,7 @@ from unittest.mock import patch
 
 import draccus
 from lerobot.configs.eval import EvalPipelineConfig
+from lerobot.configs.parser import PLUGIN_DISCOVERY_SUFFIX, filter_arg, load_plugin, parse_plugin_args
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.scripts.lerobot_edit_dataset import EditDatasetConfig
 from lerobot.scripts.lerobot_record import RecordConfig
@@ -67,6 +68,9 @@ def check(command: str) -> None:
             check_ours(SCRIPTS[program].partition(":")[0], flags)
         elif program in LEROBOT:
             register_third_party_plugins()
+            for name, package in parse_plugin_args(PLUGIN_DISCOVERY_SUFFIX, flags).items():
+                load_plugin(package)
+                flags = filter_arg(name, flags)
             with without_help_texts():
                 draccus.parse(LEROBOT[program], args=without_paths(flags))
         else:

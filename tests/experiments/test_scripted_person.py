@@ -1,0 +1,79 @@
+"""A scripted person's keys, and what lerobot-record keeps of them."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lerobot.scripts.lerobot_record import record
+
+from experiments.person.script import SPEED, Hands, make_parser, write_script
+from lerobot_wmrl.data.episodes import open_dataset, read_episodes
+from lerobot_wmrl.maniskill.embodiment import ACTION_NAMES, FPS
+
+FRAMES = 6
+
+
+@pytest.fixture
+def axes():
+    moves = {"low": -1.0, "high": 1.0, "rest": 0.0, "springs": True}
+    return [moves, {**moves, "rest": -1.0, "springs": False}]
+
+
+def test_keys_move_at_one_speed_and_make_up_for_what_is_owed(axes):
+    hands = Hands(axes)
+    given = np.array([hands.press(np.array([SPEED / 4, -1.0])) for _ in range(8)])
+    assert {*given[:, 0]} == {0.0, SPEED}
+    assert given[:, 0].sum() == pytest.approx(2 * SPEED)
+
+
+def test_an_axis_that_is_held_moves_there_step_by_step_and_stays(axes):
+    hands = Hands(axes)
+    given = [hands.press(np.array([0.0, 1.0]))[1] for _ in range(6)]
+    assert given[0] == pytest.approx(-1 + SPEED)
+    assert np.diff(given).max() == pytest.approx(SPEED)
+    assert given[-1] == pytest.approx(given[-2], abs=SPEED)
+    assert abs(given[-1] - 1) <= SPEED / 2
+
+
+@pytest.fixture
+def world_model(trained_models) -> str:
+    return str(trained_models["action_world_model"])
+
+
+@pytest.fixture
+def script(small_dataset, world_model, tmp_path) -> Path:
+    """What the person does in two episodes; nearly everything is a success here."""
+    folder = tmp_path / "person"
+    flags = [
+        f"--world_model={world_model}", f"--dataset.root={small_dataset.root}", f"--output_dir={folder}",
+        "--episodes=2", f"--frames={FRAMES}", "--done_threshold=1e-9", "--done_frames=3",
+    ]  # fmt: skip
+    write_script(make_parser().parse_args(flags))
+    return folder
+
+
+def test_lerobot_record_keeps_what_the_person_does(script, small_dataset, world_model, tmp_path, monkeypatch):
+    written = json.loads((script / "script.json").read_text())
+    episodes = [int(each) for each in (script / "episodes.txt").read_text().split(",")]
+    assert written["names"] == [*ACTION_NAMES]
+    assert [len(actions) for actions in written["actions"]] == [FRAMES, FRAMES]
+    seconds, calibration, folder = FRAMES / FPS, tmp_path / "calibration", tmp_path / "driven"
+    flags = [
+        "--robot.type=imagined", f"--robot.world_model_path={world_model}", "--robot.device=cpu",
+        f"--robot.dataset.root={small_dataset.root}", f"--robot.dataset.episodes={episodes}",
+        f"--robot.episode_time_s={seconds}", f"--robot.calibration_dir={calibration}",
+        "--teleop.discover_packages_path=experiments.person", "--teleop.type=scripted_person",
+        f"--teleop.script={script / 'script.json'}", f"--teleop.episode_time_s={seconds}",
+        f"--teleop.calibration_dir={calibration}", "--dataset.repo_id=local/driven",
+        f"--dataset.root={folder}", "--dataset.single_task=push", "--dataset.num_episodes=2",
+        f"--dataset.fps={FPS}", f"--dataset.episode_time_s={seconds}", "--dataset.reset_time_s=0",
+        "--dataset.push_to_hub=false", "--dataset.video=false", "--play_sounds=false",
+    ]  # fmt: skip
+    monkeypatch.setattr(sys, "argv", ["lerobot-record", *flags])
+    record()
+    found, source = read_episodes(open_dataset(folder)), read_episodes(small_dataset)
+    np.testing.assert_allclose(found.state[found.start], source.state[source.start[episodes]], rtol=1e-5)
+    for begin, actions in zip(found.start, written["actions"], strict=True):
+        np.testing.assert_allclose(found.action[begin : begin + 3], actions[:3], rtol=1e-5)
