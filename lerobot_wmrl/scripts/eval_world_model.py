@@ -71,6 +71,8 @@ class EvalWorldModelConfig(RunConfig):
         policy_episodes: episodes of each policy in each of the two.
         real_env: simulator for `policies`, `--real_env.type=wmrl_maniskill` and its settings.
         device: device of the models; by default the best one of this machine.
+        push_to_hub: put what was found on the model's card on the hub, with animations of recorded and
+            imagined episodes. `model.path` must be its name there.
         output_dir: folder of metrics.json, metrics.md and the pictures.
     """
 
@@ -86,6 +88,7 @@ class EvalWorldModelConfig(RunConfig):
     policy_episodes: int = 50
     real_env: EnvConfig | None = None
     device: str | None = None
+    push_to_hub: bool = False
     output_dir: Path = Path("outputs/eval_world_model")
 
     def check(self) -> None:
@@ -93,6 +96,11 @@ class EvalWorldModelConfig(RunConfig):
         require_at_least(self, 1, "max_episodes", "done_frames", "policy_episodes")
         if not 0 < self.done_threshold < 1:
             raise FieldError("done_threshold", self.done_threshold, "must be a probability between 0 and 1")
+        if self.push_to_hub and Path(self.model.path).exists():
+            raise FieldError(
+                "push_to_hub", True, f"{self.model.path} is a folder here",
+                "publish it by lerobot-wmrl-train-world-model, and give its name there as `model.path`",
+            )  # fmt: skip
         if self.policies and self.real_env is None:
             raise FieldError(
                 "real_env.type", None,
@@ -137,7 +145,23 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     page = "\n\n".join(report.page for report in reports)
     write_json(cfg.output_dir / "metrics.json", metrics)
     write_text(cfg.output_dir / "metrics.md", f"{page}\n")
+    if cfg.push_to_hub:
+        publish(cfg, page, len(episodes))
     print(f"{page}\n\n{conclusion(cfg, len(episodes), reports[0])}")
+
+
+def publish(cfg: EvalWorldModelConfig, page: str, episodes: int) -> None:
+    """Put what was found on the model's card."""
+    from lerobot_wmrl.world_models.hub_card import publish_evaluation
+
+    said = (
+        f"{episodes} recorded episodes of `{cfg.dataset.name}` ({cfg.split}), imagined from their first "
+        f"frames with their own actions. An episode succeeds in imagination when {cfg.done_frames} frames in "
+        f"a row have a success probability of at least {cfg.done_threshold}. Recorded above, imagined below:"
+    )
+    pictures = sorted(cfg.output_dir.glob("comparison_*.gif"))
+    others = [cfg.output_dir / "metrics.json", cfg.output_dir / "metrics.md"]
+    publish_evaluation(cfg.model.path, said, page, pictures, others)
 
 
 def conclusion(cfg: EvalWorldModelConfig, episodes: int, report: "Report") -> str:

@@ -1,11 +1,16 @@
 """Publishing trained models on the Hugging Face hub, each with a card that says what it is."""
 
 import logging
+import re
+from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
 
-from huggingface_hub import HfApi, ModelCard, ModelCardData
+from huggingface_hub import CommitOperationAdd, HfApi, ModelCard, ModelCardData
+from huggingface_hub.errors import HfHubHTTPError, HFValidationError
+
+from lerobot_wmrl.common.errors import FieldError
 
 CARD = """---
 {metadata}
@@ -66,3 +71,56 @@ class HubCard:
                 repo_id=config.repo_id,
             )
         )  # fmt: skip
+
+
+EVALUATION: Final = "evaluation"
+"""Folder of a published model's evaluation."""
+
+SECTION: Final = """<!-- evaluation -->
+
+## What it imagines
+
+{said}
+
+{pictures}
+
+{found}
+
+<!-- end of evaluation -->
+"""
+
+
+def publish_evaluation(
+    name: str, said: str, found: str, pictures: Sequence[Path], others: Sequence[Path]
+) -> None:
+    """Put what an evaluation has found on the card of a published model, in place of an earlier one.
+
+    Args:
+        name: the model's on the hub, user/name.
+        said: what was done, in Markdown.
+        found: what was found.
+        pictures: files that the card shows between them.
+        others: further files, which are uploaded beside.
+
+    Raises:
+        FieldError: it is not on the hub, or may not be written.
+    """
+    shown = "\n\n".join(f"![{path.stem.replace('_', ' ')}]({EVALUATION}/{path.name})" for path in pictures)
+    try:
+        card = ModelCard.load(name)
+        before = re.sub(
+            r"\s*<!-- evaluation -->.*<!-- end of evaluation -->\s*", "\n\n", card.text, flags=re.S
+        )
+        card.text = f"{before.rstrip()}\n\n{SECTION.format(said=said, pictures=shown, found=found)}"
+        content = {f"{EVALUATION}/{path.name}": path.read_bytes() for path in (*pictures, *others)}
+        operations = [
+            CommitOperationAdd(path, data)
+            for path, data in {"README.md": str(card).encode(), **content}.items()
+        ]
+        commit = HfApi().create_commit(name, operations, commit_message="Add an evaluation")
+    except (HfHubHTTPError, HFValidationError) as error:
+        raise FieldError(
+            "push_to_hub", True, f"{name} cannot be written on the hub ({error})",
+            "give the model by its name there, user/name, as `model.path`",
+        ) from error  # fmt: skip
+    logging.info("published at %s", commit.repo_url)

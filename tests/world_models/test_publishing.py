@@ -7,7 +7,10 @@ import pytest
 import torch
 from lerobot.rewards.factory import get_reward_model_class
 
+from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.data.episodes import ChosenEpisodes
+from lerobot_wmrl.scripts.eval_world_model import EvalWorldModelConfig, eval_world_model
 from lerobot_wmrl.world_models.checkpoint import load_model
 from tests.trained import action_config, run_training, text_config, tokenizer_config
 
@@ -59,3 +62,38 @@ def test_a_model_without_a_name_is_not_trained_in_order_to_be_published(small_da
     with pytest.raises(FieldError, match=r"^model\.push_to_hub=True: .*`model\.repo_id`"):
         run_training(config, Path(small_dataset.root), tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+def test_an_evaluation_is_put_on_the_card_and_replaced_by_the_next(
+    hub, small_dataset, trained_models, tmp_path
+):
+    config = action_config(trained_models["frame_tokenizer"])
+    config.push_to_hub, config.repo_id = True, "somebody/world_model"
+    run_training(config, Path(small_dataset.root), tmp_path / "run", steps=1)
+    repo = hub.repos["models", "somebody/world_model"]
+    weights, card = repo.head["model.safetensors"], repo.head["README.md"].decode()
+    for run, split in enumerate(["all", "train"]):
+        evaluation = EvalWorldModelConfig(
+            model=Checkpoint("somebody/world_model"), dataset=ChosenEpisodes(root=str(small_dataset.root)),
+            split=split, push_to_hub=True, output_dir=tmp_path / f"check{run}", device="cpu",
+        )  # fmt: skip
+        eval_world_model(evaluation)
+        found = repo.head["README.md"].decode()
+        assert found.startswith(card.rstrip())
+        assert found.count("## What it imagines") == 1
+        assert f"({split}), imagined from their first frames" in found
+        assert (tmp_path / f"check{run}" / "metrics.md").read_text().strip() in found
+        for name in ("comparison_success.gif", "metrics.json", "metrics.md"):
+            assert repo.head[f"evaluation/{name}"] == (tmp_path / f"check{run}" / name).read_bytes()
+    assert "(evaluation/comparison_success.gif)" in found
+    assert repo.head["model.safetensors"] == weights
+
+
+def test_an_evaluation_of_a_folder_is_not_published(trained_models, small_dataset, tmp_path):
+    evaluation = EvalWorldModelConfig(
+        model=Checkpoint(str(trained_models["action_world_model"])), push_to_hub=True,
+        dataset=ChosenEpisodes(root=str(small_dataset.root)), output_dir=tmp_path / "check",
+    )  # fmt: skip
+    with pytest.raises(FieldError, match=r"^push_to_hub=True: .* is a folder here; publish it by"):
+        eval_world_model(evaluation)
+    assert not (tmp_path / "check").exists()
