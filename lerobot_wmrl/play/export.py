@@ -26,6 +26,16 @@ RUNTIME: Final = "onnxruntime-web@1.22.0"
 """What runs the graphs in a browser, as npm names it (MIT licence)."""
 
 RUNTIME_FILES: Final = ("ort.wasm.min.mjs", "ort-wasm-simd-threaded.mjs", "ort-wasm-simd-threaded.wasm")
+SPACE: Final = """---
+title: Drive a world model
+sdk: static
+tags: [lerobot, robotics, world-model]
+---
+
+A world model of a robot, in your browser. Made by `lerobot-wmrl-play --export`.
+"""
+"""What the hub shows a folder as a static Space by."""
+
 PAGE_FILES: Final = ("play.js", "play.css", "local.js")
 
 
@@ -52,6 +62,7 @@ def export_page(world: World, folder: Path, starts: int) -> str:
             shutil.copy2(PAGES / name, static)
         page = (PAGES / "index.html").read_text().replace("./server.js", "./local.js")
         write_text(partial / "index.html", page)
+        write_text(partial / "README.md", SPACE)
         export_graphs(world.models.model, partial)
         write_frames(world, world.table, rows, frames)
         write_text(partial / "world.json", json.dumps(describe(world, world.table, rows)))
