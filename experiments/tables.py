@@ -36,6 +36,7 @@ SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     "value_dyna": ("Policies", partial(value.rows_above, ["dyna"])),
     "value_imagined": ("Policies", partial(value.rows_above, ["imagined_cloning"])),
     "value_distilled_ppo": ("Policies", partial(value.rows_above, ["distilled_ppo"])),
+    "value_ppo_distilled": ("Policies", partial(value.rows_above, ["ppo_distilled"])),
     "value_controls": ("Policies", value.value_controls),
     "driven": ("Policies", value.driven),
     "demo": ("Policies", policies.demo),

@@ -29,11 +29,13 @@ TITLES: Final = {
     "imagined_cloning": "BC of recorded and imagined successes",
     "distilled": "planner distilled in imagination",
     "distilled_ppo": "planner distilled, then PPO in imagination",
+    "ppo_distilled": "PPO in imagination, then the planner distilled",
 }
 """Methods in the order of the table."""
 
 IMAGINED: Final = (
     "imagined_ppo", "planned", "dyna", "iterated_ppo", "imagined_cloning", "distilled", "distilled_ppo",
+    "ppo_distilled",
 )  # fmt: skip
 """Methods that use a world model."""
 
@@ -63,6 +65,7 @@ MORE_COLOURS: Final = (
     "#63b3ed",
     "#553c9a",
     "#b7791f",
+    "#22543d",
 )
 
 STUDY: Final = "value_push"
@@ -73,6 +76,7 @@ PARTS: Final = (
     "value_dyna",
     "value_imagined",
     "value_distilled_ppo",
+    "value_ppo_distilled",
 )
 """Studies whose cells add methods to its table."""
 
