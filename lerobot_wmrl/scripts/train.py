@@ -68,8 +68,11 @@ A `{type}` policy of LeRobot, trained further by reinforcement learning with ler
 
 {description}
 
-`train_config.json` has the settings of the training. Evaluate the policy with `lerobot-eval
---policy.path={name} --env.type=…`.
+It began as {start}. `train_config.json` has all settings. Evaluate it:
+
+```
+{command}
+```
 """
 
 
@@ -328,7 +331,6 @@ def summary(cfg: TrainConfig) -> list[str]:
     """Return lines that say what was made, how good it is, and how to evaluate it."""
     from lerobot_wmrl.common.tracking import read_metrics
     from lerobot_wmrl.rl.callbacks import read_record
-    from lerobot_wmrl.rl.recorders import env_flags
     from lerobot_wmrl.rl.selection import Selection, success
 
     iterations = [line for line in read_metrics(cfg.output_dir) if "success_rate" in line]
@@ -348,12 +350,18 @@ def summary(cfg: TrainConfig) -> list[str]:
         measured = [place for place in ("real", "imagined") if place in record]
         found = ", ".join(f"{place} success {success(record, place)}" for place in measured)
         lines.append(f"best checkpoint: iteration {best}, {found}")
+    return [*lines, f"next: {evaluation(cfg, str(checkpoint / PRETRAINED_MODEL_DIR))}"]
+
+
+def evaluation(cfg: TrainConfig, path: str) -> str:
+    """Return the command that evaluates the policy at `path`, a folder or a name on the hub."""
+    from lerobot_wmrl.rl.recorders import env_flags
+
     evaluated: Any = cfg.real_env or cfg.env
     flags = {
-        "policy.path": str(checkpoint / PRETRAINED_MODEL_DIR), **env_flags(evaluated), "eval.n_episodes": 100,
-        "seed": EVALUATION_SEED,
+        "policy.path": path, **env_flags(evaluated), "eval.n_episodes": 100, "seed": EVALUATION_SEED,
     }  # fmt: skip
-    return [*lines, f"next: {shlex.join(['lerobot-eval', *format_flags(flags)])}"]
+    return shlex.join(["lerobot-eval", *format_flags(flags)])
 
 
 def publish(cfg: TrainConfig, lines: list[str]) -> None:
@@ -369,8 +377,12 @@ def publish(cfg: TrainConfig, lines: list[str]) -> None:
         license=config.license or "apache-2.0", library_name="lerobot", pipeline_tag="robotics",
         tags=sorted({*(config.tags or []), "robotics", "lerobot", config.type}), model_name=name,
     )  # fmt: skip
-    description = "\n".join(f"- {line}" for line in lines[:-1])
-    card = CARD.format(metadata=data.to_yaml(), name=name, type=config.type, description=description)
+    description, start = "\n".join(f"- {line}" for line in lines[:-1]), str(config.pretrained_path)
+    card = CARD.format(
+        metadata=data.to_yaml(), name=name, type=config.type, description=description,
+        start=f"`{start}`" if not Path(start).exists() else "a policy that is not published",
+        command=evaluation(cfg, name),
+    )  # fmt: skip
     with TemporaryDirectory() as temporary:
         folder = Path(temporary) / "policy"
         shutil.copytree(chosen_checkpoint(cfg) / PRETRAINED_MODEL_DIR, folder)

@@ -119,6 +119,8 @@ def test_it_says_what_it_made_and_publishes_it_if_asked(
     card = published["README.md"].decode()
     assert "library_name: lerobot" in card
     assert "2 iterations of PPO" in card
+    assert "It began as a policy that is not published." in card
+    assert "lerobot-eval --policy.path=me/improved --env.type=test_point" in card
     assert list(hub.repos) == [("models", "me/improved")]
 
 
