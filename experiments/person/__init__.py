@@ -2,7 +2,7 @@
 
     python -m experiments.person.script --world_model=outputs/action_world_model \\
         --dataset.root=outputs/dataset --episodes=50 --frames=40 --output_dir=outputs/person
-    lerobot-record --teleop.discover_packages_path=experiments.person \\
+    PYTHONPATH=. lerobot-record --teleop.discover_packages_path=experiments.person \\
         --teleop.type=scripted_person --teleop.script=outputs/person/script.json \\
         --robot.dataset.episodes=[$(cat outputs/person/episodes.txt)] …
 

@@ -48,7 +48,8 @@ def words_of(command: str) -> list[str]:
     """Split a command, the last one of a list. What the shell would insert is the number 0 here."""
     inserted = re.sub(r"\$\(\(.*?\)\)|\$\([^)]*\)|\$episodes", "0", command)
     words = shlex.split(inserted.rpartition("&&")[2])
-    return words[2:] if words[0] == "env" else words
+    set_by_env = next(at for at, word in enumerate(words) if word != "env" and "=" not in word)
+    return words[set_by_env:]
 
 
 def check(command: str) -> None:
