@@ -30,8 +30,6 @@ import numpy as np
 import torch
 from aiohttp.test_utils import TestServer
 from lerobot.utils.import_utils import register_third_party_plugins
-from selenium import webdriver
-from selenium.webdriver.common.by import By
 
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.precision import keep_freed_memory
@@ -59,7 +57,7 @@ BROWSER_STEPS: Final = """
         found.push(performance.now() - began);
       }
       return found;
-    })().then(done);
+    })().then(done, (error) => done(String(error)));
 """
 
 
@@ -103,6 +101,10 @@ async def page_steps(socket: aiohttp.ClientWebSocketResponse, actions: int, coun
 def browser(page: Path) -> Iterator[Callable[[int], list[float]]]:
     """Open an exported page in Chromium. Give what returns the duration of each of some of its steps."""
     handler = functools.partial(QuietHandler, directory=str(page))
+    from selenium import webdriver
+    from selenium.webdriver.common.by import By
+    from selenium.webdriver.support.wait import WebDriverWait
+
     options = webdriver.ChromeOptions()
     for flag in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage"):
         options.add_argument(flag)
@@ -110,12 +112,22 @@ def browser(page: Path) -> Iterator[Callable[[int], list[float]]]:
     driver.set_script_timeout(600)
     with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        driver.get(f"http://127.0.0.1:{server.server_port}/")
-        while driver.find_element(By.ID, "status").text != "ready":
-            time.sleep(0.1)
-        yield functools.partial(driver.execute_async_script, BROWSER_STEPS)
-        server.shutdown()
-    driver.quit()
+        try:
+            driver.get(f"http://127.0.0.1:{server.server_port}/")
+            wait = WebDriverWait(driver, 60)
+            wait.until(lambda _: driver.find_element(By.ID, "status").text == "ready")
+            yield functools.partial(steps_in, driver)
+        finally:
+            driver.quit()
+            server.shutdown()
+
+
+def steps_in(driver: Any, count: int) -> list[float]:
+    """Return the duration of each of `count` steps of an exported page."""
+    found = driver.execute_async_script(BROWSER_STEPS, count)
+    if isinstance(found, str):
+        raise RuntimeError(found)
+    return [float(each) for each in found]
 
 
 class QuietHandler(SimpleHTTPRequestHandler):

@@ -7,9 +7,8 @@
         --robot.dataset.episodes=[$(cat outputs/person/episodes.txt)] …
 
 The person knows what to do from a planner in the same world model, but can only hold keys down: each axis of
-the action moves at one speed, forwards, backwards or not at all, as on the page of lerobot-wmrl-play. What a
-plan asks for in between becomes presses now and then. Drives that fail are not recorded, as a person would
-record them again.
+the action moves at one speed, forwards, backwards or not at all. What a plan asks for in between becomes
+presses now and then. Drives that fail are not recorded, as a person would record them again.
 """
 
 from experiments.person.teleoperator import ScriptedPerson, ScriptedPersonConfig

@@ -33,7 +33,7 @@ class Hands:
     def __init__(self, axes: Axes) -> None:
         self.rest, low, high = (np.array([axis[name] for axis in axes]) for name in ("rest", "low", "high"))
         self.held = np.array([not axis["springs"] for axis in axes])
-        self.step = SPEED * (high - low) / 2
+        self.low, self.high, self.step = low, high, SPEED * (high - low) / 2
         self.owed = np.zeros(len(axes))
         self.now = self.rest.copy()
 
@@ -43,7 +43,7 @@ class Hands:
         missing = wanted + np.where(self.held, 0.0, self.owed) - base
         keys = np.clip(np.round(missing / self.step), -1, 1)
         self.owed = np.clip(missing - keys * self.step, -self.step, self.step)
-        self.now = base + keys * self.step
+        self.now = np.clip(base + keys * self.step, self.low, self.high)
         return self.now
 
 
@@ -81,6 +81,11 @@ def write_script(given: argparse.Namespace) -> None:
             progress.set_postfix(success=f"{len(driven)}/{count}")
             if len(driven) == given.episodes:
                 break
+    if len(driven) < given.episodes:
+        raise SystemExit(
+            f"error: --episodes={given.episodes}: {len(driven)} of {len(order)} drives succeed; ask for "
+            "fewer, or give a dataset with more episodes or a better world model"
+        )
     chosen = sorted(driven)
     names = world.model.embodiment.action_names
     write_json(given.output_dir / "script.json", {"names": names, "actions": [driven[row] for row in chosen]})

@@ -67,13 +67,12 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         self.generator.seed()
 
     def _observation_space(self) -> gym.spaces.Dict:
-        bounds = {True: (-np.inf, np.inf), False: (0.0, 1.0)}
-        return gym.spaces.Dict(
-            {
-                key: gym.spaces.Box(*bounds[key == OBS_STATE], shape, np.float32)
-                for key, shape in self.model.config.observation_shapes.items()
-            }
-        )
+        def box(key: str, shape: tuple[int, ...]) -> gym.spaces.Box:
+            low, high = (-np.inf, np.inf) if key == OBS_STATE else (0.0, 1.0)
+            return gym.spaces.Box(low, high, shape, np.float32)
+
+        shapes = self.model.config.observation_shapes
+        return gym.spaces.Dict({key: box(key, shape) for key, shape in shapes.items()})
 
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None

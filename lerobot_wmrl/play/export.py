@@ -25,7 +25,23 @@ from lerobot_wmrl.play.world import World
 RUNTIME: Final = "onnxruntime-web@1.22.0"
 """What runs the graphs in a browser, as npm names it (MIT licence)."""
 
-RUNTIME_FILES: Final = ("ort.wasm.min.mjs", "ort-wasm-simd-threaded.mjs", "ort-wasm-simd-threaded.wasm")
+RUNTIME_FILES: Final = {
+    "ort.wasm.min.js": "ort.wasm.min.mjs",
+    "ort-wasm-simd-threaded.js": "ort-wasm-simd-threaded.mjs",
+    "ort-wasm-simd-threaded.wasm": "ort-wasm-simd-threaded.wasm",
+}
+"""Name in the page → in the package. Not every host of files knows that `.mjs` is JavaScript."""
+
+POLICY: Final = (
+    "default-src 'self'; script-src 'self' 'wasm-unsafe-eval'; img-src 'self' data: blob:; "
+    "connect-src 'self' data:; worker-src 'self' blob:"
+)
+"""Where the page may load from (Content-Security-Policy)."""
+
+FETCH_SECONDS: Final = 600
+FRAMES_BEYOND: Final = 8
+"""Frames after a clip's length in which the exported networks are compared too."""
+
 SPACE: Final = """---
 title: Drive a world model
 sdk: static
@@ -34,7 +50,7 @@ tags: [lerobot, robotics, world-model]
 
 A world model of a robot, in your browser. Made by `lerobot-wmrl-play --export`.
 """
-"""What the hub shows a folder as a static Space by."""
+"""README.md, by which the hub shows the folder as a static Space."""
 
 PAGE_FILES: Final = ("play.js", "play.css", "local.js")
 
@@ -48,10 +64,9 @@ def export_page(world: World, folder: Path, starts: int) -> str:
         starts: episodes of the dataset, spread evenly, in whose first frames a drive can begin.
 
     Raises:
-        FieldError: there is no dataset, or the world model or the runtime cannot be had.
+        FieldError: the world model cannot be exported, or the runtime cannot be had.
     """
-    if world.table is None:
-        raise FieldError("dataset.root", "", "is missing: the page holds first frames", "give a dataset")
+    assert world.table is not None, "the command has asked for a dataset"
     rows = np.unique(np.linspace(0, len(world.table.start) - 1, starts).round().astype(int))
     with whole_folder(folder) as partial:
         static, frames = partial / "static", partial / "frames"
@@ -60,17 +75,25 @@ def export_page(world: World, folder: Path, starts: int) -> str:
         fetch_runtime(static)
         for name in PAGE_FILES:
             shutil.copy2(PAGES / name, static)
-        page = (PAGES / "index.html").read_text().replace("./server.js", "./local.js")
-        write_text(partial / "index.html", page)
+        write_text(partial / "index.html", index_page())
         write_text(partial / "README.md", SPACE)
         export_graphs(world.models.model, partial)
         write_frames(world, world.table, rows, frames)
-        write_text(partial / "world.json", json.dumps(describe(world, world.table, rows)))
-        return compare(world, world.table, int(rows[0]), partial)
+        described = describe(world, world.table, rows)
+        write_text(partial / "world.json", json.dumps(described, allow_nan=False))
+        longest = rows[world.table.length[rows].argmax()]
+        return compare(world, world.table, int(longest), partial)
+
+
+def index_page() -> str:
+    """Return the served page, but with the world model in the browser."""
+    served = (PAGES / "index.html").read_text()
+    guard = f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'
+    return served.replace("<head>", f"<head>\n{guard}").replace("./server.js", "./local.js")
 
 
 def compare(world: World, table: EpisodeTable, row: int, folder: Path) -> str:
-    """Imagine a recorded episode with the exported networks and with the world model.
+    """Imagine a recorded episode with the exported networks and with the world model, beyond a clip.
 
     Returns:
         How far the pictures and probabilities of success are apart.
@@ -84,14 +107,15 @@ def compare(world: World, table: EpisodeTable, row: int, folder: Path) -> str:
     frames = Frames(model.tokenizer.encode(pictures, context), state, context)
     exported.begin(pictures.numpy(), state.numpy())
     colours, chances = [], []
-    actions = table.action[first:end].astype(np.float32)
+    wanted = world.model.clip_length + FRAMES_BEYOND
+    actions = np.resize(table.action[first:end].astype(np.float32), (wanted, table.action.shape[1]))
     for action, imagined in zip(actions, model.imagine(frames, torch.from_numpy(actions)[None]), strict=True):
         found = exported.step(action[None])
         shown = model.decode(imagined.tokens, context).images[0].movedim(1, -1).numpy() * 255
         colours.append(np.abs(found["pixels"][..., :3] - shown).mean())
         chances.append(np.abs(found["done_probability"] - imagined.done_logit.sigmoid().numpy()).max())
     return (
-        f"along a recorded episode of {len(actions)} frames, its pictures are {np.mean(colours):.2f} of 255 "
+        f"over {len(actions)} frames with recorded actions, its pictures are {np.mean(colours):.2f} of 255 "
         f"away from the world model's on average, its probabilities of success at most {max(chances):.3f}"
     )
 
@@ -106,8 +130,7 @@ def describe(world: World, table: EpisodeTable, rows: np.ndarray) -> dict[str, A
         "side": world.sizes.image_size,
         "sizes": [[width, height] for _, height, width in world.sizes.frame_shapes.values()],
         "window": world.model.clip_length,
-        "done_frames": world.done_frames,
-        "end_at_success": world.config.done_frames == world.done_frames,
+        "done_frames": world.config.done_frames,
         "episode_length": world.config.horizon,
         "episodes": [{**served["episodes"][row], **recorded(world, table, row)} for row in rows.tolist()],
     }  # fmt: skip
@@ -133,15 +156,17 @@ def fetch_runtime(folder: Path) -> None:
     with tempfile.TemporaryDirectory() as place:
         command = ["npm", "pack", RUNTIME, "--prefer-offline", "--silent", f"--pack-destination={place}"]
         try:
-            subprocess.run(command, check=True, capture_output=True, text=True, cwd=place)
-        except (OSError, subprocess.CalledProcessError) as error:
+            subprocess.run(
+                command, check=True, capture_output=True, text=True, cwd=place, timeout=FETCH_SECONDS
+            )
+            with tarfile.open(next(Path(place).glob("*.tgz"))) as package:
+                for name, source in RUNTIME_FILES.items():
+                    content = package.extractfile(f"package/dist/{source}")
+                    assert content is not None, source
+                    (folder / name).write_bytes(content.read())
+        except (OSError, subprocess.SubprocessError, tarfile.TarError, StopIteration, KeyError) as error:
             reason = getattr(error, "stderr", None) or error
             raise FieldError(
                 "export", RUNTIME, f"npm cannot fetch it ({str(reason).strip()})",
                 "install npm, and let it reach a registry",
             ) from error  # fmt: skip
-        with tarfile.open(next(Path(place).glob("*.tgz"))) as package:
-            for name in RUNTIME_FILES:
-                content = package.extractfile(f"package/dist/{name}")
-                assert content is not None, name
-                (folder / name).write_bytes(content.read())

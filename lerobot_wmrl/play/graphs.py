@@ -1,8 +1,8 @@
 """A world model as three ONNX graphs, which a page without a server runs in the visitor's browser.
 
-`look` reads the pictures and the state in which an episode begins. `scene` encodes a frame, from which `step`
-then imagines one action after the other; after as many steps as a training clip has, `scene` is run again on
-the newest frame. All shapes are constant.
+`start` reads the pictures and the state in which an episode begins. `scene` encodes a frame, from which
+`step` then imagines one action after the other; after as many steps as a training clip has, `scene` is run
+again on the newest frame. All shapes are constant.
 
 What one graph returns and another needs has the same name in both. An output `next_…` is an input of the same
 graph's next run.
@@ -28,16 +28,19 @@ from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewar
 if TYPE_CHECKING:
     import onnx
 
-GRAPHS: Final = ("look", "scene", "step")
+GRAPHS: Final = ("start", "scene", "step")
 NEXT: Final = "next_"
 Tensors = dict[str, Tensor]
 """Named tensors of one imagination, between the graphs."""
 
 LARGE: Final = 1024
-"""Numbers from which on weights are stored in 16 bits."""
+"""Tensors of at least so many weights are stored in 16 bits."""
 
 SCENE: Final = ("anchor", "tokens", "scene_keys_values", "summary", "local")
+"""Names of the parts of a `Scene`; the codes of its frame are the `anchor`."""
+
 ROLLOUT: Final = ("state", "change", "hidden")
+"""Names of the parts of a `StateRollout`."""
 
 
 class WrittenMemory:
@@ -91,7 +94,7 @@ class Graph(nn.Module):
         return tuple(self.compute(dict(zip(self.reads, tensors, strict=True))).values())
 
 
-class Look(Graph):
+class ReadStart(Graph):
     """The pictures (1, N, 3, S, S) in [0, 1] and the state (1, P) in which an episode begins."""
 
     def __init__(self, model: ActionWorldModelRewardModel) -> None:
@@ -102,7 +105,7 @@ class Look(Graph):
         context = tokenizer.context(pictures)
         codes = self.network.codebook.codes(tokenizer.encode(pictures, context))[:, None]
         state = self.model.normalize_state(given["measured_state"])[:, None]
-        return {"codes": codes, "state": state, **named("context", context.maps)}
+        return {"codes": codes, "state": state, **numbered("context", context.maps)}
 
 
 class EncodeScene(Graph):
@@ -154,7 +157,7 @@ class ImagineStep(Graph):
         }
 
 
-def named(name: str, tensors: Sequence[Tensor]) -> Tensors:
+def numbered(name: str, tensors: Sequence[Tensor]) -> Tensors:
     """Number tensors of a name."""
     return {f"{name}_{index}": tensor for index, tensor in enumerate(tensors)}
 
@@ -165,13 +168,13 @@ def opaque_pixels(images: Tensor) -> Tensor:
     return torch.cat([colours, torch.full_like(colours[..., :1], 255)], -1).to(torch.uint8)
 
 
-def carried(tensors: Mapping[str, Any]) -> dict[str, Any]:
+def input_names(tensors: Mapping[str, Any]) -> dict[str, Any]:
     """Return a graph's outputs under the names by which they are read."""
     return {name.removeprefix(NEXT): each for name, each in tensors.items()}
 
 
 def export_graphs(model: ActionWorldModelRewardModel, folder: Path) -> None:
-    """Write `look.onnx`, `scene.onnx` and `step.onnx`.
+    """Write `start.onnx`, `scene.onnx` and `step.onnx`.
 
     Args:
         model: on the CPU.
@@ -194,10 +197,10 @@ def export_graphs(model: ActionWorldModelRewardModel, folder: Path) -> None:
         "action": model.action_mean[None].clone(),
         "age": torch.zeros(1, dtype=torch.long),
     }
-    look = Look(model)
+    start = ReadStart(model)
     contexts = len(model.tokenizer.context(given["pictures"]).maps)
     logging.getLogger("onnx_ir").setLevel(logging.ERROR)
-    graphs = {"look": look, "scene": EncodeScene(model, contexts), "step": ImagineStep(model, contexts)}
+    graphs = {"start": start, "scene": EncodeScene(model, contexts), "step": ImagineStep(model, contexts)}
     for name, graph in graphs.items():
         inputs = {read: given[read] for read in graph.reads}
         with torch.no_grad(), warnings.catch_warnings(action="ignore"):  # of torch's, about torch's own code
@@ -207,11 +210,11 @@ def export_graphs(model: ActionWorldModelRewardModel, folder: Path) -> None:
                 dynamo=True, verbose=False,
             )  # fmt: skip
         assert program is not None
-        (folder / f"{name}.onnx").write_bytes(halved(program.model_proto).SerializeToString())
-        given |= carried(outputs)
+        (folder / f"{name}.onnx").write_bytes(in_float16(program.model_proto).SerializeToString())
+        given |= input_names(outputs)
 
 
-def halved(proto: "onnx.ModelProto") -> "onnx.ModelProto":
+def in_float16(proto: "onnx.ModelProto") -> "onnx.ModelProto":
     """Store a graph's weights in 16 bits. They are made 32 bits again when the graph is loaded."""
     from onnx import TensorProto, helper, numpy_helper
 
@@ -247,7 +250,7 @@ class ExportedWorldModel:
         """Begin in pictures (1, N, 3, S, S), in [0, 1], and a state (1, P)."""
         self.tensors: dict[str, np.ndarray] = {"pictures": pictures, "measured_state": state}
         self.imagined = 0
-        self._run("look")
+        self._run("start")
 
     def step(self, action: np.ndarray) -> Mapping[str, np.ndarray]:
         """Imagine the frame after an action (1, A). Return all tensors, see `ImagineStep`."""
@@ -263,4 +266,4 @@ class ExportedWorldModel:
         graph = self.graphs[name]
         found = graph.run(None, {each.name: self.tensors[each.name] for each in graph.get_inputs()})
         names = (each.name for each in graph.get_outputs())
-        self.tensors |= carried(dict(zip(names, found, strict=True)))
+        self.tensors |= input_names(dict(zip(names, found, strict=True)))

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from filelock import FileLock
+from filelock import FileLock, Timeout
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import ACTION, DEFAULT_FEATURES
 
@@ -19,6 +19,7 @@ from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.play.drive import Step
 from lerobot_wmrl.rl.recorders import episode_features, observation_row
 
+WAITING_SECONDS: Final = 30
 SUCCESS_FRAMES: Final = WorldModelEnv.done_frames
 """Frames at the end of a successful episode in which success holds."""
 
@@ -62,9 +63,10 @@ class SavedEpisodes:
         """
         if not count:
             raise FieldError("save", 0, "nothing has been driven yet", "drive first")
+        driven = list(steps)  # imagined before anybody else has to wait
         with replacing(self.folder) as folder:
             dataset = None
-            for index, step in enumerate(steps):
+            for index, step in enumerate(driven):
                 if dataset is None:
                     dataset = self._open(folder, episode_features(step.before, self.robot, "image"))
                 solved = success and index >= count - SUCCESS_FRAMES
@@ -102,11 +104,11 @@ def replacing(folder: Path) -> Iterator[Path]:
     """Give a copy of a dataset's folder to add to, which then takes its place.
 
     LeRobot adds new files of episodes and never changes old ones, so these are not copied but linked. Others
-    who replace the same folder wait.
+    who replace the same folder wait. FieldError if it takes too long.
     """
     partial, old = beside(folder)
     partial.parent.mkdir(parents=True, exist_ok=True)
-    with FileLock(lock_of(folder)):
+    with locked(folder):
         shutil.rmtree(partial, ignore_errors=True)
         if folder.is_dir() and any(folder.iterdir()):
             shutil.copytree(folder, partial, copy_function=link_or_copy)
@@ -131,16 +133,27 @@ def recover(folder: Path) -> None:
     partial, old = beside(folder)
     if not (partial.exists() or old.exists()):
         return
-    with FileLock(lock_of(folder)):
+    with locked(folder):
         if old.is_dir() and not folder.exists():
             old.replace(folder)
         for leftover in (partial, old):
             shutil.rmtree(leftover, ignore_errors=True)
 
 
-def lock_of(folder: Path) -> Path:
-    """Return the file that is locked while a dataset is replaced."""
-    return folder.with_name(f".{folder.name}.lock")
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Lock a dataset while it is replaced. FieldError if somebody else does not come to an end."""
+    lock = FileLock(folder.with_name(f".{folder.name}.lock"), timeout=WAITING_SECONDS)
+    try:
+        lock.acquire()
+    except Timeout as error:
+        raise FieldError(
+            "output_dir", folder, "another server is saving there", "save again, or give it another folder"
+        ) from error
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 def beside(folder: Path) -> tuple[Path, Path]:

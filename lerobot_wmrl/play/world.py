@@ -86,7 +86,7 @@ class World:
             "cameras": list(self.sizes.cameras),
             "fps": self.model.embodiment.fps,
             "axes": self.axes(),
-            "state": self.model.embodiment.state_names,
+            "state": self.model.embodiment.state_names if self.model.state_size else [],
             "clip_length": self.model.clip_length,
             "done_threshold": self.config.done_threshold,
             "drivers": self.driver_names(),

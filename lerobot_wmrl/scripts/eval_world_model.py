@@ -12,10 +12,12 @@ Add `--policies=[outputs/rl] --real_env.type=wmrl_maniskill …` to compare the 
 model with their success in that environment.
 """
 
+import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import draccus
 from lerobot.envs.configs import EnvConfig
@@ -119,8 +121,11 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     from lerobot_wmrl.evaluation.report import evaluate, report_action_model, report_agreement
     from lerobot_wmrl.maniskill.recordings import scene_splits
     from lerobot_wmrl.world_models.checkpoint import check_dataset, load_model
+    from lerobot_wmrl.world_models.hub_card import check_login
 
     cfg.check()
+    if cfg.push_to_hub:
+        check_login(cfg.model.path)
     model = load_model(cfg.model.path, "action_world_model", cfg.device, "model.path")
     table = read_episodes(cfg.dataset.open())
     check_dataset(model.config, table.dataset.meta)
@@ -145,23 +150,28 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     page = "\n\n".join(report.page for report in reports)
     write_json(cfg.output_dir / "metrics.json", metrics)
     write_text(cfg.output_dir / "metrics.md", f"{page}\n")
-    if cfg.push_to_hub:
-        publish(cfg, page, len(episodes))
     print(f"{page}\n\n{conclusion(cfg, len(episodes), reports[0])}")
+    if cfg.push_to_hub:
+        publish(cfg, metrics, page, len(episodes))
 
 
-def publish(cfg: EvalWorldModelConfig, page: str, episodes: int) -> None:
-    """Put what was found on the model's card."""
-    from lerobot_wmrl.world_models.hub_card import publish_evaluation
+def publish(cfg: EvalWorldModelConfig, metrics: Mapping[str, Any], page: str, episodes: int) -> None:
+    """Put what was found on the model's card, without paths of this machine."""
+    from lerobot_wmrl.world_models.hub_card import EVALUATION, publish_evaluation
 
-    said = (
-        f"{episodes} recorded episodes of `{cfg.dataset.name}` ({cfg.split}), imagined from their first "
-        f"frames with their own actions. An episode succeeds in imagination when {cfg.done_frames} frames in "
-        f"a row have a success probability of at least {cfg.done_threshold}. Recorded above, imagined below:"
-    )
+    dataset = cfg.dataset.repo_id or Path(cfg.dataset.name).name
     pictures = sorted(cfg.output_dir.glob("comparison_*.gif"))
-    others = [cfg.output_dir / "metrics.json", cfg.output_dir / "metrics.md"]
-    publish_evaluation(cfg.model.path, said, page, pictures, others)
+    said = (
+        f"{episodes} recorded episodes of `{dataset}` ({cfg.split}), imagined from their first frames with "
+        f"their own actions. An episode succeeds in imagination when {cfg.done_frames} frames in a row have "
+        f"a success probability of at least {cfg.done_threshold}."
+    )
+    shown = [f"![{path.stem.replace('_', ' ')}]({EVALUATION}/{path.name})" for path in pictures]
+    if shown:
+        shown.append("*Recorded above, imagined below.*")
+    files = {path.name: path.read_bytes() for path in pictures}
+    files["metrics.json"] = json.dumps({**metrics, "dataset": dataset}, indent=2).encode()
+    publish_evaluation(cfg.model.path, "\n\n".join(["## What it imagines", said, *shown, page]), files)
 
 
 def conclusion(cfg: EvalWorldModelConfig, episodes: int, report: "Report") -> str:

@@ -114,11 +114,19 @@ class PlayConfig(RunConfig):
             self._check_export(self.export)
 
     def _check_export(self, folder: Path) -> None:
-        """FieldError if no page can be exported."""
+        """FieldError if no page can be exported, or something is given that it would not have."""
         if not self.dataset.given:
             raise FieldError(
-                "dataset.root", "", "is missing: an exported page begins in its frames", "give it"
+                "dataset.root", "", "is missing: an exported page begins in its frames", "give a dataset"
             )
+        for name, given in (
+            ("policy.path", self.policy), ("real_env.type", self.real_env),
+            ("text_world_model.path", self.text_world_model.path),
+        ):  # fmt: skip
+            if given:
+                raise FieldError(
+                    name, getattr(given, "type", given), "is in no exported page", "leave it out"
+                )
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise FieldError("export", folder, "there is something already", "choose a new folder")
         for package in ("onnx", "onnxscript", "onnxruntime"):
@@ -141,7 +149,7 @@ def play(cfg: PlayConfig) -> None:
     env = DrivenEnv(
         world_model_path=cfg.world_model.path, text_world_model_path=cfg.text_world_model.path,
         episode_length=cfg.episode_length, done_threshold=cfg.done_threshold, done_frames=cfg.done_frames,
-        device=cfg.device, **reward,
+        device=cfg.device if cfg.export is None else "cpu", **reward,
     )  # fmt: skip
     world = load_world(env, cfg.dataset, cfg.policy, cfg.real_env, cfg.end_at_success)
     if cfg.export is not None:

@@ -2,13 +2,21 @@
 
 import logging
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, ClassVar, Final
 
-from huggingface_hub import CommitOperationAdd, HfApi, ModelCard, ModelCardData
-from huggingface_hub.errors import HfHubHTTPError, HFValidationError
+import httpx
+from huggingface_hub import (
+    CommitOperationAdd,
+    CommitOperationDelete,
+    HfApi,
+    ModelCard,
+    ModelCardData,
+    get_token,
+)
+from huggingface_hub.errors import HFValidationError
 
 from lerobot_wmrl.common.errors import FieldError
 
@@ -78,49 +86,48 @@ EVALUATION: Final = "evaluation"
 
 SECTION: Final = """<!-- evaluation -->
 
-## What it imagines
-
-{said}
-
-{pictures}
-
-{found}
+{text}
 
 <!-- end of evaluation -->
 """
 
 
-def publish_evaluation(
-    name: str, said: str, found: str, pictures: Sequence[Path], others: Sequence[Path]
-) -> None:
+def publish_evaluation(name: str, text: str, files: Mapping[str, bytes]) -> None:
     """Put what an evaluation has found on the card of a published model, in place of an earlier one.
 
     Args:
         name: the model's on the hub, user/name.
-        said: what was done, in Markdown.
-        found: what was found.
-        pictures: files that the card shows between them.
-        others: further files, which are uploaded beside.
+        text: what was found, in Markdown. It shows pictures by their paths, `evaluation/…`.
+        files: of the folder `evaluation`, by name.
 
     Raises:
-        FieldError: it is not on the hub, or may not be written.
+        FieldError: it may not be written, or the hub cannot be reached.
     """
-    shown = "\n\n".join(f"![{path.stem.replace('_', ' ')}]({EVALUATION}/{path.name})" for path in pictures)
+    api = HfApi()
     try:
         card = ModelCard.load(name)
-        before = re.sub(
-            r"\s*<!-- evaluation -->.*<!-- end of evaluation -->\s*", "\n\n", card.text, flags=re.S
-        )
-        card.text = f"{before.rstrip()}\n\n{SECTION.format(said=said, pictures=shown, found=found)}"
-        content = {f"{EVALUATION}/{path.name}": path.read_bytes() for path in (*pictures, *others)}
+        before = re.sub(r"<!-- evaluation -->.*<!-- end of evaluation -->", "", card.text, flags=re.S)
+        card.text = f"{before.rstrip()}\n\n{SECTION.format(text=text)}"
+        content = {f"{EVALUATION}/{file}": data for file, data in files.items()}
+        earlier = {path for path in api.list_repo_files(name) if path.startswith(f"{EVALUATION}/")}
         operations = [
-            CommitOperationAdd(path, data)
-            for path, data in {"README.md": str(card).encode(), **content}.items()
+            *(CommitOperationDelete(path) for path in sorted(earlier - content.keys())),
+            *(CommitOperationAdd(path, data) for path, data in content.items()),
+            CommitOperationAdd("README.md", str(card).encode()),
         ]
-        commit = HfApi().create_commit(name, operations, commit_message="Add an evaluation")
-    except (HfHubHTTPError, HFValidationError) as error:
+        commit = api.create_commit(name, operations, commit_message="Add an evaluation")
+    except (OSError, httpx.HTTPError, HFValidationError) as error:
         raise FieldError(
-            "push_to_hub", True, f"{name} cannot be written on the hub ({error})",
-            "give the model by its name there, user/name, as `model.path`",
+            "push_to_hub", True, f"the card of {name} cannot be written ({error})",
+            "log in with `hf auth login` to an account that may write there, and repeat the command",
         ) from error  # fmt: skip
     logging.info("published at %s", commit.repo_url)
+
+
+def check_login(name: str) -> None:
+    """Raise FieldError if nobody is logged in to the hub, where a model of this name is to be changed."""
+    if get_token() is None:
+        raise FieldError(
+            "push_to_hub", True, f"the card of {name} cannot be written: nobody is logged in to the hub",
+            "log in with `hf auth login` to an account that may write there",
+        )  # fmt: skip

@@ -37,6 +37,21 @@ def test_an_axis_that_is_held_moves_there_step_by_step_and_stays(axes):
     assert abs(given[-1] - 1) <= SPEED / 2
 
 
+def test_an_axis_stays_in_its_range(axes):
+    hands = Hands([{**axes[1], "rest": 0.5}])
+    assert hands.press(np.array([2.0]))[0] == 1.0
+
+
+def test_too_few_successes_are_said(small_dataset, world_model, tmp_path):
+    flags = [
+        f"--world_model={world_model}", f"--dataset.root={small_dataset.root}", "--frames=3",
+        "--episodes=7", "--done_threshold=1e-9", "--done_frames=3", f"--output_dir={tmp_path / 'person'}",
+    ]  # fmt: skip
+    with pytest.raises(SystemExit, match="--episodes=7: 6 of 6 drives succeed; ask for fewer"):
+        write_script(make_parser().parse_args(flags))
+    assert not (tmp_path / "person").exists()
+
+
 @pytest.fixture
 def world_model(trained_models) -> str:
     return str(trained_models["action_world_model"])

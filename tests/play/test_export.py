@@ -5,8 +5,10 @@ import functools
 import http.server
 import io
 import json
+import shutil
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,9 +19,11 @@ import torch
 from PIL import Image
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
+from selenium.webdriver.support.wait import WebDriverWait
 
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.frames import Frames
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.play.export import export_page
 from lerobot_wmrl.play.graphs import ExportedWorldModel, export_graphs
 from lerobot_wmrl.play.world import World
@@ -39,16 +43,22 @@ def folder(world: World, tmp_path_factory) -> Path:
     return found
 
 
-@pytest.fixture
-def page(folder, chromium) -> Iterator[Page]:
-    """The page from a server that knows nothing but files."""
+@contextmanager
+def served(folder: Path) -> Iterator[str]:
+    """Serve a folder by a server that knows nothing but files. Give its address."""
     handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=str(folder))
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        chromium.get_log("browser")
-        yield Page(chromium, f"http://127.0.0.1:{server.server_port}/")
-        assert [entry for entry in chromium.get_log("browser") if entry["source"] == "javascript"] == []
+        yield f"http://127.0.0.1:{server.server_port}/"
         server.shutdown()
+
+
+@pytest.fixture
+def page(folder, chromium) -> Iterator[Page]:
+    with served(folder) as address:
+        chromium.get_log("browser")
+        yield Page(chromium, address)
+        assert [entry for entry in chromium.get_log("browser") if entry["source"] == "javascript"] == []
 
 
 def first_frame(folder: Path, episode: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -110,7 +120,7 @@ def pixels(source: str) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(source.split(",")[1]))).convert("RGB"))
 
 
-def test_the_page_imagines_without_a_server(page, folder, world):
+def test_the_page_imagines_what_the_graphs_imagine(page, folder):
     pictures, state, actions = first_frame(folder, 0)
     page.choose("recorded")
     for frame in range(1, 4):
@@ -122,23 +132,88 @@ def test_the_page_imagines_without_a_server(page, folder, world):
         found = exported.step(action[None])
     assert np.abs(pixels(page.image) - found["pixels"][0, ..., :3].astype(float)).mean() < 1
 
-    page.choose("you")
+
+def test_after_going_back_across_a_clip_the_same_actions_lead_to_the_same_pictures(page):
     page.hold(Keys.ARROW_RIGHT, CLIP_LENGTH + 5)
-    there = page.frame
-    before = page.image
-    page.press("k")  # something else
-    page.pause()
-    page.driver.execute_script(
-        "const t = arguments[0]; t.value = 2; t.dispatchEvent(new Event('input'))", page["timeline"]
+    frames = page.frame
+    images = ask(page, {"do": "resume"})["views"]
+    assert len(images) == frames + 1
+    actions = [each["action"] for each in images[1:]]
+    ask(page, {"do": "rewind", "frame": 2})
+    for action, expected in zip(actions[2:], images[3:], strict=True):
+        assert ask(page, {"do": "step", "driver": "you", "action": action})["view"] == expected
+
+
+def ask(page: Page, message: dict[str, Any]) -> Any:
+    """Ask the world model in the page. Return its answer, or what is wrong."""
+    return page.driver.execute_async_script(
+        """
+        const [message, done] = arguments;
+        import("/static/local.js").then(({ ask }) => ask(message)).then(done, (error) => done(error.message));
+        """,
+        message,
+    )  # fmt: skip
+
+
+def test_an_error_midway_leaves_the_drive_as_it_was(page, folder):
+    actions = first_frame(folder, 0)[2].tolist()
+    views = [ask(page, {"do": "step", "driver": "you", "action": each})["view"] for each in actions[:6]]
+    broken = page.driver.execute_async_script(
+        """
+        const done = arguments[0];
+        (async () => {
+          const { ask } = await import("/static/local.js");
+          const fetch0 = window.fetch;
+          window.fetch = async () => { throw new Error("out of reach"); };
+          const message = await ask({ do: "begin", episode: 1, frame: 0 }).catch((error) => error.message);
+          window.fetch = fetch0;
+          return message;
+        })().then(done);
+        """
     )
-    assert page.frame == 2
-    second = page.image
-    page["next"].click()  # branches off
-    page.wait(lambda: page.frame == 3)
-    page["back"].click()
-    assert page.image == second
-    assert there > CLIP_LENGTH
-    assert before
+    assert broken == "out of reach"
+    assert [each["images"] for each in ask(page, {"do": "resume"})["views"][1:]] == [
+        each["images"] for each in views
+    ]
+    assert ask(page, {"do": "step", "driver": "you", "action": actions[6]})["view"]["frame"] == 7
+
+
+@pytest.mark.parametrize(
+    ("message", "said"),
+    [
+        ({"do": "step", "driver": "you", "action": [0.0, 0.0]}, "action: must be 7 finite numbers"),
+        ({"do": "step", "driver": "you", "action": [None, "a", 0, 0, 0, 0, 0]}, "must be 7 finite numbers"),
+        (
+            {"do": "begin", "episode": "length", "frame": 0},
+            "this page has the first frames (frame 0) of",
+        ),
+        ({"do": "begin", "episode": 3, "frame": 0}, "of episodes 0 to 2"),
+        ({"do": "begin", "episode": 0, "frame": 1}, "of episodes 0 to 2"),
+        ({"do": "begin", "picture": "constructor"}, "is none that was uploaded; upload it again"),
+    ],
+)
+def test_what_cannot_be_is_said_and_changes_nothing(page, message, said):
+    before = ask(page, {"do": "resume"})
+    assert said in ask(page, message)
+    assert ask(page, {"do": "resume"}) == before
+
+
+def test_a_recorded_episode_ends_and_actions_in_range_are_not_clipped(page, folder):
+    actions = first_frame(folder, 1)[2]
+    ask(page, {"do": "begin", "episode": 1, "frame": 0})
+    views = [ask(page, {"do": "step", "driver": "recorded"})["view"] for _ in actions]
+    assert {view["measured"]["clipped"] for view in views} == {0}
+    assert "the recorded episode is over" in ask(page, {"do": "step", "driver": "recorded"})
+
+
+def test_a_drive_ends_at_success_and_at_its_length(make_world, tmp_path, chromium):
+    world = make_world(end=True, done_threshold=1e-9, done_frames=2, episode_length=300)
+    export_page(world, tmp_path / "page", 1)
+    with served(tmp_path / "page") as address:
+        page = Page(chromium, address)
+        first, second = (ask(page, {"do": "step", "driver": "recorded"})["view"] for _ in range(2))
+    assert (first["ended"], second["ended"]) == ("", "success")
+    assert (first["measured"]["reward"], second["measured"]["reward"]) == (0, 1)
 
 
 def test_the_page_begins_elsewhere_and_its_links_replay(page, tmp_path):
@@ -155,19 +230,47 @@ def test_the_page_begins_elsewhere_and_its_links_replay(page, tmp_path):
     page.wait(lambda: page["status"].text == "ready" and page.frame == driven)
     assert page.image == image
 
+
+def test_a_picture_is_a_place_to_begin_that_has_no_link(page, tmp_path):
     page.driver.find_element(By.CSS_SELECTOR, "#places button[value=picture]").click()
-    picture = tmp_path / "picture.png"
-    Image.new("RGB", (50, 40), "teal").save(picture)
-    page.driver.find_element(By.NAME, "third_view").send_keys(str(picture))
     begin = page.driver.find_element(By.CSS_SELECTOR, "#place-picture button")
+    page["picture-state"].send_keys("[a]")
     begin.click()
     page.wait(lambda: "must be 8 finite numbers" in page["status"].text)
+    page["picture-state"].clear()
     page["picture-state"].send_keys(", ".join("0" * 8))
     begin.click()
+    page.wait(lambda: "give one for each camera: third_view" in page["status"].text)
+    file = page.driver.find_element(By.NAME, "third_view")
+    broken = tmp_path / "broken.png"
+    broken.write_bytes(b"no picture")
+    file.send_keys(str(broken))
+    begin.click()
+    page.wait(lambda: "broken.png cannot be read" in page["status"].text)
+    stripes = np.tile(np.array([20, 200], np.uint8).repeat(3), (300, 200, 1))[..., :3]
+    stripes[:, 100:] = (0, 128, 128)
+    picture = tmp_path / "picture.png"
+    Image.fromarray(np.ascontiguousarray(stripes)).save(picture)
+    file.send_keys(str(picture))
+    begin.click()
     page.wait(lambda: page["status"].text == "ready" and page.frame == 0)
-    assert np.abs(pixels(page.image) - (0, 128, 128)).max() <= 2
+    shown = np.asarray(Image.open(picture).resize((32, 32), Image.Resampling.BILINEAR), float)
+    assert np.abs(pixels(page.image) - shown).mean() < 6
     page["next"].click()
     page.wait(lambda: page.frame == 1)
+    page["link"].click()
+    page.wait(lambda: "has no link" in page["status"].text)
+
+
+def test_a_page_whose_world_model_cannot_be_loaded_says_so(folder, tmp_path, chromium):
+    shutil.copytree(folder, tmp_path / "page")
+    (tmp_path / "page" / "static" / "ort.wasm.min.js").unlink()
+    with served(tmp_path / "page") as address:
+        chromium.switch_to.new_window("window")
+        chromium.get(address)
+        WebDriverWait(chromium, 60).until(
+            lambda _: "the world model cannot be loaded" in chromium.find_element(By.ID, "status").text
+        )
 
 
 def test_what_has_no_meaning_without_a_server_is_not_shown(page):
@@ -189,7 +292,7 @@ def test_autoregressive_dynamics_are_refused(small_dataset, trained_models, tmp_
 
 @pytest.fixture
 def config(small_dataset, trained_models, tmp_path) -> PlayConfig:
-    found = PlayConfig(export=tmp_path / "page", device="cpu")
+    found = PlayConfig(export=tmp_path / "page")
     found.world_model.path = str(trained_models["action_world_model"])
     found.dataset.root = str(small_dataset.root)
     return found
@@ -200,7 +303,11 @@ def test_a_page_without_frames_and_a_full_folder_are_refused(config, tmp_path):
     (tmp_path / "page" / "note.txt").touch()
     with pytest.raises(FieldError, match=r"^export=.*: there is something already; choose a new folder"):
         play(config)
-    config.dataset.root, config.real_env = None, config
+    config.export = tmp_path / "new"
+    config.text_world_model.path = "text"
+    with pytest.raises(FieldError, match=r"^text_world_model\.path=text: is in no exported page; leave it"):
+        play(config)
+    config.dataset.root, config.real_env = None, WmrlManiSkillEnv()
     with pytest.raises(FieldError, match=r"^dataset\.root=: is missing: an exported page begins in its"):
         play(config)
 

@@ -83,10 +83,22 @@ def test_an_evaluation_is_put_on_the_card_and_replaced_by_the_next(
         assert found.count("## What it imagines") == 1
         assert f"({split}), imagined from their first frames" in found
         assert (tmp_path / f"check{run}" / "metrics.md").read_text().strip() in found
-        for name in ("comparison_success.gif", "metrics.json", "metrics.md"):
-            assert repo.head[f"evaluation/{name}"] == (tmp_path / f"check{run}" / name).read_bytes()
+        shown = repo.head["evaluation/comparison_success.gif"]
+        assert shown == (tmp_path / f"check{run}" / "comparison_success.gif").read_bytes()
+        assert str(tmp_path) not in found + repo.head["evaluation/metrics.json"].decode()
     assert "(evaluation/comparison_success.gif)" in found
     assert repo.head["model.safetensors"] == weights
+
+
+def test_an_evaluation_without_a_login_is_not_begun(hub, small_dataset, tmp_path, monkeypatch):
+    monkeypatch.setattr("lerobot_wmrl.world_models.hub_card.get_token", lambda: None)
+    evaluation = EvalWorldModelConfig(
+        model=Checkpoint("somebody/world_model"), dataset=ChosenEpisodes(root=str(small_dataset.root)),
+        push_to_hub=True, output_dir=tmp_path / "check",
+    )  # fmt: skip
+    with pytest.raises(FieldError, match=r"^push_to_hub=True: .*: nobody is logged in"):
+        eval_world_model(evaluation)
+    assert not (tmp_path / "check").exists()
 
 
 def test_an_evaluation_of_a_folder_is_not_published(trained_models, small_dataset, tmp_path):

@@ -2,7 +2,6 @@
 // goes through `inTurn`, one after the other. The world model runs in a server (server.js) or in this browser
 // (local.js).
 
-const { describe, connect, ask, upload } = await import(document.body.dataset.world);
 const $ = (id) => document.getElementById(id);
 const sleep = (milliseconds) => new Promise((done) => setTimeout(done, milliseconds));
 const YOU = "you";
@@ -14,7 +13,8 @@ const KEYS = [
 const SECONDS_ACROSS = 1.5; // that a held key takes to move an axis across its range
 const COLOURS = { you: "#1f6feb", policy: "#8250df", planner: "#bc4c00", recorded: "#57606a" };
 
-let world; // what the server says of itself
+let ask, upload; // of the module in which the world model runs
+let world; // what it says of itself
 let axes = []; // of an action, with the keys and values of this page
 let views = []; // frames of the drive
 let begun = null; // how the drive began
@@ -487,6 +487,7 @@ async function beginInPictures() {
 }
 
 async function copyLink() {
+  if ("picture" in begun.place) throw new Error("a drive that begins in an uploaded picture has no link");
   const actions = views.slice(1, shown + 1).map((view) => view.action.map((each) => Number(each.toPrecision(9))));
   const url = new URL(location.href);
   url.hash = encodeURIComponent(JSON.stringify({ place: begun.place, actions }));
@@ -496,10 +497,14 @@ async function copyLink() {
 }
 
 async function main() {
-  world = await describe();
+  const model = await import(document.body.dataset.world).catch((error) => {
+    throw new Error(`the world model cannot be loaded (${error.message}); open the page from a web server`);
+  });
+  ({ ask, upload } = model);
+  world = await model.describe();
   build();
   listen();
-  connect(() => inTurn(restore).catch(say), say);
+  model.connect(() => inTurn(restore).catch(say), say);
   run();
 }
 
