@@ -285,8 +285,10 @@ against the first row:
 
 {table(["episodes", "demonstrations", "seed", "known scenes", "unseen scenes"], rows)}
 
-A scripted person holds keys down for what a planner in the world model finds, and does again what fails.
-LeRobot's own `lerobot-record` records it in real time, without the simulator."""
+A scripted person holds keys down for what a planner in the world model finds, which changes what PPO's
+policy would do, and does again what fails. LeRobot's own `lerobot-record` records it in real time, without
+the simulator. How this person was chosen, and why others drove worse, is
+[here](pilots.md#fifty-driven-demonstrations)."""
 
 
 DRIVEN: Final = {

@@ -11,10 +11,16 @@ from tqdm import tqdm
 
 from experiments import person
 from lerobot_wmrl.common.files import write_json, write_text
+from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.data.episodes import DatasetSource
 from lerobot_wmrl.envs.configuration_world_model import DrivenEnv
 from lerobot_wmrl.play.drive import Drive
+from lerobot_wmrl.play.drivers import PlannerDriver
 from lerobot_wmrl.play.world import World, load_world
+from lerobot_wmrl.world_models.configuration_planner import PlannerSettings
+
+SEARCH: Final = PlannerSettings(horizon=28, samples=16, elites=4, iterations=2, spread=0.5)
+"""How the planner searches for changes of what the policy would do, as in value_push.yaml."""
 
 SPEED: Final = 0.6
 """Share of half an axis's range at which a key moves it."""
@@ -50,7 +56,7 @@ class Hands:
 def drive_by_keys(world: World, episode: int, frames: int) -> tuple[list[list[float]], Drive]:
     """Drive from an episode's first frame until success, at most so many frames. Return the actions."""
     drive = world.begin({"episode": episode, "frame": 0}, None)
-    hands, planner = Hands(world.axes()), world.driver("planner")
+    hands, planner = Hands(world.axes()), PlannerDriver(SEARCH, world.done_frames, world.policy)
     actions: list[list[float]] = []
     while not drive.ended and len(actions) < frames:
         wanted = planner.act(drive)[0].numpy()
@@ -65,7 +71,8 @@ def write_script(given: argparse.Namespace) -> None:
         world_model_path=given.world_model, episode_length=given.frames, done_threshold=given.done_threshold,
         done_frames=given.done_frames, device="cpu",
     )  # fmt: skip
-    world = load_world(env, DatasetSource(given.root), None, None)
+    policy = read_policy_config(given.policy, ["--device=cpu"])
+    world = load_world(env, DatasetSource(given.root), policy, None)
     assert world.table is not None
     axes = world.axes()
     rest = [axis["rest"] for axis in axes]
@@ -97,6 +104,7 @@ def make_parser() -> argparse.ArgumentParser:
         description=person.__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--world_model", required=True, help="an action world model")
+    parser.add_argument("--policy", required=True, help="whose actions the planner changes")
     parser.add_argument("--dataset.root", dest="root", required=True, help="in whose first frames it begins")
     parser.add_argument("--episodes", type=int, required=True, help="successful drives to write")
     parser.add_argument("--frames", type=int, required=True, help="of an episode")

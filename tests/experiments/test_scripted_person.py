@@ -11,6 +11,7 @@ from lerobot.scripts.lerobot_record import record
 from experiments.person.script import SPEED, Hands, make_parser, write_script
 from lerobot_wmrl.data.episodes import open_dataset, read_episodes
 from lerobot_wmrl.maniskill.embodiment import ACTION_NAMES, FPS
+from tests.rl.checkpoints import save_untrained_policy
 
 FRAMES = 6
 
@@ -42,10 +43,10 @@ def test_an_axis_stays_in_its_range(axes):
     assert hands.press(np.array([2.0]))[0] == 1.0
 
 
-def test_too_few_successes_are_said(small_dataset, world_model, tmp_path):
+def test_too_few_successes_are_said(small_dataset, world_model, policy, tmp_path):
     flags = [
         f"--world_model={world_model}", f"--dataset.root={small_dataset.root}", "--frames=3",
-        "--episodes=7", "--done_threshold=1e-9", "--done_frames=3", f"--output_dir={tmp_path / 'person'}",
+        f"--policy={policy}", "--episodes=7", "--done_threshold=1e-9", "--done_frames=3", f"--output_dir={tmp_path / 'person'}",
     ]  # fmt: skip
     with pytest.raises(SystemExit, match="--episodes=7: 6 of 6 drives succeed; ask for fewer"):
         write_script(make_parser().parse_args(flags))
@@ -58,11 +59,17 @@ def world_model(trained_models) -> str:
 
 
 @pytest.fixture
-def script(small_dataset, world_model, tmp_path) -> Path:
+def policy(tmp_path) -> str:
+    return str(save_untrained_policy(tmp_path / "policy", actions=7))
+
+
+@pytest.fixture
+def script(small_dataset, world_model, policy, tmp_path) -> Path:
     """What the person does in two episodes; nearly everything is a success here."""
     folder = tmp_path / "person"
     flags = [
         f"--world_model={world_model}", f"--dataset.root={small_dataset.root}", f"--output_dir={folder}",
+        f"--policy={policy}",
         "--episodes=2", f"--frames={FRAMES}", "--done_threshold=1e-9", "--done_frames=3",
     ]  # fmt: skip
     write_script(make_parser().parse_args(flags))
