@@ -46,7 +46,8 @@ def test_an_axis_stays_in_its_range(axes):
 def test_too_few_successes_are_said(small_dataset, world_model, policy, tmp_path):
     flags = [
         f"--world_model={world_model}", f"--dataset.root={small_dataset.root}", "--frames=3",
-        f"--policy={policy}", "--episodes=7", "--done_threshold=1e-9", "--done_frames=3", f"--output_dir={tmp_path / 'person'}",
+        f"--policy={policy}", "--episodes=7", "--done_threshold=1e-9", "--done_frames=3",
+        f"--output_dir={tmp_path / 'person'}",
     ]  # fmt: skip
     with pytest.raises(SystemExit, match="--episodes=7: 6 of 6 drives succeed; ask for fewer"):
         write_script(make_parser().parse_args(flags))
