@@ -1,6 +1,7 @@
 """What several test packages need: a small LeRobotDataset made without the simulator."""
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,20 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot_wmrl.common.constants import KINDS, TASKS
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW, ACTION_NAMES, FPS, STATE_NAMES
 from tests.hub_client import hub as hub
+
+
+@pytest.fixture(autouse=True)
+def ordinary_priority() -> None:
+    """Give up the real-time priority that SVT-AV1 gives the thread in which root encodes a video: processes
+    that a test starts would have it too, and keep all others from running."""
+    give_up_priority()
+
+
+def give_up_priority() -> None:
+    """Schedule this thread, and what it starts, like any other."""
+    if hasattr(os, "sched_setscheduler"):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
 
 HOLD_FRAMES = 5
 SPEED = 0.04

@@ -21,6 +21,7 @@ from lerobot_wmrl.play.saving import SavedEpisodes
 from lerobot_wmrl.play.server import PlayServer
 from lerobot_wmrl.play.world import World, load_world
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
+from tests.conftest import give_up_priority
 from tests.rl.checkpoints import save_untrained_policy
 
 
@@ -108,6 +109,7 @@ def folder(saved) -> Path:
 @pytest.fixture(scope="session")
 def browser() -> Iterator[WebDriver]:
     """Chromium, without a window on the screen."""
+    give_up_priority()
     options = webdriver.ChromeOptions()
     for flag in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--window-size=1300,1000"):
         options.add_argument(flag)
