@@ -287,8 +287,8 @@ against the first row:
 
 A scripted person holds keys down for what a planner in the world model finds, which changes what PPO's
 policy would do, and does again what fails. LeRobot's own `lerobot-record` records it in real time, without
-the simulator. How this person was chosen, and why others drove worse, is
-[here](pilots.md#fifty-driven-demonstrations)."""
+the simulator, and goes on for 1.6 s whether it has succeeded or not: policies learn to stand still. Without
+these frames they [do better](pilots.md#fifty-driven-demonstrations)."""
 
 
 DRIVEN: Final = {
