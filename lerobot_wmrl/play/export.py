@@ -17,7 +17,6 @@ from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.files import whole_folder, write_text
 from lerobot_wmrl.data.episodes import EpisodeTable
 from lerobot_wmrl.data.frame_cache import cached_frames
-from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.play.graphs import ExportedWorldModel, export_graphs
 from lerobot_wmrl.play.web import PAGES
 from lerobot_wmrl.play.world import World
@@ -82,7 +81,7 @@ def export_page(world: World, folder: Path, starts: int) -> str:
         described = describe(world, world.table, rows)
         write_text(partial / "world.json", json.dumps(described, allow_nan=False))
         longest = rows[world.table.length[rows].argmax()]
-        return compare(world, world.table, int(longest), partial)
+        return compare(world, int(longest), partial)
 
 
 def index_page() -> str:
@@ -92,26 +91,24 @@ def index_page() -> str:
     return served.replace("<head>", f"<head>\n{guard}").replace("./server.js", "./local.js")
 
 
-def compare(world: World, table: EpisodeTable, row: int, folder: Path) -> str:
+def compare(world: World, row: int, folder: Path) -> str:
     """Imagine a recorded episode with the exported networks and with the world model, beyond a clip.
 
     Returns:
         How far the pictures and probabilities of success are apart.
     """
     model, exported = world.models.model, ExportedWorldModel(folder, world.model.clip_length)
-    first, end = int(table.start[row]), int(table.start[row] + table.length[row])
-    images = cached_frames(table.dataset, world.sizes.camera_keys, world.sizes.image_size)[first]
-    pictures = torch.from_numpy(np.array(images)).movedim(-1, 1)[None] / 255
-    state = torch.from_numpy(table.state[first, : world.model.state_size].astype(np.float32))[None]
-    context = model.tokenizer.context(pictures)
-    frames = Frames(model.tokenizer.encode(pictures, context), state, context)
-    exported.begin(pictures.numpy(), state.numpy())
+    drive = world.begin({"episode": row, "frame": 0}, None)
+    assert drive.recorded is not None, "it begins in a recorded frame"
+    frames = drive.env.newest_frames()
+    pictures = drive.recorded.images[:1].transpose(0, 1, 4, 2, 3).astype(np.float32) / 255
+    exported.begin(pictures, frames.state.numpy())
     colours, chances = [], []
     wanted = world.model.clip_length + FRAMES_BEYOND
-    actions = np.resize(table.action[first:end].astype(np.float32), (wanted, table.action.shape[1]))
+    actions = np.resize(drive.recorded.actions, (wanted, drive.recorded.actions.shape[1]))
     for action, imagined in zip(actions, model.imagine(frames, torch.from_numpy(actions)[None]), strict=True):
         found = exported.step(action[None])
-        shown = model.decode(imagined.tokens, context).images[0].movedim(1, -1).numpy() * 255
+        shown = model.decode(imagined.tokens, frames.context).images[0].movedim(1, -1).numpy() * 255
         colours.append(np.abs(found["pixels"][..., :3] - shown).mean())
         chances.append(np.abs(found["done_probability"] - imagined.done_logit.sigmoid().numpy()).max())
     return (
