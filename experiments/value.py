@@ -10,7 +10,7 @@ from experiments.run import read_record
 from experiments.study import Study
 from experiments.success import Results, outcomes, rate
 from lerobot_wmrl.data.budget import Ledger
-from lerobot_wmrl.data.episodes import open_dataset
+from lerobot_wmrl.data.episodes import open_dataset, read_episodes
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 from lerobot_wmrl.scripts.compare import RESULTS
 
@@ -68,11 +68,10 @@ def driven(study: Study) -> Results:
     settings = {
         name: study.variables[name] for name in ("count", "demonstrations", "rollouts", "seed", "starts")
     }
-    wanted = study.variables["count"] * study.variables["episode_length"]
-    if (frames := open_dataset(study.folder / "driven").num_frames) != wanted:
-        raise ValueError(
-            f"lerobot-record has kept {frames} of {wanted} frames: it did not keep up; repeat it"
-        )
+    driven = json.loads((study.folder / "person" / "script.json").read_text())["actions"]
+    wanted = [len(actions) for actions in driven]
+    if (kept := read_episodes(open_dataset(study.folder / "driven")).length.tolist()) != wanted:
+        raise ValueError(f"lerobot-record has kept {kept} frames of {wanted}: it did not keep up; repeat it")
     found = {name: success(study, name) for name in study.variables["methods"]}
     return {study.variables["cell"]: {**settings, "methods": found}}
 

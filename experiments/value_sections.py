@@ -286,9 +286,8 @@ against the first row:
 {table(["episodes", "demonstrations", "seed", "known scenes", "unseen scenes"], rows)}
 
 A scripted person holds keys down for what a planner in the world model finds, which changes what PPO's
-policy would do, and does again what fails. LeRobot's own `lerobot-record` records it in real time, without
-the simulator, and goes on for 1.6 s whether it has succeeded or not: policies learn to stand still. Without
-these frames they [do better](pilots.md#fifty-driven-demonstrations)."""
+policy would do, does again what fails, and ends an episode at success. LeRobot's own `lerobot-record`
+records it in real time, without the simulator."""
 
 
 DRIVEN: Final = {

@@ -8,7 +8,8 @@
 
 The person knows what to do from a policy and a planner in the same world model, but can only hold keys down:
 each axis of the action moves at one speed, forwards, backwards or not at all. What a plan asks for in between
-becomes presses now and then. Drives that fail are not recorded, as a person would record them again.
+becomes presses now and then. Drives that fail are not recorded, as a person would record them again. At
+success the person presses `n`, which ends an episode in lerobot-record.
 """
 
 from experiments.person.teleoperator import ScriptedPerson, ScriptedPersonConfig

@@ -74,16 +74,13 @@ def write_script(given: argparse.Namespace) -> None:
     policy = read_policy_config(given.policy, ["--device=cpu"])
     world = load_world(env, DatasetSource(given.root), policy, None)
     assert world.table is not None
-    axes = world.axes()
-    rest = [axis["rest"] for axis in axes]
     order = np.random.default_rng(given.seed).permutation(len(world.table.start)).tolist()
     driven: dict[int, list[list[float]]] = {}
     with tqdm(total=given.episodes, unit="episode") as progress:
         for count, episode in enumerate(order, 1):
             actions, drive = drive_by_keys(world, episode, given.frames)
             if drive.ended == "success":
-                last = np.where([axis["springs"] for axis in axes], rest, actions[-1]).tolist()
-                driven[episode] = [*actions, *[last] * (given.frames - len(actions))]
+                driven[episode] = actions
                 progress.update()
             progress.set_postfix(success=f"{len(driven)}/{count}")
             if len(driven) == given.episodes:
@@ -107,7 +104,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--policy", required=True, help="whose actions the planner changes")
     parser.add_argument("--dataset.root", dest="root", required=True, help="in whose first frames it begins")
     parser.add_argument("--episodes", type=int, required=True, help="successful drives to write")
-    parser.add_argument("--frames", type=int, required=True, help="of an episode")
+    parser.add_argument("--frames", type=int, required=True, help="of an episode at most")
     parser.add_argument("--done_threshold", type=float, default=0.95, help="as in lerobot-wmrl-play")
     parser.add_argument("--done_frames", type=int, default=2, help="as in lerobot-wmrl-play")
     parser.add_argument("--seed", type=int, default=0, help="of the order of the episodes")

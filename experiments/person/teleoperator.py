@@ -1,12 +1,13 @@
 """The person as a teleoperator of LeRobot, `--teleop.type=scripted_person`."""
 
 import json
-import time
+import os
+import pty
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from lerobot.teleoperators.config import TeleoperatorConfig
 from lerobot.teleoperators.teleoperator import Teleoperator
 
@@ -18,15 +19,14 @@ class ScriptedPersonConfig(TeleoperatorConfig):
 
     Args:
         script: what they do, one episode after the other.
-        episode_time_s: the robot's, after which the next episode begins.
     """
 
     script: str = ""
-    episode_time_s: float = 1.6
 
 
 class ScriptedPerson(Teleoperator):
-    """Sends the actions of a script. An episode begins when the robot's does: after its time is up."""
+    """Sends the actions of a script, and presses `n` at an episode's last: on a terminal of its own, which it
+    gives to lerobot-record as its standard input."""
 
     config_class, name = ScriptedPersonConfig, "scripted_person"
     feedback_features: dict[str, type] = {}  # noqa: RUF012
@@ -36,25 +36,29 @@ class ScriptedPerson(Teleoperator):
         super().__init__(config)
         script = json.loads(Path(config.script).read_text())
         self.names, self.script = script["names"], script["actions"]
-        self.limit = config.episode_time_s
 
     @property
     def action_features(self) -> dict[str, type]:
         return dict.fromkeys(self.names, float)
 
     def connect(self, calibrate: bool = True) -> None:
-        self.episode, self.frame = -1, 0
-        self.began = -np.inf
+        self.episode = self.frame = 0
+        self.keyboard, terminal = pty.openpty()
+        self.terminal = os.fdopen(terminal)  # LeRobot uses it beyond `disconnect`
+        self.stdin, sys.stdin = sys.stdin, self.terminal
 
     def get_action(self) -> dict[str, float]:
-        if time.perf_counter() - self.began >= self.limit:
-            self.episode, self.frame, self.began = self.episode + 1, 0, time.perf_counter()
         actions = self.script[self.episode]
-        action = actions[min(self.frame, len(actions) - 1)]
+        action = actions[self.frame]
         self.frame += 1
+        if self.frame == len(actions):
+            os.write(self.keyboard, b"n")
+            self.episode, self.frame = self.episode + 1, 0
         return dict(zip(self.names, action, strict=True))
+
+    def disconnect(self) -> None:
+        sys.stdin = self.stdin
 
     def calibrate(self) -> None: ...
     def configure(self) -> None: ...
     def send_feedback(self, feedback: dict[str, Any]) -> None: ...
-    def disconnect(self) -> None: ...

@@ -14,17 +14,16 @@ class ImaginedRobotConfig(RobotConfig):
     """A robot whose cameras and state a world model imagines, for lerobot-teleoperate, lerobot-record,
     lerobot-replay and lerobot-rollout.
 
-    LeRobot's commands do not tell a robot that an episode is over. This one begins the next episode
-    `episode_time_s` after it has shown the first frame of one. After a success it stands still until then.
+    An episode is over at the key that ends it in lerobot-record or lerobot-rollout (right arrow, or `n` in a
+    terminal; the left arrow or `r` begins it again), and `episode_time_s` after its first frame was shown.
+    LeRobot's commands do not tell a robot of it otherwise. After a success the robot stands still until then.
 
     Args:
         world_model_path: the action world model, a checkpoint or the output folder of its training.
         dataset: in whose frames episodes begin, one after the other.
         first_start: number of the frame in which the first episode begins.
         episode_time_s: seconds after which the next episode begins: `dataset.episode_time_s` and
-            `dataset.reset_time_s` of the command together. None for a single episode.
-        right_arrow: begin the next episode at the right arrow too, which ends an episode in lerobot-record.
-            It needs pynput and a screen. Not for teleoperators that move with arrows, such as keyboard_ee.
+            `dataset.reset_time_s` of the command together. None if keys alone end one.
         done_threshold: predicted success probability at which a frame counts as done.
         done_frames: consecutive done frames that make a success.
         suffix: what is added to the names of states and actions. lerobot-rollout needs `.pos` where the
@@ -36,7 +35,6 @@ class ImaginedRobotConfig(RobotConfig):
     dataset: StartFrames = field(default_factory=StartFrames)
     first_start: int = 0
     episode_time_s: float | None = None
-    right_arrow: bool = False
     done_threshold: float = 0.5
     done_frames: int = 3
     suffix: str = ""

@@ -8,9 +8,9 @@ from typing import Any, Final
 import torch
 from lerobot.robots import Robot
 from lerobot.utils.constants import OBS_STATE
-from lerobot.utils.keyboard_input import init_keyboard_listener, pynput_can_capture
 
 from lerobot_robot_imagined.config_imagined import ImaginedRobotConfig
+from lerobot_robot_imagined.keys import EpisodeKeys
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.images import to_bytes
 from lerobot_wmrl.envs.configuration_world_model import DrivenEnv
@@ -43,8 +43,7 @@ class ImaginedRobot(Robot):
         self.config = config
         self.model: Any = read_config(config.world_model_path, "action_world_model")
         self.env: Any = None
-        self.listener: Any = None
-        self.events = {"exit_early": False}
+        self.keys: EpisodeKeys | None = None
         self.succeeded = False
         self.began: float | None = None
 
@@ -85,11 +84,10 @@ class ImaginedRobot(Robot):
             episode_length=LONGEST, done_threshold=config.done_threshold, done_frames=config.done_frames,
             device=config.device,
         )  # fmt: skip
-        if config.right_arrow:
-            self._listen()
         models = load_world_models(env, env.device)
         self.env = make_env_at(read_start_images(config.dataset, models.model.config), models, env, 1)
-        self.start = config.first_start - 1
+        self.keys = EpisodeKeys()
+        self.start = config.first_start
         self._begin()
         logging.info(
             "the world model has learnt %d frames a second: use this as the command's fps",
@@ -99,15 +97,17 @@ class ImaginedRobot(Robot):
     def disconnect(self) -> None:
         """Forget the world model."""
         self.env = None
-        if self.listener is not None:
-            self.listener.stop()
-            self.listener = None
+        if self.keys is not None:
+            self.keys.close()
+            self.keys = None
 
     def get_observation(self) -> dict[str, Any]:
         """Return the newest frame, that of the next episode if this one is over."""
         if not self.is_connected:
             raise ConnectionError("the imagined robot is not connected")
-        if self._is_over():
+        ended = self._ended()
+        if ended is not None:
+            self.start += ended != "left"
             self._begin()
         self.began = self.began or time.perf_counter()
         state = self.observation[OBS_STATE][0].tolist() if OBS_STATE in self.observation else []
@@ -152,28 +152,19 @@ class ImaginedRobot(Robot):
         return [f"{name}{self.config.suffix}" for name in getattr(self.model.embodiment, f"{kind}_names")]
 
     def _begin(self) -> None:
-        """Begin the next episode."""
-        self.start += 1
+        """Begin an episode in the frame whose turn it is."""
         self.observation, _ = self.env.reset(seed=[self.start])
         self.began, self.succeeded = None, False
         self.last = self.env.model.action_mean[None].cpu()
 
-    def _is_over(self) -> bool:
-        """Return whether the right arrow was pressed since the last observation, or time is up."""
-        pressed, self.events["exit_early"] = self.events["exit_early"], False
+    def _ended(self) -> str | None:
+        """Return what has ended the episode: a key's name, "time", or None if it goes on."""
+        assert self.keys is not None
+        if (key := self.keys.pressed()) is not None:
+            return key
         limit = self.config.episode_time_s
-        if limit is None or self.began is None:
-            return pressed
-        return pressed or time.perf_counter() - self.began >= limit
-
-    def _listen(self) -> None:
-        """Watch the keyboard. FieldError where keys would be taken from LeRobot's command."""
-        if not pynput_can_capture():
-            raise FieldError(
-                "robot.right_arrow", True, "keys can be watched only with pynput, on a screen",
-                "leave it out, and set `robot.episode_time_s`",
-            )  # fmt: skip
-        self.listener, self.events = init_keyboard_listener()
+        late = limit is not None and self.began is not None and time.perf_counter() - self.began >= limit
+        return "time" if late else None
 
     def _displaced(self, sent: Mapping[str, float]) -> dict[str, float]:
         """Return the action that a keyboard's or gamepad's displacement stands for.

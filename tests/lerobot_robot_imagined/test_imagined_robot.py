@@ -19,6 +19,7 @@ from lerobot.scripts.lerobot_rollout import rollout
 from lerobot.scripts.lerobot_teleoperate import teleoperate
 from lerobot.teleoperators.config import TeleoperatorConfig
 from lerobot.teleoperators.teleoperator import Teleoperator
+from lerobot.utils import keyboard_input
 
 from lerobot_robot_imagined.config_imagined import ImaginedRobotConfig
 from lerobot_robot_imagined.imagined import ImaginedRobot
@@ -205,17 +206,28 @@ def test_time_begins_the_next_episode_from_the_first_frame_that_was_shown_on(mak
     assert robot.start == 1
 
 
-def test_the_right_arrow_begins_the_next_episode_where_keys_can_be_watched(make_robot, monkeypatch):
-    with pytest.raises(FieldError, match=r"^robot\.right_arrow=True: keys can be watched only with pynput"):
-        make_robot(right_arrow=True)
-    events = {"exit_early": False}
-    monkeypatch.setattr("lerobot_robot_imagined.imagined.pynput_can_capture", lambda: True)
-    monkeypatch.setattr("lerobot_robot_imagined.imagined.init_keyboard_listener", lambda: (None, events))
-    robot = make_robot(right_arrow=True)
-    robot.get_observation()
-    events["exit_early"] = True
-    robot.get_observation()
-    assert (robot.start, events["exit_early"]) == (1, False)
+@pytest.mark.parametrize(("key", "start"), [("right", 1), ("left", 0), ("esc", 1)])
+def test_a_key_ends_the_episode_once_the_command_has_noticed_it(make_robot, key, start):
+    robot, events = make_robot(), {"exit_early": False, "rerecord_episode": False, "stop_recording": False}
+    first = robot.get_observation()
+    robot.send_action(dict.fromkeys(ACTION_NAMES, 0.05))
+    keyboard_input.apply_recording_control(key, events)
+    moved = robot.get_observation()
+    assert moved["tcp_x"] != first["tcp_x"]
+    assert events["exit_early"]
+    events["exit_early"] = False
+    again = robot.get_observation()
+    assert robot.start == start
+    assert (again["tcp_x"] == first["tcp_x"]) == (key == "left")
+    assert robot.get_observation()["tcp_x"] == again["tcp_x"]
+
+
+def test_a_disconnected_robot_leaves_the_keys_to_lerobot(make_robot):
+    before = keyboard_input.apply_recording_control
+    robot = make_robot()
+    assert keyboard_input.apply_recording_control != before
+    robot.disconnect()
+    assert keyboard_input.apply_recording_control == before
 
 
 def test_it_stands_still_after_a_success(make_robot):
