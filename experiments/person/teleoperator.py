@@ -35,6 +35,7 @@ class ScriptedPerson(Teleoperator):
     def __init__(self, config: ScriptedPersonConfig) -> None:
         super().__init__(config)
         script = json.loads(Path(config.script).read_text())
+        self.stdin = sys.stdin
         self.names, self.script = script["names"], script["actions"]
 
     @property
@@ -44,8 +45,7 @@ class ScriptedPerson(Teleoperator):
     def connect(self, calibrate: bool = True) -> None:
         self.episode = self.frame = 0
         self.keyboard, terminal = pty.openpty()
-        self.terminal = os.fdopen(terminal)  # LeRobot uses it beyond `disconnect`
-        self.stdin, sys.stdin = sys.stdin, self.terminal
+        self.terminal = sys.stdin = os.fdopen(terminal)
 
     def get_action(self) -> dict[str, float]:
         actions = self.script[self.episode]
@@ -57,6 +57,7 @@ class ScriptedPerson(Teleoperator):
         return dict(zip(self.names, action, strict=True))
 
     def disconnect(self) -> None:
+        """Give the standard input back; LeRobot uses the terminal once more after this."""
         sys.stdin = self.stdin
 
     def calibrate(self) -> None: ...
