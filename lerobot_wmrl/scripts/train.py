@@ -58,6 +58,9 @@ MAY_DIFFER = (
 """Settings that may change when a run is resumed."""
 
 
+UNPUBLISHED: Final = "FOLDER"
+"""On a card, what stands for a folder of the machine on which the policy was trained."""
+
 CARD: Final = """---
 {metadata}
 ---
@@ -353,14 +356,19 @@ def summary(cfg: TrainConfig) -> list[str]:
     return [*lines, f"next: {evaluation(cfg, str(checkpoint / PRETRAINED_MODEL_DIR))}"]
 
 
-def evaluation(cfg: TrainConfig, path: str) -> str:
-    """Return the command that evaluates the policy at `path`, a folder or a name on the hub."""
+def evaluation(cfg: TrainConfig, path: str, shared: bool = False) -> str:
+    """Return the command that evaluates the policy at `path`, a folder or a name on the hub.
+
+    `shared`: for others, who do not have this machine's folders.
+    """
     from lerobot_wmrl.rl.recorders import env_flags
 
     evaluated: Any = cfg.real_env or cfg.env
-    flags = {
-        "policy.path": path, **env_flags(evaluated), "eval.n_episodes": 100, "seed": EVALUATION_SEED,
-    }  # fmt: skip
+    settings = dict(env_flags(evaluated))
+    for name in settings if shared else ():
+        if name.endswith(("path", "root")) and Path(str(settings[name])).exists():
+            settings[name] = UNPUBLISHED
+    flags = {"policy.path": path, **settings, "eval.n_episodes": 100, "seed": EVALUATION_SEED}
     return shlex.join(["lerobot-eval", *format_flags(flags)])
 
 
@@ -377,11 +385,12 @@ def publish(cfg: TrainConfig, lines: list[str]) -> None:
         license=config.license or "apache-2.0", library_name="lerobot", pipeline_tag="robotics",
         tags=sorted({*(config.tags or []), "robotics", "lerobot", config.type}), model_name=name,
     )  # fmt: skip
-    description, start = "\n".join(f"- {line}" for line in lines[:-1]), str(config.pretrained_path)
+    described = [lines[0].removeprefix(f"{cfg.output_dir}: "), *lines[1:-1]]
+    description, start = "\n".join(f"- {line}" for line in described), str(config.pretrained_path)
     card = CARD.format(
         metadata=data.to_yaml(), name=name, type=config.type, description=description,
-        start=f"`{start}`" if not Path(start).exists() else "a policy that is not published",
-        command=evaluation(cfg, name),
+        start="a policy that is not published" if Path(start).exists() else f"`{start}`",
+        command=evaluation(cfg, name, shared=True),
     )  # fmt: skip
     with TemporaryDirectory() as temporary:
         folder = Path(temporary) / "policy"

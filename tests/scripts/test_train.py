@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -13,8 +14,10 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from safetensors.torch import load_file
 
 from lerobot_wmrl.common.tracking import read_metrics
+from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
+from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
-from lerobot_wmrl.scripts.train import TrainConfig, check_config, main, rollout_length
+from lerobot_wmrl.scripts.train import TrainConfig, check_config, evaluation, main, rollout_length
 from tests.hub_server import Hub
 from tests.rl.checkpoints import save_untrained_policy
 from tests.scripts.point_config import PointConfig
@@ -121,7 +124,21 @@ def test_it_says_what_it_made_and_publishes_it_if_asked(
     assert "2 iterations of PPO" in card
     assert "It began as a policy that is not published." in card
     assert "lerobot-eval --policy.path=me/improved --env.type=test_point" in card
+    assert str(tmp_path) not in card
     assert list(hub.repos) == [("models", "me/improved")]
+
+
+def test_a_command_for_others_names_no_folder_of_this_machine(trained_models: dict[str, Path]) -> None:
+    world_model = str(trained_models["action_world_model"])
+    reward = GeneralConfig(alpha=1)
+    settings = WorldModelEnv(
+        world_model_path=world_model, dataset=StartFrames(root="me/frames"), reward=reward
+    )
+    cfg: Any = SimpleNamespace(real_env=None, env=settings)
+    assert f"--env.world_model_path={world_model}" in evaluation(cfg, "me/improved")
+    command = evaluation(cfg, "me/improved", shared=True)
+    assert world_model not in command
+    assert "--env.world_model_path=FOLDER --env.dataset.root=me/frames" in command
 
 
 def test_grpo_trains_by_the_same_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
