@@ -77,7 +77,7 @@ def best_success(cells: Sequence[dict[str, Any]], methods: Sequence[str], domain
 
 def test_the_readme_says_what_was_measured() -> None:
     text, results = (ROOT / "README.md").read_text(), ROOT / "docs" / "results"
-    budgets = groups(loader(ROOT / "docs")).values()
+    budgets = groups(loader(ROOT / "docs"))
     rows = {
         "BC of the demonstrations": ("cloning",),
         "best baseline": BASELINES,
@@ -85,8 +85,12 @@ def test_the_readme_says_what_was_measured() -> None:
         "PPO, then planning": ("planned",),
     }
     for title, methods in rows.items():
-        shares = [[best_success(cells, methods, domain) for domain in ("ind", "ood")] for cells in budgets]
+        shares = [
+            [best_success(cells, methods, domain) for domain in ("ind", "ood")] for cells in budgets.values()
+        ]
         assert f"| {title} | " + " | ".join(f"{known}/{unseen}" for known, unseen in shares) in text
+    distilled = [best_success(budgets[25, 1000], ("ppo_distilled",), domain) for domain in ("ind", "ood")]
+    assert "after distillation of the planner PPO's policy has {}/{}".format(*distilled) in text
     policies = json.loads((results / "demo.json").read_text())["runs"][0]["policies"].values()
     unseen, known = (
         "{}, {} and {} %".format(*(round(100 * policy[where]["share"]) for policy in policies))
