@@ -48,6 +48,8 @@ class ScriptedPerson(Teleoperator):
         self.terminal = sys.stdin = os.fdopen(terminal)
 
     def get_action(self) -> dict[str, float]:
+        if self.episode == len(self.script):
+            raise RuntimeError("lerobot-record did not keep up with the keys: record again")
         actions = self.script[self.episode]
         action = actions[self.frame]
         self.frame += 1

@@ -58,6 +58,9 @@ MAY_DIFFER = (
 """Settings that may change when a run is resumed."""
 
 
+PATHS: Final = ("path", "root", "frames", "assets")
+"""Ends of the names of settings that may be folders or files of this machine."""
+
 UNPUBLISHED: Final = "FOLDER"
 """On a card, what stands for a folder of the machine on which the policy was trained."""
 
@@ -71,7 +74,7 @@ A `{type}` policy of LeRobot, trained further by reinforcement learning with ler
 
 {description}
 
-It began as {start}. `train_config.json` has all settings. Evaluate it:
+It began as {start}. `train_config.json` has all settings. Evaluate it (FOLDER: what is not published):
 
 ```
 {command}
@@ -366,7 +369,8 @@ def evaluation(cfg: TrainConfig, path: str, shared: bool = False) -> str:
     evaluated: Any = cfg.real_env or cfg.env
     settings = dict(env_flags(evaluated))
     for name in settings if shared else ():
-        if name.endswith(("path", "root")) and Path(str(settings[name])).exists():
+        place = Path(str(settings[name]))
+        if name.endswith(PATHS) and (place.is_absolute() or place.exists()):
             settings[name] = UNPUBLISHED
     flags = {"policy.path": path, **settings, "eval.n_episodes": 100, "seed": EVALUATION_SEED}
     return shlex.join(["lerobot-eval", *format_flags(flags)])

@@ -14,16 +14,17 @@ class ImaginedRobotConfig(RobotConfig):
     """A robot whose cameras and state a world model imagines, for lerobot-teleoperate, lerobot-record,
     lerobot-replay and lerobot-rollout.
 
-    An episode is over at the key that ends it in lerobot-record or lerobot-rollout (right arrow, or `n` in a
-    terminal; the left arrow or `r` begins it again), and `episode_time_s` after its first frame was shown.
-    LeRobot's commands do not tell a robot of it otherwise. After a success the robot stands still until then.
+    The next episode begins at the key that ends one in lerobot-record (right arrow or `n`; at the left arrow
+    or `r`, which record an episode again, the same begins again), and `episode_time_s` after an episode's
+    first frame was shown. LeRobot's commands do not tell a robot of it otherwise. Nothing has to be reset by
+    hand: give lerobot-record `--dataset.reset_time_s=0`. After a success the robot stands still.
 
     Args:
         world_model_path: the action world model, a checkpoint or the output folder of its training.
         dataset: in whose frames episodes begin, one after the other.
         first_start: number of the frame in which the first episode begins.
-        episode_time_s: seconds after which the next episode begins: `dataset.episode_time_s` and
-            `dataset.reset_time_s` of the command together. None if keys alone end one.
+        episode_time_s: seconds after which the next episode begins, `dataset.episode_time_s` of the command.
+            None if keys alone end one.
         done_threshold: predicted success probability at which a frame counts as done.
         done_frames: consecutive done frames that make a success.
         suffix: what is added to the names of states and actions. lerobot-rollout needs `.pos` where the

@@ -105,9 +105,10 @@ class ImaginedRobot(Robot):
         """Return the newest frame, that of the next episode if this one is over."""
         if not self.is_connected:
             raise ConnectionError("the imagined robot is not connected")
-        ended = self._ended()
-        if ended is not None:
-            self.start += ended != "left"
+        assert self.keys is not None
+        keys = self.keys.ended()
+        if keys or self._is_late():
+            self.start += sum(key != "left" for key in keys) if keys else 1
             self._begin()
         self.began = self.began or time.perf_counter()
         state = self.observation[OBS_STATE][0].tolist() if OBS_STATE in self.observation else []
@@ -157,14 +158,10 @@ class ImaginedRobot(Robot):
         self.began, self.succeeded = None, False
         self.last = self.env.model.action_mean[None].cpu()
 
-    def _ended(self) -> str | None:
-        """Return what has ended the episode: a key's name, "time", or None if it goes on."""
-        assert self.keys is not None
-        if (key := self.keys.pressed()) is not None:
-            return key
+    def _is_late(self) -> bool:
+        """Return whether the episode's time is up."""
         limit = self.config.episode_time_s
-        late = limit is not None and self.began is not None and time.perf_counter() - self.began >= limit
-        return "time" if late else None
+        return limit is not None and self.began is not None and time.perf_counter() - self.began >= limit
 
     def _displaced(self, sent: Mapping[str, float]) -> dict[str, float]:
         """Return the action that a keyboard's or gamepad's displacement stands for.

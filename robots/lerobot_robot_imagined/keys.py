@@ -1,4 +1,4 @@
-"""The keys that end an episode in LeRobot's commands."""
+"""The keys that end an episode in lerobot-record."""
 
 from threading import Lock
 from typing import Any
@@ -7,7 +7,7 @@ from lerobot.utils import keyboard_input
 
 
 class EpisodeKeys:
-    """Notices the keys with which somebody ends an episode in lerobot-record or lerobot-rollout.
+    """Notices the keys with which somebody ends an episode in lerobot-record.
 
     LeRobot tells a robot nothing of them, and of two that read a terminal each would miss keys that the other
     gets. So this takes the place of the function to which LeRobot's own listeners give them, until `close`.
@@ -15,20 +15,21 @@ class EpisodeKeys:
 
     def __init__(self) -> None:
         self._lock = Lock()
-        self._last: tuple[str, dict[str, Any]] | None = None
+        self._pending: tuple[str, dict[str, Any]] | None = None
+        self._ended: list[str] = []
         self._apply = keyboard_input.apply_recording_control
         keyboard_input.apply_recording_control = self._take
 
-    def pressed(self) -> str | None:
-        """Return the key at which LeRobot's command has just ended an episode: "right", "left" or "esc".
+    def ended(self) -> list[str]:
+        """Return the keys at which LeRobot's command has ended episodes since the last call.
 
-        None before the command has noticed it, too: until then it records the same episode.
+        Each is "right", "left" or "esc". One that the command has not noticed yet is not among them: until
+        then it records the same episode.
         """
         with self._lock:
-            if self._last is None or self._last[1]["exit_early"]:
-                return None
-            (key, _), self._last = self._last, None
-            return key
+            self._settle()
+            ended, self._ended = self._ended, []
+            return ended
 
     def close(self) -> None:
         """Give the keys to LeRobot alone again."""
@@ -36,5 +37,13 @@ class EpisodeKeys:
 
     def _take(self, control: str, events: dict[str, Any]) -> None:
         with self._lock:
+            self._settle()
+            again = self._pending is not None and self._pending[0] == "left"
             self._apply(control, events)
-            self._last = control, events
+            self._pending = "left" if again else control, events
+
+    def _settle(self) -> None:
+        """Note that the command has noticed the last key, if it has."""
+        if self._pending is not None and not self._pending[1]["exit_early"]:
+            self._ended.append(self._pending[0])
+            self._pending = None

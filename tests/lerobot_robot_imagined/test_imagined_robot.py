@@ -222,6 +222,25 @@ def test_a_key_ends_the_episode_once_the_command_has_noticed_it(make_robot, key,
     assert robot.get_observation()["tcp_x"] == again["tcp_x"]
 
 
+def test_keys_between_two_episodes_are_all_counted(make_robot):
+    """One that ended an episode, and one while it was saved, which records the next again."""
+    robot, events = make_robot(), {"exit_early": False, "rerecord_episode": False, "stop_recording": False}
+    for key in ("right", "left"):
+        keyboard_input.apply_recording_control(key, events)
+        events["exit_early"] = False
+    robot.get_observation()
+    assert robot.start == 1
+
+
+def test_an_episode_that_is_to_be_recorded_again_begins_again_whatever_follows(make_robot):
+    robot, events = make_robot(), {"exit_early": False, "rerecord_episode": False, "stop_recording": False}
+    for key in ("left", "right"):
+        keyboard_input.apply_recording_control(key, events)
+    events["exit_early"] = False
+    robot.get_observation()
+    assert robot.start == 0
+
+
 def test_a_disconnected_robot_leaves_the_keys_to_lerobot(make_robot):
     before = keyboard_input.apply_recording_control
     robot = make_robot()
