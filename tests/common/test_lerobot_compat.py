@@ -53,8 +53,8 @@ UNDOCUMENTED = {
     "lerobot.rl.algorithms.base": {"RLAlgorithm"},
     "lerobot.rl.algorithms.configs": {"RLAlgorithmConfig", "TrainingStats"},
     "lerobot.scripts.lerobot_eval": {"eval_policy", "eval_policy_all", "rollout"},
+    "lerobot.utils": {"keyboard_input"},
     "lerobot.utils.import_utils": {"register_third_party_plugins"},
-    "lerobot.utils.keyboard_input": {"init_keyboard_listener", "pynput_can_capture"},
     "lerobot.utils.logging_utils": {"MetricsTracker"},
     "lerobot.utils.random_utils": {
         "deserialize_rng_state", "get_rng_state", "serialize_rng_state", "set_rng_state", "set_seed",
