@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -80,7 +81,8 @@ def test_what_is_imported_from_lerobot_outside_its_documented_api_is_listed() ->
     assert undocumented_imports() == UNDOCUMENTED
     for module, names in UNDOCUMENTED.items():
         for name in names:
-            assert hasattr(importlib.import_module(module), name), f"{module}.{name}"
+            known = hasattr(importlib.import_module(module), name) or find_spec(f"{module}.{name}")
+            assert known, f"{module}.{name}"
 
 
 def learn(
