@@ -1,9 +1,13 @@
 """The keys that end an episode in lerobot-record."""
 
+from importlib import import_module
 from threading import Lock
-from typing import Any
+from typing import Any, Final
 
-from lerobot.utils import keyboard_input
+from lerobot.utils.keyboard_input import apply_recording_control
+
+LISTENERS: Final = import_module(apply_recording_control.__module__)
+"""LeRobot's module whose listeners call that function by its name in it."""
 
 
 class EpisodeKeys:
@@ -17,8 +21,8 @@ class EpisodeKeys:
         self._lock = Lock()
         self._pending: tuple[str, dict[str, Any]] | None = None
         self._ended: list[str] = []
-        self._apply = keyboard_input.apply_recording_control
-        keyboard_input.apply_recording_control = self._take
+        self._apply = LISTENERS.apply_recording_control
+        LISTENERS.apply_recording_control = self._take
 
     def ended(self) -> list[str]:
         """Return the keys at which LeRobot's command has ended episodes since the last call.
@@ -33,7 +37,7 @@ class EpisodeKeys:
 
     def close(self) -> None:
         """Give the keys to LeRobot alone again."""
-        keyboard_input.apply_recording_control = self._apply
+        LISTENERS.apply_recording_control = self._apply
 
     def _take(self, control: str, events: dict[str, Any]) -> None:
         with self._lock:

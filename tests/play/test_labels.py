@@ -152,7 +152,7 @@ def test_ctrl_c_keeps_the_labels_and_says_so(unlabelled, rule, tmp_path):
     assert command.stdout is not None
     assert next(line for line in command.stdout if line.startswith("open "))
     command.send_signal(signal.SIGINT)
-    said = command.communicate(timeout=300)[1]
+    said = command.communicate(timeout=60)[1]
     assert said.strip().splitlines()[-1] == (
         f"1 of 6 episodes have a label, kept in {rule.file}; the same command goes on"
     )
