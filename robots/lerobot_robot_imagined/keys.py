@@ -6,7 +6,7 @@ from typing import Any, Final
 
 from lerobot.utils.keyboard_input import apply_recording_control
 
-LISTENERS: Final = import_module(apply_recording_control.__module__)
+LISTENERS: Final[Any] = import_module(apply_recording_control.__module__)
 """LeRobot's module whose listeners call that function by its name in it."""
 
 
