@@ -12,11 +12,11 @@ def demo(load: Load) -> str:
     rows = [
         [
             run["seed"],
-            title,
-            *(share(run["policies"][policy][where]) for where in ("known", "unseen", "imagined")),
+            POLICY_TITLES[policy],
+            *(share(row[where]) for where in ("known", "unseen", "imagined")),
         ]
         for run in found
-        for policy, title in POLICY_TITLES.items()
+        for policy, row in run["policies"].items()
     ]
     changes = ". ".join(
         f"Seed {run['seed']}, {run['seconds'] / 60:.0f} minutes: {paired(run['changes']['known'])} in known "
@@ -24,8 +24,9 @@ def demo(load: Load) -> str:
         f"model predicts {counted(run['replayed']['filtered']['false_positive_rate'])} as successes"
         for run in found
     )
-    return f"""PPO in imagination against the policy that it begins with, which is cloned from the same data's
-successes, on the same starts. {changes}.
+    last = POLICY_TITLES[next(reversed(found[0]["policies"]))]
+    return f"""The last policy ({last}) against that which PPO begins with, which is cloned from the same
+data's successes, on the same starts. {changes}.
 
 {table(["seed", "policy", "known scenes", "unseen scenes", "in the world model"], rows)}
 

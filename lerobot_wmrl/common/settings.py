@@ -220,10 +220,12 @@ def preset_lines(command: str) -> list[str]:
     presets = presets_of(command)
     if not presets:
         return []
-    by_type = any(presets.values())
+    typed = any(presets.values())
+    whole = all((FOLDER / size / f"{command}.yaml").is_file() for size in presets)
+    kind = ("[.<type>]" if whole else ".<type>") if typed else ""
     return [
-        f"Presets: --preset={'|'.join(presets)}{' (give the type too)' if by_type else ''} stands for the "
-        f"settings in {FOLDER.name}/<preset>/{command}{'.<type>' if by_type else ''}.yaml;",
+        f"Presets: --preset={'|'.join(presets)}{'' if whole else ' (give the type too)'} stands for the "
+        f"settings in {FOLDER.name}/<preset>/{command}{kind}.yaml;",
         "flags further right override them.",
         "",
     ]

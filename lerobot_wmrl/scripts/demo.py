@@ -4,9 +4,9 @@
 
 It records demonstrations of a task in ManiSkill, clones a policy, records that policy's rollouts, and learns
 from these alone: a policy cloned again with the successful rollouts, world models, and that policy trained by
-PPO inside them. All policies are measured on the same held-out starts in ManiSkill. Every stage is
-one console command, which it prints. Running the same command again continues an interrupted demo. It ends
-with a summary and `report.html`.
+PPO inside them and then fitted to a planner. All policies are measured on the same held-out starts in
+ManiSkill. Every stage is one console command, which it prints. Running the same command again continues an
+interrupted demo. It ends with a summary and `report.html`.
 """
 
 import signal

@@ -13,7 +13,7 @@ def test_the_demo_s_section_says_what_ppo_added_to_the_rival() -> None:
         "seconds": 2400.0,
         "policies": {
             policy: {"known": rate, "unseen": rate, "imagined": rate}
-            for policy in ("cloned", "filtered", "rl")
+            for policy in ("cloned", "filtered", "rl", "distilled")
         },
         "changes": {"known": change, "unseen": change},
         "replayed": {"filtered": {"false_positive_rate": rate}},

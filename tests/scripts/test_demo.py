@@ -96,7 +96,7 @@ def test_no_held_out_seed_is_trained_on(outputs: tuple[Path, str]) -> None:
     demo, _ = outputs
     for dataset in ("demonstrations", "rollouts", "dataset"):
         assert recorded_episodes(demo / dataset)["seed"].max() < EVALUATION_SEED
-    for policy in ("filtered", "rl"):
+    for policy in ("filtered", "distilled"):
         rollouts = recorded_episodes(demo / f"checked_{policy}")["seed"]
         evaluated = range(
             EVALUATION_SEED, EVALUATION_SEED + int(preset_settings("tiny", "demo")["eval_episodes"])
@@ -120,7 +120,7 @@ def test_everything_learns_from_the_demonstrations_and_the_rollouts(outputs: tup
     given = preset_settings("tiny", "demo")
     table = recorded_episodes(demo / "dataset")
     assert len(table["episode"]) == given["demonstrations"] + given["rollouts"]
-    for stage in ("filtered", "frame_tokenizer", "action_world_model", "text_world_model", "rl"):
+    for stage in ("filtered", "frame_tokenizer", "action_world_model", "text_world_model", "rl", "distilled"):
         assert "dataset.root=demo/dataset" in str(stage_record(demo, stage)["command"])
 
 
@@ -130,7 +130,7 @@ def test_the_summary_counts_what_was_evaluated(outputs: tuple[Path, str]) -> Non
     n = preset_settings("tiny", "demo")["eval_episodes"]
     for policy in MEASURED:
         assert {row["n"] for row in summary["policies"][policy].values()} == {n}
-    for policy in ("filtered", "rl"):
+    for policy in ("filtered", "distilled"):
         replayed = summary["replayed"][policy]
         assert replayed["false_positive_rate"]["n"] + replayed["recall"]["n"] == len(
             recorded_episodes(demo / f"checked_{policy}")["episode"]
@@ -140,7 +140,7 @@ def test_the_summary_counts_what_was_evaluated(outputs: tuple[Path, str]) -> Non
 
 def test_training_left_metrics_and_whole_checkpoints(outputs: tuple[Path, str]) -> None:
     demo, _ = outputs
-    for folder in ("frame_tokenizer", "action_world_model", "text_world_model", "rl"):
+    for folder in ("frame_tokenizer", "action_world_model", "text_world_model", "rl", "distilled"):
         assert read_metrics(demo / folder), f"{folder} has no metrics"
     whole = {"config.json", "model.safetensors", "train_config.json"}
     for folder in ("frame_tokenizer", "action_world_model", "text_world_model", *MEASURED):

@@ -13,7 +13,7 @@ from lerobot_wmrl.common.constants import KINDS
 from lerobot_wmrl.common.files import write_json, write_text
 from lerobot_wmrl.common.statistics import PairedChange, Proportion
 from lerobot_wmrl.demo.report import figures, results
-from lerobot_wmrl.demo.report.results import BASELINE, EPISODES, PPO_POLICY, Rates, Summary
+from lerobot_wmrl.demo.report.results import BASELINE, EPISODES, IMPROVED, Rates, Summary
 from lerobot_wmrl.demo.stages import MEASURED, WHERE, DemoConfig, drive
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
@@ -23,6 +23,7 @@ POLICY_TITLES = {
     "cloned": "cloned from the demonstrations",
     "filtered": "cloned with successful rollouts",
     "rl": "PPO in imagination",
+    "distilled": "then fitted to a planner",
 }
 """What each policy learnt from, under its bars."""
 
@@ -107,10 +108,10 @@ def render(
 
 
 def run_verdicts(output_dir: Path, rates: Rates) -> list[str]:
-    """State, for known and for unseen scenes, what PPO in imagination added."""
+    """State, for known and for unseen scenes, what PPO and a planner in imagination added."""
     return [
         verdict(
-            where, rates[BASELINE][where], rates[PPO_POLICY][where], results.paired_change(output_dir, where)
+            where, rates[BASELINE][where], rates[IMPROVED][where], results.paired_change(output_dir, where)
         )
         for where in WHERE
     ]
@@ -119,7 +120,7 @@ def run_verdicts(output_dir: Path, rates: Rates) -> list[str]:
 def verdict(where: str, before: Proportion, after: Proportion, change: PairedChange) -> str:
     """State whether success in ManiSkill changed, judged on the same starts; nothing more is claimed."""
     said = (
-        f"In {where} scenes PPO in the world model brought success in ManiSkill from "
+        f"In {where} scenes PPO and a planner in the world model brought success in ManiSkill from "
         f"{100 * before.share:.0f} % to {100 * after.share:.0f} % "
         f"({100 * (after.share - before.share):+.0f} points): "
         f"of the same {before.n} starts, {change.gained} were gained and {change.lost} lost "
@@ -137,7 +138,7 @@ def conclusion(config: DemoConfig, page: Path) -> str:
     found = results.replayed(out, BASELINE)
     false_positives, recall = found["false_positive_rate"], found["recall"]
     lines = [
-        f"Made: a dataset, a frame tokenizer, two world models and three policies in {out}.",
+        f"Made: a dataset, a frame tokenizer, two world models and four policies in {out}.",
         *run_verdicts(out, results.policy_rates(out)),
         f"Of held-out episodes of the {MEASURED[BASELINE]}, the world model predicts {false_positives.k} of "
         f"{false_positives.n} failures as successes (false positives) and {recall.k} of {recall.n} successes "

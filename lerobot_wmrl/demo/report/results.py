@@ -12,11 +12,11 @@ from lerobot_wmrl.common.statistics import MeanChange, PairedChange, Proportion
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.demo.stages import MEASURED, WHERE, DemoConfig
 
-BASELINE, PPO_POLICY = "filtered", "rl"
-"""The policy that PPO begins with, which has used the same data without a world model; and PPO's."""
+BASELINE, IMPROVED = "filtered", "distilled"
+"""The policy that PPO begins with, which has used the same data without a world model; and the last one."""
 
 EPISODES = {
-    PPO_POLICY: MEASURED[PPO_POLICY],
+    IMPROVED: MEASURED[IMPROVED],
     BASELINE: MEASURED[BASELINE],
     "held_out": "recorded, held out from training",
 }
@@ -78,8 +78,8 @@ def replayed(output_dir: Path, whose: str) -> dict[str, Proportion]:
 
 
 def paired_change(output_dir: Path, where: str) -> PairedChange:
-    """Compare PPO's policy with the one that it began with, on the same held-out starts in ManiSkill."""
-    before, after = (outcomes(output_dir / f"eval_{where}_{policy}") for policy in (BASELINE, PPO_POLICY))
+    """Compare the last policy with the one that PPO began with, on the same held-out starts in ManiSkill."""
+    before, after = (outcomes(output_dir / f"eval_{where}_{policy}") for policy in (BASELINE, IMPROVED))
     return PairedChange.between(before, after)
 
 
@@ -160,7 +160,7 @@ def other_seeds(config: DemoConfig) -> dict[str, Any] | None:
     runs = [
         run
         for run in finished_runs(config.output_dir, config.stage_preset)
-        if len(run["outcomes"]["known"][PPO_POLICY]) == config.eval_episodes
+        if len(run["outcomes"]["known"][IMPROVED]) == config.eval_episodes
     ]
     if len(runs) < 2:
         return None
@@ -176,7 +176,7 @@ def finished_runs(output_dir: Path, preset: str) -> list[Summary]:
     folders = sorted(path.parent for path in output_dir.absolute().parent.glob("*/summary.json"))
     for folder in sorted(folders, key=lambda folder: folder != output_dir.absolute()):
         summary = json.loads((folder / "summary.json").read_text())
-        if summary.get("preset") == preset and "replayed" in summary:
+        if summary.get("preset") == preset and MEASURED.keys() == summary["policies"].keys():
             found.setdefault(summary["seed"], summary)
     return [found[seed] for seed in sorted(found)]
 
@@ -184,7 +184,7 @@ def finished_runs(output_dir: Path, preset: str) -> list[Summary]:
 def mean_change(runs: Sequence[Summary], where: str) -> MeanChange:
     """Average the change of success in ManiSkill. Raises ValueError if the runs met different starts."""
     both = [run["outcomes"][where] for run in runs]
-    return MeanChange.over_runs([each[BASELINE] for each in both], [each[PPO_POLICY] for each in both])
+    return MeanChange.over_runs([each[BASELINE] for each in both], [each[IMPROVED] for each in both])
 
 
 def run_rows(runs: Sequence[Summary]) -> list[dict[str, str]]:
