@@ -1,6 +1,6 @@
 """Record a Meta-World task with its scripted expert, made worse by noise, by LeRobot's own API alone.
 
-    pip install 'lerobot[metaworld]'
+    pip install 'lerobot[metaworld]' 'mujoco<3.17'
     MUJOCO_GL=egl python examples/record_metaworld.py --task=push-v3 --root=outputs/metaworld
 
 The expert's skill is drawn for each episode: the noise on its actions (`--noise`). LeRobot's environment ends
