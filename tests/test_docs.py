@@ -93,7 +93,7 @@ def test_the_readme_says_what_was_measured() -> None:
     assert "after distillation of the planner PPO's policy has {}/{}".format(*distilled) in text
     policies = json.loads((results / "demo.json").read_text())["runs"][0]["policies"].values()
     unseen, known = (
-        "{}, {} and {} %".format(*(round(100 * policy[where]["share"]) for policy in policies))
+        "{}, {}, {} and {} %".format(*(round(100 * policy[where]["share"]) for policy in policies))
         for where in ("unseen", "known")
     )
     assert f"{unseen} in unseen scenes, {known} in known ones" in text

@@ -72,6 +72,10 @@ class RecordConfig(RunConfig):
     with which the recording can then be merged. Its columns, their names and the range of the actions are
     taken from it. Without it, columns are LeRobot's, and actions have numbers for names."""
 
+    like_columns: bool = True
+    """Take the columns of `like`. False takes names and the range of the actions alone, where the dataset has
+    columns that the environment does not show."""
+
     depth: bool = False
     """Also record every camera's depth, as LeRobot's depth maps (observation.images.<camera>_depth)."""
 
@@ -275,7 +279,8 @@ class RecordConfig(RunConfig):
         if isinstance(self.env, WorldModelEnv):
             return imagined_content(self.env)
         if self.elsewhere:
-            return {"env": draccus.encode(self.env, EnvConfig), "like": asdict(self.like)}
+            columns = {} if self.like_columns else {"like_columns": False}
+            return {"env": draccus.encode(self.env, EnvConfig), "like": asdict(self.like), **columns}
         return self._simulated_content()
 
     def _policy_content(self) -> dict[str, Any]:

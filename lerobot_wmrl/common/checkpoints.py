@@ -43,6 +43,11 @@ def resolve_checkpoint(path: str | Path) -> Path:
     return root
 
 
+def last_checkpoint(folder: Path) -> Path:
+    """Return the model of the last checkpoint of a training command that writes to `folder`."""
+    return folder / LAST_CHECKPOINT / PRETRAINED_MODEL_DIR
+
+
 def write_checkpoint(output_dir: Path, total_steps: int, step: int, write: Callable[[Path], None]) -> Path:
     """Let `write` fill a temporary folder, then move it to `checkpoints/<step>` and point `last` at it."""
     target = checkpoint_dir(output_dir, step, total_steps)

@@ -115,6 +115,15 @@ def require_single_observations(config: PreTrainedConfig) -> None:
         )  # fmt: skip
 
 
+def require_chunks(config: PreTrainedConfig) -> None:
+    """Raise FieldError for an ACT policy whose actions are averages of several chunks."""
+    if config.temporal_ensemble_coeff is not None:
+        raise FieldError(
+            "policy.temporal_ensemble_coeff", config.temporal_ensemble_coeff,
+            "averaged chunks have no log-probability", "set `policy.temporal_ensemble_coeff` to null",
+        )  # fmt: skip
+
+
 def fit_to_environment(
     config: PreTrainedConfig, shown: Mapping[str, tuple[int, ...]], action_size: int
 ) -> None:

@@ -21,12 +21,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NoReturn
 
 import huggingface_hub.constants
 import psutil
 
-from lerobot_wmrl.common.command_line import different_settings
+from lerobot_wmrl.common.command_line import RunConfig, different_settings, run_command
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.files import foreign_files, write_json
 from lerobot_wmrl.common.precision import keep_freed_memory
@@ -58,6 +58,26 @@ class Stage:
 
 class StageError(RuntimeError):
     """A stage's command failed; the message names the stage, its log, and how to go on."""
+
+
+def interrupt(signal_number: int, frame: object) -> NoReturn:
+    """Let `kill` end a command as Ctrl-C does: with its stage, and with a word on how to go on."""
+    raise KeyboardInterrupt
+
+
+def run_stage_command[Config: RunConfig](
+    function: Callable[[Config], None],
+    config_class: type[Config],
+    expand: Callable[[Sequence[str]], list[str]],
+) -> None:
+    """Run a console command that is made of stages, as `run_command` runs the others."""
+    signal.signal(signal.SIGTERM, interrupt)
+    try:
+        run_command(function, config_class, expand)
+    except StageError as error:
+        sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        sys.exit("\nstopped: run the same command again to continue where it stopped")
 
 
 @contextmanager

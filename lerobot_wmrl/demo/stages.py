@@ -8,7 +8,7 @@ from pathlib import Path
 
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 
-from lerobot_wmrl.common.checkpoints import LAST_CHECKPOINT, latest_checkpoint
+from lerobot_wmrl.common.checkpoints import LAST_CHECKPOINT, last_checkpoint, latest_checkpoint
 from lerobot_wmrl.common.command_line import RunConfig
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import FieldError, require_at_least
@@ -140,11 +140,6 @@ def checks(config: DemoConfig, policy: str) -> list[Stage]:
     ]
 
 
-def checkpoint(folder: Path) -> Path:
-    """Return the latest checkpoint of a training command that wrote to `folder`."""
-    return folder / LAST_CHECKPOINT / PRETRAINED_MODEL_DIR
-
-
 def first_seed(config: DemoConfig) -> int:
     return config.seed * SEED_STRIDE
 
@@ -224,7 +219,7 @@ def record_checked(config: DemoConfig, policy: str) -> list[str]:
 
 def record_policy(config: DemoConfig, policy: str, name: str, episodes: int, seed: int) -> list[str]:
     flags: Flags = {
-        "policy.path": str(checkpoint(config.output_dir / policy)),
+        "policy.path": str(last_checkpoint(config.output_dir / policy)),
         "env.type": "wmrl_maniskill",
         "num_episodes": episodes,
         "video": False,
@@ -253,7 +248,7 @@ def train_model(config: DemoConfig, model: str) -> list[str]:
     out = config.output_dir
     flags: dict[str, str | int] = {"model.type": model, "dataset.root": str(out / "dataset")}
     if model != "frame_tokenizer":
-        flags["model.tokenizer_path"] = str(checkpoint(out / "frame_tokenizer"))
+        flags["model.tokenizer_path"] = str(last_checkpoint(out / "frame_tokenizer"))
     flags |= {"output_dir": str(out / model), "seed": first_seed(config)}
     return preset_command(config, "lerobot-wmrl-train-world-model", flags)
 
@@ -264,7 +259,7 @@ def imagination(config: DemoConfig) -> Flags:
     out = config.output_dir
     return {
         "env.type": "world_model",
-        "env.world_model_path": str(checkpoint(out / "action_world_model")),
+        "env.world_model_path": str(last_checkpoint(out / "action_world_model")),
         "env.dataset.root": str(out / "dataset"),
         "env.reward.type": "general",
         "env.reward.alpha": 1,
@@ -272,10 +267,10 @@ def imagination(config: DemoConfig) -> Flags:
 
 
 def reinforce(config: DemoConfig) -> list[str]:
-    """Train whatever the gate says of the policy's rollouts; the report shows its warning."""
+    """Train even if the gate fails on the policy's rollouts; the report shows its warning."""
     out = config.output_dir
     flags: Flags = {
-        "policy.path": str(checkpoint(out / "filtered")),
+        "policy.path": str(last_checkpoint(out / "filtered")),
         **imagination(config),
         "gate.dataset.root": str(out / "checked_filtered"),
         "algorithm.type": "ppo",
@@ -289,7 +284,7 @@ def reinforce(config: DemoConfig) -> list[str]:
 def distil(config: DemoConfig) -> list[str]:
     """Fit PPO's policy to a planner that searches from what it does, by labels from imagination alone."""
     flags: Flags = {
-        "policy.path": str(checkpoint(config.output_dir / "rl")),
+        "policy.path": str(last_checkpoint(config.output_dir / "rl")),
         **imagination(config),
         "gate.action": "off",
         "algorithm.type": "distillation",
@@ -315,7 +310,7 @@ def imagine(config: DemoConfig, policy: str) -> list[str]:
 def success_rate(config: DemoConfig, policy: str, env: Flags, preset: str, folder: str) -> list[str]:
     """Return LeRobot's own evaluation command."""
     flags: Flags = {
-        "policy.path": str(checkpoint(config.output_dir / policy)),
+        "policy.path": str(last_checkpoint(config.output_dir / policy)),
         **env,
         "eval.n_episodes": config.eval_episodes,
         "seed": EVALUATION_SEED,
@@ -328,8 +323,8 @@ def replay(config: DemoConfig, dataset: str, name: str) -> list[str]:
     """Replay recorded episodes in the world model; of the training data, those held out."""
     out = config.output_dir
     flags: Flags = {
-        "model.path": str(checkpoint(out / "action_world_model")),
-        "text_model.path": str(checkpoint(out / "text_world_model")),
+        "model.path": str(last_checkpoint(out / "action_world_model")),
+        "text_model.path": str(last_checkpoint(out / "text_world_model")),
         "dataset.root": str(out / dataset),
         "split": "validation" if dataset == "dataset" else "all",
         "output_dir": str(out / f"replay_{name}"),

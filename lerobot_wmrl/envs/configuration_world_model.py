@@ -20,7 +20,7 @@ from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 
 @dataclass
 class StartFrames(ChosenEpisodes):
-    """Where imagined episodes begin: in the first frames of a dataset's episodes (`root` or `repo_id`), in
+    """Where imagined episodes begin: in a dataset's episodes (`root` or `repo_id`), in their first frames, in
     saved frames (`frames`) or in ManiSkill's resets (`resets`).
 
     Args:

@@ -9,6 +9,8 @@ import torch
 from lerobot.utils.constants import OBS_IMAGE, OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
+from lerobot_wmrl.common.images import to_bytes
+
 Observation = dict[str, Any]
 
 
@@ -116,7 +118,7 @@ def images_to_numpy(observation: Observation) -> dict[str, np.ndarray]:
     """
     prefix = f"{OBS_IMAGES}."
     return {
-        key.removeprefix(prefix): (value.permute(0, 2, 3, 1) * 255).round().byte().cpu().numpy()
+        key.removeprefix(prefix): to_bytes(value).permute(0, 2, 3, 1).cpu().numpy()
         for key, value in observation.items()
         if key.startswith(OBS_IMAGE)
     }

@@ -13,6 +13,9 @@ from lerobot_wmrl.common.policies import check_fit
 from lerobot_wmrl.data.embodiment import component_names
 from lerobot_wmrl.data.episodes import DONE, EpisodeTable, camera_names, frame_size, success_column
 
+FEW_DECISIONS = 5
+"""Decisions an imagined episode below which RL has little to choose."""
+
 FEW_FAILURES = 10
 """Failed episodes below which a world model hardly learns what failure looks like."""
 
@@ -26,10 +29,13 @@ class Findings:
         missing: what it lacks, and what that costs.
         cameras: names of the cameras that the policy looks at.
         frame_side: the shorter side of their frames in pixels.
+        pixels: of all these cameras' frames.
         episodes: how many there are.
         held_out: how many of them are held out from training.
         fewest: how many there are of the task that has the fewest.
         longest: frames of the longest episode.
+        usual: frames of an episode than which nine of ten are shorter.
+        success_frames: frames of all successful episodes.
         held: frames in which success holds in a successful episode, the median.
     """
 
@@ -37,10 +43,13 @@ class Findings:
     missing: list[str]
     cameras: list[str]
     frame_side: int
+    pixels: int
     episodes: int
     held_out: int
     fewest: int
     longest: int
+    usual: int
+    success_frames: int
     held: int
 
     def __str__(self) -> str:
@@ -84,9 +93,12 @@ def look(table: EpisodeTable, policy: PreTrainedConfig, episodes: Sequence[int] 
     tasks = np.unique(table.column(START_TASK), return_counts=True)[1]
     done = [table.done[a : a + n].sum() for a, n in zip(table.start, table.length, strict=True)]
     return Findings(
-        lines=lines, missing=missing(table), cameras=camera_names(keys),
-        frame_side=min(map(min, sizes.values())), episodes=len(success),
+        lines=lines, missing=[*missing(table), *coarse(policy, table)], cameras=camera_names(keys),
+        frame_side=min(map(min, sizes.values())), pixels=sum(h * w for h, w in sizes.values()),
+        episodes=len(success),
         held_out=held_out, fewest=int(tasks.min()), longest=int(table.length.max()),
+        usual=int(np.quantile(table.length, 0.9, method="inverted_cdf")),
+        success_frames=int(table.length[success].sum()),
         held=int(np.median(np.array(done)[success])),
     )  # fmt: skip
 
@@ -95,7 +107,10 @@ def missing(table: EpisodeTable) -> list[str]:
     """Return what a dataset lacks, and what that costs."""
     failures, found = int((~table.success).sum()), []
     if success_column(table.dataset.features) == DONE:
-        found.append("next.done is taken for success: there is no next.success (lerobot-wmrl-label adds it)")
+        found.append(
+            "next.done is taken for success: there is no next.success (lerobot-wmrl-label adds it)"
+            + ("" if failures else ". It is in every episode: label those that failed")
+        )
     if failures < FEW_FAILURES:
         found.append(
             f"failures: {failures}. The world model will hardly tell them from successes, and the policy "
@@ -103,3 +118,14 @@ def missing(table: EpisodeTable) -> list[str]:
             "--real_env), and leave the failures in"
         )
     return found
+
+
+def coarse(policy: PreTrainedConfig, table: EpisodeTable) -> list[str]:
+    """Say so if a policy of chunks decides only a few times an episode."""
+    steps, usual = getattr(policy, "n_action_steps", 1), int(np.median(table.length))
+    if steps == 1 or usual >= FEW_DECISIONS * steps:
+        return []
+    return [
+        f"decisions: {policy.type} takes {steps} actions at a time, and half of the episodes have at most "
+        f"{usual} frames. RL has little to choose: set `n_action_steps` lower in the policy's config.json"
+    ]

@@ -1,27 +1,34 @@
 """The stages of an improvement: which command each one runs, as a user would type it."""
 
+import json
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import ClassVar, Final
+from typing import Any, ClassVar, Final
 
 import torch
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_wmrl.common.checkpoints import LAST_CHECKPOINT
+from lerobot_wmrl.common.checkpoints import last_checkpoint
 from lerobot_wmrl.common.command_line import RunConfig
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
-from lerobot_wmrl.common.policies import read_policy_config, require_single_observations, require_trained
-from lerobot_wmrl.common.presets import Flags, format_flags
+from lerobot_wmrl.common.policies import (
+    read_policy_config,
+    require_chunks,
+    require_single_observations,
+    require_trained,
+)
+from lerobot_wmrl.common.presets import Flags, format_flags, preset_settings
 from lerobot_wmrl.common.stages import Stage
 from lerobot_wmrl.data.episodes import ChosenEpisodes, DatasetSource
 from lerobot_wmrl.improve.findings import Findings
+from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.recorders import env_flags
 
 SIZES: Final = ("auto", "tiny", "demo", "cpu")
-"""Presets of the stages; `auto` is `demo` on a processor and `cpu` with an accelerator."""
+"""Presets of the stages; `auto` is `cpu` with CUDA and `demo` without."""
 
 DURATIONS: Final = {
     "tiny": "about a minute on two cores", "demo": "about an hour on two cores",
@@ -32,8 +39,20 @@ DURATIONS: Final = {
 SIDES: Final = {"tiny": 32, "demo": 64, "cpu": 128}
 """Pixels a side of imagined frames at each size, unless the dataset's are smaller."""
 
-SIDE_STEP: Final = 16
-"""A side is a multiple of this, a token's side at any of the sizes."""
+SIDE_STEP: Final = 32
+"""A side is a multiple of this: at any of the sizes, the transformer's patches divide the token grid."""
+
+ROLLOUT_BYTES: Final = 2**31
+"""Bytes of frames, in the policy's size, that an iteration in imagination keeps at most."""
+
+KEPT_ITERATIONS: Final = 6
+"""Iterations of distillation, whose labels are all kept."""
+
+CHANNELS: Final = 3
+"""Of a frame, a byte each."""
+
+PASS_PIXELS: Final = 2**23
+"""Pixels of observations in one forward and backward pass of PPO at most."""
 
 ALGORITHMS: Final[dict[str, Flags]] = {
     "cnn": {"algorithm.type": "ppo", "algorithm.train_encoder": False},
@@ -44,6 +63,9 @@ ALGORITHMS: Final[dict[str, Flags]] = {
 
 OTHERS: Final[Flags] = {"algorithm.type": "distillation"}
 """How all others are: they are fitted to a planner in the world model."""
+
+MINIBATCH: Final = PPOConfig.minibatch_size
+"""Decisions in an optimizer step of PPO."""
 
 LONGEST_IMAGINATION: Final = 98
 """Frames of an imagined episode at most. Where recorded episodes are longer, imagination also begins in their
@@ -74,7 +96,7 @@ class ImproveConfig(RunConfig):
         rollouts: rollouts of the policy that are recorded in `real_env` first, and learnt from.
         exploration: noise on the actions of these rollouts, as a share of half their range.
         size: how large models are and how long they train: `demo` (an hour on two cores), `cpu` (several),
-            `tiny` (seconds, to try the command), or `auto`.
+            `tiny` (a minute, to try the command), or `auto`.
         iterations: of RL; by default those of the size.
         eval_episodes: starts on which both policies are compared.
         seed: of recording and training. Evaluation has seeds of its own, from 1,000,000 on.
@@ -98,12 +120,20 @@ class ImproveConfig(RunConfig):
         """Read the policy's configuration. FieldError for a setting that cannot be."""
         path = parser.get_path_arg("policy")
         if path:
-            self.policy = read_policy_config(path, parser.get_cli_overrides("policy") or [])
+            for flag in parser.get_cli_overrides("policy") or []:
+                name, _, value = flag.removeprefix("--").partition("=")
+                raise FieldError(
+                    f"policy.{name}", value, "would hold for some of the commands only",
+                    "set it in the policy's config.json",
+                )  # fmt: skip
+            self.policy = read_policy_config(path, [])
         if self.policy is None:
             raise FieldError("policy.path", None, "is missing", "give the policy to improve")
         require_trained(self.policy)
         if self.policy.type not in ALGORITHMS:
             require_single_observations(self.policy)
+        if self.policy.type == "act":
+            require_chunks(self.policy)
         if not self.dataset.given:
             raise FieldError("dataset.root", "", "is missing", "give `dataset.root` or `dataset.repo_id`")
         require_choice(self, "size", SIZES)
@@ -136,7 +166,7 @@ class Improvement:
             "rollouts": "Record rollouts of the policy",
             "tokenizer": "Train the frame tokenizer",
             "world_model": "Train the world model",
-            "check": "Check the world model on held-out episodes",
+            "check": f"Check the world model on {'held-out' if self.holds_out else 'the'} episodes",
             "rl": "Train the policy in imagination",
             "comparison": "Compare the policy before and after",
         }
@@ -164,7 +194,12 @@ class Improvement:
     @property
     def improved(self) -> Path:
         """Folder of the improved policy's checkpoint."""
-        return self.out / "rl" / LAST_CHECKPOINT / "pretrained_model"
+        return last_checkpoint(self.out / "rl")
+
+    @property
+    def branches(self) -> int:
+        """Frames beyond the first from which imagination of a recorded episode begins."""
+        return (self.found.usual - 1) // self.length
 
     @property
     def holds_out(self) -> bool:
@@ -185,9 +220,18 @@ class Improvement:
         more = f"[{self.out / 'rollouts'}]" if self.config.rollouts else None
         return self.config.dataset.flags() | ({"dataset.more": more} if more else {})
 
-    def _done(self, prefix: str = "") -> Flags:
-        held = min(DONE_FRAMES, max(1, self.found.held))
-        return {f"{prefix}done_threshold": DONE_THRESHOLD, f"{prefix}done_frames": held}
+    def _done(self) -> Flags:
+        return {"done_threshold": DONE_THRESHOLD, "done_frames": min(DONE_FRAMES, max(1, self.found.held))}
+
+    def _recognised(self) -> Flags:
+        """Return where imagination sees success: where no recorded one is recognised at the strict threshold,
+        at the operating point that the check found."""
+        metrics = self.out / "check" / "metrics.json"
+        found: dict[str, Any] = (
+            json.loads(metrics.read_text()) if metrics.is_file() else {"true_positives": 1}
+        )
+        point = None if found["true_positives"] else found["operating_point"]
+        return {name: point[name] for name in ("done_threshold", "done_frames")} if point else self._done()
 
     def _real_env(self, prefix: str) -> Flags:
         assert self.config.real_env is not None
@@ -198,9 +242,9 @@ class Improvement:
         return {
             "env.type": "world_model", "env.world_model_path": str(self.out / "world_model"),
             **{f"env.{name}": value for name, value in self.config.dataset.flags().items()},
-            "env.dataset.max_starts": 1024, "env.dataset.branches": (self.found.longest - 1) // self.length,
+            "env.dataset.max_starts": 1024, "env.dataset.branches": self.branches,
             "env.reward.type": "general", "env.reward.alpha": 1, "env.episode_length": self.length,
-            **self._done("env."),
+            **{f"env.{name}": value for name, value in self._recognised().items()},
         }  # fmt: skip
 
     def _command(self, program: str, flags: Flags) -> list[str]:
@@ -211,7 +255,8 @@ class Improvement:
         like = {name.replace("dataset.", "like."): each for name, each in whole.items()}
         simulator = self.config.real_env is not None and self.config.real_env.type == "wmrl_maniskill"
         flags: Flags = {
-            "policy.path": self.policy, **self._real_env("env"), **({} if simulator else like),
+            "policy.path": self.policy, **self._real_env("env"),
+            **({} if simulator else {**like, "like_columns": False}),
             "video": False, "num_episodes": self.config.rollouts, "exploration": self.config.exploration,
             "seed": self.config.seed, "output_dir": str(self.out / "rollouts"),
         }  # fmt: skip
@@ -250,19 +295,37 @@ class Improvement:
             "policy.path": self.policy, **self._imagination(), **real,
             "gate.action": "warn" if real else "off", "gate.freq": 0,
             "gate.n_episodes": min(50, self.config.eval_episodes),
-            **ALGORITHMS.get(self.config.policy.type, OTHERS), "seed": self.config.seed,
+            **ALGORITHMS.get(self.config.policy.type, OTHERS), **self._memory(), "seed": self.config.seed,
             "output_dir": str(self.out / "rl"),
         }  # fmt: skip
         if self.config.iterations is not None:
             flags["iterations"] = self.config.iterations
         return self._command("lerobot-wmrl-train", flags)
 
+    def _memory(self) -> Flags:
+        """Return what keeps the frames that a policy sees in memory, where they are large."""
+        assert self.config.policy is not None
+        algorithm = ALGORITHMS.get(self.config.policy.type, OTHERS)["algorithm.type"]
+        distils, pixels = algorithm == "distillation", self.found.pixels
+        wanted = preset_settings(self.config.preset, "train", [str(algorithm)])["num_envs"]
+        kept = KEPT_ITERATIONS if distils else 1
+        flags: dict[str, bool | int] = {}
+        if (fits := max(1, ROLLOUT_BYTES // (kept * self.length * pixels * CHANNELS))) < wanted:
+            flags["num_envs"] = fits
+        if distils and self.found.success_frames * pixels * CHANNELS > ROLLOUT_BYTES:
+            flags["algorithm.recorded"] = False
+        if not distils and (fits := max(1, PASS_PIXELS // pixels)) < MINIBATCH:
+            flags["algorithm.micro_batch_size"] = fits
+        return flags
+
     def _comparison(self) -> list[str]:
         imagined = self.config.real_env is None
         env = self._imagination() if imagined else self._real_env("env")
         starts = self.config.eval_episodes
         if imagined:  # each start of each task once
-            starts = min(starts, self.found.fewest)
+            starts = min(starts, self.found.fewest * (1 + self.branches))
+        if imagined and self.branches:  # those from the middle of episodes too
+            env = {**env, "env.dataset.max_starts": starts}
         flags: Flags = {
             "policies": f"[{self.policy},{self.improved}]", **env, "n_episodes": starts,
             "batch_size": min(16 if imagined else 1, starts), "stop_early": False, "seed": EVALUATION_SEED,

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from lerobot.rl.algorithms.base import RLAlgorithm
 from lerobot.rl.algorithms.configs import TrainingStats
+from lerobot.utils.constants import OBS_STR
 from torch import Tensor, nn
 from torch.optim import Optimizer
 from tqdm import tqdm
@@ -192,7 +193,10 @@ class Distillation(RLAlgorithm):
     def batches(self, updates: int, pipeline: Pipeline) -> Iterator[dict[str, Any]]:
         """Draw that many batches of labels."""
         for _ in tqdm(range(updates), "update", leave=False, unit="step", disable=hidden_progress()):
-            yield pipeline.prepare(self.labels.draw(self.config.batch_size))
+            drawn = self.labels.draw(self.config.batch_size)
+            if self.lerobot_policy.config.observation_delta_indices is not None:  # as a dataset gives it
+                drawn |= {name: drawn[name][:, None] for name in drawn if name.startswith(OBS_STR)}
+            yield pipeline.prepare(drawn)
 
     def update(self, batch_iterator: Iterator[dict[str, Any]]) -> TrainingStats:
         """Take one optimizer step on each batch.

@@ -1,6 +1,6 @@
 """Dyna rounds (Sutton 1991): train the world model further on what the policy does by then.
 
-A round records the policy in ManiSkill, with and without noise, or takes a dataset recorded elsewhere. It
+A round records the policy in `real_env`, with and without noise, or takes a dataset recorded elsewhere. It
 then trains the world model on that and on its first dataset. Recording and training run as commands of this
 package, so a round that was killed continues where it was.
 """

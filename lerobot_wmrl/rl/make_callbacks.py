@@ -59,7 +59,9 @@ def make_recorder(settings: CallbackSettings, env: WorldModelVectorEnv) -> Recor
     if simulator is None:
         return None
     if not isinstance(simulator, WmrlManiSkillEnv):
-        return EnvRecorder(simulator, model.embodiment, env.device.type, settings.budget)
+        return EnvRecorder(
+            simulator, model.embodiment, env.device.type, settings.real_num_envs, settings.budget
+        )
     cameras = list(dict.fromkeys([*simulator.cameras, *model.tokenizer.cameras]))
     return ManiSkillRecorder(simulator, settings.real_num_envs, cameras, model.depth, settings.budget)
 

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.distributions import Normal
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.policies import unwrapped
+from lerobot_wmrl.common.policies import require_chunks, unwrapped
 from lerobot_wmrl.rl.protocol import Observation, Pipeline, StochasticPolicy
 
 ACTION_IS_PAD = f"{ACTION}_is_pad"
@@ -46,11 +46,7 @@ class ActAdapter(nn.Module):
     def __init__(self, policy: Any) -> None:
         super().__init__()
         config = policy.config
-        if config.temporal_ensemble_coeff is not None:
-            raise FieldError(
-                "policy.temporal_ensemble_coeff", config.temporal_ensemble_coeff,
-                "averaged chunks have no log-probability", "set `policy.temporal_ensemble_coeff` to null",
-            )  # fmt: skip
+        require_chunks(config)
         self.policy, self.config = policy, config
         width, actions = config.dim_model, config.action_feature.shape[0]
         device = next(policy.parameters()).device

@@ -45,7 +45,7 @@ class Recorder(Protocol):
     def record(
         self, checkpoint: Path, episodes: int, seed: int, folder: Path, exploration: float = 0.0
     ) -> None:
-        """Record a dataset in `folder`, or complete it after a kill. Episode i starts from `seed` + i.
+        """Record a dataset in `folder`, unless it is there. Episode i starts from `seed` + i.
 
         Args:
             checkpoint: of the policy.
@@ -94,12 +94,14 @@ class EnvRecorder:
         env: the environment; if it has several tasks, they take turns.
         robot: names and range of the actions, and names of the state, as the world model has them.
         device: of the policy.
+        num_envs: episodes at once.
         budget: ledger in which the episodes are entered; None without.
     """
 
     env: EnvConfig
     robot: Embodiment
     device: str
+    num_envs: int = 1
     budget: Path | None = None
 
     def record(
@@ -111,7 +113,9 @@ class EnvRecorder:
                 ledger.require_left({spending(POLICY): episodes})
             path = str(checkpoint / PRETRAINED_MODEL_DIR)
             policy = read_policy_config(path, [f"--device={self.device}"])
-            rollouts = RolloutRecorder(self.env, policy, self.robot, exploration)
+            rollouts = RolloutRecorder(
+                self.env, policy, self.robot, exploration, num_envs=min(self.num_envs, episodes)
+            )
             with trange(episodes, desc="Recording rollouts", unit="episode") as bar, closing(rollouts):
                 rollouts.record(folder, range(seed, seed + episodes), lambda success: bar.update())
         if ledger is not None:
@@ -127,16 +131,18 @@ class RolloutRecorder:
         robot: names and range of the actions, and names of the state; None for what `like` or the
             environment says.
         exploration: largest noise on the actions, as a share of half their range.
-        like: metadata of a dataset with which the new one is to be merged, from which its columns are taken.
+        like: metadata of a dataset of the same robot.
+        like_columns: take its columns too, so that the new one can be merged with it.
         num_envs: episodes at once.
         video: store the cameras as videos; without `like`, which decides it.
     """
 
     def __init__(
         self, env: EnvConfig, policy: PreTrainedConfig, robot: Embodiment | None, exploration: float = 0.0,
-        like: Any | None = None, num_envs: int = 1, video: bool = False,
+        like: Any | None = None, num_envs: int = 1, video: bool = False, like_columns: bool = True,
     ) -> None:  # fmt: skip
-        self.config, self.exploration, self.like, self.video = env, exploration, like, video
+        self.config, self.exploration, self.video = env, exploration, video
+        self.columns = like.features if like is not None and like_columns else None
         self.hold = env.done_frames if isinstance(env, WorldModelEnv) else 1
         self.policy, self.processors = load_policy(policy).eval(), load_processors(policy)
         self.env_processors = make_env_pre_post_processors(env, policy)
@@ -157,9 +163,10 @@ class RolloutRecorder:
         dataset = None
         size = self.envs[0].num_envs
         with whole_folder(folder) as partial:
-            for number, first in enumerate(range(0, len(seeds), size)):
+            for first in range(0, len(seeds), size):
                 chosen = seeds[first : first + size]
-                seen, taken = self._roll_out(self.envs[number % len(self.envs)], chosen)
+                turn = chosen[0] // size % len(self.envs)
+                seen, taken = self._roll_out(self.envs[turn], chosen)
                 dataset = dataset or self._create(partial, seen.observations[0])
                 for row, seed in enumerate(chosen):
                     report(self._add_episode(dataset, seen, taken, row, seed))
@@ -186,7 +193,7 @@ class RolloutRecorder:
             **episode_features(observation, self.robot, "video" if self.video else "image"),
             START_SEED: whole, START_KIND: whole,
         }  # fmt: skip
-        features = own if self.like is None else matched(own, self.like.features)
+        features = own if self.columns is None else matched(own, self.columns)
         return LeRobotDataset.create(
             f"local/{folder.name.strip('.')}", self.config.fps, features, root=folder,
             use_videos=any(feature["dtype"] == "video" for feature in features.values()),
@@ -203,6 +210,7 @@ class RolloutRecorder:
         """Add the episode of one environment of a rollout. Return whether it succeeds."""
         length = int(taken["done"][row].int().argmax()) + 1
         success = bool(taken["success"][row, length - 1])
+        labelled = "next.success" in dataset.features  # else next.done is taken for it
         for step in range(length):
             observation = seen.observations[step]
             frame: dict[str, Any] = observation_row(observation, row)
@@ -210,7 +218,8 @@ class RolloutRecorder:
             frame |= {
                 ACTION: seen.actions[step][row],
                 "next.reward": np.array([float(taken["reward"][row, step])], np.float32),
-                "next.success": np.array([solved]), "next.done": np.array([step == length - 1]),
+                "next.success": np.array([solved]),
+                "next.done": np.array([step == length - 1 if labelled else solved]),
                 START_SEED: np.array([seed]), START_KIND: np.array([KINDS.index(POLICY)]),
             }  # fmt: skip
             kept = {key: value for key, value in frame.items() if key in dataset.features}
@@ -276,7 +285,8 @@ def matched(own: Mapping[str, Any], columns: Mapping[str, Any]) -> dict[str, Any
         if found != tuple(feature["shape"]):
             raise FieldError(
                 "like.root", name, f"the dataset has it with shape {tuple(feature['shape'])}, a rollout has "
-                f"{found or 'none'}", "leave `like` out, and give the recording as `dataset.more`",
+                f"{found or 'none'}",
+                "give `like_columns=false`, and the recording as `dataset.more` to what learns from it",
             )  # fmt: skip
         if "info" in feature and feature["dtype"] == "video":
             feature.pop("info")  # the encoder's, which LeRobot writes

@@ -9,13 +9,9 @@ ManiSkill. Every stage is one console command, which it prints. Running the same
 interrupted demo. It ends with a summary and `report.html`.
 """
 
-import signal
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import NoReturn
 
-from lerobot_wmrl.common.command_line import run_command
 from lerobot_wmrl.common.presets import expand_preset
 from lerobot_wmrl.demo.stages import DemoConfig, demo_stages
 
@@ -40,22 +36,11 @@ def with_preset(argv: Sequence[str]) -> list[str]:
     return expand_preset(argv if given else ["--preset=demo", *argv], "demo")
 
 
-def interrupt(signal_number: int, frame: object) -> NoReturn:
-    """Let `kill` end the demo as Ctrl-C does: with its stage, and with a word on how to go on."""
-    raise KeyboardInterrupt
-
-
 def main() -> None:
     """Run the console command."""
-    from lerobot_wmrl.common.stages import StageError
+    from lerobot_wmrl.common.stages import run_stage_command
 
-    signal.signal(signal.SIGTERM, interrupt)
-    try:
-        run_command(run_demo, DemoConfig, with_preset)
-    except StageError as error:
-        sys.exit(f"error: {error}")
-    except KeyboardInterrupt:
-        sys.exit("\nstopped: run the same command again to continue where it stopped")
+    run_stage_command(run_demo, DemoConfig, with_preset)
 
 
 if __name__ == "__main__":

@@ -12,13 +12,8 @@ them too. Every stage is one console command, which it prints. Running the same 
 it stopped. It ends with a summary and `report.md`.
 """
 
-import signal
-import sys
-from typing import NoReturn
-
 import draccus
 
-from lerobot_wmrl.common.command_line import run_command
 from lerobot_wmrl.improve.stages import ImproveConfig, Improvement
 
 
@@ -45,25 +40,16 @@ def settings(cfg: ImproveConfig) -> dict[str, object]:
     """Return what decides the result, as JSON."""
     assert cfg.policy is not None
     given = {name: value for name, value in draccus.encode(cfg).items() if name != "policy"}
-    return given | {"policy": str(cfg.policy.pretrained_path), "output_dir": str(cfg.output_dir)}
-
-
-def interrupt(signal_number: int, frame: object) -> NoReturn:
-    """Let `kill` end the command as Ctrl-C does: with its stage, and with a word on how to go on."""
-    raise KeyboardInterrupt
+    return given | {
+        "policy": str(cfg.policy.pretrained_path), "size": cfg.preset, "output_dir": str(cfg.output_dir)
+    }  # fmt: skip
 
 
 def main() -> None:
     """Run the console command."""
-    from lerobot_wmrl.common.stages import StageError
+    from lerobot_wmrl.common.stages import run_stage_command
 
-    signal.signal(signal.SIGTERM, interrupt)
-    try:
-        run_command(improve, ImproveConfig, list)
-    except StageError as error:
-        sys.exit(f"error: {error}")
-    except KeyboardInterrupt:
-        sys.exit("\nstopped: run the same command again to continue where it stopped")
+    run_stage_command(improve, ImproveConfig, list)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""lerobot-wmrl-train: train a policy further by reinforcement learning, in a world model or in ManiSkill.
+"""lerobot-wmrl-train: train a policy further by reinforcement learning, in a world model or any environment.
 
     lerobot-wmrl-train --policy.path=outputs/sft --env.type=world_model --env.world_model_path=W \\
         --env.text_world_model_path=X --env.dataset.root=D --gate.dataset.root=ROLLOUTS --output_dir=rl
@@ -92,7 +92,7 @@ class TrainConfig(CallbackSettings, RunConfig):
         policy: the SFT policy to improve, `--policy.path=FOLDER`: a checkpoint, or the output folder of
             lerobot-train. PPO and GRPO train `cnn`, `act` and `openvla`; distillation trains any policy that
             lerobot-train can clone.
-        env: `--env.type=world_model` or `wmrl_maniskill`, and its settings.
+        env: `--env.type=world_model`, `wmrl_maniskill` or one of LeRobot's, and its settings.
         algorithm: `--algorithm.type=ppo`, `grpo` or `distillation`, and its settings.
         peft: `--peft.method_type=LORA --peft.r=32`, as in lerobot-train, trains new adapters and the value
             function alone. A policy that has adapters already needs none of these flags.

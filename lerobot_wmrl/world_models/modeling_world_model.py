@@ -49,7 +49,8 @@ CONDITION_TOKENS: Final = 4
 """Tokens that an action is embedded into."""
 
 MIN_SPREAD: Final = 1e-3
-"""Standard deviation below which a component is a constant, and not scaled."""
+"""Standard deviation below which a component is a constant, and not scaled: of the state in the dataset's
+units, of an action in halves of its range."""
 
 STATE_SPREAD: Final = 0.02
 """Least standard deviation by which the state is scaled, in the dataset's units. The opening of a closed
@@ -140,13 +141,18 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
         if self.config.state_size:
             self.config.state_size = features[OBS_STATE]["shape"][0] if OBS_STATE in features else 0
 
-    def _register_statistics(self, name: str, key: str, size: int, stats: Any, least: float = 0.0) -> None:
-        """Register mean and standard deviation of the feature `key`, the latter at least `least`."""
+    def _register_statistics(
+        self, name: str, key: str, size: int, stats: Any, least: float = 0.0, unit: Tensor | float = 1.0
+    ) -> None:
+        """Register mean and standard deviation of the feature `key`, the latter at least `least`.
+
+        unit: in which `MIN_SPREAD` is measured, one for all components or (size,).
+        """
         mean, std = torch.zeros(size), torch.ones(size)
         if stats is not None and size:
             mean = torch.as_tensor(stats[key]["mean"], dtype=torch.float32)
             std = torch.as_tensor(stats[key]["std"], dtype=torch.float32)
-            std = torch.where(std < MIN_SPREAD, 1.0, std).clamp_min(least)
+            std = torch.where(std <= MIN_SPREAD * unit, 1.0, std).clamp_min(least)
         self.register_buffer(f"{name}_mean", mean)
         self.register_buffer(f"{name}_std", std)
 
@@ -219,7 +225,9 @@ class ActionWorldModelRewardModel(WorldModelRewardModel):
 
     def __init__(self, config: ActionWorldModelConfig, dataset_stats: Any = None, **kwargs: Any) -> None:
         super().__init__(config, dataset_stats, **kwargs)
-        self._register_statistics("action", ACTION, config.action_size, dataset_stats)
+        low, high = map(torch.tensor, (config.embodiment.action_low, config.embodiment.action_high))
+        half = (high - low) / 2 if len(low) else 1.0
+        self._register_statistics("action", ACTION, config.action_size, dataset_stats, unit=half)
         width = config.dynamics.width
         self.embed_action = nn.Sequential(
             nn.Linear(config.action_size, width), nn.SiLU(), nn.Linear(width, CONDITION_TOKENS * width)

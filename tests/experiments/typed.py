@@ -22,6 +22,7 @@ from lerobot.scripts.lerobot_teleoperate import TeleoperateConfig
 from lerobot.utils.import_utils import register_third_party_plugins
 
 import lerobot_env_wmrl  # noqa: F401 (registers what LeRobot is to know)
+from lerobot_wmrl.common import stages
 from lerobot_wmrl.common.command_line import parse_flags, without_help_texts
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.rewards.configuration_rewards import EmbeddingConfig
@@ -99,7 +100,8 @@ def check_ours(module_name: str, flags: list[str]) -> None:
         raise Stopped
 
     with patch.object(sys, "argv", [module_name, *without_paths(flags)]):
-        with patch.object(module, "run_command", run_command), suppress(Stopped):
+        runner = module if hasattr(module, "run_command") else stages  # of commands that are made of stages
+        with patch.object(runner, "run_command", run_command), suppress(Stopped):
             module.main()
         sys.argv[1:] = said["expand"](sys.argv[1:])
         parse_flags(said["config_class"])

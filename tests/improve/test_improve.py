@@ -4,14 +4,23 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies.act.configuration_act import ACTConfig
+from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
 from lerobot.utils.constants import OBS_IMAGE
 
 from lerobot_policy_cnn.configuration_cnn import CnnConfig
-from lerobot_wmrl.data.episodes import ChosenEpisodes
-from lerobot_wmrl.improve.findings import Findings
+from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.common.presets import preset_settings
+from lerobot_wmrl.data.episodes import ChosenEpisodes, read_episodes
+from lerobot_wmrl.improve.findings import Findings, coarse
 from lerobot_wmrl.improve.stages import ImproveConfig, Improvement
+from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
+from lerobot_wmrl.world_models.configuration_world_model import AnchoredConfig
 from tests.pusht import record_pusht
 from tests.rl.checkpoints import save_untrained_policy
 
@@ -71,6 +80,7 @@ def test_without_one_the_report_says_that_it_is_a_belief(demonstrations: Path, t
 @pytest.mark.parametrize(("flags", "message"), [
     (["--rollouts=2"], "--rollouts=2: are recorded in a real environment; give --real_env.type"),
     (["--size=huge"], "--size=huge: choose one of auto, tiny, demo, cpu"),
+    (["--policy.n_action_steps=8"], "--policy.n_action_steps=8: would hold for some of the commands only"),
     (["--dataset.root=nowhere"], "no LeRobotDataset there"),
 ])  # fmt: skip
 def test_bad_settings_are_named_and_nothing_is_made(
@@ -87,12 +97,80 @@ def test_long_episodes_are_imagined_in_parts(
     longest: int, clip: int, length: int, branches: int, tmp_path: Path
 ) -> None:
     """From frames all over them, as many as it takes to cover them."""
-    policy = CnnConfig(device="cpu", pretrained_path=tmp_path)
-    found = Findings(
-        [], [], ["top"], frame_side=96, episodes=40, held_out=2, fewest=40, longest=longest, held=2
-    )
-    improvement = Improvement(ImproveConfig(policy=policy, dataset=ChosenEpisodes("data")), found)
-    commands = {stage.name: stage.command() for stage in improvement.stages()}
+    commands = made_commands(tmp_path, longest=longest, usual=longest)
     assert f"--model.clip_length={clip}" in commands["world_model"]
     for stage in ("rl", "comparison"):
         assert {f"--env.episode_length={length}", f"--env.dataset.branches={branches}"} <= {*commands[stage]}
+
+
+def test_the_comparison_meets_the_first_frames_and_the_branches_alike(tmp_path: Path) -> None:
+    """120 episodes of 300 frames: 100 starts are those of 25 episodes."""
+    comparison = made_commands(tmp_path, longest=300, usual=300, fewest=120)["comparison"]
+    assert {"--n_episodes=100", "--env.dataset.max_starts=100", "--env.dataset.branches=3"} <= {*comparison}
+
+
+def test_one_long_recording_does_not_divide_all_the_others(tmp_path: Path) -> None:
+    assert "--env.dataset.branches=3" in made_commands(tmp_path, longest=9000, usual=300)["rl"]
+
+
+@pytest.mark.parametrize("size", ["tiny", "demo", "cpu"])
+@pytest.mark.parametrize("side", [16, 48, 63, 80, 84, 96, 112, 480])
+def test_frames_of_any_size_make_a_grid_that_the_transformer_divides(
+    size: str, side: int, tmp_path: Path
+) -> None:
+    command = made_commands(tmp_path, size, frame_side=side)["tokenizer"]
+    (given,) = (flag for flag in command if flag.startswith("--model.tokenizer.image_size="))
+    settings = preset_settings(size, "train-world-model", ["frame_tokenizer"])
+    sizes = {name.rpartition(".")[2]: value for name, value in settings.items() if "tokenizer." in name}
+    tokenizer = TokenizerConfig(**{**sizes, "image_size": int(given.partition("=")[2])})
+    dynamics = preset_settings(size, "train-world-model", ["action_world_model"])
+    grid = tokenizer.image_size // tokenizer.downsample
+    assert grid % int(dynamics.get("model.dynamics.patch", AnchoredConfig.patch)) == 0
+
+
+@pytest.mark.parametrize(("kind", "pixels", "flags"), [
+    (CnnConfig, 2 * 64**2, set()),
+    (CnnConfig, 480 * 640, {"--num_envs=23", "--algorithm.micro_batch_size=27"}),
+    (VQBeTConfig, 480 * 640, {"--num_envs=3", "--algorithm.recorded=false"}),
+])  # fmt: skip
+def test_large_frames_are_trained_on_in_smaller_numbers(
+    kind: type[PreTrainedConfig], pixels: int, flags: set[str], tmp_path: Path
+) -> None:
+    """A rollout holds at most 2 GiB of frames, all labels of a distillation too, and a pass 2²³ pixels."""
+    policy = kind(device="cpu", pretrained_path=tmp_path)
+    command = made_commands(
+        tmp_path, policy=policy, pixels=pixels, longest=98, usual=98, success_frames=3000
+    )["rl"]
+    limits = ("--num_envs=", "--algorithm.micro_batch_size=", "--algorithm.recorded=")
+    assert {flag for flag in command if flag.startswith(limits)} == flags
+
+
+def test_where_the_strict_threshold_recognises_nothing_the_check_s_own_is_taken(tmp_path: Path) -> None:
+    point = {"done_threshold": 0.5, "done_frames": 1}
+    for hits, found in ((0, point), (3, None)):
+        write_json(tmp_path / "check" / "metrics.json", {"true_positives": hits, "operating_point": point})
+        wanted = found or {"done_threshold": 0.95, "done_frames": 2}
+        assert {f"--env.{name}={value}" for name, value in wanted.items()} <= {*made_commands(tmp_path)["rl"]}
+
+
+def test_a_policy_that_seldom_decides_is_named(make_synthetic_dataset: Any, tmp_path: Path) -> None:
+    """Episodes of ten frames: ACT's hundred actions are one decision."""
+    table = read_episodes(make_synthetic_dataset(tmp_path / "data", episodes=2))
+    assert "act takes 100 actions at a time" in coarse(ACTConfig(device="cpu"), table)[0]
+    few = int(np.median(table.length)) // 5
+    assert not coarse(ACTConfig(device="cpu", n_action_steps=few), table)
+    assert not coarse(CnnConfig(device="cpu"), table)
+
+
+def made_commands(
+    folder: Path, size: str = "demo", policy: PreTrainedConfig | None = None, **found: int
+) -> dict[str, list[str]]:
+    """Return the commands for data of which this was found, where nothing is said 40 short episodes."""
+    policy = policy or CnnConfig(device="cpu", pretrained_path=folder)
+    data = {
+        "frame_side": 96, "pixels": 96**2, "episodes": 40, "held_out": 2, "fewest": 40, "longest": 40,
+        "usual": 40, "success_frames": 1000, "held": 2,
+    }  # fmt: skip
+    config = ImproveConfig(policy=policy, dataset=ChosenEpisodes("data"), size=size, output_dir=folder)
+    improvement = Improvement(config, Findings([], [], ["top"], **(data | found)))
+    return {stage.name: stage.command() for stage in improvement.stages()}

@@ -1,16 +1,20 @@
 """Rollouts in an environment of LeRobot's, recorded so that they can be merged with demonstrations."""
 
+from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from lerobot.datasets.dataset_tools import remove_feature
 from lerobot.envs.configs import PushtEnv
 from lerobot.utils.constants import OBS_IMAGE
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.elsewhere import record_elsewhere
 from lerobot_dataset_maniskill.merging import merge_folders
+from lerobot_wmrl.common.constants import START_SEED
 from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.data.episodes import DatasetSource, open_dataset, read_episodes
 from lerobot_wmrl.rl.recorders import RolloutRecorder, matched
@@ -48,6 +52,46 @@ def test_they_have_the_columns_of_the_demonstrations_and_can_be_merged(
     assert len({tuple(table.state[start]) for start in table.start}) == 3
     merge_folders([demonstrations, config.root], tmp_path / "merged", "local/merged")
     assert len(read_episodes(open_dataset(tmp_path / "merged")).length) == 4
+
+
+def test_where_next_done_is_taken_for_success_it_says_success(
+    config: RecordConfig, demonstrations: Path, tmp_path: Path
+) -> None:
+    """A dataset without next.success: its next.done must not call failures successes."""
+    bare = tmp_path / "bare"
+    remove_feature(open_dataset(demonstrations), "next.success", output_dir=bare)
+    config.like = DatasetSource(str(bare))
+    record_elsewhere(config)
+    table = read_episodes(open_dataset(config.root))
+    assert "next.success" not in table.dataset.features
+    assert not table.success.any(), "none of these episodes succeeds"
+
+
+def test_names_and_range_can_be_taken_without_the_columns(config: RecordConfig, tmp_path: Path) -> None:
+    config.like_columns = False
+    record_elsewhere(config)
+    features = open_dataset(config.root).features
+    given = config.like.open().features
+    assert features["action"]["names"] == given["action"]["names"]
+    assert START_SEED in features
+    assert START_SEED not in given
+
+
+def test_tasks_take_turns_across_the_parts_of_a_recording() -> None:
+    """An environment of several tasks, as stand-ins that note what is asked of them."""
+    recorder = RolloutRecorder.__new__(RolloutRecorder)
+    recorder.envs = [SimpleNamespace(num_envs=1, name=name) for name in "abc"]
+    asked: list[str] = []
+
+    def noted(env: Any, seeds: Sequence[int]) -> None:
+        asked.append(env.name)
+        raise StopIteration
+
+    recorder._roll_out = noted  # type: ignore[method-assign, assignment]
+    for seed in range(5):  # parts of one episode each
+        with pytest.raises(StopIteration):
+            recorder.record(Path("nowhere"), [seed], lambda success: None)
+    assert asked == ["a", "b", "c", "a", "b"]
 
 
 def test_an_interrupted_recording_continues_and_a_whole_one_is_left_alone(

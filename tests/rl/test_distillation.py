@@ -8,8 +8,12 @@ from typing import Any
 
 import pytest
 import torch
+from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
+from lerobot.policies.factory import make_pre_post_processors
+from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
+from lerobot.policies.vqbet.modeling_vqbet import VQBeTPolicy
 from safetensors.torch import load_file
 from torch import Tensor
 
@@ -23,7 +27,7 @@ from lerobot_wmrl.rl.labels import Labels, Part, action_chunks, recorded_success
 from lerobot_wmrl.scripts.train import main
 from lerobot_wmrl.world_models.configuration_planner import PlannerSettings
 from lerobot_wmrl.world_models.planning import Planner
-from tests.rl.act_checkpoint import save_small_act
+from tests.rl.act_checkpoint import IMAGE, STATE, save_small_act
 from tests.rl.checkpoints import save_untrained_policy
 
 FAST = [
@@ -164,6 +168,30 @@ def test_policies_of_chunks_learn_chunks(
     train(monkeypatch, f"--policy.path={policy}", *FAST, *imagined, f"--output_dir={output_dir}")
     assert read_metrics(output_dir)[-1]["labels"] >= 3 * 4
     assert len(weights(output_dir))
+
+
+def test_policies_whose_observations_have_a_time_axis_get_one(
+    imagined: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """LeRobot's VQ-BeT learns from observations (B, 1, …), even of one frame."""
+    features = {IMAGE: (FeatureType.VISUAL, (3, 32, 32)), STATE: (FeatureType.STATE, (8,))}
+    config = VQBeTConfig(
+        device="cpu", n_obs_steps=1, pretrained_backbone_weights=None, crop_shape=None, use_group_norm=True,
+        spatial_softmax_num_keypoints=4, vqvae_embedding_dim=8, vqvae_enc_hidden_dim=8, gpt_input_dim=16,
+        gpt_output_dim=16, gpt_hidden_dim=16, gpt_n_layer=1, gpt_n_head=2,
+        input_features={key: PolicyFeature(*each) for key, each in features.items()},
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (7,))},
+    )  # fmt: skip
+    policy, output_dir = tmp_path / "vqbet", tmp_path / "rl"
+    VQBeTPolicy(config).save_pretrained(policy)
+    stats = {key: {"min": torch.full(size, -1.0), "max": torch.ones(size)} for key, size in (
+        (STATE, (8,)), ("action", (7,))
+    )}  # fmt: skip
+    stats[IMAGE] = {"mean": torch.zeros(3, 1, 1), "std": torch.ones(3, 1, 1)}
+    for processor in make_pre_post_processors(config, dataset_stats=stats):
+        processor.save_pretrained(policy)
+    train(monkeypatch, f"--policy.path={policy}", *FAST, *imagined, f"--output_dir={output_dir}")
+    assert read_metrics(output_dir)[-1]["labels"] >= 3 * 4
 
 
 def test_without_a_success_there_is_nothing_to_learn_from(

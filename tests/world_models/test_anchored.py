@@ -10,6 +10,7 @@ from torch import Tensor
 
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.clips import Clip, known_transitions, take_steps
+from lerobot_wmrl.data.embodiment import Embodiment
 from lerobot_wmrl.data.frames import NO_CONTEXT, Context, Frames
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig
 from lerobot_wmrl.world_models import losses
@@ -274,3 +275,17 @@ def test_noise_of_what_hardly_varies_does_not_weigh_as_much_as_motion():
     expected = torch.tensor([0.07, STATE_SPREAD, 1.0, 0.03, 0.03, 0.03, 0.03, 0.4])
     torch.testing.assert_close(model.state_std, expected)
     torch.testing.assert_close(model.action_std, torch.full((7,), 0.01))
+
+
+def test_small_actions_are_scaled_if_their_range_is_small():
+    """Displacements in metres: what is a constant is judged by the range of the component."""
+    robot = Embodiment(action_low=[-0.002] * 6 + [0.0], action_high=[0.002] * 6 + [0.0])
+    spread = torch.tensor([7e-4] * 5 + [1e-7, 0.0])
+    model = ActionWorldModelRewardModel(
+        ActionWorldModelConfig(**nested(SIZES), embodiment=robot),
+        dataset_stats={
+            "observation.state": {"mean": torch.zeros(8), "std": torch.ones(8)},
+            "action": {"mean": torch.zeros(7), "std": spread},
+        },
+    )
+    torch.testing.assert_close(model.action_std, torch.tensor([7e-4] * 5 + [1.0, 1.0]))

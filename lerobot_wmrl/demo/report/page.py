@@ -23,7 +23,7 @@ POLICY_TITLES = {
     "cloned": "cloned from the demonstrations",
     "filtered": "cloned with successful rollouts",
     "rl": "PPO in imagination",
-    "distilled": "then fitted to a planner",
+    "distilled": "PPO, then fitted to a planner",
 }
 """What each policy learnt from, under its bars."""
 
