@@ -183,12 +183,12 @@ def undecided_frames(table: EpisodeTable, episodes: np.ndarray) -> np.ndarray:
 def branch_frames(table: EpisodeTable, episodes: np.ndarray, branches: int) -> np.ndarray:
     """Return the rows of each episode's first frame and `branches` later ones. (K,), without repetitions
 
-    They are spread evenly over the frames before its success, and before its last frame. All first frames
-    come before the later ones, so that the first N starts are of as many episodes as there are.
+    They are spread evenly over the frames before its success, and before its last frame, and follow the first
+    frame: any starts in a row are as many first frames as others.
     """
     last = np.minimum(undecided_frames(table, episodes), table.length[episodes] - 1)
     offsets = np.maximum(last, 1)[:, None] * np.arange(1 + branches) // (1 + branches)
-    rows = (table.start[episodes, None] + offsets).T.flatten()
+    rows = (table.start[episodes, None] + offsets).flatten()
     _, first = np.unique(rows, return_index=True)
     return rows[np.sort(first)]
 

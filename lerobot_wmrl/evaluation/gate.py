@@ -277,7 +277,9 @@ def best_operating_point(gates: Sequence[Gate]) -> Gate | None:
         return gate.recall.k, -gate.false_positives.k, not gate.repeats_last, gate.threshold, gate.frames
 
     allowed = [
-        gate for gate in gates if gate.false_positives.share <= MAX_FALSE_POSITIVE_RATE and gate.recall.k
+        gate
+        for gate in gates
+        if gate.recall.k and gate.false_positives.k <= MAX_FALSE_POSITIVE_RATE * gate.false_positives.n
     ]
     return max(allowed, key=merit, default=None)
 

@@ -13,6 +13,10 @@ from lerobot_wmrl.common.policies import check_fit
 from lerobot_wmrl.data.embodiment import component_names
 from lerobot_wmrl.data.episodes import DONE, EpisodeTable, camera_names, frame_size, success_column
 
+LONGEST_IMAGINATION = 98
+"""Frames of an imagined episode at most. Where recorded episodes are longer, imagination also begins in their
+middle, and no prediction looks further ahead than this."""
+
 FEW_DECISIONS = 5
 """Decisions an imagined episode below which RL has little to choose."""
 
@@ -34,7 +38,7 @@ class Findings:
         held_out: how many of them are held out from training.
         fewest: how many there are of the task that has the fewest.
         longest: frames of the longest episode.
-        usual: frames of an episode than which nine of ten are shorter.
+        usual: length that nine of ten episodes do not exceed, of the task with the longest.
         success_frames: frames of all successful episodes.
         held: frames in which success holds in a successful episode, the median.
     """
@@ -97,7 +101,10 @@ def look(table: EpisodeTable, policy: PreTrainedConfig, episodes: Sequence[int] 
         frame_side=min(map(min, sizes.values())), pixels=sum(h * w for h, w in sizes.values()),
         episodes=len(success),
         held_out=held_out, fewest=int(tasks.min()), longest=int(table.length.max()),
-        usual=int(np.quantile(table.length, 0.9, method="inverted_cdf")),
+        usual=max(
+            int(np.quantile(table.length[table.column(START_TASK) == task], 0.9, method="inverted_cdf"))
+            for task in np.unique(table.column(START_TASK))
+        ),
         success_frames=int(table.length[success].sum()),
         held=int(np.median(np.array(done)[success])),
     )  # fmt: skip
@@ -122,10 +129,11 @@ def missing(table: EpisodeTable) -> list[str]:
 
 def coarse(policy: PreTrainedConfig, table: EpisodeTable) -> list[str]:
     """Say so if a policy of chunks decides only a few times an episode."""
-    steps, usual = getattr(policy, "n_action_steps", 1), int(np.median(table.length))
+    steps = getattr(policy, "n_action_steps", 1)
+    usual = min(LONGEST_IMAGINATION, int(np.median(table.length)))
     if steps == 1 or usual >= FEW_DECISIONS * steps:
         return []
     return [
-        f"decisions: {policy.type} takes {steps} actions at a time, and half of the episodes have at most "
+        f"decisions: {policy.type} takes {steps} actions at a time, and an imagined episode has about "
         f"{usual} frames. RL has little to choose: set `n_action_steps` lower in the policy's config.json"
     ]

@@ -7,7 +7,7 @@ from typing import Any, Final
 from lerobot_wmrl.common.files import write_text
 from lerobot_wmrl.common.stages import Stage, read_record
 from lerobot_wmrl.common.statistics import Proportion
-from lerobot_wmrl.improve.stages import Improvement
+from lerobot_wmrl.improve.stages import DONE_THRESHOLD, Improvement
 
 DOUBTFUL_AUC: Final = 0.8
 """AUC of held-out successes against failures below which the world model's reward says little."""
@@ -57,7 +57,7 @@ def trust(improvement: Improvement) -> str:
     if not wins or not losses:
         return (
             f"Unknown: of the {kind} {wins} succeed and {losses} fail, and both are needed. Record more: "
-            f"every twentieth episode is held out."
+            f"every twentieth episode is held out.{taken_instead(improvement)}"
         )
     false, recall = Proportion(found["false_positives"], losses), Proportion(found["true_positives"], wins)
     said = (
@@ -66,7 +66,22 @@ def trust(improvement: Improvement) -> str:
     )
     if found["auc"] < DOUBTFUL_AUC:
         said += " That is not enough to trust its reward: record more episodes, failures above all."
-    return said
+    return said + taken_instead(improvement)
+
+
+def taken_instead(improvement: Improvement) -> str:
+    """Say where imagination saw success, if not at the strict threshold."""
+    point = improvement.relaxed()
+    if point is None:
+        return ""
+    false, recall = (
+        Proportion(point[name]["k"], point[name]["n"]) for name in ("false_positive_rate", "recall")
+    )
+    return (
+        f" No success is recognised at done_threshold={DONE_THRESHOLD}: imagination took "
+        f"done_threshold={point['done_threshold']} and done_frames={point['done_frames']}, chosen on the same "
+        f"episodes (false positives {false}, recall {recall})."
+    )
 
 
 def read(path: Path) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from lerobot_wmrl.common.policies import (
 from lerobot_wmrl.common.presets import Flags, format_flags, preset_settings
 from lerobot_wmrl.common.stages import Stage
 from lerobot_wmrl.data.episodes import ChosenEpisodes, DatasetSource
-from lerobot_wmrl.improve.findings import Findings
+from lerobot_wmrl.improve.findings import LONGEST_IMAGINATION, Findings
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.recorders import env_flags
 
@@ -43,10 +43,8 @@ SIDE_STEP: Final = 32
 """A side is a multiple of this: at any of the sizes, the transformer's patches divide the token grid."""
 
 ROLLOUT_BYTES: Final = 2**31
-"""Bytes of frames, in the policy's size, that an iteration in imagination keeps at most."""
-
-KEPT_ITERATIONS: Final = 6
-"""Iterations of distillation, whose labels are all kept."""
+"""Bytes of frames, in the policy's size, that RL keeps at most: PPO those of an iteration, distillation those
+of all iterations."""
 
 CHANNELS: Final = 3
 """Of a frame, a byte each."""
@@ -66,10 +64,6 @@ OTHERS: Final[Flags] = {"algorithm.type": "distillation"}
 
 MINIBATCH: Final = PPOConfig.minibatch_size
 """Decisions in an optimizer step of PPO."""
-
-LONGEST_IMAGINATION: Final = 98
-"""Frames of an imagined episode at most. Where recorded episodes are longer, imagination also begins in their
-middle: every part of the task is imagined, and no prediction looks further ahead than this."""
 
 DONE_FRAMES: Final = 2
 """Consecutive done frames that make an imagined success, if the data shows that many."""
@@ -223,14 +217,17 @@ class Improvement:
     def _done(self) -> Flags:
         return {"done_threshold": DONE_THRESHOLD, "done_frames": min(DONE_FRAMES, max(1, self.found.held))}
 
-    def _recognised(self) -> Flags:
-        """Return where imagination sees success: where no recorded one is recognised at the strict threshold,
-        at the operating point that the check found."""
+    def relaxed(self) -> dict[str, Any] | None:
+        """Return the operating point that the check found, if no recorded success is recognised at the strict
+        threshold: imagination sees success there instead."""
         metrics = self.out / "check" / "metrics.json"
-        found: dict[str, Any] = (
-            json.loads(metrics.read_text()) if metrics.is_file() else {"true_positives": 1}
-        )
-        point = None if found["true_positives"] else found["operating_point"]
+        if not metrics.is_file():
+            return None
+        found: dict[str, Any] = json.loads(metrics.read_text())
+        return None if found["true_positives"] else found["operating_point"]
+
+    def _recognised(self) -> Flags:
+        point = self.relaxed()
         return {name: point[name] for name in ("done_threshold", "done_frames")} if point else self._done()
 
     def _real_env(self, prefix: str) -> Flags:
@@ -307,10 +304,10 @@ class Improvement:
         assert self.config.policy is not None
         algorithm = ALGORITHMS.get(self.config.policy.type, OTHERS)["algorithm.type"]
         distils, pixels = algorithm == "distillation", self.found.pixels
-        wanted = preset_settings(self.config.preset, "train", [str(algorithm)])["num_envs"]
-        kept = KEPT_ITERATIONS if distils else 1
+        preset = preset_settings(self.config.preset, "train", [str(algorithm)])
+        kept = self.config.iterations or preset["iterations"] if distils else 1
         flags: dict[str, bool | int] = {}
-        if (fits := max(1, ROLLOUT_BYTES // (kept * self.length * pixels * CHANNELS))) < wanted:
+        if (fits := max(1, ROLLOUT_BYTES // (kept * self.length * pixels * CHANNELS))) < preset["num_envs"]:
             flags["num_envs"] = fits
         if distils and self.found.success_frames * pixels * CHANNELS > ROLLOUT_BYTES:
             flags["algorithm.recorded"] = False
@@ -324,8 +321,6 @@ class Improvement:
         starts = self.config.eval_episodes
         if imagined:  # each start of each task once
             starts = min(starts, self.found.fewest * (1 + self.branches))
-        if imagined and self.branches:  # those from the middle of episodes too
-            env = {**env, "env.dataset.max_starts": starts}
         flags: Flags = {
             "policies": f"[{self.policy},{self.improved}]", **env, "n_episodes": starts,
             "batch_size": min(16 if imagined else 1, starts), "stop_early": False, "seed": EVALUATION_SEED,

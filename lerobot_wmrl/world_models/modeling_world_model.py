@@ -49,8 +49,8 @@ CONDITION_TOKENS: Final = 4
 """Tokens that an action is embedded into."""
 
 MIN_SPREAD: Final = 1e-3
-"""Standard deviation below which a component is a constant, and not scaled: of the state in the dataset's
-units, of an action in halves of its range."""
+"""Standard deviation below which a component is a constant, and not scaled: in the dataset's units, or for
+actions that are all small, in halves of the largest range."""
 
 STATE_SPREAD: Final = 0.02
 """Least standard deviation by which the state is scaled, in the dataset's units. The opening of a closed
@@ -142,11 +142,11 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
             self.config.state_size = features[OBS_STATE]["shape"][0] if OBS_STATE in features else 0
 
     def _register_statistics(
-        self, name: str, key: str, size: int, stats: Any, least: float = 0.0, unit: Tensor | float = 1.0
+        self, name: str, key: str, size: int, stats: Any, least: float = 0.0, unit: float = 1.0
     ) -> None:
         """Register mean and standard deviation of the feature `key`, the latter at least `least`.
 
-        unit: in which `MIN_SPREAD` is measured, one for all components or (size,).
+        unit: in which `MIN_SPREAD` is measured.
         """
         mean, std = torch.zeros(size), torch.ones(size)
         if stats is not None and size:
@@ -225,9 +225,9 @@ class ActionWorldModelRewardModel(WorldModelRewardModel):
 
     def __init__(self, config: ActionWorldModelConfig, dataset_stats: Any = None, **kwargs: Any) -> None:
         super().__init__(config, dataset_stats, **kwargs)
-        low, high = map(torch.tensor, (config.embodiment.action_low, config.embodiment.action_high))
-        half = (high - low) / 2 if len(low) else 1.0
-        self._register_statistics("action", ACTION, config.action_size, dataset_stats, unit=half)
+        ends = zip(config.embodiment.action_low, config.embodiment.action_high, strict=True)
+        unit = min(1.0, max(((high - low) / 2 for low, high in ends), default=1.0))
+        self._register_statistics("action", ACTION, config.action_size, dataset_stats, unit=unit)
         width = config.dynamics.width
         self.embed_action = nn.Sequential(
             nn.Linear(config.action_size, width), nn.SiLU(), nn.Linear(width, CONDITION_TOKENS * width)

@@ -18,6 +18,7 @@ from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.presets import preset_settings
 from lerobot_wmrl.data.episodes import ChosenEpisodes, read_episodes
 from lerobot_wmrl.improve.findings import Findings, coarse
+from lerobot_wmrl.improve.report import trust
 from lerobot_wmrl.improve.stages import ImproveConfig, Improvement
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 from lerobot_wmrl.world_models.configuration_world_model import AnchoredConfig
@@ -103,12 +104,6 @@ def test_long_episodes_are_imagined_in_parts(
         assert {f"--env.episode_length={length}", f"--env.dataset.branches={branches}"} <= {*commands[stage]}
 
 
-def test_the_comparison_meets_the_first_frames_and_the_branches_alike(tmp_path: Path) -> None:
-    """120 episodes of 300 frames: 100 starts are those of 25 episodes."""
-    comparison = made_commands(tmp_path, longest=300, usual=300, fewest=120)["comparison"]
-    assert {"--n_episodes=100", "--env.dataset.max_starts=100", "--env.dataset.branches=3"} <= {*comparison}
-
-
 def test_one_long_recording_does_not_divide_all_the_others(tmp_path: Path) -> None:
     assert "--env.dataset.branches=3" in made_commands(tmp_path, longest=9000, usual=300)["rl"]
 
@@ -154,23 +149,46 @@ def test_where_the_strict_threshold_recognises_nothing_the_check_s_own_is_taken(
 
 
 def test_a_policy_that_seldom_decides_is_named(make_synthetic_dataset: Any, tmp_path: Path) -> None:
-    """Episodes of ten frames: ACT's hundred actions are one decision."""
+    """However long recorded episodes are, an imagined one has at most 98 frames."""
     table = read_episodes(make_synthetic_dataset(tmp_path / "data", episodes=2))
-    assert "act takes 100 actions at a time" in coarse(ACTConfig(device="cpu"), table)[0]
     few = int(np.median(table.length)) // 5
     assert not coarse(ACTConfig(device="cpu", n_action_steps=few), table)
     assert not coarse(CnnConfig(device="cpu"), table)
+    table.length = np.array([600, 600])
+    assert (
+        "act takes 100 actions at a time, and an imagined episode has about 98 frames"
+        in (coarse(ACTConfig(device="cpu"), table)[0])
+    )
 
 
-def made_commands(
+def test_the_report_says_that_success_was_taken_for_less(tmp_path: Path) -> None:
+    share = {"k": 3, "n": 4}
+    point = {
+        "done_threshold": 0.5,
+        "done_frames": 1,
+        "false_positive_rate": {"k": 0, "n": 9},
+        "recall": share,
+    }
+    found = {"true_positives": 0, "successes": 4, "failures": 9, "false_positives": 0, "auc": 0.9}
+    write_json(tmp_path / "check" / "metrics.json", found | {"operating_point": point})
+    said = trust(improvement_of(tmp_path))
+    assert "imagination took done_threshold=0.5 and done_frames=1, chosen on the same episodes" in said
+    assert "3 of 4" in said
+
+
+def improvement_of(
     folder: Path, size: str = "demo", policy: PreTrainedConfig | None = None, **found: int
-) -> dict[str, list[str]]:
-    """Return the commands for data of which this was found, where nothing is said 40 short episodes."""
+) -> Improvement:
+    """Return the stages for data of which this was found, where nothing is said 40 short episodes."""
     policy = policy or CnnConfig(device="cpu", pretrained_path=folder)
     data = {
         "frame_side": 96, "pixels": 96**2, "episodes": 40, "held_out": 2, "fewest": 40, "longest": 40,
         "usual": 40, "success_frames": 1000, "held": 2,
     }  # fmt: skip
     config = ImproveConfig(policy=policy, dataset=ChosenEpisodes("data"), size=size, output_dir=folder)
-    improvement = Improvement(config, Findings([], [], ["top"], **(data | found)))
-    return {stage.name: stage.command() for stage in improvement.stages()}
+    return Improvement(config, Findings([], [], ["top"], **(data | found)))
+
+
+def made_commands(folder: Path, *given: Any, **found: Any) -> dict[str, list[str]]:
+    """Return the commands of such stages by name."""
+    return {stage.name: stage.command() for stage in improvement_of(folder, *given, **found).stages()}

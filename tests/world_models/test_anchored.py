@@ -278,8 +278,8 @@ def test_noise_of_what_hardly_varies_does_not_weigh_as_much_as_motion():
 
 
 def test_small_actions_are_scaled_if_their_range_is_small():
-    """Displacements in metres: what is a constant is judged by the range of the component."""
-    robot = Embodiment(action_low=[-0.002] * 6 + [0.0], action_high=[0.002] * 6 + [0.0])
+    """Displacements in metres, one of them idle but for its noise, and one constant."""
+    robot = Embodiment(action_low=[-0.002] * 5 + [-1e-7, 0.3], action_high=[0.002] * 5 + [1e-7, 0.3])
     spread = torch.tensor([7e-4] * 5 + [1e-7, 0.0])
     model = ActionWorldModelRewardModel(
         ActionWorldModelConfig(**nested(SIZES), embodiment=robot),
