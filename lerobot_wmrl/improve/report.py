@@ -79,8 +79,8 @@ def taken_instead(improvement: Improvement) -> str:
     )
     return (
         f" No success is recognised at done_threshold={DONE_THRESHOLD}: imagination took "
-        f"done_threshold={point['done_threshold']} and done_frames={point['done_frames']}, chosen on the same "
-        f"episodes (false positives {false}, recall {recall})."
+        f"done_threshold={point['done_threshold']} and done_frames={point['done_frames']}, chosen on the "
+        f"same episodes (false positives {false}, recall {recall})."
     )
 
 
