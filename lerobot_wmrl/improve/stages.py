@@ -319,8 +319,8 @@ class Improvement:
         imagined = self.config.real_env is None
         env = self._imagination() if imagined else self._real_env("env")
         starts = self.config.eval_episodes
-        if imagined:  # each start of each task once
-            starts = min(starts, self.found.fewest * (1 + self.branches))
+        if imagined:  # none twice: there are at least as many as episodes
+            starts = min(starts, self.found.fewest)
         flags: Flags = {
             "policies": f"[{self.policy},{self.improved}]", **env, "n_episodes": starts,
             "batch_size": min(16 if imagined else 1, starts), "stop_early": False, "seed": EVALUATION_SEED,

@@ -6,12 +6,14 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from gymnasium.vector import AutoresetMode
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.constants import TASKS
-from lerobot_wmrl.data.episodes import ChosenEpisodes
+from lerobot_wmrl.data.episodes import ChosenEpisodes, read_episodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
+from lerobot_wmrl.envs.start_frames import branch_frames
 from lerobot_wmrl.envs.uncertainty import Uncertainty
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH
 from lerobot_wmrl.rewards.configuration_rewards import EmbeddingConfig, GeneralConfig, ProxyConfig
@@ -490,3 +492,15 @@ def test_episodes_last_as_long_as_the_world_model_has_learnt(config, trained_mod
         WorldModelEnv(world_model_path=path, done_frames=11, reward=GeneralConfig(alpha=1.0))
     with pytest.raises(ValueError, match="world_model_path: is missing"):
         _ = WorldModelEnv().horizon
+
+
+def test_starts_in_a_row_are_first_and_later_frames_alike(small_dataset: LeRobotDataset) -> None:
+    """Each episode's first frame, then those of its branches: before its success, none twice."""
+    table = read_episodes(small_dataset)
+    table.done[:] = False
+    table.done[table.start[1] + 2] = True
+    rows = branch_frames(table, np.array([0, 1]), branches=1)
+    first, second = table.start[:2]
+    assert rows.tolist() == [first, first + (table.length[0] - 1) // 2, second, second + 1]
+    table.done[second + 1] = True
+    assert branch_frames(table, np.array([1]), branches=1).tolist() == [second]
