@@ -59,9 +59,8 @@ def make_recorder(settings: CallbackSettings, env: WorldModelVectorEnv) -> Recor
     if simulator is None:
         return None
     if not isinstance(simulator, WmrlManiSkillEnv):
-        return EnvRecorder(
-            simulator, model.embodiment, env.device.type, settings.real_num_envs, settings.budget
-        )
+        num_envs = settings.real_num_envs
+        return EnvRecorder(simulator, model.embodiment, env.device.type, settings.budget, num_envs)
     cameras = list(dict.fromkeys([*simulator.cameras, *model.tokenizer.cameras]))
     return ManiSkillRecorder(simulator, settings.real_num_envs, cameras, model.depth, settings.budget)
 

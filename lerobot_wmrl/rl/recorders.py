@@ -94,15 +94,15 @@ class EnvRecorder:
         env: the environment; if it has several tasks, they take turns.
         robot: names and range of the actions, and names of the state, as the world model has them.
         device: of the policy.
-        num_envs: episodes at once.
         budget: ledger in which the episodes are entered; None without.
+        num_envs: episodes at once.
     """
 
     env: EnvConfig
     robot: Embodiment
     device: str
-    num_envs: int = 1
     budget: Path | None = None
+    num_envs: int = 1
 
     def record(
         self, checkpoint: Path, episodes: int, seed: int, folder: Path, exploration: float = 0.0

@@ -21,9 +21,10 @@ from tests.experiments.typed import check
 from tests.recorded import write_recording
 
 SUCCESSES = {
-    "eval_known_cloned": 2, "eval_known_filtered": 4, "eval_known_rl": 6,
-    "eval_unseen_cloned": 1, "eval_unseen_filtered": 3, "eval_unseen_rl": 3,
+    "eval_known_cloned": 2, "eval_known_filtered": 4, "eval_known_rl": 5,
+    "eval_unseen_cloned": 1, "eval_unseen_filtered": 3, "eval_unseen_rl": 2,
     "imagine_cloned": 3, "imagine_filtered": 5, "imagine_rl": 9,
+    "eval_known_distilled": 6, "eval_unseen_distilled": 3, "imagine_distilled": 8,
 }  # fmt: skip
 
 
@@ -42,7 +43,7 @@ def finished(tmp_path: Path) -> DemoConfig:
     for folder, successes in SUCCESSES.items():
         outcomes = [i < successes for i in range(10)]
         write_json(tmp_path / folder / "eval_info.json", {"per_task": [{"metrics": {"successes": outcomes}}]})
-    for policy in ("filtered", "rl", "held_out"):
+    for policy in ("filtered", "distilled", "held_out"):
         replay = {"false_positives": 2, "failures": 5, "true_positives": 3, "successes": 4}
         write_json(tmp_path / f"replay_{policy}" / "metrics.json", replay)
         Image.new("RGB", (8, 8)).save(tmp_path / f"replay_{policy}" / "comparison_0.png")
@@ -67,10 +68,13 @@ def test_page_is_self_contained_and_says_the_numbers(finished: DemoConfig) -> No
     assert not re.findall(r"""(?:src|href)=["'](?!data:)""", page), "the page needs other files"
     assert "4 of 10; 95 %: 17–69 %" in page
     assert (
-        "In known scenes PPO in the world model brought success in ManiSkill from 40 % to 60 % (+20 points): "
+        "In known scenes PPO and a planner in the world model brought success in ManiSkill from 40 % to 60 % (+20 points): "
         "of the same 10 starts, 2 were gained" in page
     )
-    assert "In unseen scenes PPO in the world model brought success in ManiSkill from 30 % to 30 %" in page
+    assert (
+        "In unseen scenes PPO and a planner in the world model brought success in ManiSkill from 30 % to 30 %"
+        in page
+    )
     assert "40 % (2 of 5; 12–77 %)" in page
     for name in stages:
         assert f"<pre>run-{name}</pre>" in page
@@ -122,7 +126,7 @@ def test_runs_with_other_seeds_stand_side_by_side(finished: DemoConfig) -> None:
     assert "Other seeds" not in write_report(config, stages).read_text()
     own = json.loads((config.output_dir / "summary.json").read_text())
     beside = config.output_dir.parent
-    changed = {**own["outcomes"]["known"], "filtered": [False] * 10, "rl": [True] * 4 + [False] * 6}
+    changed = {**own["outcomes"]["known"], "filtered": [False] * 10, "distilled": [True] * 4 + [False] * 6}
     other = {**own, "seed": 1, "outcomes": {**own["outcomes"], "known": changed}}
     write_json(beside / "another" / "summary.json", other)
     write_json(beside / "copy" / "summary.json", own)

@@ -175,10 +175,7 @@ def test_environments_decode_beside_their_own_start_also_after_a_restart(models,
 
 
 def test_imagined_episodes_branch_off_from_recorded_ones_before_their_success(models, small_dataset, table):
-    """From frames spread over what comes before it, each beside the first frame of its episode.
-
-    The first frames of all episodes come first.
-    """
+    """From frames spread over what comes before it, each beside the first frame of its episode."""
     starts = StartFrames(root=str(Path(small_dataset.root)), branches=2)
     path = str(models["action_world_model"])
     env = WorldModelEnv(world_model_path=path, dataset=starts, reward=GeneralConfig(alpha=1.0))
@@ -187,13 +184,13 @@ def test_imagined_episodes_branch_off_from_recorded_ones_before_their_success(mo
     for start, length in zip(table.start, table.length, strict=True):
         solved = np.flatnonzero(table.done[start : start + length])
         last.append(min([length - 1, *solved[:1]]))
-    expected = np.concatenate([table.start + np.array(last) * branch // 3 for branch in range(3)])
+    expected = (table.start[:, None] + np.array(last)[:, None] * np.arange(3) // 3).flatten()
     np.testing.assert_array_equal(frames.state, table.state[expected])
     assert not table.done[expected].any()
     tensor_env = env.create_tensor_env(len(expected))
     observation, _ = tensor_env.reset(seed=list(range(len(expected))))
     torch.testing.assert_close(observation["observation.state"], torch.from_numpy(table.state[expected]))
-    first = frames_to_tensor(cached_frames(small_dataset, [CAMERA], 32)[np.tile(table.start, 3)])
+    first = frames_to_tensor(cached_frames(small_dataset, [CAMERA], 32)[np.repeat(table.start, 3)])
     torch.testing.assert_close(
         tensor_env.starts.frames.context.maps, tensor_env.model.tokenizer.context(first).maps
     )
