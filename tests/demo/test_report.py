@@ -68,8 +68,8 @@ def test_page_is_self_contained_and_says_the_numbers(finished: DemoConfig) -> No
     assert not re.findall(r"""(?:src|href)=["'](?!data:)""", page), "the page needs other files"
     assert "4 of 10; 95 %: 17–69 %" in page
     assert (
-        "In known scenes PPO and a planner in the world model brought success in ManiSkill from 40 % to 60 % (+20 points): "
-        "of the same 10 starts, 2 were gained" in page
+        "In known scenes PPO and a planner in the world model brought success in ManiSkill from 40 % to 60 % "
+        "(+20 points): of the same 10 starts, 2 were gained" in page
     )
     assert (
         "In unseen scenes PPO and a planner in the world model brought success in ManiSkill from 30 % to 30 %"
