@@ -37,7 +37,7 @@ class Checkpoint:
 def resolve_checkpoint(path: str | Path) -> Path:
     """Return the `pretrained_model` folder inside a training's output folder or one of its checkpoints."""
     root = Path(path)
-    for candidate in (root, root / PRETRAINED_MODEL_DIR, root / LAST_CHECKPOINT / PRETRAINED_MODEL_DIR):
+    for candidate in (root, root / PRETRAINED_MODEL_DIR, last_checkpoint(root)):
         if (candidate / "config.json").is_file():
             return candidate
     return root

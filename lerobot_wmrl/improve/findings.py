@@ -97,7 +97,7 @@ def look(table: EpisodeTable, policy: PreTrainedConfig, episodes: Sequence[int] 
     tasks = np.unique(table.column(START_TASK), return_counts=True)[1]
     done = [table.done[a : a + n].sum() for a, n in zip(table.start, table.length, strict=True)]
     return Findings(
-        lines=lines, missing=[*missing(table), *coarse(policy, table)], cameras=camera_names(keys),
+        lines=lines, missing=[*missing(table), *few_decisions(policy, table)], cameras=camera_names(keys),
         frame_side=min(map(min, sizes.values())), pixels=sum(h * w for h, w in sizes.values()),
         episodes=len(success),
         held_out=held_out, fewest=int(tasks.min()), longest=int(table.length.max()),
@@ -127,7 +127,7 @@ def missing(table: EpisodeTable) -> list[str]:
     return found
 
 
-def coarse(policy: PreTrainedConfig, table: EpisodeTable) -> list[str]:
+def few_decisions(policy: PreTrainedConfig, table: EpisodeTable) -> list[str]:
     """Say so if a policy of chunks decides only a few times an episode."""
     steps = getattr(policy, "n_action_steps", 1)
     usual = min(LONGEST_IMAGINATION, int(np.median(table.length)))

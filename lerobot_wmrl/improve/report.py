@@ -71,7 +71,7 @@ def trust(improvement: Improvement) -> str:
 
 def taken_instead(improvement: Improvement) -> str:
     """Say where imagination saw success, if not at the strict threshold."""
-    point = improvement.relaxed()
+    point = improvement.relaxed_criterion()
     if point is None:
         return ""
     false, recall = (

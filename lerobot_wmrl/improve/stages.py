@@ -217,7 +217,7 @@ class Improvement:
     def _done(self) -> Flags:
         return {"done_threshold": DONE_THRESHOLD, "done_frames": min(DONE_FRAMES, max(1, self.found.held))}
 
-    def relaxed(self) -> dict[str, Any] | None:
+    def relaxed_criterion(self) -> dict[str, Any] | None:
         """Return the operating point that the check found, if no recorded success is recognised at the strict
         threshold: imagination sees success there instead."""
         metrics = self.out / "check" / "metrics.json"
@@ -226,8 +226,8 @@ class Improvement:
         found: dict[str, Any] = json.loads(metrics.read_text())
         return None if found["true_positives"] else found["operating_point"]
 
-    def _recognised(self) -> Flags:
-        point = self.relaxed()
+    def _success_criterion(self) -> Flags:
+        point = self.relaxed_criterion()
         return {name: point[name] for name in ("done_threshold", "done_frames")} if point else self._done()
 
     def _real_env(self, prefix: str) -> Flags:
@@ -241,7 +241,7 @@ class Improvement:
             **{f"env.{name}": value for name, value in self.config.dataset.flags().items()},
             "env.dataset.max_starts": 1024, "env.dataset.branches": self.branches,
             "env.reward.type": "general", "env.reward.alpha": 1, "env.episode_length": self.length,
-            **{f"env.{name}": value for name, value in self._recognised().items()},
+            **{f"env.{name}": value for name, value in self._success_criterion().items()},
         }  # fmt: skip
 
     def _command(self, program: str, flags: Flags) -> list[str]:

@@ -102,6 +102,13 @@ def test_the_best_operating_point_is_tolerable_and_recognises_most(outcomes):
     assert gate_at(knowing, 0.5, 2).passed
 
 
+def test_successes_alone_have_an_operating_point_too(outcomes):
+    wins = Outcomes(outcomes.episodes[:3], outcomes.probability[:3], outcomes.done[:3])
+    best = best_operating_point(sweep(wins))
+    assert best is not None
+    assert (best.false_positives.n, best.recall.k) == (0, 2)
+
+
 def test_verdicts_of_every_episode_are_reported_as_json(outcomes):
     agreement = json.loads(json.dumps(gate_details(outcomes, 0.5, 3)))
     assert agreement["predicted_success"] == [True, True, False, True, False]

@@ -17,7 +17,7 @@ from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.presets import preset_settings
 from lerobot_wmrl.data.episodes import ChosenEpisodes, read_episodes
-from lerobot_wmrl.improve.findings import Findings, coarse
+from lerobot_wmrl.improve.findings import Findings, few_decisions
 from lerobot_wmrl.improve.report import trust
 from lerobot_wmrl.improve.stages import ImproveConfig, Improvement
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
@@ -152,12 +152,12 @@ def test_a_policy_that_seldom_decides_is_named(make_synthetic_dataset: Any, tmp_
     """However long recorded episodes are, an imagined one has at most 98 frames."""
     table = read_episodes(make_synthetic_dataset(tmp_path / "data", episodes=2))
     few = int(np.median(table.length)) // 5
-    assert not coarse(ACTConfig(device="cpu", n_action_steps=few), table)
-    assert not coarse(CnnConfig(device="cpu"), table)
+    assert not few_decisions(ACTConfig(device="cpu", n_action_steps=few), table)
+    assert not few_decisions(CnnConfig(device="cpu"), table)
     table.length = np.array([600, 600])
     assert (
         "act takes 100 actions at a time, and an imagined episode has about 98 frames"
-        in (coarse(ACTConfig(device="cpu"), table)[0])
+        in (few_decisions(ACTConfig(device="cpu"), table)[0])
     )
 
 
@@ -179,7 +179,7 @@ def test_the_report_says_that_success_was_taken_for_less(tmp_path: Path) -> None
 def improvement_of(
     folder: Path, size: str = "demo", policy: PreTrainedConfig | None = None, **found: int
 ) -> Improvement:
-    """Return the stages for data of which this was found, where nothing is said 40 short episodes."""
+    """Return the stages for data of which this was found: 40 short episodes unless something else is said."""
     policy = policy or CnnConfig(device="cpu", pretrained_path=folder)
     data = {
         "frame_side": 96, "pixels": 96**2, "episodes": 40, "held_out": 2, "fewest": 40, "longest": 40,

@@ -177,10 +177,9 @@ def test_policies_whose_observations_have_a_time_axis_get_one(
     features = {IMAGE: (FeatureType.VISUAL, (3, 32, 32)), STATE: (FeatureType.STATE, (8,))}
     config = VQBeTConfig(
         device="cpu", n_obs_steps=1, pretrained_backbone_weights=None, crop_shape=None,
-        use_group_norm=True,
-        spatial_softmax_num_keypoints=4, n_vqvae_training_steps=1,
-        vqvae_embedding_dim=8, vqvae_enc_hidden_dim=8, gpt_input_dim=16,
-        gpt_output_dim=16, gpt_hidden_dim=16, gpt_n_layer=1, gpt_n_head=2,
+        use_group_norm=True, spatial_softmax_num_keypoints=4, n_vqvae_training_steps=1,
+        vqvae_embedding_dim=8, vqvae_enc_hidden_dim=8, gpt_input_dim=16, gpt_output_dim=16,
+        gpt_hidden_dim=16, gpt_n_layer=1, gpt_n_head=2,
         input_features={key: PolicyFeature(*each) for key, each in features.items()},
         output_features={"action": PolicyFeature(FeatureType.ACTION, (7,))},
     )  # fmt: skip
