@@ -1,6 +1,7 @@
 """What fine-tuning OpenVLA by LoRA takes of a GPU's memory, computed without one.
 
     python benchmarks/openvla_memory.py --rank=32 --batch_sizes 1 8 16
+    python benchmarks/openvla_memory.py --measure --output=docs/results/openvla_memory.json
 
 The network is built in the release's size without memory (torch's fake tensors), PEFT puts adapters in, and a
 loss is taken: autograd then tells what it keeps for the backward pass. Not counted: the workspace of kernels,
@@ -9,11 +10,16 @@ what the allocator loses to fragments, and the environment.
 Parts, in GB: `weights` bfloat16; `adapters` and value head float32, with gradients and AdamW's two moments;
 `reference` their frozen copy (PPO); `cache` keys and values of a rollout's step; `activations` of an update,
 without and with checkpointing.
+
+`--measure` also runs it on this machine's GPU, with random weights: the peak memory of SFT's updates, beside
+the computed sum, and of decoding all environments' actions; and observations a second of both.
 """
 
 import argparse
 import json
 from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -24,8 +30,10 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 
 from lerobot_policy_openvla.actions import BINS
 from lerobot_policy_openvla.modeling_openvla import adapter_targets
-from lerobot_policy_openvla.network import OpenVLANetwork, make_value_head
+from lerobot_policy_openvla.network import OpenVLANetwork, Prefix, make_value_head
 from lerobot_policy_openvla.sizes import RELEASED
+from lerobot_wmrl.common.files import write_json
+from machine import rates
 
 GB = 1e9
 ACTIONS = 7
@@ -50,12 +58,21 @@ class Policy(nn.Module):
 
     def forward(self, batch: int) -> Tensor:
         """A loss over all action tokens and the value: what SFT and PPO differentiate, (B, 7, V) logits."""
-        pixels = torch.zeros(batch, 6, RELEASED.image_size, RELEASED.image_size)
-        prompt = torch.zeros(batch, PROMPT, dtype=torch.long)
         ids = torch.zeros(batch, ACTIONS - 1, dtype=torch.long)
-        states = self.model.states(self.model.prefix(pixels, prompt), ids)
+        states = self.model.states(self.prefix(batch), ids)
         log_probs = self.model.logits(states).log_softmax(dim=2)[..., :BINS]
         return log_probs.sum() + self.value_head(states[:, 0].detach().float()).sum()
+
+    def prefix(self, batch: int) -> Prefix:
+        """Encoded pictures and prompts, of the default device."""
+        pixels = torch.zeros(batch, 6, RELEASED.image_size, RELEASED.image_size)
+        return self.model.prefix(pixels, torch.zeros(batch, PROMPT, dtype=torch.long))
+
+    @torch.inference_mode()
+    def act(self, environments: int) -> Tensor:
+        """A rollout's step: action tokens, (B, 7)."""
+        ids, _ = self.model.decode(self.prefix(environments), ACTIONS, lambda logits: logits.argmax(dim=1))
+        return ids
 
 
 def adapted(rank: int) -> nn.Module:
@@ -166,6 +183,58 @@ def by_mode(name: str, sizes: tuple[int, int], total: Callable[[int], int]) -> d
     return {name: in_gb(total(plain)), f"{name}, checkpointing": in_gb(total(checkpointed))}
 
 
+def measured(rank: int, batch_sizes: Sequence[int], environments: int) -> dict[str, Any]:
+    """Peak memory in GB and observations a second on the GPU, each mode from a policy of its own."""
+    device = torch.device("cuda")
+    found: dict[str, Any] = {"device": torch.cuda.get_device_name(device)}
+    with device:
+        for checkpointing in (False, True):
+            found["checkpointing" if checkpointing else "plain"] = updates(rank, batch_sizes, checkpointing)
+        policy = on_gpu(adapted(rank))
+        found["decoding"] = {"environments": environments} | peak_and_rate(
+            lambda: policy.get_base_model().act(environments), environments
+        )
+    return found
+
+
+def updates(rank: int, batch_sizes: Sequence[int], checkpointing: bool) -> list[dict[str, Any]]:
+    """Peak memory and rate of SFT's optimizer steps, by batch size."""
+    policy = on_gpu(adapted(rank))
+    if checkpointing:
+        policy.get_base_model().model.enable_checkpointing()
+    optimizer = torch.optim.AdamW(each for each in policy.parameters() if each.requires_grad)
+
+    def update(batch: int) -> None:
+        policy(batch).backward()
+        optimizer.step()
+        optimizer.zero_grad()
+
+    return [{"batch": batch} | peak_and_rate(partial(update, batch), batch) for batch in batch_sizes]
+
+
+def on_gpu(policy: nn.Module) -> nn.Module:
+    """Give every weight small random values on the default device."""
+    for module in policy.modules():
+        for name, weight in module._parameters.items():
+            if weight is not None:
+                values = torch.empty(weight.shape, dtype=weight.dtype).normal_(std=0.02)
+                module._parameters[name] = nn.Parameter(values, requires_grad=weight.requires_grad)
+        for name, buffer in module._buffers.items():
+            module._buffers[name] = None if buffer is None else buffer.to(torch.get_default_device())
+    return policy.train()
+
+
+def peak_and_rate(work: Callable[[], object], units: int) -> dict[str, float | str]:
+    """Most memory that was allocated at once, and units a second; or that it did not fit."""
+    torch.cuda.empty_cache()
+    torch.cuda.reset_peak_memory_stats()
+    try:
+        rate = rates({"work": (units, work)}, torch.get_default_device())["work"]
+    except torch.OutOfMemoryError:
+        return {"GB": "does not fit"}
+    return {"GB": in_gb(torch.cuda.max_memory_allocated()), "a second": round(rate, 2)}
+
+
 def in_gb(size: int) -> float:
     return round(size / GB, 2)
 
@@ -178,8 +247,14 @@ def main() -> None:
     parser.add_argument("--rank", type=int, default=32, help="of the adapters")
     parser.add_argument("--batch_sizes", type=int, nargs="+", default=[1, 8, 16], help="of updates")
     parser.add_argument("--environments", type=int, default=64, help="stepped together in a rollout")
+    parser.add_argument("--measure", action="store_true", help="run it on the GPU too")
+    parser.add_argument("--output", type=Path, help="JSON file for what is printed")
     given = parser.parse_args()
-    print(json.dumps(table(given.rank, given.batch_sizes, given.environments), indent=2))
+    sizes = (given.rank, given.batch_sizes, given.environments)
+    found = table(*sizes) | ({"measured": measured(*sizes)} if given.measure else {})
+    print(json.dumps(found, indent=2))
+    if given.output:
+        write_json(given.output, found)
 
 
 if __name__ == "__main__":

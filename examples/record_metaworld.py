@@ -20,6 +20,9 @@ from tqdm import trange
 SMOOTHNESS = 0.8
 """Share of the noise that an action takes over from the one before."""
 
+WRITERS = 4
+"""Threads that compress frames."""
+
 FEATURES = {
     "observation.image": {
         "dtype": "image",
@@ -43,7 +46,9 @@ def record(task: str, root: Path, num_episodes: int, seed: int, noise: list[floa
     """Record the episodes and print how many succeed."""
     env = MetaworldEnv(task, obs_type="pixels_agent_pos")
     fps = MetaworldConfig().fps
-    dataset = LeRobotDataset.create(f"local/{task}", fps, FEATURES, root=root, use_videos=False)
+    dataset = LeRobotDataset.create(
+        f"local/{task}", fps, FEATURES, root=root, use_videos=False, image_writer_threads=WRITERS
+    )
     successes = 0
     for episode in trange(num_episodes, unit="episode"):
         rng = np.random.default_rng((seed, episode))
