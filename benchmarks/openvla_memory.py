@@ -16,6 +16,7 @@ the computed sum, and of decoding all environments' actions; and observations a 
 """
 
 import argparse
+import gc
 import json
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -226,6 +227,7 @@ def on_gpu(policy: nn.Module) -> nn.Module:
 
 def peak_and_rate(work: Callable[[], object], units: int) -> dict[str, float | str]:
     """Most memory that was allocated at once, and units a second; or that it did not fit."""
+    gc.collect()
     torch.cuda.empty_cache()
     torch.cuda.reset_peak_memory_stats()
     try:

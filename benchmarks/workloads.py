@@ -44,7 +44,7 @@ class Imagination:
     def frames(self) -> int:
         """That are remembered in the long run: the window, or half of what an anchor is kept for."""
         config = self.model.config
-        return config.clip_length // 2 if config.dynamics.type == "anchored" else config.memory
+        return config.clip_length // 2 if config.dynamics.type == "anchored" else config.dynamics.window
 
     def step(self) -> Tensor:
         """Tokens of one more frame, (B, S)."""

@@ -18,6 +18,7 @@ import argparse
 import json
 import platform
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -65,8 +66,9 @@ def measure_batch(
         "imagined_without_memory": (batch, fast.step_without_memory),
     }
     if frames <= MOST_TRAINING_FRAMES:
-        clip = random_clip(model, batch, device)
-        works["trained"] = (frames, training_step(model, clip, dtype))
+        train = training_step(model, random_clip(model, batch, device), dtype)
+        if fits(train):
+            works["trained"] = (frames, train)
     found = rates(works, device)
     arithmetic = {
         "imagined": flop(fast.step) / batch,
@@ -86,6 +88,27 @@ def measure_batch(
         "times_faster_than_without_memory": round(found["imagined"] / found["imagined_without_memory"], 2),
         "times_faster_than_float32": round(found["imagined"] / found["imagined_in_float32"], 2),
     }
+
+
+def measure_if_it_fits(
+    model: ActionWorldModelRewardModel, batch: int, matmul: float, stream: float
+) -> dict[str, Any]:
+    """`measure_batch`, or that the GPU's memory is too small for it."""
+    try:
+        return measure_batch(model, batch, matmul, stream)
+    except torch.OutOfMemoryError:
+        torch.cuda.empty_cache()
+        return {"batch": batch, "does not fit": True}
+
+
+def fits(work: Work) -> bool:
+    """Whether the GPU's memory is large enough for one call."""
+    try:
+        work()
+    except torch.OutOfMemoryError:
+        torch.cuda.empty_cache()
+        return False
+    return True
 
 
 def maniskill_rates(image_size: int, cameras: list[str]) -> dict[str, float]:
@@ -166,14 +189,15 @@ def main() -> None:
         "dtype": str(dtype).removeprefix("torch."),
         "image_size": config.tokenizer.image_size,
         "network": {
-            name: getattr(config, name)
-            for name in ("dynamics", "layers", "width", "heads", "patch", "window", "clip_length")
-        }
-        | {"cameras": config.tokenizer.cameras},
+            "type": config.dynamics.type,
+            **asdict(config.dynamics),
+            "clip_length": config.clip_length,
+            "cameras": config.tokenizer.cameras,
+        },
         "transformer_tokens": model.dynamics.network.tokens_per_frame,
         "matmul_gflop_per_s": round(matmul / 1e9, 1),
         "stream_gbyte_per_s": round(stream / 1e9, 1),
-        "by_batch": [measure_batch(model, batch, matmul, stream) for batch in given.batches],
+        "by_batch": [measure_if_it_fits(model, batch, matmul, stream) for batch in given.batches],
     }
     if not given.no_maniskill:
         simulated = figures["maniskill_frames_per_s"] = maniskill_rates(
@@ -183,6 +207,7 @@ def main() -> None:
             meshes: {
                 str(row["batch"]): round(row["frames_per_s"]["imagined_and_decoded"] / rate, 2)
                 for row in figures["by_batch"]
+                if "frames_per_s" in row
             }
             for meshes, rate in simulated.items()
         }

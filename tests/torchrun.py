@@ -14,8 +14,9 @@ def torchrun(script: Path, *arguments: str) -> None:
     """Two processes, which meet on this machine's loopback, whatever its name resolves to."""
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--local-addr=127.0.0.1",
                "--nproc_per_node=2", str(script), *arguments]  # fmt: skip
-    folders = os.pathsep.join(str(ROOT / folder) for folder in ("", "policies", "datasets", "robots"))
-    own = {"PYTHONPATH": folders, "GLOO_SOCKET_IFNAME": "lo"}
+    folders = [str(ROOT / folder) for folder in ("", "policies", "datasets", "robots")]
+    paths = os.pathsep.join([*folders, os.environ.get("PYTHONPATH", "")])
+    own = {"PYTHONPATH": paths, "GLOO_SOCKET_IFNAME": "lo"}
     result = subprocess.run(
         command, env={**os.environ, **own}, capture_output=True, text=True, cwd=ROOT,
         timeout=PATIENCE_S,

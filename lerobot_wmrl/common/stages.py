@@ -2,6 +2,7 @@
 
 Each stage is one console command. It runs in a forked process, which shows and logs its output and is
 measured. Forking from a process that has imported the libraries saves every stage the ten seconds of import.
+With CUDA, which does not survive a fork, the process then starts the command anew.
 """
 
 import fcntl
@@ -25,12 +26,13 @@ from typing import Any, BinaryIO, NoReturn
 
 import huggingface_hub.constants
 import psutil
+import torch
 
 from lerobot_wmrl.common.command_line import RunConfig, different_settings, run_command
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.files import foreign_files, write_json
 from lerobot_wmrl.common.precision import keep_freed_memory
-from lerobot_wmrl.common.processes import die_with, own_progress_lock
+from lerobot_wmrl.common.processes import die_with, find_program, own_progress_lock
 
 MARKER = "settings.json"
 
@@ -224,6 +226,9 @@ def _run_command(command: list[str], output: int, parent: int) -> None:
     sys.stdout, sys.stderr = (os.fdopen(stream, "w", buffering=1, closefd=False) for stream in (1, 2))
     os.environ.setdefault("COLUMNS", str(shutil.get_terminal_size().columns))
     keep_freed_memory()
+    if torch.cuda.is_available():  # a fork of a process that has asked for CUDA cannot use it
+        os.environ["PYTHONUNBUFFERED"] = "1"
+        os.execv(find_program(command[0]), command)
     sys.argv = command
     sys.exit(entry_point(command[0])())
 

@@ -6,7 +6,7 @@ that train together have seeds of their own.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import torch
@@ -17,6 +17,9 @@ from lerobot_wmrl.common.images import camera_key
 from lerobot_wmrl.data.episodes import EpisodeTable
 from lerobot_wmrl.data.frame_cache import frames_to_tensor
 from lerobot_wmrl.data.frames import NO_CONTEXT, Context, Frames
+
+SUCCESS_SHARE: Final = 0.05
+"""Share of what is learnt that shows success, at least: where fewer frames do, they count more."""
 
 
 class Clip(NamedTuple):
@@ -33,6 +36,7 @@ class Clip(NamedTuple):
         features: (B, T, F) of the frames, by the tokenizer's success classifier, if it has one.
         depth: (B, T, S) metres of each token, for models that look at depth.
         context: of the B episodes' first frames, for models that look at it.
+        success_weight: of a frame with success in the loss of done.
     """
 
     tokens: Tensor
@@ -45,6 +49,7 @@ class Clip(NamedTuple):
     depth: Tensor | None = None
     context: Context = NO_CONTEXT
     features: Tensor | None = None
+    success_weight: float = 1.0
 
     def first(self) -> Frames:
         """Return the clips' first frames."""
@@ -97,6 +102,12 @@ class ClipSampler:
     features: np.ndarray | None = None
     done_known: bool = True
 
+    def __post_init__(self) -> None:
+        """Weigh success by how rare it is."""
+        done = np.concatenate([self.table.done[rows] for rows in self.table.rows(self.episodes)])
+        odds = SUCCESS_SHARE / (1 - SUCCESS_SHARE)
+        self.success_weight = max(1.0, odds * (~done).sum() / done.sum()) if done.any() else 1.0
+
     def __call__(self, step: int) -> Clip:
         """Draw the batch of one training step."""
         rng = np.random.default_rng([self.seed, step])
@@ -126,6 +137,7 @@ class ClipSampler:
             None if self.depth is None else self._tensor(self.depth[rows]),
             context,
             None if self.features is None else self._tensor(self.features[rows]),
+            self.success_weight,
         )
 
     def _tensor(self, array: np.ndarray) -> Tensor:
@@ -154,6 +166,15 @@ class FrameSampler:
     seed: int
     device: str
 
+    def __post_init__(self) -> None:
+        """Find the frames that show success, and the share of draws that must fall on them besides."""
+        shown = [np.flatnonzero(self._shows_success(rows)) for rows in self.table.rows(self.episodes)]
+        counts, length = np.array([len(each) for each in shown]), self.table.length[self.episodes]
+        self.solved_episodes = np.repeat(self.episodes, counts)
+        self.solved_offsets = np.concatenate(shown)
+        share = float((counts / length).mean())
+        self.extra = max(0.0, (SUCCESS_SHARE - share) / (1 - share)) if counts.any() else 0.0
+
     def __call__(self, step: int) -> dict[str, Tensor]:
         """Draw the batch of one step.
 
@@ -161,15 +182,25 @@ class FrameSampler:
         """
         rng = np.random.default_rng([self.seed, step])
         episodes = rng.choice(self.episodes, self.batch_size)
+        offsets = rng.integers(0, self.table.length[episodes])
+        if self.extra:
+            extra = rng.random(self.batch_size) < self.extra
+            solved = rng.integers(0, len(self.solved_offsets), self.batch_size)
+            episodes = np.where(extra, self.solved_episodes[solved], episodes)
+            offsets = np.where(extra, self.solved_offsets[solved], offsets)
         start = self.table.start[episodes]
-        rows = start + rng.integers(0, self.table.length[episodes])
+        rows = start + offsets
         images, reference = (frames_to_tensor(self.frames[index]).to(self.device) for index in (rows, start))
-        seen = (rows > start) & self.table.done[np.maximum(rows - 1, start)]
-        batch = {"success": torch.from_numpy(seen).to(self.device)}
+        shown = (offsets > 0) & self.table.done[np.maximum(rows - 1, start)]
+        batch = {"success": torch.from_numpy(shown).to(self.device)}
         for index, camera in enumerate(self.cameras):
             batch[camera_key(camera)] = images[:, index]
             batch[f"reference.{camera}"] = reference[:, index]
         return batch
+
+    def _shows_success(self, rows: slice) -> np.ndarray:
+        """Mark an episode's frames in which success holds: what follows an action that is done. (T,)"""
+        return np.append(False, self.table.done[rows][:-1])
 
 
 @dataclass

@@ -1,7 +1,7 @@
 """Episodes of a LeRobotDataset: all columns but the pictures, and checks of a dataset against a model."""
 
 import logging
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
@@ -19,6 +19,9 @@ VIDEO_BACKEND: Final = "pyav"
 
 VALIDATION_EVERY: Final = 20
 """Every twentieth episode is held out from the training of tokenizers and world models."""
+
+SOLVED_FRAMES: Final = 3
+"""Last frames of an episode that are taken for solved where episodes end as soon as they succeed."""
 
 SUCCESS_COLUMNS: Final = ("next.success", DONE)
 """Columns that can hold success, best first: `next.done` may mark the mere end of an episode."""
@@ -146,6 +149,10 @@ class EpisodeTable:
         """Held-out episodes. (E,)"""
         return np.arange(len(self.start)) % VALIDATION_EVERY == VALIDATION_EVERY - 1
 
+    def rows(self, episodes: Iterable[int]) -> list[slice]:
+        """Return where each of the episodes has its frames."""
+        return [slice(self.start[each], self.start[each] + self.length[each]) for each in episodes]
+
     def subset(self, episodes: np.ndarray) -> "EpisodeTable":
         """Return some of the episodes, a mask (E,) or indices; `validation` means nothing in the result."""
         columns = {name: values[episodes] for name, values in self.columns.items()}
@@ -236,17 +243,40 @@ def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
             raise bad_row(dataset, column, row, np.asarray(rows[column][row]).tolist())
     frames = len(rows["episode_index"])
     _, start, length = np.unique(rows["episode_index"], return_index=True, return_counts=True)
-    done = np.asarray(rows[success]).reshape(-1) if success else np.zeros(frames, bool)
+    done = np.asarray(rows[success]).reshape(-1).astype(bool) if success else np.zeros(frames, bool)
+    if end_at_success(done, start, length):
+        logging.warning(
+            "%s: episodes end as soon as they succeed, so that no frame shows success. The last %d frames of "
+            "those that succeed are taken for solved; record a few more, if you can",
+            dataset.root, SOLVED_FRAMES,
+        )  # fmt: skip
+        done = solved_at_end(done, start, length)
     return EpisodeTable(
         dataset=dataset,
         state=as_columns(rows[OBS_STATE]) if OBS_STATE in rows else np.zeros((frames, 0), np.float32),
         action=as_columns(rows[ACTION]),
-        done=done.astype(bool),
+        done=done,
         start=start,
         length=length,
         instructions=first_instructions(dataset, np.asarray(rows["task_index"]), start),
         columns={name: np.asarray(rows[name]).reshape(-1)[start] for name in further},
     )
+
+
+def end_at_success(done: np.ndarray, start: np.ndarray, length: np.ndarray) -> bool:
+    """Say whether some episodes succeed, (N,) frames of E episodes, and all that do with their last action:
+    the picture after it is not recorded."""
+    last = np.zeros_like(done)
+    last[start + length - 1] = True
+    return bool(done.any() and not (done & ~last).any())
+
+
+def solved_at_end(done: np.ndarray, start: np.ndarray, length: np.ndarray) -> np.ndarray:
+    """Return done (N,) with the last `SOLVED_FRAMES` frames of each successful episode."""
+    solved = done.copy()
+    for first, after in zip(start, start + length, strict=True):
+        solved[max(first, after - SOLVED_FRAMES) : after] = done[after - 1]
+    return solved
 
 
 def first_instructions(dataset: LeRobotDataset, task: np.ndarray, start: np.ndarray) -> list[str]:

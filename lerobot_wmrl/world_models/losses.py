@@ -95,7 +95,10 @@ def next_frame_loss(
     logits = prediction.logits[:, : target.codes.shape[1]]
     token_loss = masked_mean(codebook.cross_entropy(logits, target.codes), target.weight)
     state_loss = next_state_loss(prediction.state, clip)
-    done = F.binary_cross_entropy_with_logits(prediction.done_logit, clip.done, reduction="none")
+    weight = prediction.done_logit.new_tensor(clip.success_weight)
+    done = F.binary_cross_entropy_with_logits(
+        prediction.done_logit, clip.done, reduction="none", pos_weight=weight
+    )
     done_loss = masked_mean(done, clip.done_known & clip.valid)
     loss = token_loss + done_loss + STATE_WEIGHT * state_loss
     right = (codebook.most_likely(logits.detach()) == target.codes).all(-1)

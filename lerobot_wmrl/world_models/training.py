@@ -237,7 +237,8 @@ def train(
     Raises:
         ValueError: the loss or its gradient is not finite; no new checkpoint is written.
     """
-    processes, device = PartialState(), model.config.device
+    device = model.config.device
+    processes = PartialState(cpu=torch.device(device).type == "cpu")
     set_seed(settings.seed + processes.process_index)
     preset: Any = model.config.get_optimizer_preset()
     optimizer = preset.build([p for p in model.parameters() if p.requires_grad])

@@ -31,3 +31,32 @@ def test_the_instruction_of_an_episode_is_that_of_its_first_frame(
     several = record(tmp_path / "several", [["open", "open"], ["close", "open", "lift"]])
     assert read_episodes(open_dataset(several)).instructions == ["open", "close"]
     assert "the instruction changes within 1 of 2 episodes" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("recorded", "read"),
+    [
+        ([[0, 0, 0, 0, 1], [0, 0], [1]], [[0, 0, 1, 1, 1], [0, 0], [1]]),
+        ([[0, 0, 0, 0, 1], [0, 1, 1]], [[0, 0, 0, 0, 1], [0, 1, 1]]),
+        ([[0, 0, 0, 1, 0], [0, 0, 1]], [[0, 0, 0, 1, 0], [0, 0, 1]]),
+        ([[0, 0], [0]], [[0, 0], [0]]),
+    ],
+    ids=["all end at success", "one holds it", "one goes on", "none succeeds"],
+)
+def test_where_no_frame_shows_success_the_last_ones_are_taken_for_it(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, recorded: list[list[int]], read: list[list[int]]
+) -> None:
+    """LeRobot's environments end an episode at its first success; the picture after it is not recorded."""
+    flag = {"dtype": "bool", "shape": (1,), "names": None}
+    dataset = LeRobotDataset.create("local/ends", 10, FEATURES | {"next.success": flag}, root=tmp_path / "d")
+    for episode in recorded:
+        for success in episode:
+            dataset.add_frame({
+                "action": np.zeros(1, np.float32), "next.success": np.array([bool(success)]), "task": "open"
+            })  # fmt: skip
+        dataset.save_episode()
+    dataset.finalize()
+    table = read_episodes(open_dataset(tmp_path / "d"))
+    assert table.done.astype(int).tolist() == [frame for episode in read for frame in episode]
+    assert table.success.tolist() == [any(episode) for episode in recorded]
+    assert ("no frame shows success" in caplog.text) == (recorded != read)

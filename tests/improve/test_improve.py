@@ -140,6 +140,13 @@ def test_large_frames_are_trained_on_in_smaller_numbers(
     assert {flag for flag in command if flag.startswith(limits)} == flags
 
 
+@pytest.mark.parametrize(("held_out", "split"), [(0, "all"), (9, "all"), (10, "validation")])
+def test_the_check_takes_held_out_episodes_where_there_are_enough(
+    tmp_path: Path, held_out: int, split: str
+) -> None:
+    assert f"--split={split}" in made_commands(tmp_path, held_out=held_out)["check"]
+
+
 def test_where_the_strict_threshold_recognises_nothing_the_check_s_own_is_taken(tmp_path: Path) -> None:
     point = {"done_threshold": 0.5, "done_frames": 1}
     for hits, found in ((0, point), (3, None)):

@@ -54,7 +54,7 @@ def environment(trained_models, small_dataset, kind: str, path: Path | None) -> 
     return WorldModelEnv(
         world_model_path=str(trained_models["action_world_model"]),
         dataset=StartFrames(root=str(Path(small_dataset.root))),
-        reward=config(device="cpu", pretrained_path=path and str(path)), episode_length=3,
+        reward=config(device="cpu", pretrained_path=path and str(path)), episode_length=3, device="cpu",
     )  # fmt: skip
 
 

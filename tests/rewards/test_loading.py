@@ -44,6 +44,7 @@ def config(classifier, trained_models, small_dataset) -> WorldModelEnv:
         world_model_path=str(trained_models["action_world_model"]),
         dataset=StartFrames(root=str(Path(small_dataset.root))),
         reward=RewardClassifierConfig(device="cpu", pretrained_path=str(classifier)), episode_length=3,
+        device="cpu",
     )  # fmt: skip
 
 

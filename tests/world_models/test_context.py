@@ -178,7 +178,8 @@ def test_imagined_episodes_branch_off_from_recorded_ones_before_their_success(mo
     """From frames spread over what comes before it, each beside the first frame of its episode."""
     starts = StartFrames(root=str(Path(small_dataset.root)), branches=2)
     path = str(models["action_world_model"])
-    env = WorldModelEnv(world_model_path=path, dataset=starts, reward=GeneralConfig(alpha=1.0))
+    reward = GeneralConfig(alpha=1.0)
+    env = WorldModelEnv(world_model_path=path, dataset=starts, reward=reward, device="cpu")
     frames = read_start_images(starts, read_config(path, "action_world_model"))
     last = []
     for start, length in zip(table.start, table.length, strict=True):

@@ -1,6 +1,7 @@
 """Success classified in frames, and read by a world model from the features that it predicts."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -9,8 +10,8 @@ import torch
 from torch import Tensor
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.clips import FrameSampler
-from lerobot_wmrl.data.episodes import TrainingData, read_episodes
+from lerobot_wmrl.data.clips import SUCCESS_SHARE, ClipSampler, FrameSampler
+from lerobot_wmrl.data.episodes import EpisodeTable, TrainingData, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_features, cached_frames, frames_to_tensor
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig, train_world_model
 from lerobot_wmrl.world_models.checkpoint import load_model
@@ -103,6 +104,51 @@ def test_a_frame_is_labelled_by_the_action_before_it(small_dataset):
     seen = (255 * batch[CAMERA]).round().byte().permute(0, 2, 3, 1).numpy()
     assert batch["success"].tolist() == [known[image[None].tobytes()] for image in seen]
     assert any(known.values())
+
+
+def rare(length: int) -> EpisodeTable:
+    """Ten episodes of `length` frames; half of them show success in their last frame, and only there."""
+    rows, start = 10 * length, np.arange(10) * length
+    done = np.zeros(rows, bool)
+    done[start[:5] + length - 2] = True
+    numbers = np.zeros((rows, 1), np.float32)
+    dataset: Any = SimpleNamespace(root="made up")
+    return EpisodeTable(dataset, numbers, numbers, done, start, np.full(10, length), ["open"] * 10)
+
+
+def test_batches_of_frames_show_success_in_a_twentieth_at_least():
+    table = rare(100)  # of every 200th frame
+    frames = np.zeros((len(table.done), 1, 4, 4, 3), np.uint8)
+    sampler = FrameSampler(table, frames, np.arange(10), ["third_view"], 400, 0, "cpu")
+    drawn = np.mean([sampler(step)["success"].float().mean() for step in range(20)])
+    assert drawn == pytest.approx(SUCCESS_SHARE, abs=0.01)
+    frames[table.start + 99] = 255
+    batch = sampler(20)
+    shown = batch[CAMERA].mean((1, 2, 3)) == 1
+    assert (shown >= batch["success"]).all()  # the frames themselves, not their labels alone
+    assert (batch["reference.third_view"] == 0).all()
+
+
+def test_frames_that_show_success_often_enough_are_drawn_as_they_are():
+    table = rare(10)
+    sampler = FrameSampler(
+        table, np.zeros((100, 1, 4, 4, 3), np.uint8), np.arange(10), ["third_view"], 400, 0, "cpu"
+    )
+    assert sampler.extra == 0
+    none = FrameSampler(
+        table, np.zeros((100, 1, 4, 4, 3), np.uint8), np.arange(5, 10), ["third_view"], 400, 0, "cpu"
+    )
+    assert none.extra == 0
+    assert not none(0)["success"].any()
+
+
+@pytest.mark.parametrize(("length", "weight"), [(10, 1.0), (100, 199 / 19)])
+def test_rare_success_weighs_as_much_as_a_twentieth_in_the_loss_of_done(length: int, weight: float):
+    table = rare(length)
+    sampler = ClipSampler(
+        table, np.zeros((len(table.done), 4), np.int32), np.arange(10), 8, 0.5, 2, seed=0, device="cpu"
+    )
+    assert sampler(0).success_weight == pytest.approx(weight)
 
 
 @torch.no_grad()
