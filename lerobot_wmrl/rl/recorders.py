@@ -33,6 +33,9 @@ from lerobot_wmrl.data.episodes import open_dataset, read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 
+IMAGE_WRITERS = 4
+"""Threads that compress the frames of rollouts in a LeRobot environment."""
+
 DERIVED = ("features", "features_map")
 """Settings of an environment that are derived from others."""
 
@@ -197,6 +200,7 @@ class RolloutRecorder:
         return LeRobotDataset.create(
             f"local/{folder.name.strip('.')}", self.config.fps, features, root=folder,
             use_videos=any(feature["dtype"] == "video" for feature in features.values()),
+            image_writer_threads=IMAGE_WRITERS,
         )  # fmt: skip
 
     def _add_episode(
