@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import MetaworldEnv as MetaworldConfig
-from lerobot.envs.metaworld import MetaworldEnv
 from tqdm import trange
 
 SMOOTHNESS = 0.8
@@ -44,6 +43,8 @@ FEATURES = {
 
 def record(task: str, root: Path, num_episodes: int, seed: int, noise: list[float], steps: int) -> None:
     """Record the episodes and print how many succeed."""
+    from lerobot.envs.metaworld import MetaworldEnv  # imports Meta-World
+
     env = MetaworldEnv(task, obs_type="pixels_agent_pos")
     fps = MetaworldConfig().fps
     dataset = LeRobotDataset.create(
@@ -79,8 +80,7 @@ def record(task: str, root: Path, num_episodes: int, seed: int, noise: list[floa
     print(f"{root}: {num_episodes} episodes, {successes} succeed")
 
 
-def main() -> None:
-    """Entry point."""
+def make_parser() -> argparse.ArgumentParser:
     verbatim = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=verbatim)
     parser.add_argument("--task", default="push-v3", help="one of Meta-World's tasks")
@@ -90,7 +90,12 @@ def main() -> None:
     noise = {"type": float, "nargs": "+", "default": [0.1, 0.4, 0.8]}
     parser.add_argument("--noise", **noise, help="standard deviation of the noise; actions are from -1 to 1")
     parser.add_argument("--steps", type=int, default=150, help="longest episode")
-    record(**vars(parser.parse_args()))
+    return parser
+
+
+def main() -> None:
+    """Entry point."""
+    record(**vars(make_parser().parse_args()))
 
 
 if __name__ == "__main__":

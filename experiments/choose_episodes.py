@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from lerobot_wmrl.common.constants import KINDS
+from lerobot_wmrl.data.episodes import open_dataset, read_episodes
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
 
@@ -49,8 +50,7 @@ def optimal_episodes(root: Path, count: int) -> list[int]:
 
 def successes(root: Path, count: int | None) -> list[int]:
     """Return the first `count` successful episodes, or all. ValueError if there are not so many, or none."""
-    table = recorded_episodes(root)
-    found = table["episode"][table["success"]]
+    found = np.flatnonzero(read_episodes(open_dataset(root)).success)
     if len(found) < (count or 1):
         raise ValueError(f"{root}: {len(found)} successes, {count or 1} are needed: record more")
     return [int(episode) for episode in found[:count]]

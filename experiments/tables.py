@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
+from experiments import foreign
 from experiments import policy_sections as policies
 from experiments import value_sections as value
 from experiments import world_model_sections as world_models
@@ -40,6 +41,7 @@ SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     "value_controls": ("Policies", value.value_controls),
     "driven": ("Policies", value.driven),
     "demo": ("Policies", policies.demo),
+    "metaworld": ("Policies", foreign.section),
     "cloning_control": ("Policies", policies.cloning_control),
     "rl_comparison": ("Policies", policies.rl_comparison),
     "planning": ("Policies", policies.planning),

@@ -108,13 +108,14 @@ def check_ours(module_name: str, flags: list[str]) -> None:
 
 
 def check_module(arguments: list[str]) -> None:
-    """`python -m experiments.NAME …` and `python benchmarks/NAME.py …`: their parsers take the flags."""
+    """`python -m experiments.NAME …` and `python benchmarks/NAME.py …` (or examples/): their parsers take the
+    flags."""
     if arguments[0] == "-m":
         module_name, flags = arguments[1], arguments[2:]
         if not module_name.startswith("experiments"):
             return
     else:
-        sys.path[:0] = [str(ROOT / "benchmarks"), str(ROOT / "tools")]
+        sys.path[:0] = [str(ROOT / folder) for folder in ("benchmarks", "examples", "tools")]
         module_name, flags = Path(arguments[0]).stem, arguments[1:]
     try:
         import_module(module_name).make_parser().parse_known_args(flags)

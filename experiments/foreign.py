@@ -1,0 +1,82 @@
+"""Results in a simulator that nothing here was built for: collected from a study, and told in a section."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any, Final
+
+import numpy as np
+
+from experiments.cells import Load, counted, points, table
+from experiments.study import ROOT, Study, read_cells
+from experiments.success import Results, rate
+from experiments.value import seconds
+from experiments.value_sections import Cell, against, published
+from lerobot_wmrl.common.statistics import RunsMean
+
+CELL: Final = ("task", "episodes", "noise", "iterations", "seed")
+
+POLICIES: Final = {
+    "cloned": "cloned from all episodes",
+    "filtered": "cloned from those that succeed",
+    "improve": "that one, improved in imagination",
+}
+"""Folder of a policy in the study → what it is."""
+
+TIMED: Final = ("data", "cloned", "filtered", "improve", "comparison")
+
+
+def metaworld(study: Study) -> Results:
+    """Return the success of the three policies on the same starts, and the minutes of each step."""
+    found: dict[str, list[int]] = json.loads((study.folder / "comparison" / "outcomes.json").read_text())
+    by_name = dict(zip(POLICIES, found.values(), strict=True))
+    gate = study.folder / "improve" / "check" / "metrics.json"
+    results = {
+        **{name: study.variables[name] for name in CELL},
+        "minutes": {step: round(seconds(study, step) / 60, 1) for step in TIMED},
+        "policies": {name: rate(outcomes) for name, outcomes in by_name.items()},
+        "check": json.loads(gate.read_text()),
+    }
+    return {study.variables["cell"]: results}
+
+
+def section(load: Load) -> str:
+    """Return the section: success of the three policies, seed by seed, and the mean gains."""
+    variables = [each.variables for each in read_cells(ROOT / "experiments" / "metaworld.yaml")]
+    cells = [cell for each in variables if (cell := published(load, "metaworld", each["cell"]))]
+    rows: list[list[Any]] = []
+    for cell in cells:
+        found = cell["policies"]
+        changes = {name: against(found[name], found["filtered"]) for name in ("cloned", "improve")}
+        rows += [
+            [cell["seed"], POLICIES[name], counted(found[name]), changes.get(name, "")] for name in POLICIES
+        ]
+    improved = gains(cells, "improve")
+    for rival in ("cloned", "filtered"):
+        mean = RunsMean.over(improved - gains(cells, rival))
+        rows.append(["all", f"improved, against the one {POLICIES[rival]}", "", points(asdict(mean))])
+    first = cells[0]
+    return f"""`{first["task"]}`: {first["episodes"]} episodes of a scripted expert with noise on its actions, of
+{first["noise"]} of half their range; {first["iterations"]} iterations of PPO. Changes are against the policy
+cloned from the successful episodes, on the same starts:
+
+{table(["seed", "policy", "success", "change"], rows)}
+
+{minutes_of(cells)} An episode of LeRobot's environment has up to 500 steps. The interval of a mean draws
+seeds and starts. Everything ran by the commands that the documentation has for any data; no line of code knows
+Meta-World but the [script that records it](../examples/record_metaworld.py), which uses LeRobot alone."""
+
+
+def gains(cells: Sequence[Cell], policy: str) -> np.ndarray:
+    """Return the outcomes of a policy in all cells, which have the same starts. (R, E)"""
+    return np.array([cell["policies"][policy]["outcomes"] for cell in cells], float)
+
+
+def minutes_of(cells: Sequence[Cell]) -> str:
+    """Say how long the steps of a cell took."""
+    mean = {step: np.mean([cell["minutes"][step] for cell in cells]) for step in TIMED}
+    cloned = mean["cloned"] + mean["filtered"]
+    return (
+        f"A seed takes {mean['data']:.1f} minutes to record, {cloned:.1f} to clone twice, "
+        f"{mean['improve']:.1f} to improve and {mean['comparison']:.1f} to compare."
+    )
