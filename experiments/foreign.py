@@ -56,15 +56,16 @@ def section(load: Load) -> str:
         mean = RunsMean.over(improved - gains(cells, rival))
         rows.append(["all", f"improved, against the one {POLICIES[rival]}", "", points(asdict(mean))])
     first = cells[0]
-    return f"""`{first["task"]}`: {first["episodes"]} episodes of a scripted expert with noise on its actions, of
-{first["noise"]} of half their range; {first["iterations"]} iterations of PPO. Changes are against the policy
-cloned from the successful episodes, on the same starts:
+    return f"""`{first["task"]}`: {first["episodes"]} episodes of a scripted expert with noise on its actions
+({first["noise"]} of half their range), {first["iterations"]} iterations of PPO. Changes are against the
+policy cloned from the successful episodes, on the same starts:
 
 {table(["seed", "policy", "success", "change"], rows)}
 
-{minutes_of(cells)} An episode of LeRobot's environment has up to 500 steps. The interval of a mean draws
-seeds and starts. Everything ran by the commands that the documentation has for any data; no line of code knows
-Meta-World but the [script that records it](../examples/record_metaworld.py), which uses LeRobot alone."""
+{minutes_of(cells)} An episode of LeRobot's environment has up to 500 steps. The interval of a mean
+draws seeds and starts. Everything ran by the commands that the documentation has for any data; no line of
+code knows Meta-World but the [script that records it](../examples/record_metaworld.py), which uses LeRobot
+alone."""
 
 
 def gains(cells: Sequence[Cell], policy: str) -> np.ndarray:
