@@ -54,13 +54,13 @@ def run_parts(given: argparse.Namespace, flags: Sequence[str]) -> list[Path]:
     return [folder / RESULTS for folder in processes]
 
 
-def joined(parts: Sequence[Path]) -> dict[str, list[int]]:
-    """Return each policy's successes, 0 or 1 for every start, in the order of the starts."""
-    found: dict[str, list[int]] = {}
+def joined(parts: Sequence[Path]) -> dict[str, list[bool]]:
+    """Return each policy's success from every start, in the order of the starts."""
+    found: dict[str, list[bool]] = {}
     for part in parts:
         comparison: dict[str, Any] = json.loads(part.read_text())
         for column, policy in enumerate(comparison["policies"]):
-            outcomes = [int(each["successes"][column]) for each in comparison["episodes"]]
+            outcomes = [each["successes"][column] for each in comparison["episodes"]]
             found.setdefault(policy, []).extend(outcomes)
     return found
 

@@ -28,7 +28,7 @@ TIMED: Final = ("data", "cloned", "filtered", "improve", "comparison")
 
 def metaworld(study: Study) -> Results:
     """Return the success of the three policies on the same starts, and the minutes of each step."""
-    found: dict[str, list[int]] = json.loads((study.folder / "comparison" / "outcomes.json").read_text())
+    found: dict[str, list[bool]] = json.loads((study.folder / "comparison" / "outcomes.json").read_text())
     by_name = dict(zip(POLICIES, found.values(), strict=True))
     gate = study.folder / "improve" / "check" / "metrics.json"
     results = {

@@ -63,6 +63,7 @@ SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     "cameras": ("Recording, algorithms, speed", world_models.cameras),
     "control": ("Recording, algorithms, speed", world_models.control),
     "speed": ("Recording, algorithms, speed", world_models.speed),
+    "speed_gpu": ("Recording, algorithms, speed", world_models.speed_gpu),
 }
 """Study → chapter and section, in the order of the page."""
 
@@ -76,9 +77,9 @@ Each section is a question, its answer, one table and its limits. The page is ge
   world model were trained in; *unseen* ones are in no training data. Starts are held out in both.
 - Intervals in parentheses are 95 %: Wilson's for a share, bootstrap over episodes for a mean, bootstrap over
   starts for a change. None of them covers other seeds of training.
-- All numbers come from CPUs and from earlier commits than the present one. The commit is under each
-  table; *before* means that only the commit that added the numbers is known. Today's studies repeat the
-  set-up, but not all have been run again.
+- All numbers but those of [speed_gpu](#speed_gpu) come from CPUs, and all from earlier commits than the
+  present one. The commit is under each table; *before* means that only the commit that added the numbers is
+  known. Today's studies repeat the set-up, but not all have been run again.
 - Null results stay here.
 """
 
