@@ -1,4 +1,4 @@
-"""What fine-tuning OpenVLA by LoRA takes of a GPU's memory, computed without one.
+"""What fine-tuning OpenVLA by LoRA takes of a GPU's memory: computed without one, or measured.
 
     python benchmarks/openvla_memory.py --rank=32 --batch_sizes 1 8 16
     python benchmarks/openvla_memory.py --measure --output=docs/results/openvla_memory.json

@@ -48,7 +48,11 @@ def run_parts(given: argparse.Namespace, flags: Sequence[str]) -> list[Path]:
             processes[folder] = subprocess.Popen(
                 [find_program("lerobot-wmrl-compare"), *flags, *own], stdout=log, stderr=log
             )
-    failed = [str(folder) for folder, process in processes.items() if process.wait()]
+    try:
+        failed = [str(folder) for folder, process in processes.items() if process.wait()]
+    finally:
+        for process in processes.values():
+            process.terminate()
     if failed:
         sys.exit(f"error: failed, see the logs beside them: {', '.join(failed)}")
     return [folder / RESULTS for folder in processes]

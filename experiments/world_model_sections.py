@@ -370,11 +370,9 @@ def speed_gpu(load: Load) -> str:
 
 {table(["parallel episodes", "imagined", "with decoding", "trained", "times as fast as without cache"], rows)}
 
-Most of the GPU is idle, even though a step of imagination is one CUDA graph; it has not been profiled why.
-The preset `paper` did not finish the same measurement within 55 seconds. Nor is `improve` fast there: two
-trainings at once of the anchored world model of the preset `demo`, on clips of 100 frames, made 5.4 steps a
-second each, two to three times as many as one CPU core, because it predicts the robot's state in 100 steps
-one after another. Their tokenizers made 39.
+Three recordings of Meta-World rendered on it meanwhile. Most of the GPU is idle, even though a step of
+imagination is one CUDA graph; it has not been profiled why.
+[`improve`](pilots.md#meta-world) was not fast there either.
 
 LoRA (rank {memory["rank"]}) on OpenVLA's 7B, random weights. Gigabytes that `benchmarks/openvla_memory.py`
 computes without a GPU, and the peak there:

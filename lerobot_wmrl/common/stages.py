@@ -198,7 +198,7 @@ def run_measured(command: Sequence[str], log: Path, progress: Progress) -> int:
     """Run `command` to its end and return its exit status; an exception ends its process group first."""
     reader, writer = os.pipe()
     process = multiprocessing.get_context("fork").Process(
-        target=_run_command, args=(list(command), writer, os.getpid())
+        target=_run_command, args=(list(command), writer, os.getpid(), torch.cuda.is_available())
     )
     sys.stdout.flush()
     try:
@@ -214,8 +214,8 @@ def run_measured(command: Sequence[str], log: Path, progress: Progress) -> int:
         os.close(reader)
 
 
-def _run_command(command: list[str], output: int, parent: int) -> None:
-    """Become, in the forked process, what a shell would have started."""
+def _run_command(command: list[str], output: int, parent: int, anew: bool) -> None:
+    """Become, in the forked process, what a shell would have started; `anew` by starting it."""
     os.setsid()
     die_with(parent)
     own_progress_lock()
@@ -226,7 +226,7 @@ def _run_command(command: list[str], output: int, parent: int) -> None:
     sys.stdout, sys.stderr = (os.fdopen(stream, "w", buffering=1, closefd=False) for stream in (1, 2))
     os.environ.setdefault("COLUMNS", str(shutil.get_terminal_size().columns))
     keep_freed_memory()
-    if torch.cuda.is_available():  # a fork of a process that has asked for CUDA cannot use it
+    if anew:  # a fork of a process that has asked for CUDA cannot use it
         os.environ["PYTHONUNBUFFERED"] = "1"
         os.execv(find_program(command[0]), command)
     sys.argv = command

@@ -21,6 +21,9 @@ from lerobot_wmrl.data.frames import NO_CONTEXT, Context, Frames
 SUCCESS_SHARE: Final = 0.05
 """Share of what is learnt that shows success, at least: where fewer frames do, they count more."""
 
+MOST_WEIGHT: Final = 20.0
+"""Weight of a frame with success in the loss of done, at most."""
+
 
 class Clip(NamedTuple):
     """T consecutive frames of B episodes, with actions and success.
@@ -104,9 +107,10 @@ class ClipSampler:
 
     def __post_init__(self) -> None:
         """Weigh success by how rare it is."""
-        done = np.concatenate([self.table.done[rows] for rows in self.table.rows(self.episodes)])
+        done = np.concatenate([self.table.taught[rows] for rows in self.table.rows(self.episodes)])
         odds = SUCCESS_SHARE / (1 - SUCCESS_SHARE)
-        self.success_weight = max(1.0, odds * (~done).sum() / done.sum()) if done.any() else 1.0
+        rarity = float(odds * (~done).sum() / done.sum()) if done.any() else 1.0
+        self.success_weight = min(max(1.0, rarity), MOST_WEIGHT)
 
     def __call__(self, step: int) -> Clip:
         """Draw the batch of one training step."""
@@ -130,7 +134,7 @@ class ClipSampler:
             self._tensor(self.tokens[rows]).long(),
             self._tensor(self.table.state[rows]),
             self._tensor(self.table.action[rows]),
-            self._tensor(self.table.done[rows]).float(),
+            self._tensor(self.table.taught[rows]).float(),
             self._tensor(valid),
             self._tensor(known),
             [self.table.instructions[episode] for episode in episodes],
@@ -191,7 +195,7 @@ class FrameSampler:
         start = self.table.start[episodes]
         rows = start + offsets
         images, reference = (frames_to_tensor(self.frames[index]).to(self.device) for index in (rows, start))
-        shown = (offsets > 0) & self.table.done[np.maximum(rows - 1, start)]
+        shown = (offsets > 0) & self.table.taught[np.maximum(rows - 1, start)]
         batch = {"success": torch.from_numpy(shown).to(self.device)}
         for index, camera in enumerate(self.cameras):
             batch[camera_key(camera)] = images[:, index]
@@ -200,7 +204,7 @@ class FrameSampler:
 
     def _shows_success(self, rows: slice) -> np.ndarray:
         """Mark an episode's frames in which success holds: what follows an action that is done. (T,)"""
-        return np.append(False, self.table.done[rows][:-1])
+        return np.append(False, self.table.taught[rows][:-1])
 
 
 @dataclass

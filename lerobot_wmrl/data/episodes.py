@@ -20,8 +20,9 @@ VIDEO_BACKEND: Final = "pyav"
 VALIDATION_EVERY: Final = 20
 """Every twentieth episode is held out from the training of tokenizers and world models."""
 
-SOLVED_FRAMES: Final = 3
-"""Last frames of an episode that are taken for solved where episodes end as soon as they succeed."""
+SOLVED_FRAMES: Final = 2
+"""Last frames of an episode that are taken for solved where episodes end as soon as they succeed. The picture
+after the last action, which shows it, is not recorded."""
 
 SUCCESS_COLUMNS: Final = ("next.success", DONE)
 """Columns that can hold success, best first: `next.done` may mark the mere end of an episode."""
@@ -114,11 +115,12 @@ class EpisodeTable:
         dataset: the dataset that was read.
         state: (N, P), P = 0 where the dataset has none.
         action: (N, A).
-        done: (N,), whether success holds at the frame; False everywhere where the dataset does not say.
+        done: (N,), whether success holds after the frame's action; False where the dataset does not say.
         start: (E,), row of each episode's first frame.
         length: (E,), frames of each episode.
         instructions: one an episode, that of its first frame.
         columns: the dataset's further integer columns by name, (E,): their values at the first frames.
+        filled: what stands for `done` in training, (N,), where no frame shows success.
     """
 
     dataset: LeRobotDataset
@@ -129,6 +131,12 @@ class EpisodeTable:
     length: np.ndarray
     instructions: list[str]
     columns: Mapping[str, np.ndarray] = field(default_factory=dict)
+    filled: np.ndarray | None = None
+
+    @property
+    def taught(self) -> np.ndarray:
+        """What models learn as success: `done`, or what stands for it. (N,)"""
+        return self.done if self.filled is None else self.filled
 
     def column(self, name: str) -> np.ndarray:
         """Return an integer column's values, −1 where the dataset has no such column. (E,)"""
@@ -244,13 +252,16 @@ def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
     frames = len(rows["episode_index"])
     _, start, length = np.unique(rows["episode_index"], return_index=True, return_counts=True)
     done = np.asarray(rows[success]).reshape(-1).astype(bool) if success else np.zeros(frames, bool)
-    if end_at_success(done, start, length):
+    filled = None
+    if success != DONE and end_at_success(
+        done, start, length
+    ):  # next.done may say no more than that they end
         logging.warning(
             "%s: episodes end as soon as they succeed, so that no frame shows success. The last %d frames of "
             "those that succeed are taken for solved; record a few more, if you can",
             dataset.root, SOLVED_FRAMES,
         )  # fmt: skip
-        done = solved_at_end(done, start, length)
+        filled = solved_at_end(done, start, length)
     return EpisodeTable(
         dataset=dataset,
         state=as_columns(rows[OBS_STATE]) if OBS_STATE in rows else np.zeros((frames, 0), np.float32),
@@ -260,6 +271,7 @@ def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
         length=length,
         instructions=first_instructions(dataset, np.asarray(rows["task_index"]), start),
         columns={name: np.asarray(rows[name]).reshape(-1)[start] for name in further},
+        filled=filled,
     )
 
 
@@ -272,10 +284,10 @@ def end_at_success(done: np.ndarray, start: np.ndarray, length: np.ndarray) -> b
 
 
 def solved_at_end(done: np.ndarray, start: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """Return done (N,) with the last `SOLVED_FRAMES` frames of each successful episode."""
+    """Mark the last action of successful episodes and those before the last `SOLVED_FRAMES` frames. (N,)"""
     solved = done.copy()
     for first, after in zip(start, start + length, strict=True):
-        solved[max(first, after - SOLVED_FRAMES) : after] = done[after - 1]
+        solved[max(first, after - 1 - SOLVED_FRAMES) : after] = done[after - 1]
     return solved
 
 

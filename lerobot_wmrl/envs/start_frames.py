@@ -176,7 +176,7 @@ def check_starts(source: StartFrames, ledger: Ledger | None) -> None:
 
 def undecided_frames(table: EpisodeTable, episodes: np.ndarray) -> np.ndarray:
     """Return the number of frames before the first success of K episodes, all if there is none. (K,)"""
-    start, solved = table.start[episodes], np.append(np.flatnonzero(table.done), len(table.done))
+    start, solved = table.start[episodes], np.append(np.flatnonzero(table.taught), len(table.taught))
     return np.minimum(solved[np.searchsorted(solved, start)] - start, table.length[episodes])
 
 

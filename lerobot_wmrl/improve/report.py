@@ -53,11 +53,11 @@ def trust(improvement: Improvement) -> str:
     """Say how well the world model tells recorded successes from failures."""
     found = read(improvement.out / "check" / "metrics.json")
     wins, losses = found["successes"], found["failures"]
-    kind = "held-out episodes" if improvement.holds_out else "episodes, from which it has learnt,"
+    kind = "held-out episodes" if improvement.holds_out else "episodes, most of which it has learnt from,"
     if not wins or not losses:
         return (
-            f"Unknown: of the {kind} {wins} succeed and {losses} fail, and both are needed. Record more: "
-            f"every twentieth episode is held out.{taken_instead(improvement)}"
+            f"Unknown: of the {kind} {wins} succeed and {losses} fail, and both are needed. Record more."
+            f"{taken_instead(improvement)}"
         )
     false, recall = Proportion(found["false_positives"], losses), Proportion(found["true_positives"], wins)
     said = (

@@ -40,8 +40,8 @@ SIDES: Final = {"tiny": 32, "demo": 64, "cpu": 128}
 """Pixels a side of imagined frames at each size, unless the dataset's are smaller."""
 
 ENOUGH_HELD_OUT: Final = 10
-"""If fewer episodes are held out, the check takes all, most of which were learnt from: no threshold can be
-chosen from one or two successes."""
+"""If fewer episodes are held out, the check takes all, most of which were learnt from: a few say too little
+about a threshold."""
 
 SIDE_STEP: Final = 32
 """A side is a multiple of this: at any of the sizes, the transformer's patches divide the token grid."""

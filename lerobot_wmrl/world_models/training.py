@@ -320,6 +320,7 @@ def held_out_metrics(model: Any, table: EpisodeTable, batch_size: int) -> dict[s
     if not episodes.any():
         return {}
     sampler = make_clip_sampler(model, table, episodes.nonzero()[0], batch_size, seed=0)
+    sampler.success_weight = 1.0
     model.eval()
     every = []
     for batch in range(HELD_OUT_BATCHES):

@@ -31,8 +31,9 @@ def run_code() -> None:
 
 @pytest.fixture(autouse=True)
 def commands_of_the_tests(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The test stages run code that takes a moment, and need none of the libraries that are preloaded."""
+    """Code that takes a moment stands for commands; it needs no preloaded library and no GPU."""
     monkeypatch.setattr(runner, "entry_point", lambda program: run_code)
+    monkeypatch.setattr(runner.torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(runner, "preload", lambda modules, offline: None)
 
 
@@ -148,6 +149,15 @@ def test_training_and_evaluation_seeds_are_disjoint() -> None:
     assert len(trained) == 20
     assert len(held_out) == 2
     assert min(held_out) - max(trained) >= 50_000
+
+
+def test_with_cuda_a_stage_is_a_fresh_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It cannot use CUDA in a fork of a process that has asked for it."""
+    monkeypatch.setattr(runner.torch.cuda, "is_available", lambda: True)
+    log = tmp_path / "log"
+    code = "import os, sys; print('torch' in sys.modules, os.getsid(0) == os.getpid()); sys.exit(3)"
+    assert run_measured(["python", "-c", code], log, lambda *_: None) == 3
+    assert log.read_text().split() == ["False", "True"]
 
 
 def test_a_command_that_is_not_installed_is_named() -> None:

@@ -33,6 +33,19 @@ def test_the_instruction_of_an_episode_is_that_of_its_first_frame(
     assert "the instruction changes within 1 of 2 episodes" in caplog.text
 
 
+def test_where_episodes_merely_end_nothing_is_added(tmp_path: Path) -> None:
+    """`next.done` alone may mark timeouts."""
+    flag = {"dtype": "bool", "shape": (1,), "names": None}
+    dataset = LeRobotDataset.create("local/ends", 10, FEATURES | {"next.done": flag}, root=tmp_path / "d")
+    for step in range(5):
+        dataset.add_frame({
+            "action": np.zeros(1, np.float32), "next.done": np.array([step == 4]), "task": "open"
+        })  # fmt: skip
+    dataset.save_episode()
+    dataset.finalize()
+    assert read_episodes(open_dataset(tmp_path / "d")).taught.tolist() == [False] * 4 + [True]
+
+
 @pytest.mark.parametrize(
     ("recorded", "read"),
     [
@@ -57,6 +70,7 @@ def test_where_no_frame_shows_success_the_last_ones_are_taken_for_it(
         dataset.save_episode()
     dataset.finalize()
     table = read_episodes(open_dataset(tmp_path / "d"))
-    assert table.done.astype(int).tolist() == [frame for episode in read for frame in episode]
+    assert table.taught.astype(int).tolist() == [frame for episode in read for frame in episode]
+    assert table.done.astype(int).tolist() == [frame for episode in recorded for frame in episode]
     assert table.success.tolist() == [any(episode) for episode in recorded]
     assert ("no frame shows success" in caplog.text) == (recorded != read)

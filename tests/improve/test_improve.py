@@ -73,7 +73,7 @@ def test_without_one_the_report_says_that_it_is_a_belief(demonstrations: Path, t
     report = (tmp_path / "improve" / "report.md").read_text()
     assert "Success in imagination" in report
     assert "shows nothing about the real world" in report
-    assert "from which it has learnt" in report
+    assert "most of which it has learnt from" in report
     assert "2 episodes, " in done.stdout
     assert report.count("dataset.episodes=[0,2]") == 5
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.clips import SUCCESS_SHARE, ClipSampler, FrameSampler
+from lerobot_wmrl.data.clips import MOST_WEIGHT, SUCCESS_SHARE, ClipSampler, FrameSampler
 from lerobot_wmrl.data.episodes import EpisodeTable, TrainingData, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_features, cached_frames, frames_to_tensor
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig, train_world_model
@@ -142,7 +142,7 @@ def test_frames_that_show_success_often_enough_are_drawn_as_they_are():
     assert not none(0)["success"].any()
 
 
-@pytest.mark.parametrize(("length", "weight"), [(10, 1.0), (100, 199 / 19)])
+@pytest.mark.parametrize(("length", "weight"), [(10, 1.0), (100, 199 / 19), (1000, MOST_WEIGHT)])
 def test_rare_success_weighs_as_much_as_a_twentieth_in_the_loss_of_done(length: int, weight: float):
     table = rare(length)
     sampler = ClipSampler(
