@@ -241,8 +241,7 @@ def in_gb(size: int) -> float:
     return round(size / GB, 2)
 
 
-def main() -> None:
-    """Compute everything and print it."""
+def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -251,7 +250,12 @@ def main() -> None:
     parser.add_argument("--environments", type=int, default=64, help="stepped together in a rollout")
     parser.add_argument("--measure", action="store_true", help="run it on the GPU too")
     parser.add_argument("--output", type=Path, help="JSON file for what is printed")
-    given = parser.parse_args()
+    return parser
+
+
+def main() -> None:
+    """Compute everything, measure it if wanted, and print it."""
+    given = make_parser().parse_args()
     sizes = (given.rank, given.batch_sizes, given.environments)
     found = table(*sizes) | ({"measured": measured(*sizes)} if given.measure else {})
     print(json.dumps(found, indent=2))
