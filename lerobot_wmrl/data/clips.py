@@ -172,10 +172,12 @@ class FrameSampler:
 
     def __post_init__(self) -> None:
         """Find the frames that show success, and the share of draws that must fall on them besides."""
-        shown = [np.flatnonzero(self._shows_success(rows)) for rows in self.table.rows(self.episodes)]
-        counts, length = np.array([len(each) for each in shown]), self.table.length[self.episodes]
+        self.shown = np.append(False, self.table.taught[:-1])  # a frame follows the action before it,
+        self.shown[self.table.start] = False  # and an episode's first frame none
+        offsets = [np.flatnonzero(self.shown[rows]) for rows in self.table.rows(self.episodes)]
+        counts, length = np.array([len(each) for each in offsets]), self.table.length[self.episodes]
         self.solved_episodes = np.repeat(self.episodes, counts)
-        self.solved_offsets = np.concatenate(shown)
+        self.solved_offsets = np.concatenate(offsets)
         share = float((counts / length).mean())
         self.extra = max(0.0, (SUCCESS_SHARE - share) / (1 - share)) if counts.any() else 0.0
 
@@ -195,16 +197,11 @@ class FrameSampler:
         start = self.table.start[episodes]
         rows = start + offsets
         images, reference = (frames_to_tensor(self.frames[index]).to(self.device) for index in (rows, start))
-        shown = (offsets > 0) & self.table.taught[np.maximum(rows - 1, start)]
-        batch = {"success": torch.from_numpy(shown).to(self.device)}
+        batch = {"success": torch.from_numpy(self.shown[rows]).to(self.device)}
         for index, camera in enumerate(self.cameras):
             batch[camera_key(camera)] = images[:, index]
             batch[f"reference.{camera}"] = reference[:, index]
         return batch
-
-    def _shows_success(self, rows: slice) -> np.ndarray:
-        """Mark an episode's frames in which success holds: what follows an action that is done. (T,)"""
-        return np.append(False, self.table.taught[rows][:-1])
 
 
 @dataclass

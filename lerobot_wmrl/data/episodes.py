@@ -253,9 +253,8 @@ def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
     _, start, length = np.unique(rows["episode_index"], return_index=True, return_counts=True)
     done = np.asarray(rows[success]).reshape(-1).astype(bool) if success else np.zeros(frames, bool)
     filled = None
-    if success != DONE and end_at_success(
-        done, start, length
-    ):  # next.done may say no more than that they end
+    # next.done may say no more than that episodes end
+    if success != DONE and end_at_success(done, start, length):
         logging.warning(
             "%s: episodes end as soon as they succeed, so that no frame shows success. The last %d frames of "
             "those that succeed are taken for solved; record a few more, if you can",
