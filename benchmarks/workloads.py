@@ -14,6 +14,7 @@ from lerobot_wmrl.world_models.anchored.imagination import AnchoredImagination
 from lerobot_wmrl.world_models.autoregressive.dynamics import AutoregressiveImagination
 from lerobot_wmrl.world_models.dynamics import Imagination as RunningImagination
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
+from lerobot_wmrl.world_models.success import num_features
 
 STEPS = 8
 """Frames imagined at a turn."""
@@ -127,9 +128,13 @@ def random_clip(model: ActionWorldModelRewardModel, batch: int, device: torch.de
     )
     yes = torch.ones(shape, dtype=torch.bool, device=device)
     done, depth = torch.zeros(shape, device=device), torch.ones(tokens.shape, device=device)
+    features = None
+    if model.config.predicts_success:
+        features = torch.zeros(*shape, num_features(model.tokenizer.num_cameras), device=device)
     return Clip(
-        tokens, state, action, done, yes, yes, [""] * batch, depth, black_context(model, batch, device)
-    )
+        tokens, state, action, done, yes, yes, [""] * batch, depth, black_context(model, batch, device),
+        features,
+    )  # fmt: skip
 
 
 def training_step(model: ActionWorldModelRewardModel, clip: Clip, dtype: torch.dtype) -> Work:

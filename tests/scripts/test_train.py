@@ -13,6 +13,7 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from safetensors.torch import load_file
 
+from lerobot_wmrl.common.presets import PRESETS
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
@@ -71,6 +72,17 @@ def test_clone_improve_and_evaluate(cloned: Path, tmp_path: Path, monkeypatch: p
         "--seed=1000000", f"--output_dir={tmp_path / 'eval'}",
     )  # fmt: skip
     assert "pc_success" in json.loads((tmp_path / "eval" / "eval_info.json").read_text())["overall"]
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_preset_trains_for_four_iterations_with_few_environments(
+    preset: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    few = ["--num_envs=2", "--iterations=4", "--algorithm.minibatch_size=4", "--gate.action=off"]
+    policy = save_untrained_policy(tmp_path / "policy")
+    flags = [f"--preset={preset}", f"--policy.path={policy}", *POINT, *few, f"--output_dir={tmp_path / 'rl'}"]
+    improve(monkeypatch, *flags)
+    assert [line["step"] for line in read_metrics(tmp_path / "rl")] == [1, 2, 3, 4]
 
 
 def test_a_finished_training_is_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

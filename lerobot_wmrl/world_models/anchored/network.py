@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from lerobot_wmrl.common.cuda_graphs import GraphedInTraining
 from lerobot_wmrl.common.precision import compute_in
 from lerobot_wmrl.data.clips import take_steps
 from lerobot_wmrl.data.frames import NO_CONTEXT, Context
@@ -210,6 +211,7 @@ class AnchoredNetwork(FrameNetwork):
         width, heads = config.width, config.heads
         self.window, self.heads, self.head_width = sizes.clip_length, heads, width // heads
         self.state_rollout = StateRolloutNetwork(sizes.state_size, width)
+        self._unroll = GraphedInTraining(self.state_rollout)
         channels = sizes.context_channels
         self.context = ContextEmbedding(channels, config.patch, width) if channels else None
         self.scene = nn.ModuleList(SpatialBlock(width, heads) for _ in range(max(1, config.layers // 2)))
@@ -276,7 +278,7 @@ class AnchoredNetwork(FrameNetwork):
         Returns:
             The prediction, with logits of the frames after `steps` (B, K) alone, and the state rollout.
         """
-        rollout = self.state_rollout(begin, spread(scene.summary, len(mean)), mean)
+        rollout: StateRollout = self._unroll(begin, spread(scene.summary, len(mean)), mean)
         x = self.register + mean + self.motion(rollout.hidden) + self.state_in(rollout.state)  # (B, T, D)
         x = x[:, None]  # (B, 1, T, D): space before time
         for layer, block in enumerate(self.trajectory):
