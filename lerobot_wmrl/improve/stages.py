@@ -22,7 +22,7 @@ from lerobot_wmrl.common.policies import (
 )
 from lerobot_wmrl.common.presets import Flags, format_flags, preset_settings
 from lerobot_wmrl.common.stages import Stage
-from lerobot_wmrl.data.episodes import ChosenEpisodes, DatasetSource
+from lerobot_wmrl.data.episodes import VALIDATION_EVERY, ChosenEpisodes, DatasetSource
 from lerobot_wmrl.improve.findings import LONGEST_IMAGINATION, Findings
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.recorders import env_flags
@@ -200,9 +200,15 @@ class Improvement:
         return (self.found.usual - 1) // self.length
 
     @property
+    def checks_rollouts(self) -> bool:
+        """Whether the world model is checked on the rollouts, unless they are few: RL acts like them."""
+        return self.config.rollouts >= ENOUGH_HELD_OUT
+
+    @property
     def holds_out(self) -> bool:
-        """Whether enough of the episodes are held out from training to check the world model on."""
-        return self.found.held_out >= ENOUGH_HELD_OUT
+        """Whether enough of these episodes are held out from training to check the world model on."""
+        rollouts = self.config.rollouts // VALIDATION_EVERY
+        return (rollouts if self.checks_rollouts else self.found.held_out) >= ENOUGH_HELD_OUT
 
     @property
     def length(self) -> int:
@@ -215,8 +221,8 @@ class Improvement:
 
     def _data(self) -> Flags:
         """Return the flags of all that is learnt from."""
-        more = f"[{self.out / 'rollouts'}]" if self.config.rollouts else None
-        return self.config.dataset.flags() | ({"dataset.more": more} if more else {})
+        more = {"dataset.more": f"[{self.out / 'rollouts'}]"} if self.config.rollouts else {}
+        return self.config.dataset.flags() | more
 
     def _done(self) -> Flags:
         return {"done_threshold": DONE_THRESHOLD, "done_frames": min(DONE_FRAMES, max(1, self.found.held))}
@@ -242,7 +248,7 @@ class Improvement:
     def _imagination(self) -> Flags:
         return {
             "env.type": "world_model", "env.world_model_path": str(self.out / "world_model"),
-            **{f"env.{name}": value for name, value in self.config.dataset.flags().items()},
+            **{f"env.{name}": value for name, value in self._data().items()},
             "env.dataset.max_starts": 1024, "env.dataset.branches": self.branches,
             "env.reward.type": "general", "env.reward.alpha": 1, "env.episode_length": self.length,
             **{f"env.{name}": value for name, value in self._success_criterion().items()},
@@ -282,8 +288,9 @@ class Improvement:
         }, "world_model")  # fmt: skip
 
     def _check(self) -> list[str]:
+        rollouts, data = {"dataset.root": str(self.out / "rollouts")}, self.config.dataset.flags()
         flags: Flags = {
-            "model.path": str(self.out / "world_model"), **self.config.dataset.flags(),
+            "model.path": str(self.out / "world_model"), **(rollouts if self.checks_rollouts else data),
             "split": "validation" if self.holds_out else "all",
             **self._done(), "max_episodes": 200, "output_dir": str(self.out / "check"),
         }  # fmt: skip

@@ -105,21 +105,27 @@ class Labels:
 def recorded_successes(
     source: StartFrames, cameras: Sequence[str], state_size: int, chunk: int
 ) -> list[Part]:
-    """Return the actions of a dataset's successful episodes as labels; nothing without a dataset or success.
+    """Return the actions of the datasets' successful episodes as labels; nothing without any.
 
     Args:
-        source: the episodes, those of its split, tasks and scenes.
+        source: the datasets, and the split, tasks and scenes of their episodes.
         cameras: keys of the images.
         state_size: components of the state, 0 for observations without it.
         chunk: actions of a chunk, n; 0 for policies without chunks.
     """
     if not source.given:
         return []
+    parts = (successes(dataset, cameras, state_size, chunk) for dataset in source.each())
+    return [part for part in parts if part is not None]
+
+
+def successes(source: StartFrames, cameras: Sequence[str], state_size: int, chunk: int) -> Part | None:
+    """Return what `recorded_successes` says of one dataset, None if nothing succeeds."""
     table = read_episodes(source.open())
     episodes = every_chosen_episode(table, source)
     episodes = episodes[table.success[episodes]]
     if not len(episodes):
-        return []
+        return None
     steps = np.arange(table.length[episodes].max())[:, None]  # (T, E) below
     acting = torch.from_numpy(steps < table.length[episodes])
     rows = np.minimum(table.start[episodes] + steps, table.start[episodes] + table.length[episodes] - 1)
@@ -133,7 +139,7 @@ def recorded_successes(
     if state_size:
         labels[OBS_STATE] = torch.from_numpy(table.state[chosen])
     labels[TASK] = episode
-    return [Part(labels, [table.instructions[each] for each in episodes])]
+    return Part(labels, [table.instructions[each] for each in episodes])
 
 
 def action_chunks(actions: Tensor, labelled: Tensor, length: int) -> dict[str, Tensor]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from lerobot.configs import PreTrainedConfig
+from lerobot.envs.configs import PushtEnv
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
 from lerobot.utils.constants import OBS_IMAGE
@@ -58,7 +59,7 @@ def test_with_a_real_environment_its_rollouts_are_learnt_from_and_success_is_mea
     assert "failures: 0. The world model will hardly tell them" in first.stdout
     report = (folder / "report.md").read_text()
     assert "Success in pusht: 0 % (0 of 2" in report
-    assert "--dataset.more=" in report
+    assert report.count("dataset.more=") == 3  # tokenizer, world model and starts
     last = Path("checkpoints/last/pretrained_model")
     trained = json.loads((folder / "tokenizer" / last / "config.json").read_text())
     assert trained["tokenizer"]["frame_sizes"] == [[96, 96]]
@@ -145,6 +146,21 @@ def test_the_check_takes_held_out_episodes_where_there_are_enough(
     tmp_path: Path, held_out: int, split: str
 ) -> None:
     assert f"--split={split}" in made_commands(tmp_path, held_out=held_out)["check"]
+
+
+@pytest.mark.parametrize(("rollouts", "root", "split"), [
+    (9, "data", "validation"), (10, "rollouts", "all"),
+    (199, "rollouts", "all"), (200, "rollouts", "validation"),
+])  # fmt: skip
+def test_rollouts_are_checked_on_where_there_are_enough(
+    tmp_path: Path, rollouts: int, root: str, split: str
+) -> None:
+    improvement = improvement_of(tmp_path, held_out=10)
+    improvement.config.rollouts, improvement.config.real_env = rollouts, PushtEnv()
+    commands = {stage.name: stage.command() for stage in improvement.stages()}
+    folder = root if root == "data" else tmp_path / root
+    assert {f"--dataset.root={folder}", f"--split={split}"} <= {*commands["check"]}
+    assert f"--env.dataset.more=[{tmp_path / 'rollouts'}]" in commands["rl"]
 
 
 def test_where_the_strict_threshold_recognises_nothing_the_check_s_own_is_taken(tmp_path: Path) -> None:
