@@ -26,7 +26,7 @@ FEATURES = {
     "observation.image": {
         "dtype": "image",
         "shape": (480, 480, 3),
-        "names": ["height", "width", "channel"],
+        "names": ["height", "width", "channels"],
     },
     "observation.state": {"dtype": "float32", "shape": (4,), "names": ["x", "y", "z", "gripper"]},
     "action": {

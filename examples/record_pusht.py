@@ -45,7 +45,7 @@ FEATURES = {
     "observation.image": {
         "dtype": "image",
         "shape": (SIZE, SIZE, 3),
-        "names": ["height", "width", "channel"],
+        "names": ["height", "width", "channels"],
     },
     "observation.state": {"dtype": "float32", "shape": (2,), "names": ["x", "y"]},
     "action": {"dtype": "float32", "shape": (2,), "names": ["x", "y"]},

@@ -76,6 +76,10 @@ class RecordConfig(RunConfig):
     """Take the columns of `like`. False takes names and the range of the actions alone, where the dataset has
     columns that the environment does not show."""
 
+    max_frames: int | None = None
+    """In another environment of LeRobot's: frames of an episode at most, if its own limit is not lower.
+    Without success until then an episode has failed."""
+
     depth: bool = False
     """Also record every camera's depth, as LeRobot's depth maps (observation.images.<camera>_depth)."""
 
@@ -135,6 +139,13 @@ class RecordConfig(RunConfig):
         if self.output_dir is None:
             raise FieldError("output_dir", None, "missing", "give the folder for the dataset")
         require_at_least(self, 1, "num_episodes", "num_workers", "part_episodes")
+        if self.max_frames is not None:
+            require_at_least(self, 1, "max_frames")
+            if isinstance(self.env, WmrlManiSkillEnv | WorldModelEnv):
+                raise FieldError(
+                    "max_frames", self.max_frames, f"{self.env.type} has a setting of its own",
+                    "set `env.episode_length`",
+                )  # fmt: skip
         if self.seed < 0 or (self.policy is None and self.seed + self.num_episodes > EVALUATION_SEED):
             raise FieldError(
                 "seed",
@@ -279,8 +290,10 @@ class RecordConfig(RunConfig):
         if isinstance(self.env, WorldModelEnv):
             return imagined_content(self.env)
         if self.elsewhere:
+            given = {"env": draccus.encode(self.env, EnvConfig), "like": asdict(self.like)}
             columns = {} if self.like_columns else {"like_columns": False}
-            return {"env": draccus.encode(self.env, EnvConfig), "like": asdict(self.like), **columns}
+            limit = {} if self.max_frames is None else {"max_frames": self.max_frames}
+            return given | columns | limit
         return self._simulated_content()
 
     def _policy_content(self) -> dict[str, Any]:

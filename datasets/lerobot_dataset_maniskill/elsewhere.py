@@ -101,7 +101,7 @@ def record_parts(config: RecordConfig, work: Path) -> None:
     recorder = RolloutRecorder(
         config.env, config.policy, None, config.exploration, like,
         num_envs=episodes if isinstance(config.env, WorldModelEnv) else 1, video=config.video,
-        like_columns=config.like_columns,
+        like_columns=config.like_columns, max_frames=config.max_frames,
     )  # fmt: skip
     won: list[bool] = []
     done = config.num_episodes - sum(map(len, missing.values()))

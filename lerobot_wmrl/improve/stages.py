@@ -43,6 +43,9 @@ ENOUGH_HELD_OUT: Final = 10
 """If fewer episodes are held out, the check takes all, most of which were learnt from: a few say too little
 about a threshold."""
 
+SLOWEST: Final = 2
+"""A rollout may take this many times as long as the longest recorded episode."""
+
 SIDE_STEP: Final = 32
 """A side is a multiple of this: at any of the sizes, the transformer's patches divide the token grid."""
 
@@ -263,11 +266,15 @@ class Improvement:
         simulator = self.config.real_env is not None and self.config.real_env.type == "wmrl_maniskill"
         flags: Flags = {
             "policy.path": self.policy, **self._real_env("env"),
-            **({} if simulator else {**like, "like_columns": False}),
+            **({} if simulator else {**like, "like_columns": False, "max_frames": self._longest_rollout()}),
             "video": False, "num_episodes": self.config.rollouts, "exploration": self.config.exploration,
             "seed": self.config.seed, "output_dir": str(self.out / "rollouts"),
         }  # fmt: skip
         return ["lerobot-wmrl-record", *format_flags(flags)]
+
+    def _longest_rollout(self) -> int:
+        """Return the frames after which a rollout has failed: what comes later would fill the data."""
+        return SLOWEST * self.found.longest
 
     def _learn(self, model: str, flags: Flags, folder: str) -> list[str]:
         return self._command("lerobot-wmrl-train-world-model", {

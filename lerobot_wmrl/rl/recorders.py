@@ -36,6 +36,9 @@ from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 IMAGE_WRITERS = 4
 """Threads that compress the frames of rollouts in a LeRobot environment."""
 
+FRAME_LIMIT = "_max_episode_steps"
+"""Attribute of an environment that ends LeRobot's rollouts."""
+
 DERIVED = ("features", "features_map")
 """Settings of an environment that are derived from others."""
 
@@ -138,11 +141,13 @@ class RolloutRecorder:
         like_columns: take its columns too, so that the new one can be merged with it.
         num_envs: episodes at once.
         video: store the cameras as videos; without `like`, which decides it.
+        max_frames: of an episode, if the environment's own limit is not lower.
     """
 
     def __init__(
         self, env: EnvConfig, policy: PreTrainedConfig, robot: Embodiment | None, exploration: float = 0.0,
         like: Any | None = None, num_envs: int = 1, video: bool = False, like_columns: bool = True,
+        max_frames: int | None = None,
     ) -> None:  # fmt: skip
         self.config, self.exploration, self.video = env, exploration, video
         self.columns = like.features if like is not None and like_columns else None
@@ -151,6 +156,9 @@ class RolloutRecorder:
         self.env_processors = make_env_pre_post_processors(env, policy)
         made = make_env(env, num_envs, use_async_envs=False)
         self.envs = [each for tasks in made.values() for each in tasks.values()]
+        if max_frames is not None:
+            for each in self.envs:
+                each.set_attr(FRAME_LIMIT, min(max_frames, each.get_attr(FRAME_LIMIT)[0]))
         self.robot = robot or robot_of(env, self.envs[0], like)
 
     def close(self) -> None:

@@ -161,6 +161,7 @@ def test_rollouts_are_checked_on_where_there_are_enough(
     folder = root if root == "data" else tmp_path / root
     assert {f"--dataset.root={folder}", f"--split={split}"} <= {*commands["check"]}
     assert f"--env.dataset.more=[{tmp_path / 'rollouts'}]" in commands["rl"]
+    assert "--max_frames=80" in commands["rollouts"]  # twice the longest episode
 
 
 def test_where_the_strict_threshold_recognises_nothing_the_check_s_own_is_taken(tmp_path: Path) -> None:

@@ -54,6 +54,13 @@ def test_they_have_the_columns_of_the_demonstrations_and_can_be_merged(
     assert len(read_episodes(open_dataset(tmp_path / "merged")).length) == 4
 
 
+@pytest.mark.parametrize(("limit", "frames"), [(4, 4), (STEPS + 1, STEPS)])
+def test_an_episode_ends_at_the_lower_limit(config: RecordConfig, limit: int, frames: int) -> None:
+    config.max_frames = limit
+    record_elsewhere(config)
+    assert read_episodes(open_dataset(config.root)).length.tolist() == [frames] * 3
+
+
 def test_where_next_done_is_taken_for_success_it_says_success(
     config: RecordConfig, demonstrations: Path, tmp_path: Path
 ) -> None:
@@ -131,6 +138,7 @@ def test_without_demonstrations_the_environment_says_what_the_actions_are(config
     ("policy", None, "env.type=pusht: needs a policy"),
     ("depth", True, "depth=True: can be chosen in ManiSkill alone"),
     ("shard", "0/2", "shard=0/2: divides recordings in ManiSkill alone"),
+    ("max_frames", 0, "max_frames=0: must be at least 1"),
     ("like", DatasetSource("nowhere"), "like.*root=nowhere: no LeRobotDataset there"),
 ])  # fmt: skip
 def test_bad_settings_are_named_and_nothing_is_left(

@@ -31,6 +31,10 @@ ROLL_OUT = ["--policy.path={policy}", *SIMULATOR, "--num_episodes=1"]
 @pytest.mark.parametrize(("command", "flags", "message"), [
     (record, [*SIMULATOR, "--env.task=juggle"], "--env.task=juggle: unknown; choose one of push"),
     (record, ["--preset=huge"], "--preset=huge: unknown preset; choose one of cpu, demo"),
+    (
+        record, ["--output_dir=out", "--max_frames=9"],
+        "--max_frames=9: wmrl_maniskill has a setting of its own; set --env.episode_length",
+    ),
     (record, ["--push_to_hub=true"], "called local/new; give its name on the hub, user/name, as --repo_id"),
     (record, ["--output_dir={foreign}"], "foreign: holds something else"),
     (record, ROLL_OUT, "observation.images.third_view of shape (3, 32, 32), the environment has"),
