@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from lerobot_wmrl.common.cuda_graphs import cuda_graphs
 from lerobot_wmrl.common.precision import compute_in
 from lerobot_wmrl.data.clips import Clip
 from lerobot_wmrl.data.frames import Context, Frames
@@ -143,7 +144,7 @@ def training_step(model: ActionWorldModelRewardModel, clip: Clip, dtype: torch.d
     optimizer: Any = model.config.get_optimizer_preset().build(parameters)
 
     def descend() -> None:
-        with compute_in(dtype, clip.tokens.device):
+        with cuda_graphs(), compute_in(dtype, clip.tokens.device):
             loss, _ = model(clip)
         optimizer.zero_grad()
         loss.backward()

@@ -27,6 +27,9 @@ MODULES: Final = (
 ROOTS: Final = ("dataset.root", "env.dataset.root", "gate.dataset.root")
 """Flags with the folder of one dataset."""
 
+LISTS: Final = ("dataset.more", "env.dataset.more")
+"""Flags with the folders of several."""
+
 INSERTED: Final = "$()"
 """What stands for something that the shell inserts."""
 
@@ -128,8 +131,9 @@ def sources(step: Step) -> Iterator[Source]:
                 own = literal is not None and flag == "dataset.root"
                 chosen = tuple(yaml.safe_load(flags["dataset.episodes"])) if own else None
                 yield Source(flag, flags[flag], chosen)
-        for root in listed(flags.get("dataset.more", "[]")):
-            yield Source("dataset.more", root, None)
+        for flag in LISTS:
+            for root in listed(flags.get(flag, "[]")):
+                yield Source(flag, root, None)
 
 
 def listed(value: str) -> list[str]:

@@ -77,8 +77,8 @@ class RecordConfig(RunConfig):
     columns that the environment does not show."""
 
     max_frames: int | None = None
-    """In another environment of LeRobot's: frames of an episode at most, if its own limit is not lower.
-    Without success until then an episode has failed."""
+    """Frames of an episode at most, in LeRobot's other environments, if their own limit is not lower. Without
+    success until then an episode has failed. ManiSkill and world models have `env.episode_length`."""
 
     depth: bool = False
     """Also record every camera's depth, as LeRobot's depth maps (observation.images.<camera>_depth)."""
@@ -186,6 +186,11 @@ class RecordConfig(RunConfig):
                 "env.dataset.branches", self.env.dataset.branches,
                 "recorded episodes begin with first frames", "leave it out",
             )  # fmt: skip
+        if isinstance(self.env, WorldModelEnv) and self.env.dataset.more and not self.elsewhere:
+            raise FieldError(
+                "env.dataset.more", self.env.dataset.more,
+                "recorded episodes say from which episode of one dataset they start", "leave it out",
+            )  # fmt: skip
         if self.elsewhere and self.shard_of[1] > 1:
             raise FieldError("shard", self.shard, "divides recordings in ManiSkill alone", "leave it out")
 
@@ -292,8 +297,7 @@ class RecordConfig(RunConfig):
         if self.elsewhere:
             given = {"env": draccus.encode(self.env, EnvConfig), "like": asdict(self.like)}
             columns = {} if self.like_columns else {"like_columns": False}
-            limit = {} if self.max_frames is None else {"max_frames": self.max_frames}
-            return given | columns | limit
+            return given | columns | {"max_frames": self.max_frames}
         return self._simulated_content()
 
     def _policy_content(self) -> dict[str, Any]:

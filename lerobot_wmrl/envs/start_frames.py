@@ -183,12 +183,14 @@ def check_starts(source: StartFrames, ledger: Ledger | None) -> None:
         )  # fmt: skip
     if not source.given:
         return
-    for dataset in source.each():
+    remedy = "choose others with `dataset.split=ind` or `dataset.scenes`"
+    for number, dataset in enumerate(source.each()):
+        field = "dataset.more" if number else "dataset.root"
         table = read_episodes(dataset.open())
         episodes = every_chosen_episode(table, dataset)
-        require_unreported(table, episodes, "choose others with `dataset.split=ind` or `dataset.scenes`")
+        require_unreported(table, episodes, remedy, field)
         if ledger is not None:
-            ledger.require_known(table, episodes)
+            ledger.require_known(table, episodes, field)
 
 
 def undecided_frames(table: EpisodeTable, episodes: np.ndarray) -> np.ndarray:

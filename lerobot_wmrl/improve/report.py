@@ -53,7 +53,9 @@ def trust(improvement: Improvement) -> str:
     """Say how well the world model tells recorded successes from failures."""
     found = read(improvement.out / "check" / "metrics.json")
     wins, losses = found["successes"], found["failures"]
-    kind = "held-out episodes" if improvement.holds_out else "episodes, most of which it has learnt from,"
+    whose = "rollouts" if Path(found["dataset"]) == improvement.out / "rollouts" else "episodes"
+    held_out = found["split"] == "validation"
+    kind = f"held-out {whose}" if held_out else f"{whose} (most of which it has learnt from)"
     if not wins or not losses:
         return (
             f"Unknown: of the {kind} {wins} succeed and {losses} fail, and both are needed. Record more."

@@ -22,7 +22,7 @@ from lerobot_wmrl.common.policies import (
 )
 from lerobot_wmrl.common.presets import Flags, format_flags, preset_settings
 from lerobot_wmrl.common.stages import Stage
-from lerobot_wmrl.data.episodes import VALIDATION_EVERY, ChosenEpisodes, DatasetSource
+from lerobot_wmrl.data.episodes import ChosenEpisodes, DatasetSource, open_dataset, read_episodes
 from lerobot_wmrl.improve.findings import LONGEST_IMAGINATION, Findings
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.recorders import env_flags
@@ -167,7 +167,7 @@ class Improvement:
             "rollouts": "Record rollouts of the policy",
             "tokenizer": "Train the frame tokenizer",
             "world_model": "Train the world model",
-            "check": f"Check the world model on {'held-out' if self.holds_out else 'the'} episodes",
+            "check": "Check the world model on recorded episodes",
             "rl": "Train the policy in imagination",
             "comparison": "Compare the policy before and after",
         }
@@ -203,15 +203,28 @@ class Improvement:
         return (self.found.usual - 1) // self.length
 
     @property
-    def checks_rollouts(self) -> bool:
-        """Whether the world model is checked on the rollouts, unless they are few: RL acts like them."""
-        return self.config.rollouts >= ENOUGH_HELD_OUT
-
-    @property
     def holds_out(self) -> bool:
-        """Whether enough of these episodes are held out from training to check the world model on."""
-        rollouts = self.config.rollouts // VALIDATION_EVERY
-        return (rollouts if self.checks_rollouts else self.found.held_out) >= ENOUGH_HELD_OUT
+        """Whether enough of the dataset's episodes are held out from training to check the world model on."""
+        return self.found.held_out >= ENOUGH_HELD_OUT
+
+    def checked(self) -> tuple[Flags, str]:
+        """Return the flags of the dataset that the world model is checked on, and its split.
+
+        Held-out episodes are better than others, and rollouts better than the dataset: the policy that is
+        trained will act like them. But they must both succeed and fail.
+        """
+        data, split = self.config.dataset.flags(), "validation" if self.holds_out else "all"
+        if self.config.rollouts < ENOUGH_HELD_OUT:
+            return data, split
+        rollouts = str(self.out / "rollouts")
+        table = read_episodes(open_dataset(rollouts))
+        if table.success.all() or not table.success.any():
+            return data, split
+        if table.validation.sum() >= ENOUGH_HELD_OUT:
+            split = "validation"
+        elif self.holds_out:
+            return data, split
+        return {"dataset.root": rollouts}, split
 
     @property
     def length(self) -> int:
@@ -295,10 +308,9 @@ class Improvement:
         }, "world_model")  # fmt: skip
 
     def _check(self) -> list[str]:
-        rollouts, data = {"dataset.root": str(self.out / "rollouts")}, self.config.dataset.flags()
+        data, split = self.checked()
         flags: Flags = {
-            "model.path": str(self.out / "world_model"), **(rollouts if self.checks_rollouts else data),
-            "split": "validation" if self.holds_out else "all",
+            "model.path": str(self.out / "world_model"), **data, "split": split,
             **self._done(), "max_episodes": 200, "output_dir": str(self.out / "check"),
         }  # fmt: skip
         return ["lerobot-wmrl-eval-world-model", *format_flags(flags)]
@@ -327,7 +339,8 @@ class Improvement:
         flags: dict[str, bool | int] = {}
         if (fits := max(1, ROLLOUT_BYTES // (kept * self.length * pixels * CHANNELS))) < preset["num_envs"]:
             flags["num_envs"] = fits
-        if distils and self.found.success_frames * pixels * CHANNELS > ROLLOUT_BYTES:
+        recorded = self.found.success_frames + self.config.rollouts * self._longest_rollout()
+        if distils and recorded * pixels * CHANNELS > ROLLOUT_BYTES:
             flags["algorithm.recorded"] = False
         if not distils and (fits := max(1, PASS_PIXELS // pixels)) < MINIBATCH:
             flags["algorithm.micro_batch_size"] = fits

@@ -26,6 +26,7 @@ from tqdm import tqdm
 
 from lerobot_wmrl.common.checkpoints import latest_checkpoint, write_checkpoint
 from lerobot_wmrl.common.constants import HUMAN_LIKE, KINDS, START_KIND
+from lerobot_wmrl.common.cuda_graphs import cuda_graphs
 from lerobot_wmrl.common.distributed import mean_over_processes
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.lerobot_compat import (
@@ -256,7 +257,7 @@ def train(
     began, dtype = time.monotonic(), training_dtype(settings.precision, device)
     progress = progress_bar(model.name, first, settings.steps)
     for step in range(first + 1, settings.steps + 1):
-        with compute_in(dtype, device):
+        with cuda_graphs(), compute_in(dtype, device):
             loss, metrics = network(sampler(step - 1), (step - 1) / settings.steps)
         metrics |= optimizer_step(model, loss, optimizer, preset.grad_clip_norm)
         scheduler.step()

@@ -51,7 +51,10 @@ def test_a_dataset_that_the_ledger_does_not_know_stops_the_study(
 ) -> None:
     """With the flag of any command."""
     given = (f"data={small_dataset.root}",)
-    for flags in ("--dataset.root=$data", "--dataset.more=[$data]", "--gate.dataset.root=$data"):
+    for flags in (
+        "--dataset.root=$data", "--dataset.more=[$data]", "--env.dataset.more=[$data]",
+        "--gate.dataset.root=$data",
+    ):  # fmt: skip
         fair = study(tmp_path, "true", f"true && true {flags}", given=given)
         with pytest.raises(StudyError, match=r"step_1: --[a-z.]+=.*: 6 of 6 episodes are not in the budget"):
             run_study(fair)

@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.presets import preset_settings
 from lerobot_wmrl.data.episodes import ChosenEpisodes, read_episodes
+from lerobot_wmrl.improve import stages
 from lerobot_wmrl.improve.findings import Findings, few_decisions
 from lerobot_wmrl.improve.report import trust
 from lerobot_wmrl.improve.stages import ImproveConfig, Improvement
@@ -148,14 +150,22 @@ def test_the_check_takes_held_out_episodes_where_there_are_enough(
     assert f"--split={split}" in made_commands(tmp_path, held_out=held_out)["check"]
 
 
-@pytest.mark.parametrize(("rollouts", "root", "split"), [
-    (9, "data", "validation"), (10, "rollouts", "all"),
-    (199, "rollouts", "all"), (200, "rollouts", "validation"),
+BOTH, NEITHER = "both outcomes", "successes alone"
+
+
+@pytest.mark.parametrize(("rollouts", "outcomes", "held_out", "root", "split"), [
+    (9, BOTH, 2, "data", "all"), (10, BOTH, 2, "rollouts", "all"), (10, BOTH, 10, "data", "validation"),
+    (200, BOTH, 10, "rollouts", "validation"), (200, NEITHER, 2, "data", "all"),
 ])  # fmt: skip
-def test_rollouts_are_checked_on_where_there_are_enough(
-    tmp_path: Path, rollouts: int, root: str, split: str
-) -> None:
-    improvement = improvement_of(tmp_path, held_out=10)
+def test_rollouts_are_checked_on_if_they_tell_more_than_the_dataset(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rollouts: int, outcomes: str, held_out: int, root: str,
+    split: str,
+) -> None:  # fmt: skip
+    success = np.arange(rollouts) % 2 == 0 if outcomes == BOTH else np.ones(rollouts, bool)
+    table = SimpleNamespace(success=success, validation=np.arange(rollouts) % 20 == 19)
+    monkeypatch.setattr(stages, "open_dataset", Path)
+    monkeypatch.setattr(stages, "read_episodes", {tmp_path / "rollouts": table}.__getitem__)
+    improvement = improvement_of(tmp_path, held_out=held_out)
     improvement.config.rollouts, improvement.config.real_env = rollouts, PushtEnv()
     commands = {stage.name: stage.command() for stage in improvement.stages()}
     folder = root if root == "data" else tmp_path / root
@@ -194,10 +204,12 @@ def test_the_report_says_that_success_was_taken_for_less(tmp_path: Path) -> None
         "recall": share,
     }
     found = {"true_positives": 0, "successes": 4, "failures": 9, "false_positives": 0, "auc": 0.9}
+    found |= {"dataset": str(tmp_path / "rollouts"), "split": "all"}
     write_json(tmp_path / "check" / "metrics.json", found | {"operating_point": point})
     said = trust(improvement_of(tmp_path))
     assert "imagination took done_threshold=0.5 and done_frames=1, chosen on the same episodes" in said
     assert "3 of 4" in said
+    assert "On 13 rollouts (most of which it has learnt from): false" in said
 
 
 def improvement_of(
