@@ -11,12 +11,10 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 from lerobot_wmrl.common.constants import KINDS
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.episodes import parquet_files
+from lerobot_wmrl.data.episodes import open_dataset, read_episodes
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
 SUCCESS: Final = "next.success"
@@ -56,14 +54,12 @@ def optimal_episodes(root: Path, count: int) -> list[int]:
 
 def successes(root: Path, count: int | None) -> list[int]:
     """Return the first `count` successful episodes, or all. ValueError if there are not so many, or none."""
-    files = parquet_files(root)
-    if SUCCESS not in pq.read_schema(files[0]).names:
+    table = read_episodes(open_dataset(root))
+    if SUCCESS not in table.dataset.features:
         raise FieldError(
             "dataset.root", root, f"has no column {SUCCESS}", "record it with lerobot-wmrl-record"
         )
-    rows = pa.concat_tables(pq.read_table(file, columns=["episode_index", SUCCESS]) for file in files)
-    solved = np.asarray(rows[SUCCESS].to_pylist()).reshape(-1).astype(bool)
-    found = np.unique(rows["episode_index"].to_numpy()[solved])
+    found = np.flatnonzero(table.success)
     if len(found) < (count or 1):
         raise ValueError(f"{root}: {len(found)} successes, {count or 1} are needed: record more")
     return [int(episode) for episode in found[:count]]

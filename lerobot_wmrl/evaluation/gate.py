@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from scipy.stats import mannwhitneyu
 from torch import Tensor
@@ -19,13 +20,18 @@ from lerobot_wmrl.common.constants import KINDS, PLAY, START_KIND, START_TASK, T
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.statistics import Estimate, Proportion
 from lerobot_wmrl.data.episodes import EpisodeTable, open_dataset, read_episodes
+from lerobot_wmrl.data.frame_cache import cached_features
 from lerobot_wmrl.evaluation.replay import EpisodeReplay, Recording, in_batches
 from lerobot_wmrl.world_models.checkpoint import check_dataset
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
+from lerobot_wmrl.world_models.success import PredictedSuccess
 
 MAX_FALSE_POSITIVE_RATE: Final = 0.05
 MIN_RECALL: Final = 0.9
 """Limits within which the gate is passed."""
+
+DOUBTFUL_AUC: Final = 0.8
+"""AUC of successes against failures below which a reward says little."""
 
 SWEEP_THRESHOLDS = tuple(round(0.3 + 0.05 * step, 2) for step in range(14))
 SWEEP_FRAMES = tuple(range(1, 7))
@@ -236,6 +242,31 @@ def predict_done(model: ActionWorldModelRewardModel, recording: Recording) -> It
         for row, episode in enumerate(batch.tolist()):
             done = recording.table.done[recording.rows(episode)]
             yield PredictedDone(episode, probability[row, : len(done)], done)
+
+
+@torch.no_grad()
+def seen_outcomes(
+    model: ActionWorldModelRewardModel, recording: Recording, episodes: Iterable[int]
+) -> Outcomes | None:
+    """Judge recorded frames, not imagined ones, by the success classifier that the model has success from.
+
+    A model that predicted these frames exactly could not judge better.
+
+    Returns:
+        Their outcomes as the gate has them; None for a model without such a classifier.
+    """
+    done = model.dynamics.network.done
+    if not isinstance(done, PredictedSuccess):
+        return None
+    table = recording.table
+    features = cached_features(table.dataset, model.config.tokenizer.camera_keys, model.tokenizer)
+
+    def judged(episode: int) -> PredictedDone:
+        rows = recording.rows(episode)
+        seen = done.head(torch.from_numpy(np.array(features[rows])).to(model.state_mean.device)).sigmoid()
+        return PredictedDone(episode, torch.cat([seen[1:], seen[-1:]]), table.done[rows])
+
+    return Outcomes.stack(judged(int(episode)) for episode in episodes)
 
 
 def gate_at(outcomes: Outcomes, threshold: float, frames: int) -> Gate:

@@ -1,5 +1,6 @@
 """Evaluation of a world model on recorded episodes: one pass over them, then metrics, tables, pictures."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,6 +23,7 @@ from lerobot_wmrl.evaluation.accuracy import (
 )
 from lerobot_wmrl.evaluation.agreement import MIN_POLICIES, Agreement
 from lerobot_wmrl.evaluation.gate import (
+    DOUBTFUL_AUC,
     SWEEP_FRAMES,
     SWEEP_THRESHOLDS,
     Gate,
@@ -31,6 +33,7 @@ from lerobot_wmrl.evaluation.gate import (
     gate_at,
     gate_details,
     gates_by_task,
+    seen_outcomes,
     sweep,
 )
 from lerobot_wmrl.evaluation.goals import goal_quality, imagine_goals, train_probe
@@ -146,6 +149,8 @@ def report_action_model(
     gates, by_task = sweep(outcomes), gates_by_task(outcomes, recording.table, threshold, frames)
     best = best_operating_point(gates)
     extremes = robustness(model, recording, evaluation.attempts, threshold, frames)
+    seen = seen_outcomes(model, recording, outcomes.episodes)
+    seen_auc = math.nan if seen is None else seen.auc(frames)
     metrics = {
         **gate_details(outcomes, threshold, frames),
         **{name: estimates[name].as_json()["value"] if name in estimates else None for name in TOP_LEVEL},
@@ -154,6 +159,7 @@ def report_action_model(
         **steps,
         "play": {"episodes": len(play), **play_steps},
         "operating_point": best.as_json() if best else None,
+        "seen_auc": None if math.isnan(seen_auc) else seen_auc,
         "gate_by_task": {task: gate.as_json() for task, gate in by_task.items()},
         "gate_sweep": [gate.as_json() for gate in gates],
         "extreme_actions": extremes,
@@ -169,6 +175,7 @@ def report_action_model(
     page = [
         headline_table(estimates),
         gate_lines(gate_at(outcomes, threshold, frames), best),
+        *([] if math.isnan(seen_auc) else [seen_line(seen_auc)]),
         *([task_table(by_task)] if by_task else []),
         "False positives / recall, in percent:",
         sweep_table(gates),
@@ -235,6 +242,17 @@ def gate_lines(gate: Gate, best: Gate | None) -> str:
             f"done_frames={best.frames}; false positives {best.false_positives}; recall {best.recall}."
         )
     return "\n".join(lines)
+
+
+def seen_line(auc: float) -> str:
+    """Say how well success is seen in recorded frames, `Outcomes.auc` of these."""
+    said = f"In the recorded frames themselves the success classifier has an AUC of {auc:.2f}"
+    if auc >= DOUBTFUL_AUC:
+        return f"{said}."
+    return (
+        f"{said}: success can hardly be seen in them, and no world model of these frames can know it. Train "
+        "the tokenizer with larger frames (`model.tokenizer.image_size`) or with a camera that shows success."
+    )
 
 
 def task_table(gates: Mapping[str, Gate]) -> str:

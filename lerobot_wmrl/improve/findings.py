@@ -95,7 +95,7 @@ def look(table: EpisodeTable, policy: PreTrainedConfig, episodes: Sequence[int] 
         f"{success.sum()} episodes succeed, {(~success).sum()} fail",
     ]
     tasks = np.unique(table.column(START_TASK), return_counts=True)[1]
-    done = [table.taught[a : a + n].sum() for a, n in zip(table.start, table.length, strict=True)]
+    done = [table.taught[rows].sum() for rows in table.rows(range(len(success)))]
     return Findings(
         lines=lines, missing=[*missing(table), *few_decisions(policy, table)], cameras=camera_names(keys),
         frame_side=min(map(min, sizes.values())), pixels=sum(h * w for h, w in sizes.values()),

@@ -2,15 +2,14 @@
 
 import json
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from lerobot_wmrl.common.files import write_text
 from lerobot_wmrl.common.stages import Stage, read_record
 from lerobot_wmrl.common.statistics import Proportion
+from lerobot_wmrl.evaluation.gate import DOUBTFUL_AUC
+from lerobot_wmrl.evaluation.report import seen_line
 from lerobot_wmrl.improve.stages import DONE_THRESHOLD, Improvement
-
-DOUBTFUL_AUC: Final = 0.8
-"""AUC of held-out successes against failures below which the world model's reward says little."""
 
 
 def write_report(improvement: Improvement, stages: list[Stage]) -> Path:
@@ -68,6 +67,8 @@ def trust(improvement: Improvement) -> str:
     )
     if found["auc"] < DOUBTFUL_AUC:
         said += " That is not enough to trust its reward: record more episodes, failures above all."
+    if (seen := found.get("seen_auc")) is not None:
+        said += f" {seen_line(seen)}"
     return said + taken_instead(improvement)
 
 

@@ -2,11 +2,14 @@
 
 from pathlib import Path
 
-import pyarrow.parquet as pq
+import numpy as np
 import pytest
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from experiments.choose_episodes import main, optimal_episodes, successes
+from lerobot_wmrl.data.episodes import read_episodes
 from tests.recorded import write_recording
+from tests.relabelled import UNLABELLED, relabelled
 
 
 def test_only_successful_optimal_episodes_are_taken(tmp_path: Path) -> None:
@@ -16,18 +19,18 @@ def test_only_successful_optimal_episodes_are_taken(tmp_path: Path) -> None:
         optimal_episodes(tmp_path, 3)
 
 
-def test_successes_are_the_first_or_all(tmp_path: Path) -> None:
-    write_recording(tmp_path)
-    assert successes(tmp_path, 1) == [0]
-    assert successes(tmp_path, None) == [0, 3]
-    with pytest.raises(ValueError, match="2 successes, 3 are needed"):
-        successes(tmp_path, 3)
+def test_successes_are_the_first_or_all(small_dataset: LeRobotDataset) -> None:
+    root, found = Path(small_dataset.root), np.flatnonzero(read_episodes(small_dataset).success)
+    assert successes(root, 1) == [found[0]]
+    assert successes(root, None) == found.tolist()
+    with pytest.raises(ValueError, match=f"{len(found)} successes, 9 are needed"):
+        successes(root, 9)
 
 
-def test_a_dataset_without_labels_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_recording(tmp_path)
-    (file,) = tmp_path.rglob("*.parquet")
-    pq.write_table(pq.read_table(file).drop_columns("next.success"), file)
-    monkeypatch.setattr("sys.argv", ["choose_episodes", str(tmp_path), "--every_success"])
+def test_a_dataset_without_labels_is_refused(
+    small_dataset: LeRobotDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    silent = relabelled(Path(small_dataset.root), tmp_path / "unlabelled", UNLABELLED)
+    monkeypatch.setattr("sys.argv", ["choose_episodes", str(silent), "--every_success"])
     with pytest.raises(SystemExit, match=r"error: .*has no column next\.success; record it with"):
         main()

@@ -204,11 +204,12 @@ def test_the_report_says_that_success_was_taken_for_less(tmp_path: Path) -> None
         "recall": share,
     }
     found = {"true_positives": 0, "successes": 4, "failures": 9, "false_positives": 0, "auc": 0.9}
-    found |= {"dataset": str(tmp_path / "rollouts"), "split": "all"}
+    found |= {"dataset": str(tmp_path / "rollouts"), "split": "all", "seen_auc": 0.44}
     write_json(tmp_path / "check" / "metrics.json", found | {"operating_point": point})
     said = trust(improvement_of(tmp_path))
     assert "imagination took done_threshold=0.5 and done_frames=1, chosen on the same episodes" in said
     assert "3 of 4" in said
+    assert "the success classifier has an AUC of 0.44: success can hardly be seen" in said
     assert "On 13 rollouts (most of which it has learnt from): false" in said
 
 

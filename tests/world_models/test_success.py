@@ -13,6 +13,8 @@ from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.clips import MOST_WEIGHT, SUCCESS_SHARE, ClipSampler, FrameSampler
 from lerobot_wmrl.data.episodes import EpisodeTable, TrainingData, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_features, cached_frames, frames_to_tensor
+from lerobot_wmrl.evaluation.gate import seen_outcomes
+from lerobot_wmrl.evaluation.replay import Recording
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig, train_world_model
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
@@ -37,6 +39,25 @@ def models(small_dataset, tmp_path_factory) -> dict[str, Path]:
         "action_world_model": run_training(action_config(tokenizer), root, folder / "action"),
         "text_world_model": run_training(text, root, folder / "text"),
     }
+
+
+def test_recorded_frames_are_judged_by_the_classifier(models, trained_models, small_dataset):
+    """What a world model that imagines them exactly would say; nothing without a classifier."""
+    model, without = (
+        load_model(each["action_world_model"], "action_world_model") for each in (models, trained_models)
+    )
+    recording = Recording.read(read_episodes(small_dataset), model)
+    found = seen_outcomes(model, recording, [1, 4])
+    rows = recording.rows(4)
+    frames = frames_to_tensor(recording.frames[rows])
+    with torch.no_grad():
+        features = model.tokenizer.success_features(frames[:1].expand_as(frames), frames)
+        seen = model.tokenizer.success.head(features).sigmoid().numpy()
+    judged = found.probability[1, : len(seen)]
+    assert np.allclose(judged[:-1], seen[1:], atol=1e-5)
+    assert judged[-1] == judged[-2]
+    assert found.done[1, : len(seen)].tolist() == recording.table.done[rows].tolist()
+    assert seen_outcomes(without, recording, [1, 4]) is None
 
 
 def pushed_squares(count: int, seed: int) -> tuple[Tensor, Tensor, Tensor]:
