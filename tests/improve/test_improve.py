@@ -210,6 +210,7 @@ def test_the_report_says_that_success_was_taken_for_less(tmp_path: Path) -> None
     assert "imagination took done_threshold=0.5 and done_frames=1, chosen on the same episodes" in said
     assert "3 of 4" in said
     assert "the success classifier has an AUC of 0.44: success can hardly be seen" in said
+    assert "`--size=cpu` has larger frames" in said
     assert "On 13 rollouts (most of which it has learnt from): false" in said
 
 
