@@ -14,16 +14,16 @@ from experiments.value import seconds
 from experiments.value_sections import Cell, against, published
 from lerobot_wmrl.common.statistics import RunsMean
 
-CELL: Final = ("task", "episodes", "noise", "iterations", "seed")
+CELL: Final = ("task", "episodes", "noise", "rollouts", "iterations", "seed")
 
 POLICIES: Final = {
-    "cloned": "cloned from all episodes",
-    "filtered": "cloned from those that succeed",
+    "cloned": "cloned from the expert's episodes",
+    "filtered": "cloned from all that succeed, rollouts too",
     "improve": "that one, improved in imagination",
 }
 """Folder of a policy in the study → what it is."""
 
-TIMED: Final = ("data", "cloned", "filtered", "improve", "comparison")
+TIMED: Final = ("data", "cloned", "rollouts", "filtered", "improve", "comparison")
 
 
 def metaworld(study: Study) -> Results:
@@ -57,8 +57,9 @@ def section(load: Load) -> str:
         rows.append(["all", f"improved, against the one {POLICIES[rival]}", "", points(asdict(mean))])
     first = cells[0]
     return f"""`{first["task"]}`: {first["episodes"]} episodes of a scripted expert with noise on its actions
-({first["noise"]} of half their range), {first["iterations"]} iterations of PPO. Changes are against the
-policy cloned from the successful episodes, on the same starts:
+({first["noise"]} of half their range), {first["rollouts"]} rollouts of the policy cloned from them,
+{first["iterations"]} iterations of PPO. Changes are against the policy cloned from all successes, on the same
+starts:
 
 {table(["seed", "policy", "success", "change"], rows)}
 
@@ -78,6 +79,6 @@ def minutes_of(cells: Sequence[Cell]) -> str:
     mean = {step: np.mean([cell["minutes"][step] for cell in cells]) for step in TIMED}
     cloned = mean["cloned"] + mean["filtered"]
     return (
-        f"A seed takes {mean['data']:.1f} minutes to record, {cloned:.1f} to clone twice, "
+        f"A seed takes {mean['data'] + mean['rollouts']:.1f} minutes to record, {cloned:.1f} to clone twice, "
         f"{mean['improve']:.1f} to improve and {mean['comparison']:.1f} to compare."
     )
