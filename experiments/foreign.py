@@ -18,7 +18,7 @@ CELL: Final = ("task", "episodes", "noise", "rollouts", "iterations", "seed")
 
 POLICIES: Final = {
     "cloned": "cloned from the expert's episodes",
-    "filtered": "cloned from all that succeed, rollouts too",
+    "filtered": "cloned from all successes, the expert's and its own",
     "improve": "that one, improved in imagination",
 }
 """Folder of a policy in the study → what it is."""

@@ -100,7 +100,8 @@ def seconds(study: Study, step: str) -> float:
     Raises:
         ValueError: it is not finished.
     """
-    for folder in (study.folder, Path(study.variables["run"]), *study.needs.values()):
+    run = [Path(study.variables["run"])] if "run" in study.variables else []
+    for folder in (study.folder, *run, *study.needs.values()):
         if record := read_record(folder, step):
             return float(record["seconds"])
     raise ValueError(f"{study.name}: step {step} is not finished")

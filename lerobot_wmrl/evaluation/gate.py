@@ -250,19 +250,20 @@ def seen_outcomes(
 ) -> Outcomes | None:
     """Judge recorded frames, not imagined ones, by the success classifier that the model has success from.
 
-    A model that predicted these frames exactly could not judge better.
+    Of every episode the first frames count, as many as the model's clips have; what succeeds later has not
+    succeeded in them.
 
     Returns:
-        Their outcomes as the gate has them; None for a model without such a classifier.
+        Their outcomes as the gate has them; None for a model without such a classifier, or without labels.
     """
-    done = model.dynamics.network.done
-    if not isinstance(done, PredictedSuccess):
+    done, table, length = model.dynamics.network.done, recording.table, model.config.clip_length
+    if not isinstance(done, PredictedSuccess) or not table.done_known:
         return None
-    table = recording.table
     features = cached_features(table.dataset, model.config.tokenizer.camera_keys, model.tokenizer)
 
     def judged(episode: int) -> PredictedDone:
-        rows = recording.rows(episode)
+        whole = recording.rows(episode)
+        rows = slice(whole.start, min(whole.stop, whole.start + length))
         seen = done.head(torch.from_numpy(np.array(features[rows])).to(model.state_mean.device)).sigmoid()
         return PredictedDone(episode, torch.cat([seen[1:], seen[-1:]]), table.done[rows])
 

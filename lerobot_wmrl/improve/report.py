@@ -68,7 +68,7 @@ def trust(improvement: Improvement) -> str:
     if found["auc"] < DOUBTFUL_AUC:
         said += " That is not enough to trust its reward: record more episodes, failures above all."
     if (seen := found.get("seen_auc")) is not None:
-        larger = " `--size=cpu` has larger frames." if improvement.config.preset != "cpu" else ""
+        larger = " `--size=cpu` has larger frames." if improvement.could_be_larger else ""
         said += f" {seen_line(seen)}{larger if seen < DOUBTFUL_AUC else ''}"
     return said + taken_instead(improvement)
 

@@ -22,7 +22,13 @@ from lerobot_wmrl.common.policies import (
 )
 from lerobot_wmrl.common.presets import Flags, format_flags, preset_settings
 from lerobot_wmrl.common.stages import Stage
-from lerobot_wmrl.data.episodes import ChosenEpisodes, DatasetSource, open_dataset, read_episodes
+from lerobot_wmrl.data.episodes import (
+    ChosenEpisodes,
+    DatasetSource,
+    EpisodeTable,
+    open_dataset,
+    read_episodes,
+)
 from lerobot_wmrl.improve.findings import LONGEST_IMAGINATION, Findings
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.recorders import env_flags
@@ -213,27 +219,31 @@ class Improvement:
         Held-out episodes are better than others, and rollouts better than the dataset: the policy that is
         trained will act like them. But they must both succeed and fail.
         """
-        data, split = self.config.dataset.flags(), "validation" if self.holds_out else "all"
+        data = self.config.dataset.flags(), "validation" if self.holds_out else "all"
         if self.config.rollouts < ENOUGH_HELD_OUT:
-            return data, split
-        rollouts = str(self.out / "rollouts")
-        table = read_episodes(open_dataset(rollouts))
-        if table.success.all() or not table.success.any():
-            return data, split
-        if table.validation.sum() >= ENOUGH_HELD_OUT:
-            split = "validation"
-        elif self.holds_out:
-            return data, split
-        return {"dataset.root": rollouts}, split
+            return data
+        table = self._rollouts_table()
+        held_out = table.success[table.validation]
+        rollouts = {"dataset.root": str(self.out / "rollouts")}
+        if len(held_out) >= ENOUGH_HELD_OUT and held_out.any() and not held_out.all():
+            return rollouts, "validation"
+        if self.holds_out or table.success.all() or not table.success.any():
+            return data
+        return rollouts, "all"
 
     @property
     def length(self) -> int:
         """Frames of an imagined episode."""
         return min(self.found.longest, LONGEST_IMAGINATION)
 
-    def _side(self) -> int:
+    @property
+    def could_be_larger(self) -> bool:
+        """Whether imagined frames are larger at the size `cpu`."""
+        return self._side("cpu") > self._side(self.config.preset)
+
+    def _side(self, size: str) -> int:
         """Return the side of imagined frames in pixels."""
-        return max(SIDE_STEP, min(SIDES[self.config.preset], self.found.frame_side) // SIDE_STEP * SIDE_STEP)
+        return max(SIDE_STEP, min(SIDES[size], self.found.frame_side) // SIDE_STEP * SIDE_STEP)
 
     def _data(self) -> Flags:
         """Return the flags of all that is learnt from."""
@@ -289,6 +299,10 @@ class Improvement:
         """Return the frames after which a rollout has failed: what comes later would fill the data."""
         return SLOWEST * self.found.longest
 
+    def _rollouts_table(self) -> EpisodeTable:
+        """Read the rollouts, which the first stage has recorded."""
+        return read_episodes(open_dataset(self.out / "rollouts"))
+
     def _learn(self, model: str, flags: Flags, folder: str) -> list[str]:
         return self._command("lerobot-wmrl-train-world-model", {
             "model.type": model, **flags, **self._data(), "seed": self.config.seed,
@@ -298,7 +312,7 @@ class Improvement:
     def _tokenizer(self) -> list[str]:
         return self._learn("frame_tokenizer", {
             "model.tokenizer.cameras": f"[{','.join(self.found.cameras)}]",
-            "model.tokenizer.image_size": self._side(), "model.tokenizer.context": True,
+            "model.tokenizer.image_size": self._side(self.config.preset), "model.tokenizer.context": True,
             "model.tokenizer.success": True,
         }, "tokenizer")  # fmt: skip
 
@@ -339,7 +353,10 @@ class Improvement:
         flags: dict[str, bool | int] = {}
         if (fits := max(1, ROLLOUT_BYTES // (kept * self.length * pixels * CHANNELS))) < preset["num_envs"]:
             flags["num_envs"] = fits
-        recorded = self.found.success_frames + self.config.rollouts * self._longest_rollout()
+        recorded = self.found.success_frames
+        if distils and self.config.rollouts:
+            rollouts = self._rollouts_table()
+            recorded += int(rollouts.length[rollouts.success].sum())
         if distils and recorded * pixels * CHANNELS > ROLLOUT_BYTES:
             flags["algorithm.recorded"] = False
         if not distils and (fits := max(1, PASS_PIXELS // pixels)) < MINIBATCH:

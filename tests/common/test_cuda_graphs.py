@@ -2,6 +2,7 @@
 
 import copy
 
+import pytest
 import torch
 from torch import nn
 
@@ -19,6 +20,33 @@ def test_elsewhere_it_is_the_module() -> None:
         assert ALLOWED.get()
         assert torch.equal(graphed(x), layer(x))
     assert not ALLOWED.get()
+
+
+class OnCuda(torch.Tensor):
+    """A tensor that claims to be on a GPU."""
+
+    is_cuda = True
+
+
+def test_a_training_that_allows_it_captures_each_shape_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    captured: list[tuple[torch.Size, ...]] = []
+
+    def capture(module: nn.Module, samples: tuple[torch.Tensor, ...], **_: object) -> nn.Module:
+        captured.append(tuple(sample.shape for sample in samples))
+        return module
+
+    monkeypatch.setattr(torch.cuda, "make_graphed_callables", capture)
+    layer = nn.Linear(2, 3)
+    graphed, x = GraphedInTraining(layer), torch.randn(4, 2).as_subclass(OnCuda)
+    graphed(x)
+    with cuda_graphs():
+        for each in (x, x, x[:3]):
+            assert torch.equal(graphed(each), layer(each))
+        with torch.no_grad():
+            graphed(x[:2])
+        layer.eval()
+        graphed(x[:1])
+    assert captured == [((4, 2),), ((3, 2),)]
 
 
 def test_a_copy_of_a_network_unrolls_with_its_own_weights() -> None:

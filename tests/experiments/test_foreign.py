@@ -5,8 +5,10 @@ from pathlib import Path
 from typing import Any
 
 from experiments.compare_in_parts import joined
-from experiments.foreign import POLICIES, TIMED, section
+from experiments.foreign import POLICIES, TIMED, metaworld, section
+from experiments.study import Study
 from experiments.success import rate
+from lerobot_wmrl.common.files import write_json
 
 OUTCOMES = {
     "cloned": [True, False, False, False],
@@ -22,6 +24,22 @@ def test_parts_are_joined_in_the_order_of_the_starts(tmp_path: Path) -> None:
         parts.append(tmp_path / f"{part}.json")
         parts[-1].write_text(json.dumps({"policies": {"a": {}, "b": {}}, "episodes": episodes}))
     assert joined(parts) == {"a": [True, False, True], "b": [False, True, True]}
+
+
+def test_a_finished_seed_is_collected(tmp_path: Path) -> None:
+    variables = {"task": "push-v3", "episodes": 40, "noise": "0.0", "rollouts": 9, "iterations": 6, "seed": 1}
+    for step in TIMED:
+        write_json(tmp_path / "steps" / f"{step}.json", {"seconds": 90})
+    write_json(tmp_path / "comparison" / "outcomes.json", OUTCOMES)
+    write_json(tmp_path / "improve" / "check" / "metrics.json", {"auc": 0.9})
+    variables |= {"output_dir": str(tmp_path), "cell": "seed1"}
+    (found,) = metaworld(Study("metaworld", "?", {}, variables, (), None, ())).values()
+    assert found["minutes"] == dict.fromkeys(TIMED, 1.5)
+    assert {name: each["k"] for name, each in found["policies"].items()} == {
+        "cloned": 1, "filtered": 2, "improve": 4
+    }  # fmt: skip
+    assert found["check"] == {"auc": 0.9}
+    assert (found["rollouts"], found["seed"]) == (9, 1)
 
 
 def test_the_section_compares_the_improved_policy_with_both_clones() -> None:

@@ -150,19 +150,21 @@ def test_the_check_takes_held_out_episodes_where_there_are_enough(
     assert f"--split={split}" in made_commands(tmp_path, held_out=held_out)["check"]
 
 
-BOTH, NEITHER = "both outcomes", "successes alone"
+BOTH, EARLY, NEITHER = "both outcomes", "both, but held-out successes alone", "successes alone"
 
 
 @pytest.mark.parametrize(("rollouts", "outcomes", "held_out", "root", "split"), [
     (9, BOTH, 2, "data", "all"), (10, BOTH, 2, "rollouts", "all"), (10, BOTH, 10, "data", "validation"),
-    (200, BOTH, 10, "rollouts", "validation"), (200, NEITHER, 2, "data", "all"),
+    (200, BOTH, 10, "rollouts", "validation"), (200, EARLY, 2, "rollouts", "all"),
+    (200, EARLY, 10, "data", "validation"), (200, NEITHER, 2, "data", "all"),
 ])  # fmt: skip
 def test_rollouts_are_checked_on_if_they_tell_more_than_the_dataset(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rollouts: int, outcomes: str, held_out: int, root: str,
     split: str,
 ) -> None:  # fmt: skip
-    success = np.arange(rollouts) % 2 == 0 if outcomes == BOTH else np.ones(rollouts, bool)
-    table = SimpleNamespace(success=success, validation=np.arange(rollouts) % 20 == 19)
+    number = np.arange(rollouts)
+    success = {BOTH: (number + number // 20) % 2 == 0, EARLY: number > 9, NEITHER: number >= 0}[outcomes]
+    table = SimpleNamespace(success=success, validation=number % 20 == 19)
     monkeypatch.setattr(stages, "open_dataset", Path)
     monkeypatch.setattr(stages, "read_episodes", {tmp_path / "rollouts": table}.__getitem__)
     improvement = improvement_of(tmp_path, held_out=held_out)
@@ -209,8 +211,9 @@ def test_the_report_says_that_success_was_taken_for_less(tmp_path: Path) -> None
     said = trust(improvement_of(tmp_path))
     assert "imagination took done_threshold=0.5 and done_frames=1, chosen on the same episodes" in said
     assert "3 of 4" in said
-    assert "the success classifier has an AUC of 0.44: success can hardly be seen" in said
+    assert "the success classifier has an AUC of 0.44: it hardly sees success in them" in said
     assert "`--size=cpu` has larger frames" in said
+    assert "larger" not in trust(improvement_of(tmp_path, frame_side=64))
     assert "On 13 rollouts (most of which it has learnt from): false" in said
 
 

@@ -41,14 +41,15 @@ def models(small_dataset, tmp_path_factory) -> dict[str, Path]:
     }
 
 
-def test_recorded_frames_are_judged_by_the_classifier(models, trained_models, small_dataset):
+def test_recorded_frames_are_judged_by_the_classifier(models, trained_models, small_dataset, monkeypatch):
     """What a world model that imagines them exactly would say; nothing without a classifier."""
     model, without = (
         load_model(each["action_world_model"], "action_world_model") for each in (models, trained_models)
     )
     recording = Recording.read(read_episodes(small_dataset), model)
     found = seen_outcomes(model, recording, [1, 4])
-    rows = recording.rows(4)
+    start = recording.rows(4).start
+    rows = slice(start, start + model.config.clip_length)
     frames = frames_to_tensor(recording.frames[rows])
     with torch.no_grad():
         features = model.tokenizer.success_features(frames[:1].expand_as(frames), frames)
@@ -58,6 +59,18 @@ def test_recorded_frames_are_judged_by_the_classifier(models, trained_models, sm
     assert judged[-1] == judged[-2]
     assert found.done[1, : len(seen)].tolist() == recording.table.done[rows].tolist()
     assert seen_outcomes(without, recording, [1, 4]) is None
+    monkeypatch.setattr(EpisodeTable, "done_known", False)
+    assert seen_outcomes(model, recording, [1, 4]) is None
+
+
+def test_success_counts_as_seen_within_a_clip(models, small_dataset):
+    model = load_model(models["action_world_model"], "action_world_model")
+    recording = Recording.read(read_episodes(small_dataset), model)
+    (late,) = recording.table.success.nonzero()[0][:1]
+    model.config.clip_length = int(recording.table.done[recording.rows(late)].argmax())
+    found = seen_outcomes(model, recording, [late])
+    assert found.probability.shape[1] == model.config.clip_length
+    assert not found.success.any()
 
 
 def pushed_squares(count: int, seed: int) -> tuple[Tensor, Tensor, Tensor]:
