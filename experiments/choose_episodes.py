@@ -8,16 +8,13 @@ python -m experiments.choose_episodes outputs/attempts --every_success
 import argparse
 import sys
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 
 from lerobot_wmrl.common.constants import KINDS
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.episodes import open_dataset, read_episodes
+from lerobot_wmrl.data.episodes import SUCCESS, open_dataset, read_episodes
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
-
-SUCCESS: Final = "next.success"
 
 
 def make_parser() -> argparse.ArgumentParser:

@@ -24,7 +24,8 @@ SOLVED_FRAMES: Final = 2
 """Last frames of an episode that are taken for solved where episodes end as soon as they succeed. The picture
 after the last action, which shows it, is not recorded."""
 
-SUCCESS_COLUMNS: Final = ("next.success", DONE)
+SUCCESS: Final = "next.success"
+SUCCESS_COLUMNS: Final = (SUCCESS, DONE)
 """Columns that can hold success, best first: `next.done` may mark the mere end of an episode."""
 
 PLACE: Final = ("episode_index", "task_index")

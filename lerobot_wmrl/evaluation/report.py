@@ -48,7 +48,7 @@ MAX_GOALS = 64
 """Goal frames that a report looks at."""
 
 LARGER: Final = (
-    "Train the tokenizer with larger frames (--model.tokenizer.image_size), or with a camera that shows "
+    " Train the tokenizer with larger frames (--model.tokenizer.image_size), or with a camera that shows "
     "success better."
 )
 """The remedy where success is hardly seen."""
@@ -181,11 +181,7 @@ def report_action_model(
     page = [
         headline_table(estimates),
         gate_lines(gate_at(outcomes, threshold, frames), best),
-        *(
-            []
-            if math.isnan(seen_auc)
-            else [seen_line(seen_auc), *([LARGER] if seen_auc < DOUBTFUL_AUC else [])]
-        ),
+        *([] if math.isnan(seen_auc) else [seen_line(seen_auc, LARGER)]),
         *([task_table(by_task)] if by_task else []),
         "False positives / recall, in percent:",
         sweep_table(gates),
@@ -254,12 +250,12 @@ def gate_lines(gate: Gate, best: Gate | None) -> str:
     return "\n".join(lines)
 
 
-def seen_line(auc: float) -> str:
-    """Say how well success is seen in recorded frames, `Outcomes.auc` of these."""
+def seen_line(auc: float, remedy: str) -> str:
+    """Say how well success is seen in recorded frames, `Outcomes.auc` of these, and what helps if hardly."""
     said = f"In the recorded frames themselves the success classifier has an AUC of {auc:.2f}"
     if auc >= DOUBTFUL_AUC:
         return f"{said}."
-    return f"{said}: it hardly sees success in them, and the world model has success from it."
+    return f"{said}: it hardly sees success in them, and the world model has success from it.{remedy}"
 
 
 def task_table(gates: Mapping[str, Gate]) -> str:

@@ -50,7 +50,8 @@ ENOUGH_HELD_OUT: Final = 10
 about a threshold."""
 
 SLOWEST: Final = 2
-"""A rollout may take this many times as long as the longest recorded episode."""
+"""A rollout may take this many times as long as the longest recorded episode: what a stuck one does beyond
+would fill the data."""
 
 SIDE_STEP: Final = 32
 """A side is a multiple of this: at any of the sizes, the transformer's patches divide the token grid."""
@@ -208,18 +209,14 @@ class Improvement:
         """Frames beyond the first from which imagination of a recorded episode begins."""
         return (self.found.usual - 1) // self.length
 
-    @property
-    def holds_out(self) -> bool:
-        """Whether enough of the dataset's episodes are held out from training to check the world model on."""
-        return self.found.held_out >= ENOUGH_HELD_OUT
-
     def checked(self) -> tuple[Flags, str]:
         """Return the flags of the dataset that the world model is checked on, and its split.
 
         Held-out episodes are better than others, and rollouts better than the dataset: the policy that is
         trained will act like them. But they must both succeed and fail.
         """
-        data = self.config.dataset.flags(), "validation" if self.holds_out else "all"
+        holds_out = self.found.held_out >= ENOUGH_HELD_OUT
+        data = self.config.dataset.flags(), "validation" if holds_out else "all"
         if self.config.rollouts < ENOUGH_HELD_OUT:
             return data
         table = self._rollouts_table()
@@ -227,7 +224,7 @@ class Improvement:
         rollouts = {"dataset.root": str(self.out / "rollouts")}
         if len(held_out) >= ENOUGH_HELD_OUT and held_out.any() and not held_out.all():
             return rollouts, "validation"
-        if self.holds_out or table.success.all() or not table.success.any():
+        if holds_out or table.success.all() or not table.success.any():
             return data
         return rollouts, "all"
 
@@ -287,17 +284,14 @@ class Improvement:
         whole = DatasetSource.flags(self.config.dataset)
         like = {name.replace("dataset.", "like."): each for name, each in whole.items()}
         simulator = self.config.real_env is not None and self.config.real_env.type == "wmrl_maniskill"
+        longest = SLOWEST * self.found.longest
         flags: Flags = {
             "policy.path": self.policy, **self._real_env("env"),
-            **({} if simulator else {**like, "like_columns": False, "max_frames": self._longest_rollout()}),
+            **({} if simulator else {**like, "like_columns": False, "max_frames": longest}),
             "video": False, "num_episodes": self.config.rollouts, "exploration": self.config.exploration,
             "seed": self.config.seed, "output_dir": str(self.out / "rollouts"),
         }  # fmt: skip
         return ["lerobot-wmrl-record", *format_flags(flags)]
-
-    def _longest_rollout(self) -> int:
-        """Return the frames after which a rollout has failed: what comes later would fill the data."""
-        return SLOWEST * self.found.longest
 
     def _rollouts_table(self) -> EpisodeTable:
         """Read the rollouts, which the first stage has recorded."""

@@ -25,7 +25,7 @@ import numpy as np
 from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.files import whole_folder, writing
-from lerobot_wmrl.data.episodes import SUCCESS_COLUMNS, DatasetSource
+from lerobot_wmrl.data.episodes import SUCCESS, DatasetSource
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.play import labels  # noqa: F401 (registers `by_hand`)
 from lerobot_wmrl.rewards.success_rules import EndsRule, SuccessRule, rows_of
@@ -33,7 +33,6 @@ from lerobot_wmrl.rewards.success_rules import EndsRule, SuccessRule, rows_of
 if TYPE_CHECKING:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-SUCCESS: Final = SUCCESS_COLUMNS[0]
 DONE_FRAMES: Final = WorldModelEnv.done_frames
 """Frames in a row that make a success where nothing else is asked for."""
 
