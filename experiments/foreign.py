@@ -28,13 +28,13 @@ TIMED: Final = ("data", "cloned", "rollouts", "filtered", "improve", "comparison
 
 def metaworld(study: Study) -> Results:
     """Return the success of the three policies on the same starts, and the minutes of each step."""
-    found: dict[str, list[bool]] = json.loads((study.folder / "comparison" / "outcomes.json").read_text())
-    by_name = dict(zip(POLICIES, found.values(), strict=True))
+    comparison: dict[str, Any] = json.loads((study.folder / "comparison" / "comparison.json").read_text())
+    outcomes = zip(*(episode["successes"] for episode in comparison["episodes"]), strict=True)
     gate = study.folder / "improve" / "check" / "metrics.json"
     results = {
         **{name: study.variables[name] for name in CELL},
         "minutes": {step: round(seconds(study, step) / 60, 1) for step in TIMED},
-        "policies": {name: rate(outcomes) for name, outcomes in by_name.items()},
+        "policies": {name: rate(own) for name, own in zip(POLICIES, outcomes, strict=True)},
         "check": json.loads(gate.read_text()),
     }
     return {study.variables["cell"]: results}

@@ -24,12 +24,18 @@ def make_tensor_env(config: EnvConfig, n_envs: int, device: str) -> gym.vector.V
 
 
 def is_own(config: EnvConfig) -> bool:
-    """Return whether an environment is one of this project's.
-
-    Only these can run in processes of their own: LeRobot's rollout asks for `task_description`, and an
-    asynchronous environment that lacks it, such as PushT, does not survive the question.
-    """
+    """Return whether an environment is one of this project's."""
     return hasattr(config, "create_tensor_env")
+
+
+def runs_in_processes(config: EnvConfig) -> bool:
+    """Return whether copies of an environment can run in processes of their own.
+
+    This project's can, and so can the benchmarks that LeRobot makes itself, such as Meta-World. Those that it
+    takes from Gymnasium's registry, such as PushT, need not have `task_description`: LeRobot's rollout asks
+    for it, and an asynchronous environment that lacks it does not survive the question.
+    """
+    return is_own(config) or type(config).create_envs is not EnvConfig.create_envs
 
 
 class LeRobotTensorEnv(gym.vector.VectorEnv):

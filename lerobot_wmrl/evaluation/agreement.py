@@ -19,7 +19,7 @@ from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.policies import load_policy, load_processors, read_policy_config
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter, StepCounter
-from lerobot_wmrl.envs.lerobot_env import is_own
+from lerobot_wmrl.envs.lerobot_env import runs_in_processes
 
 MIN_POLICIES = 3
 """Policies that a correlation needs."""
@@ -65,7 +65,7 @@ def evaluate_policy(
         processors: the policy's pre- and postprocessor.
         seed: of the first episode; each further one adds one.
     """
-    made: Any = make_env(env, min(num_envs, episodes), use_async_envs=is_own(env))
+    made: Any = make_env(env, min(num_envs, episodes), use_async_envs=runs_in_processes(env))
     envs = {suite: {task: StepCounter(one) for task, one in tasks.items()} for suite, tasks in made.items()}
     info = eval_policy_all(
         envs, policy, *make_env_pre_post_processors(env, policy.config), *processors,

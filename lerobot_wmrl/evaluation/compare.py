@@ -26,7 +26,7 @@ from lerobot_wmrl.common.policies import (
     read_policy_config,
 )
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
-from lerobot_wmrl.envs.lerobot_env import is_own
+from lerobot_wmrl.envs.lerobot_env import is_own, runs_in_processes
 from lerobot_wmrl.evaluation.comparison import Comparison, Episode
 
 type Envs = dict[str, dict[int, gym.vector.VectorEnv]]
@@ -111,7 +111,7 @@ def opened(config: EnvConfig, n_envs: int, trust_remote_code: bool, policies: in
     """
     own = is_own(config)
     made = [
-        make_env(config, n_envs, use_async_envs=own, trust_remote_code=trust_remote_code)
+        make_env(config, n_envs, runs_in_processes(config), trust_remote_code=trust_remote_code)
         for _ in range(1 if own else policies)
     ]
     try:

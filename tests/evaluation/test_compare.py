@@ -285,6 +285,24 @@ def test_policies_are_compared_in_maniskill(tmp_path, caplog):
     assert "Success by scene" not in caplog.text
 
 
+@pytest.mark.parametrize(
+    ("env", "parallel"), [(ThresholdConfig(), True), (PushtEnv(episode_length=2), False)]
+)
+def test_benchmarks_run_in_processes_and_environments_that_may_lack_an_instruction_do_not(
+    env: EnvConfig, parallel: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[bool] = []
+
+    def create_envs(config: EnvConfig, n_envs: int, use_async_envs: bool) -> dict[str, Any]:
+        asked.append(use_async_envs)
+        return {}
+
+    owner = next(each for each in type(env).__mro__ if "create_envs" in vars(each))
+    monkeypatch.setattr(owner, "create_envs", create_envs)
+    with opened(env, 2, False, policies=1):
+        assert asked == [parallel]
+
+
 def test_each_policy_has_environments_of_its_own_where_resets_may_be_counted(imagination: WorldModelEnv):
     with opened(PushtEnv(episode_length=2), 1, False, policies=2) as (first, second):
         assert first["pusht"][0] is not second["pusht"][0]

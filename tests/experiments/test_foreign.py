@@ -1,10 +1,8 @@
-"""The study of a simulator that nothing here was built for: joined comparisons, and the section."""
+"""The study of a simulator that nothing here was built for: what is collected, and the section."""
 
-import json
 from pathlib import Path
 from typing import Any
 
-from experiments.compare_in_parts import joined
 from experiments.foreign import POLICIES, TIMED, metaworld, section
 from experiments.study import Study
 from experiments.success import rate
@@ -17,20 +15,12 @@ OUTCOMES = {
 }
 
 
-def test_parts_are_joined_in_the_order_of_the_starts(tmp_path: Path) -> None:
-    parts = []
-    for part, successes in enumerate([[[True, False]], [[False, True], [True, True]]]):
-        episodes = [{"seed": 10 * part + at, "successes": each} for at, each in enumerate(successes)]
-        parts.append(tmp_path / f"{part}.json")
-        parts[-1].write_text(json.dumps({"policies": {"a": {}, "b": {}}, "episodes": episodes}))
-    assert joined(parts) == {"a": [True, False, True], "b": [False, True, True]}
-
-
 def test_a_finished_seed_is_collected(tmp_path: Path) -> None:
     variables = {"task": "push-v3", "episodes": 40, "noise": "0.0", "rollouts": 9, "iterations": 6, "seed": 1}
     for step in TIMED:
         write_json(tmp_path / "steps" / f"{step}.json", {"seconds": 90})
-    write_json(tmp_path / "comparison" / "outcomes.json", OUTCOMES)
+    episodes = [{"successes": list(each)} for each in zip(*OUTCOMES.values(), strict=True)]
+    write_json(tmp_path / "comparison" / "comparison.json", {"episodes": episodes})
     write_json(tmp_path / "improve" / "check" / "metrics.json", {"auc": 0.9})
     variables |= {"output_dir": str(tmp_path), "cell": "seed1"}
     (found,) = metaworld(Study("metaworld", "?", {}, variables, (), None, ())).values()
