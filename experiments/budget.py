@@ -27,7 +27,7 @@ MODULES: Final = (
 ROOTS: Final = ("dataset.root", "env.dataset.root", "gate.dataset.root")
 """Flags with the folder of one dataset."""
 
-LISTS: Final = ("dataset.more", "env.dataset.more")
+LISTS: Final = ("dataset.more",)
 """Flags with the folders of several."""
 
 INSERTED: Final = "$()"
@@ -106,16 +106,17 @@ def check_datasets(study: Study, step: Step, checked: frozenset[Source] = frozen
     """
     if study.limits is None:
         return checked
-    from lerobot_wmrl.common.errors import FieldError
+    from lerobot_wmrl.common.errors import FieldError, renamed
     from lerobot_wmrl.data.budget import Ledger
     from lerobot_wmrl.data.episodes import open_dataset, read_episodes
 
     found = {each for each in sources(step) if each.recorded} - checked
     for source in sorted(found, key=lambda each: each[:2]):
         try:
-            table = read_episodes(open_dataset(source.root))
-            chosen = None if source.episodes is None else table.among(source.episodes).nonzero()[0]
-            Ledger(study.budget).require_known(table, chosen, source.flag)
+            with renamed("dataset.root", source.flag):
+                table = read_episodes(open_dataset(source.root))
+                chosen = None if source.episodes is None else table.among(source.episodes).nonzero()[0]
+                Ledger(study.budget).require_known(table, chosen)
         except FieldError as error:
             raise StudyError(f"{step.name}: --{error}") from error
     return checked | found

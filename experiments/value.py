@@ -11,8 +11,8 @@ from experiments.study import Study
 from experiments.success import Results, outcomes, rate
 from lerobot_wmrl.data.budget import Ledger
 from lerobot_wmrl.data.episodes import open_dataset, read_episodes
+from lerobot_wmrl.evaluation.comparison import RESULTS
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
-from lerobot_wmrl.scripts.compare import RESULTS
 
 CELL: Final = ("task", "kind", "demonstrations", "rollouts", "seed", "starts")
 """Variables of the study that say which cell it is."""

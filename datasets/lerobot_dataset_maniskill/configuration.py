@@ -186,11 +186,6 @@ class RecordConfig(RunConfig):
                 "env.dataset.branches", self.env.dataset.branches,
                 "recorded episodes begin with first frames", "leave it out",
             )  # fmt: skip
-        if isinstance(self.env, WorldModelEnv) and self.env.dataset.more and not self.elsewhere:
-            raise FieldError(
-                "env.dataset.more", self.env.dataset.more,
-                "recorded episodes say from which episode of one dataset they start", "leave it out",
-            )  # fmt: skip
         if self.elsewhere and self.shard_of[1] > 1:
             raise FieldError("shard", self.shard, "divides recordings in ManiSkill alone", "leave it out")
 

@@ -23,7 +23,7 @@ from typing import Final
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_wmrl.common.command_line import run_command
-from lerobot_wmrl.common.errors import suggestion
+from lerobot_wmrl.common.errors import renamed, suggestion
 from lerobot_wmrl.common.files import writing
 from lerobot_wmrl.common.presets import format_flags, read_settings
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
@@ -111,8 +111,9 @@ def check_shards(config: RecordConfig) -> None:
     from lerobot_wmrl.data.episodes import open_dataset, read_episodes
 
     if config.budget is not None:
-        for shard in config.merge_shards:
-            Ledger(config.budget).require_known(read_episodes(open_dataset(shard)), field="merge_shards")
+        with renamed("dataset.root", "merge_shards"):
+            for shard in config.merge_shards:
+                Ledger(config.budget).require_known(read_episodes(open_dataset(shard)))
 
 
 def main() -> None:

@@ -70,6 +70,17 @@ def within(group: str) -> Iterator[None]:
         raise FieldError(f"{group}.{error.field}", error.value, error.problem, error.remedy) from None
 
 
+@contextmanager
+def renamed(field: str, name: str) -> Iterator[None]:
+    """Let a FieldError about `field` that leaves the block be about the field `name`."""
+    try:
+        yield
+    except FieldError as error:
+        if error.field != field:
+            raise
+        raise FieldError(name, error.value, error.problem, error.remedy) from error
+
+
 def suggestion(name: str, known: Sequence[str], prefix: str = "") -> str:
     """Return the known name nearest to a wrong one, with `prefix` before it; all of them if none is near."""
     near = get_close_matches(name, known, 1)

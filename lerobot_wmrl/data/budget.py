@@ -157,23 +157,19 @@ class Ledger:
             entries.require_left(self.path, {ROLLOUTS: max(rollouts - before, 0)})
             entries.trainings[name] = max(rollouts, before)
 
-    def require_known(
-        self, table: EpisodeTable, episodes: Sequence[int] | np.ndarray | None = None,
-        field: str = "dataset.root",
-    ) -> None:  # fmt: skip
+    def require_known(self, table: EpisodeTable, episodes: Sequence[int] | np.ndarray | None = None) -> None:
         """Raise FieldError unless the ledger has every episode that is to be learnt from.
 
         Args:
             table: the dataset.
             episodes: indices of the episodes, by default all.
-            field: the setting that names the dataset.
         """
         known, digests = self.read().episodes, episode_digests(table)
         chosen = range(len(digests)) if episodes is None else episodes
         unknown = [int(episode) for episode in chosen if digests[episode] not in known]
         if unknown:
             raise FieldError(
-                field, table.dataset.root,
+                "dataset.root", table.dataset.root,
                 f"{len(unknown)} of {len(chosen)} episodes are not in the budget {self.path}, the first is "
                 f"episode {unknown[0]}",
                 f"record them with lerobot-wmrl-record --budget={self.path}, or choose others",

@@ -12,7 +12,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import ACTION, DONE, OBS_IMAGE, OBS_IMAGES, OBS_STATE
 from numpy.typing import ArrayLike
 
-from lerobot_wmrl.common.errors import FieldError, first_line
+from lerobot_wmrl.common.errors import FieldError, first_line, renamed
 
 VIDEO_BACKEND: Final = "pyav"
 """pyav ships its own FFmpeg, torchcodec needs the system's. Speed matters little: frames are decoded once."""
@@ -101,6 +101,11 @@ class TrainingData(ChosenEpisodes):
     """
 
     more: list[str] = field(default_factory=list)
+
+    def read_more(self) -> list["EpisodeTable"]:
+        """Read the further datasets. FieldError if one cannot be read."""
+        with renamed("dataset.root", "dataset.more"):
+            return [read_episodes(open_dataset(root)) for root in self.more]
 
 
 def success_column(columns: Container[str]) -> str | None:

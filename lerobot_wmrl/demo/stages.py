@@ -1,17 +1,15 @@
 """The stages of the demo: which command each one runs, as a user would type it."""
 
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from lerobot.utils.constants import PRETRAINED_MODEL_DIR
-
-from lerobot_wmrl.common.checkpoints import LAST_CHECKPOINT, last_checkpoint, latest_checkpoint
+from lerobot_wmrl.common.checkpoints import last_checkpoint
 from lerobot_wmrl.common.command_line import RunConfig
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import FieldError, require_at_least
+from lerobot_wmrl.common.lerobot_commands import merge_command, train_command
 from lerobot_wmrl.common.presets import Flags, format_flags, preset_flags
 from lerobot_wmrl.common.stages import Stage
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
@@ -181,27 +179,15 @@ def successful(root: Path) -> str:
 
 
 def lerobot_train(config: DemoConfig, name: str, dataset: Path, flags: Sequence[str]) -> list[str]:
-    """Return LeRobot's own training command, begun or continued.
-
-    It continues by other flags, and refuses a folder without checkpoints, which is therefore removed. It
-    points `last` at a checkpoint that is whole, but a kill can come between the two.
-    """
-    folder = config.output_dir / name
-    last = folder / LAST_CHECKPOINT
-    newest = last if last.exists() else latest_checkpoint(folder)
-    if newest is not None:
-        trained = newest / PRETRAINED_MODEL_DIR / "train_config.json"
-        return ["lerobot-train", *format_flags({"config_path": str(trained), "resume": True})]
-    shutil.rmtree(folder, ignore_errors=True)
+    """Return LeRobot's own training command for the policy `cnn`."""
     files: Flags = {
         "policy.type": "cnn",
         "policy.push_to_hub": False,
         "dataset.repo_id": f"local/{dataset.name}",
         "dataset.root": str(dataset),
         "seed": first_seed(config),
-        "output_dir": str(folder),
     }
-    return ["lerobot-train", *flags, *format_flags(files)]
+    return train_command(config.output_dir / name, [*flags, *format_flags(files)])
 
 
 def roll_out(config: DemoConfig) -> list[str]:
@@ -230,18 +216,9 @@ def record_policy(config: DemoConfig, policy: str, name: str, episodes: int, see
 
 
 def merge(config: DemoConfig) -> list[str]:
-    """Merge with LeRobot's own tool, which refuses what an interrupted call left; that is removed first."""
-    target, names = config.output_dir / "dataset", ("demonstrations", "rollouts")
-    shutil.rmtree(target, ignore_errors=True)
-    flags: Flags = {
-        "new_repo_id": "local/dataset",
-        "new_root": str(target),
-        "operation.type": "merge",
-        "operation.repo_ids": str([f"local/{name}" for name in names]),
-        "operation.roots": str([str(config.output_dir / name) for name in names]),
-        "operation.concatenate_data": False,
-    }
-    return ["lerobot-edit-dataset", *format_flags(flags)]
+    """Merge with LeRobot's own tool."""
+    out = config.output_dir
+    return merge_command(out / "dataset", {name: out / name for name in ("demonstrations", "rollouts")})
 
 
 def train_model(config: DemoConfig, model: str) -> list[str]:

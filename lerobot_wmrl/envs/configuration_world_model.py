@@ -1,6 +1,6 @@
 """Configuration of the world model as an environment, `--env.type=world_model`."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -28,9 +28,8 @@ class StartFrames(ChosenEpisodes):
             that training may see) or `ood` (scenes held out). Several joined by a comma: their intersection.
         tasks: only episodes of these tasks, by name.
         scenes: only episodes of these scenes, by index.
-        more: folders of further datasets, in whose episodes imagined episodes begin too.
-        max_starts: number of starts at most, spread evenly over the datasets, and over the episodes or saved
-            frames; each needs a goal frame.
+        max_starts: number of starts at most, spread evenly over the episodes or saved frames; each needs a
+            goal frame.
         branches: later frames of each episode of the dataset from which imagined episodes begin too, spread
             over those before its success (branched rollouts, Janner et al. 2019).
         frames: a file written by numpy.savez, in place of a dataset: `observation.images.<camera>`
@@ -42,17 +41,10 @@ class StartFrames(ChosenEpisodes):
     split: str = "all"
     tasks: list[str] | None = None
     scenes: list[int] | None = None
-    more: list[str] = field(default_factory=list)
     max_starts: int = 256
     branches: int = 0
     frames: Path | None = None
     resets: int = 0
-
-    def each(self) -> list["StartFrames"]:
-        """Return the starts of every dataset, each with its share of `max_starts`."""
-        alone = replace(self, more=[], max_starts=max(1, self.max_starts // (1 + len(self.more))))
-        whole = replace(alone, repo_id=None, revision=None, episodes=None)
-        return [alone, *(replace(whole, root=root) for root in self.more)]
 
     def check(self) -> None:
         """Raise FieldError unless there is exactly one kind of starts, and it can be chosen as asked."""
@@ -68,11 +60,6 @@ class StartFrames(ChosenEpisodes):
                 "dataset.branches", self.branches,
                 "imagined episodes branch off from episodes of a dataset, at least 0 times",
                 "give a dataset; saved frames and resets are first frames",
-            )  # fmt: skip
-        if self.more and not self.given:
-            raise FieldError(
-                "dataset.more", self.more, "further datasets need a first one",
-                "give it as `dataset.root` or `dataset.repo_id`",
             )  # fmt: skip
         if self.frames and (self.tasks or self.scenes or self.split != "all"):
             raise FieldError(

@@ -5,7 +5,7 @@ world model then tokenises them (`Starts`), and the text world model imagines th
 K is the number of starts, N the number of cameras.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -120,23 +120,7 @@ def read_start_images(source: StartFrames, config: WorldModelConfig) -> StartIma
         return read_saved_frames(source.frames, source.max_starts, config)
     if source.resets:
         return simulate_first_frames(source, config)
-    return joined([read_dataset_frames(dataset, config) for dataset in source.each()])
-
-
-def joined(parts: Sequence[StartImages]) -> StartImages:
-    """Put the starts of several datasets one after another."""
-
-    def depth(model: WorldModelRewardModel) -> Tensor | None:
-        found = [part.depth(model) for part in parts]
-        known = [each for each in found if each is not None]
-        return torch.cat(known) if known else None
-
-    images, first_images, state, tasks = (
-        np.concatenate([getattr(part, name) for part in parts])
-        for name in ("images", "first_images", "state", "tasks")
-    )
-    instructions = [text for part in parts for text in part.instructions]
-    return StartImages(images, first_images, state, instructions, tasks, depth)
+    return read_dataset_frames(source, config)
 
 
 def chosen_episodes(table: EpisodeTable, source: StartFrames) -> np.ndarray:
@@ -183,14 +167,11 @@ def check_starts(source: StartFrames, ledger: Ledger | None) -> None:
         )  # fmt: skip
     if not source.given:
         return
-    remedy = "choose others with `dataset.split=ind` or `dataset.scenes`"
-    for number, dataset in enumerate(source.each()):
-        field = "dataset.more" if number else "dataset.root"
-        table = read_episodes(dataset.open())
-        episodes = every_chosen_episode(table, dataset)
-        require_unreported(table, episodes, remedy, field)
-        if ledger is not None:
-            ledger.require_known(table, episodes, field)
+    table = read_episodes(source.open())
+    episodes = every_chosen_episode(table, source)
+    require_unreported(table, episodes, "choose others with `dataset.split=ind` or `dataset.scenes`")
+    if ledger is not None:
+        ledger.require_known(table, episodes)
 
 
 def undecided_frames(table: EpisodeTable, episodes: np.ndarray) -> np.ndarray:

@@ -4,12 +4,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from matplotlib.figure import Figure
 
 from lerobot_wmrl.common.statistics import PairedChange, Proportion
 from lerobot_wmrl.evaluation.sequential import SequentialTest
+
+RESULTS: Final = "comparison.json"
+"""The file of a comparison, in its folder."""
 
 
 class Episode(NamedTuple):
@@ -151,6 +154,21 @@ class Comparison:
 def read_episodes(results: Mapping[str, Any]) -> list[Episode]:
     """Return the episodes of a comparison that was written as JSON."""
     return [Episode(**episode) for episode in results["episodes"]]
+
+
+def chosen_policy(results: Mapping[str, Any]) -> str:
+    """Return which policy of a comparison, written as JSON, to go on with: the most successful of those that
+    succeed more often than the first, or the first.
+
+    Raises:
+        ValueError: the comparison was interrupted.
+    """
+    if not results["finished"]:
+        raise ValueError("the comparison is not finished: run its command again")
+    first, *_ = policies = results["policies"]
+    against = [pair for pair in results["pairs"] if pair["before"] == first]
+    better = [pair["after"] for pair in against if pair["better"] == pair["after"]]
+    return str(max(better, key=lambda name: policies[name]["share"], default=first))
 
 
 def save_picture(comparison: Comparison, path: Path) -> None:

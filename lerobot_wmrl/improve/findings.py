@@ -2,16 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from lerobot.configs import PreTrainedConfig
-from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
+from lerobot.utils.constants import ACTION, DONE, OBS_IMAGE, OBS_STATE
 
 from lerobot_wmrl.common.constants import START_TASK
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.policies import check_fit
 from lerobot_wmrl.data.embodiment import component_names
-from lerobot_wmrl.data.episodes import DONE, EpisodeTable, camera_names, frame_size, success_column
+from lerobot_wmrl.data.episodes import EpisodeTable, camera_names, frame_size, success_column
 
 LONGEST_IMAGINATION = 98
 """Frames of an imagined episode at most. Where recorded episodes are longer, imagination also begins in their
@@ -40,6 +41,10 @@ class Findings:
         longest: frames of the longest episode.
         usual: length that nine of ten episodes do not exceed, of the task with the longest.
         success_frames: frames of all successful episodes.
+        failures: how many episodes fail.
+        root: folder of the dataset.
+        total: how many episodes it has, chosen or not.
+        columns: names of its columns.
         held: frames in which success holds in a successful episode, the median.
     """
 
@@ -54,6 +59,10 @@ class Findings:
     longest: int
     usual: int
     success_frames: int
+    failures: int
+    root: Path
+    total: int
+    columns: list[str]
     held: int
 
     def __str__(self) -> str:
@@ -67,7 +76,8 @@ def look(table: EpisodeTable, policy: PreTrainedConfig, episodes: Sequence[int] 
         FieldError: the policy cannot be improved with it.
     """
     chosen = table.among(episodes)
-    held_out, table = int((table.validation & chosen).sum()), table.subset(chosen)
+    held_out, total = int((table.validation & chosen).sum()), len(chosen)
+    table = table.subset(chosen)
     features, root, success = table.dataset.features, table.dataset.root, table.success
     keys = [key for key in policy.image_features if key.startswith(OBS_IMAGE)]
     sizes = {key: frame_size(features[key]) for key in keys if key in features}
@@ -105,7 +115,9 @@ def look(table: EpisodeTable, policy: PreTrainedConfig, episodes: Sequence[int] 
             int(np.quantile(table.length[table.column(START_TASK) == task], 0.9, method="inverted_cdf"))
             for task in np.unique(table.column(START_TASK))
         ),
-        success_frames=int(table.length[success].sum()),
+        success_frames=int(table.length[success].sum()), failures=int((~success).sum()),
+        root=Path(root), total=total,
+        columns=list(features),
         held=int(np.median(np.array(done)[success])),
     )  # fmt: skip
 

@@ -1,12 +1,14 @@
 """The report of an improvement, `report.md`: what was found, learnt and gained."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from lerobot_wmrl.common.files import write_text
 from lerobot_wmrl.common.stages import Stage, read_record
 from lerobot_wmrl.common.statistics import Proportion
+from lerobot_wmrl.evaluation.comparison import RESULTS
 from lerobot_wmrl.evaluation.gate import DOUBTFUL_AUC
 from lerobot_wmrl.evaluation.report import seen_line
 from lerobot_wmrl.improve.stages import DONE_THRESHOLD, Improvement
@@ -32,27 +34,47 @@ def write_report(improvement: Improvement, stages: list[Stage]) -> Path:
 
 def verdict(improvement: Improvement) -> str:
     """Say in a few lines what was gained, and where."""
-    found = read(improvement.out / "comparison" / "comparison.json")
-    before, after = (Proportion(each["k"], each["n"]) for each in found["policies"].values())
-    (pair,), real = found["pairs"], improvement.config.real_env
+    found = read(improvement.out / "comparison" / RESULTS)
+    names = dict(zip(found["policies"], policy_titles(improvement), strict=True))
+    real = improvement.config.real_env
     where = "in imagination, from frames of the dataset" if real is None else f"in {real.type}"
-    said = (
-        f"Success {where}: {before} before, {after} after; {pair['gained']} starts gained, "
-        f"{pair['lost']} lost, p = {pair['p_value']:.2g}.\n\nThe improved policy: `{improvement.improved}`"
-    )
+    paths = dict(zip(names, improvement.policies, strict=True))
+    rates = [
+        f"- {title}: {Proportion(rate['k'], rate['n'])}, `{paths[name]}`"
+        for (name, title), rate in zip(names.items(), found["policies"].values(), strict=True)
+    ]
+    changes = [
+        f"- {names[pair['after']]}, against {names[pair['before']]}: {pair['gained']} starts gained, "
+        f"{pair['lost']} lost, p = {pair['p_value']:.2g}: {decision(pair)}"
+        for pair in found["pairs"]
+    ]
+    said = "\n".join([f"Success {where}:\n", *rates, "\nOn the same starts:\n", *changes])
     if real is None:
         said += (
-            "\n\nThis is what the world model predicts, and shows nothing about the real world. Run both "
+            "\n\nThis is what the world model predicts, and shows nothing about the real world. Run the "
             "policies there, label what they did, and run the command again on all episodes."
         )
     return said
+
+
+def policy_titles(improvement: Improvement) -> list[str]:
+    """Return what the compared policies are, in their order."""
+    cloned = ["trained further on the successes"] if improvement.clones else []
+    return ["as it was", *cloned, "improved in imagination"]
+
+
+def decision(pair: Mapping[str, Any]) -> str:
+    """Say whether the second policy of a pair is decided to be better or worse than the first."""
+    if pair["better"] is None:
+        return "not decided"
+    return "better" if pair["better"] == pair["after"] else "worse"
 
 
 def trust(improvement: Improvement) -> str:
     """Say how well the world model tells recorded successes from failures."""
     found = read(improvement.out / "check" / "metrics.json")
     wins, losses = found["successes"], found["failures"]
-    whose = "rollouts" if Path(found["dataset"]) == improvement.out / "rollouts" else "episodes"
+    whose = "rollouts" if Path(found["dataset"]) == improvement.out / "merged" else "episodes"
     held_out = found["split"] == "validation"
     kind = f"held-out {whose}" if held_out else f"{whose} (most of which it has learnt from)"
     if not wins or not losses:

@@ -1,34 +1,33 @@
 """The stages of an improvement: which command each one runs, as a user would type it."""
 
 import json
-from dataclasses import dataclass, field
-from functools import partial
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
+import numpy as np
 import torch
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.envs.configs import EnvConfig
+from lerobot.envs.utils import env_to_policy_features
+from lerobot.utils.constants import ACTION, DEFAULT_FEATURES, DONE, OBS_STATE, REWARD
 
 from lerobot_wmrl.common.checkpoints import last_checkpoint
 from lerobot_wmrl.common.command_line import RunConfig
-from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.constants import EVALUATION_SEED, START_KIND, START_SEED, START_TASK
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
+from lerobot_wmrl.common.lerobot_commands import edit_command, merge_command, train_command
 from lerobot_wmrl.common.policies import (
     read_policy_config,
     require_chunks,
     require_single_observations,
     require_trained,
 )
-from lerobot_wmrl.common.presets import Flags, format_flags, preset_settings
+from lerobot_wmrl.common.presets import Flags, format_flags, preset_flags, preset_settings
 from lerobot_wmrl.common.stages import Stage
-from lerobot_wmrl.data.episodes import (
-    ChosenEpisodes,
-    DatasetSource,
-    EpisodeTable,
-    open_dataset,
-    read_episodes,
-)
+from lerobot_wmrl.data.episodes import SUCCESS, ChosenEpisodes, EpisodeTable, read_episodes
+from lerobot_wmrl.evaluation.comparison import RESULTS, chosen_policy
 from lerobot_wmrl.improve.findings import LONGEST_IMAGINATION, Findings
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.recorders import env_flags
@@ -66,6 +65,12 @@ CHANNELS: Final = 3
 PASS_PIXELS: Final = 2**23
 """Pixels of observations in one forward and backward pass of PPO at most."""
 
+ROLLOUT_COLUMNS: Final = (*DEFAULT_FEATURES, ACTION, OBS_STATE, REWARD, SUCCESS, DONE, START_SEED, START_KIND)
+"""Columns of recorded rollouts, beside those that the policy sees and the environment declares."""
+
+CLONING_PRESETS: Final = {"tiny": "tiny"}
+"""Presets of cloning at the sizes where it is not `demo`, which trains for as long as it helps."""
+
 ALGORITHMS: Final[dict[str, Flags]] = {
     "cnn": {"algorithm.type": "ppo", "algorithm.train_encoder": False},
     "act": {"algorithm.type": "ppo", "algorithm.policy_lr": 1e-5, "algorithm.initial_std": 0.1},
@@ -79,6 +84,9 @@ OTHERS: Final[Flags] = {"algorithm.type": "distillation"}
 MINIBATCH: Final = PPOConfig.minibatch_size
 """Decisions in an optimizer step of PPO."""
 
+IMAGINED_STARTS: Final = 256
+"""Imagined episodes of each policy that choose which one to improve, at most."""
+
 DONE_FRAMES: Final = 2
 """Consecutive done frames that make an imagined success, if the data shows that many."""
 
@@ -90,10 +98,11 @@ DONE_THRESHOLD: Final = 0.95
 class ImproveConfig(RunConfig):
     """Improve a policy with a dataset, inside a world model that learns from it.
 
-    The command looks at the data and says what it has and lacks, trains a frame tokenizer and a world model,
-    checks the world model on held-out episodes, trains the policy in imagination and compares it with what it
-    was: in `real_env` if there is one, else in imagination, which proves nothing about the real world. Every
-    stage is a command that you could call yourself; it is printed. Running the same command again continues.
+    The command looks at the data and says what it has and lacks. It trains the policy further on all episodes
+    that succeed, and trains a frame tokenizer, a world model and, in imagination, the policy. In the end it
+    compares the policy before, cloned from the successes, and improved: in `real_env` if there is one, else
+    in imagination, which proves nothing about the real world. Every stage is a command that you could call
+    yourself; it is printed. Running the same command again continues.
 
     Args:
         policy: `--policy.path=FOLDER` or a name on the hub: the policy to improve, cloned from such data.
@@ -101,7 +110,8 @@ class ImproveConfig(RunConfig):
             that the policy sees, and next.success. Failures belong into it.
         real_env: `--real_env.type=…` and its settings: one of LeRobot's environments or wmrl_maniskill, to
             record rollouts and to measure success in.
-        rollouts: rollouts of the policy that are recorded in `real_env` first, and learnt from.
+        rollouts: rollouts of the policy that are recorded in `real_env` first, and learnt from. Columns of
+            the dataset that these lack are left out of what is learnt from.
         exploration: noise on the actions of these rollouts, as a share of half their range.
         size: how large models are and how long they train: `demo` (an hour on two cores), `cpu` (several),
             `tiny` (a minute, to try the command), or `auto`.
@@ -171,16 +181,27 @@ class Improvement:
     def stages(self) -> list[Stage]:
         """List every stage in order."""
         steps = {
+            "columns": "Leave out columns that rollouts lack",
             "rollouts": "Record rollouts of the policy",
+            "merged": "Merge the dataset with them",
+            "cloned": "Train the policy further on the successes",
             "tokenizer": "Train the frame tokenizer",
             "world_model": "Train the world model",
             "check": "Check the world model on recorded episodes",
-            "rl": "Train the policy in imagination",
-            "comparison": "Compare the policy before and after",
+            "start": "Choose in imagination which policy to improve",
+            "rl": "Train it in imagination",
+            "comparison": "Compare the policies",
         }
-        if not self.config.rollouts:
-            del steps["rollouts"]
-        return [Stage(name, title, partial(getattr(self, f"_{name}"))) for name, title in steps.items()]
+        needless = {
+            *(() if self.extra_columns else ("columns",)),
+            *(() if self.config.rollouts else ("rollouts", "merged")),
+            *(() if self.clones else ("cloned", "start")),
+        }
+        return [
+            Stage(name, title, getattr(self, f"_{name}"))
+            for name, title in steps.items()
+            if name not in needless
+        ]
 
     @property
     def duration(self) -> str:
@@ -205,6 +226,48 @@ class Improvement:
         return last_checkpoint(self.out / "rl")
 
     @property
+    def clones(self) -> bool:
+        """Whether a policy is cloned from the successes alone. If all episodes succeed, this one was."""
+        return bool(self.config.rollouts or self.found.failures)
+
+    @property
+    def policies(self) -> list[str]:
+        """Paths of the policies that are compared in the end."""
+        cloned = [str(last_checkpoint(self.out / "cloned"))] if self.clones else []
+        return [self.policy, *cloned, str(self.improved)]
+
+    @property
+    def data(self) -> ChosenEpisodes:
+        """The episodes that are learnt from: the dataset's, and the rollouts, which are merged with it."""
+        given, count = self.config.dataset, self.config.rollouts
+        if not count:
+            return given
+        chosen = given.episodes
+        if chosen is not None:
+            chosen = [*chosen, *self._rollout_numbers()]
+        return ChosenEpisodes(root=str(self.out / "merged"), episodes=chosen)
+
+    def _rollout_numbers(self) -> range:
+        """Return the numbers of the rollouts among the merged episodes."""
+        return range(self.found.total, self.found.total + self.config.rollouts)
+
+    @property
+    def extra_columns(self) -> list[str]:
+        """Columns of the dataset that the rollouts lack, which cannot be merged."""
+        real, policy = self.config.real_env, self.config.policy
+        if not self.config.rollouts or self._in_maniskill:
+            return []
+        assert real is not None
+        assert policy is not None
+        recorded = {*ROLLOUT_COLUMNS, *policy.input_features, *env_to_policy_features(real)}
+        return [name for name in self.found.columns if name not in recorded]
+
+    @property
+    def _in_maniskill(self) -> bool:
+        """Whether rollouts are recorded in ManiSkill, where they get the recorder's columns."""
+        return self.config.real_env is not None and self.config.real_env.type == "wmrl_maniskill"
+
+    @property
     def branches(self) -> int:
         """Frames beyond the first from which imagination of a recorded episode begins."""
         return (self.found.usual - 1) // self.length
@@ -219,12 +282,13 @@ class Improvement:
         data = self.config.dataset.flags(), "validation" if holds_out else "all"
         if self.config.rollouts < ENOUGH_HELD_OUT:
             return data
-        table = self._rollouts_table()
-        held_out = table.success[table.validation]
-        rollouts = {"dataset.root": str(self.out / "rollouts")}
+        table, numbers = self._table(), list(self._rollout_numbers())
+        success, validation = table.success[numbers], table.validation[numbers]
+        held_out = success[validation]
+        rollouts = replace(self.data, episodes=numbers).flags()
         if len(held_out) >= ENOUGH_HELD_OUT and held_out.any() and not held_out.all():
             return rollouts, "validation"
-        if holds_out or table.success.all() or not table.success.any():
+        if holds_out or success.all() or not success.any():
             return data
         return rollouts, "all"
 
@@ -241,11 +305,6 @@ class Improvement:
     def _side(self, size: str) -> int:
         """Return the side of imagined frames in pixels."""
         return max(SIDE_STEP, min(SIDES[size], self.found.frame_side) // SIDE_STEP * SIDE_STEP)
-
-    def _data(self) -> Flags:
-        """Return the flags of all that is learnt from."""
-        more = {"dataset.more": f"[{self.out / 'rollouts'}]"} if self.config.rollouts else {}
-        return self.config.dataset.flags() | more
 
     def _done(self) -> Flags:
         return {"done_threshold": DONE_THRESHOLD, "done_frames": min(DONE_FRAMES, max(1, self.found.held))}
@@ -271,7 +330,7 @@ class Improvement:
     def _imagination(self) -> Flags:
         return {
             "env.type": "world_model", "env.world_model_path": str(self.out / "world_model"),
-            **{f"env.{name}": value for name, value in self._data().items()},
+            **{f"env.{name}": value for name, value in self.data.flags().items()},
             "env.dataset.max_starts": 1024, "env.dataset.branches": self.branches,
             "env.reward.type": "general", "env.reward.alpha": 1, "env.episode_length": self.length,
             **{f"env.{name}": value for name, value in self._success_criterion().items()},
@@ -280,26 +339,60 @@ class Improvement:
     def _command(self, program: str, flags: Flags) -> list[str]:
         return [program, f"--preset={self.config.preset}", *format_flags(flags)]
 
+    def _fewest(self) -> int:
+        """Return the number of episodes that are learnt from, of the task that has the fewest."""
+        if not self.config.rollouts:
+            return self.found.fewest
+        table = self._table()
+        tasks = table.column(START_TASK)[table.among(self.data.episodes)]
+        return int(np.unique(tasks, return_counts=True)[1].min())
+
+    def _columns(self) -> list[str]:
+        names = f"local/{self.found.root.name}"
+        command = edit_command(
+            self._dataset, "remove_feature", {"operation.feature_names": str(self.extra_columns)}
+        )
+        return [*command, f"--repo_id={names}", f"--root={self.found.root}"]
+
+    @property
+    def _dataset(self) -> Path:
+        """Folder of the dataset with the columns that rollouts have too."""
+        return self.out / "columns" if self.extra_columns else self.found.root
+
     def _rollouts(self) -> list[str]:
-        whole = DatasetSource.flags(self.config.dataset)
-        like = {name.replace("dataset.", "like."): each for name, each in whole.items()}
-        simulator = self.config.real_env is not None and self.config.real_env.type == "wmrl_maniskill"
-        longest = SLOWEST * self.found.longest
+        like: Flags = {"like.root": str(self._dataset), "max_frames": SLOWEST * self.found.longest}
         flags: Flags = {
-            "policy.path": self.policy, **self._real_env("env"),
-            **({} if simulator else {**like, "like_columns": False, "max_frames": longest}),
+            "policy.path": self.policy, **self._real_env("env"), **({} if self._in_maniskill else like),
             "video": False, "num_episodes": self.config.rollouts, "exploration": self.config.exploration,
             "seed": self.config.seed, "output_dir": str(self.out / "rollouts"),
         }  # fmt: skip
         return ["lerobot-wmrl-record", *format_flags(flags)]
 
-    def _rollouts_table(self) -> EpisodeTable:
-        """Read the rollouts, which the first stage has recorded."""
-        return read_episodes(open_dataset(self.out / "rollouts"))
+    def _merged(self) -> list[str]:
+        parts = {"dataset": self._dataset, "rollouts": self.out / "rollouts"}
+        return merge_command(self.out / "merged", parts)
+
+    def _table(self) -> EpisodeTable:
+        """Read the episodes that are learnt from."""
+        return read_episodes(self.data.open())
+
+    def _cloned(self) -> list[str]:
+        table = self._table()
+        successes = np.flatnonzero(table.success & table.among(self.data.episodes)).tolist()
+        preset = CLONING_PRESETS.get(self.config.preset, "demo")
+        return train_command(self.out / "cloned", [
+            *preset_flags(preset, "sft", ["filtered"]),
+            *format_flags({
+                "policy.path": self.policy, "policy.push_to_hub": False,
+                "dataset.repo_id": f"local/{table.dataset.root.name}",
+                "dataset.root": str(table.dataset.root), "dataset.episodes": successes,
+                "seed": self.config.seed,
+            }),
+        ])  # fmt: skip
 
     def _learn(self, model: str, flags: Flags, folder: str) -> list[str]:
         return self._command("lerobot-wmrl-train-world-model", {
-            "model.type": model, **flags, **self._data(), "seed": self.config.seed,
+            "model.type": model, **flags, **self.data.flags(), "seed": self.config.seed,
             "output_dir": str(self.out / folder),
         })  # fmt: skip
 
@@ -323,11 +416,25 @@ class Improvement:
         }  # fmt: skip
         return ["lerobot-wmrl-eval-world-model", *format_flags(flags)]
 
+    def _start(self) -> list[str]:
+        before, cloned, _ = self.policies
+        return self._compare("start", [cloned, before], IMAGINED_STARTS, self.config.seed, imagined=True)
+
+    @property
+    def _chosen(self) -> str:
+        """The policy that RL begins with: the one that was cloned from the successes, unless the world model
+        decides that the one before is better."""
+        if not self.clones:
+            return self.policy
+        found = json.loads((self.out / "start" / RESULTS).read_text())
+        before, cloned, _ = self.policies
+        return [cloned, before][list(found["policies"]).index(chosen_policy(found))]
+
     def _rl(self) -> list[str]:
         assert self.config.policy is not None
         real = {} if self.config.real_env is None else self._real_env("real_env")
         flags: dict[str, str | int | float | bool] = {
-            "policy.path": self.policy, **self._imagination(), **real,
+            "policy.path": self._chosen, **self._imagination(), **real,
             "gate.action": "warn" if real else "off", "gate.freq": 0,
             "gate.n_episodes": min(50, self.config.eval_episodes),
             **ALGORITHMS.get(self.config.policy.type, OTHERS), **self._memory(), "seed": self.config.seed,
@@ -349,8 +456,8 @@ class Improvement:
             flags["num_envs"] = fits
         recorded = self.found.success_frames
         if distils and self.config.rollouts:
-            rollouts = self._rollouts_table()
-            recorded += int(rollouts.length[rollouts.success].sum())
+            table = self._table()
+            recorded = int(table.length[table.success & table.among(self.data.episodes)].sum())
         if distils and recorded * pixels * CHANNELS > ROLLOUT_BYTES:
             flags["algorithm.recorded"] = False
         if not distils and (fits := max(1, PASS_PIXELS // pixels)) < MINIBATCH:
@@ -359,13 +466,19 @@ class Improvement:
 
     def _comparison(self) -> list[str]:
         imagined = self.config.real_env is None
+        return self._compare(
+            "comparison", self.policies, self.config.eval_episodes, EVALUATION_SEED, imagined
+        )
+
+    def _compare(
+        self, folder: str, policies: Sequence[str], starts: int, seed: int, imagined: bool
+    ) -> list[str]:
         env = self._imagination() if imagined else self._real_env("env")
-        starts = self.config.eval_episodes
         if imagined:  # none twice: there are at least as many as episodes
-            starts = min(starts, self.found.fewest)
+            starts = min(starts, self._fewest())
         flags: Flags = {
-            "policies": f"[{self.policy},{self.improved}]", **env, "n_episodes": starts,
-            "batch_size": min(16 if imagined else 1, starts), "stop_early": False, "seed": EVALUATION_SEED,
-            "output_dir": str(self.out / "comparison"),
+            "policies": f"[{','.join(policies)}]", "against": "all", **env, "n_episodes": starts,
+            "batch_size": min(16 if imagined else 1, starts), "stop_early": False, "seed": seed,
+            "output_dir": str(self.out / folder),
         }  # fmt: skip
         return ["lerobot-wmrl-compare", *format_flags(flags)]

@@ -63,9 +63,7 @@ def scene_splits(
     return {"ind": (scene >= 0) & ~held_out, "ood": (scene >= 0) & held_out}
 
 
-def require_unreported(
-    table: EpisodeTable, episodes: np.ndarray, remedy: str, field: str = "dataset.root"
-) -> None:
+def require_unreported(table: EpisodeTable, episodes: np.ndarray, remedy: str) -> None:
     """Raise FieldError if results are reported on some of the episodes, so that nothing may learn from them.
 
     These have evaluation seeds, from `EVALUATION_SEED` on, or unseen scenes. A dataset without seeds and
@@ -75,14 +73,13 @@ def require_unreported(
         table: the dataset.
         episodes: indices of the episodes to learn from. (K,)
         remedy: how to choose others.
-        field: the setting that names the dataset.
     """
     seed, scene = table.column(START_SEED)[episodes], table.column(START_SCENE)[episodes]
     reported = (seed >= EVALUATION_SEED) | np.isin(scene, [each.index for each in scenes_of("ood")])
     if reported.any():
         first = int(np.argmax(reported))
         raise FieldError(
-            field, table.dataset.root,
+            "dataset.root", table.dataset.root,
             f"{reported.sum()} of {len(episodes)} episodes to learn from have evaluation seeds or unseen "
             f"scenes, the first is episode {episodes[first]} (seed {seed[first]}, scene {scene[first]})",
             f"{remedy}, or record with seeds below {EVALUATION_SEED} in known scenes",

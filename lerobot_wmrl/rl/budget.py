@@ -5,7 +5,7 @@ from pathlib import Path
 
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_wmrl.common.errors import within
+from lerobot_wmrl.common.errors import renamed, within
 from lerobot_wmrl.data.budget import Ledger
 from lerobot_wmrl.data.episodes import DatasetSource, read_episodes
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
@@ -34,7 +34,8 @@ def check_data(settings: CallbackSettings, env: EnvConfig) -> None:
     for field, sources in datasets.items():
         for source in sources:
             if source.given:
-                ledger.require_known(read_episodes(source.open()), field=field)
+                with renamed("dataset.root", field):
+                    ledger.require_known(read_episodes(source.open()))
 
 
 def charge_steps(budget: Path, output_dir: Path, steps: int, episode_length: int) -> None:

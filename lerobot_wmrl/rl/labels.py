@@ -105,27 +105,21 @@ class Labels:
 def recorded_successes(
     source: StartFrames, cameras: Sequence[str], state_size: int, chunk: int
 ) -> list[Part]:
-    """Return the actions of the datasets' successful episodes as labels; nothing without any.
+    """Return the actions of a dataset's successful episodes as labels; nothing without a dataset or success.
 
     Args:
-        source: the datasets, and the split, tasks and scenes of their episodes.
+        source: the episodes, those of its split, tasks and scenes.
         cameras: keys of the images.
         state_size: components of the state, 0 for observations without it.
         chunk: actions of a chunk, n; 0 for policies without chunks.
     """
     if not source.given:
         return []
-    parts = (successes(dataset, cameras, state_size, chunk) for dataset in source.each())
-    return [part for part in parts if part is not None]
-
-
-def successes(source: StartFrames, cameras: Sequence[str], state_size: int, chunk: int) -> Part | None:
-    """Return what `recorded_successes` says of one dataset, None if nothing succeeds."""
     table = read_episodes(source.open())
     episodes = every_chosen_episode(table, source)
     episodes = episodes[table.success[episodes]]
     if not len(episodes):
-        return None
+        return []
     steps = np.arange(table.length[episodes].max())[:, None]  # (T, E) below
     acting = torch.from_numpy(steps < table.length[episodes])
     rows = np.minimum(table.start[episodes] + steps, table.start[episodes] + table.length[episodes] - 1)
@@ -139,7 +133,7 @@ def successes(source: StartFrames, cameras: Sequence[str], state_size: int, chun
     if state_size:
         labels[OBS_STATE] = torch.from_numpy(table.state[chosen])
     labels[TASK] = episode
-    return Part(labels, [table.instructions[each] for each in episodes])
+    return [Part(labels, [table.instructions[each] for each in episodes])]
 
 
 def action_chunks(actions: Tensor, labelled: Tensor, length: int) -> dict[str, Tensor]:

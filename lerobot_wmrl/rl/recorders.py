@@ -151,6 +151,7 @@ class RolloutRecorder:
     ) -> None:  # fmt: skip
         self.config, self.exploration, self.video = env, exploration, video
         self.columns = like.features if like is not None and like_columns else None
+        self.robot_type = like.robot_type if like is not None else None
         self.hold = env.done_frames if isinstance(env, WorldModelEnv) else 1
         self.policy, self.processors = load_policy(policy).eval(), load_processors(policy)
         self.env_processors = make_env_pre_post_processors(env, policy)
@@ -207,6 +208,7 @@ class RolloutRecorder:
         features = own if self.columns is None else matched(own, self.columns)
         return LeRobotDataset.create(
             f"local/{folder.name.strip('.')}", self.config.fps, features, root=folder,
+            robot_type=self.robot_type,
             use_videos=any(feature["dtype"] == "video" for feature in features.values()),
             image_writer_threads=IMAGE_WRITERS,
         )  # fmt: skip

@@ -16,7 +16,7 @@ finished batch. With early stopping `--n_episodes` may then be higher: the test 
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import draccus
 from lerobot.envs.configs import EnvConfig
@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from lerobot.configs import PreTrainedConfig
 
     from lerobot_wmrl.evaluation.comparison import Comparison
-
-RESULTS: Final = "comparison.json"
 
 
 @dataclass
@@ -91,7 +89,7 @@ class CompareConfig(RunConfig):
 def compare(cfg: CompareConfig) -> None:
     """Run the policies, or what is missing of their episodes; write comparison.json and comparison.png."""
     from lerobot_wmrl.evaluation.compare import read_policies
-    from lerobot_wmrl.evaluation.comparison import Comparison, read_episodes, save_picture
+    from lerobot_wmrl.evaluation.comparison import RESULTS, Comparison, read_episodes, save_picture
 
     cfg.check()
     assert cfg.env is not None
@@ -116,6 +114,7 @@ def may_differ(cfg: CompareConfig) -> list[str]:
 def run(cfg: CompareConfig, comparison: "Comparison", configs: "dict[str, PreTrainedConfig]") -> None:
     """Run the episodes that are missing; write the results after every batch."""
     from lerobot_wmrl.evaluation.compare import load_policies, opened, require_new_starts, run_comparison
+    from lerobot_wmrl.evaluation.comparison import RESULTS
 
     assert cfg.env is not None
     settings: dict[str, Any] = draccus.encode(cfg)

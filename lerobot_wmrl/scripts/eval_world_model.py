@@ -233,7 +233,6 @@ def policies_imagination(cfg: EvalWorldModelConfig, table: "EpisodeTable") -> "W
     from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
     from lerobot_wmrl.envs.start_frames import chosen_episodes
 
-    longest = getattr(cfg.real_env, "horizon", None) or getattr(cfg.real_env, "episode_length", None)
     task = cfg.real_env.task if isinstance(cfg.real_env, WmrlManiSkillEnv) else None
     starts = StartFrames(
         **vars(cfg.dataset), split=cfg.split, tasks=[task] if task else None, max_starts=cfg.policy_episodes

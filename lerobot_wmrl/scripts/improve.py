@@ -5,8 +5,9 @@
     lerobot-wmrl-improve --policy.path=outputs/cloned --dataset.root=data/pusht --real_env.type=pusht \\
         --rollouts=200 --output_dir=outputs/improve
 
-It looks at the data and says what it has and lacks; trains a frame tokenizer and a world model; checks the
-world model on held-out episodes; trains the policy in imagination; and compares it with what it was, in
+It looks at the data and says what it has and lacks; trains the policy further on the episodes that succeed,
+which needs no world model, so it is the rival; trains a frame tokenizer and a world model; checks
+the world model on held-out episodes; trains the better policy in imagination; and compares all three, in
 `--real_env` if there is one. With `--rollouts` it first records rollouts of the policy there, and learns from
 them too. Every stage is one console command, which it prints. Running the same command again continues where
 it stopped. It ends with a summary and `report.md`.

@@ -24,7 +24,7 @@ from lerobot.configs.rewards import RewardModelConfig
 
 from lerobot_wmrl.common.command_line import RunConfig, claim_output_dir, require_free, run_command
 from lerobot_wmrl.common.distributed import LONGEST_WAIT
-from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
+from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least, require_choice
 from lerobot_wmrl.common.precision import PRECISIONS, keep_freed_memory, training_dtype
 from lerobot_wmrl.common.presets import expand_preset, format_flags
 from lerobot_wmrl.common.tracking import make_wandb
@@ -117,16 +117,19 @@ def check_data(cfg: TrainWorldModelConfig, table: EpisodeTable) -> None:
     These are episodes on which results are reported, and, with a budget, those that are not in its ledger.
     """
     from lerobot_wmrl.data.budget import Ledger
-    from lerobot_wmrl.data.episodes import open_dataset, read_episodes
     from lerobot_wmrl.maniskill.recordings import require_unreported
 
-    more = [("dataset.more", read_episodes(open_dataset(root)), None) for root in cfg.dataset.more]
-    for name, each, chosen in (("dataset.root", table, cfg.dataset.episodes), *more):
-        episodes = each.among(chosen).nonzero()[0]
-        learnt = episodes[~each.validation[episodes]]
-        require_unreported(each, learnt, "choose others with `dataset.episodes`", name)
+    def check(table: EpisodeTable, chosen: list[int] | None) -> None:
+        episodes = table.among(chosen).nonzero()[0]
+        learnt = episodes[~table.validation[episodes]]
+        require_unreported(table, learnt, "choose others with `dataset.episodes`")
         if cfg.budget is not None:
-            Ledger(cfg.budget).require_known(each, episodes, name)
+            Ledger(cfg.budget).require_known(table, episodes)
+
+    check(table, cfg.dataset.episodes)
+    with renamed("dataset.root", "dataset.more"):
+        for further in cfg.dataset.read_more():
+            check(further, None)
 
 
 def train_world_model(cfg: TrainWorldModelConfig) -> None:

@@ -28,7 +28,7 @@ from lerobot_wmrl.common.checkpoints import latest_checkpoint, write_checkpoint
 from lerobot_wmrl.common.constants import HUMAN_LIKE, KINDS, START_KIND
 from lerobot_wmrl.common.cuda_graphs import cuda_graphs
 from lerobot_wmrl.common.distributed import mean_over_processes
-from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.errors import FieldError, renamed
 from lerobot_wmrl.common.lerobot_compat import (
     gather_random_states,
     load_training_state,
@@ -41,8 +41,6 @@ from lerobot_wmrl.data.clips import ClipSampler, FrameSampler, InTurn
 from lerobot_wmrl.data.episodes import (
     EpisodeTable,
     TrainingData,
-    open_dataset,
-    read_episodes,
 )
 from lerobot_wmrl.data.frame_cache import (
     cached_context,
@@ -180,16 +178,20 @@ def make_joint_sampler(
 
     If some of the datasets say what success is, done is not learnt from the others.
     """
-    more = [read_episodes(open_dataset(root)) for root in data.more]
-    for other in more:
-        check_dataset(model.config, other.dataset.meta)
+    more = data.read_more()
+    with renamed("dataset.root", "dataset.more"):
+        for other in more:
+            check_dataset(model.config, other.dataset.meta)
     if isinstance(model.config, ActionWorldModelConfig):
         note_outcomes(model.config, [(table, data.episodes), *((each, None) for each in more)])
     unlabelled = not any(each.done_known for each in (table, *more))
-    first, *others = (
-        make_sampler(model, each, chosen, batch_size, seed, unlabelled or each.done_known)
-        for each, chosen in zip((table, *more), (data.episodes, *[None] * len(more)), strict=True)
-    )
+
+    def sampler(each: EpisodeTable, chosen: Sequence[int] | None) -> ClipSampler | FrameSampler:
+        return make_sampler(model, each, chosen, batch_size, seed, unlabelled or each.done_known)
+
+    first = sampler(table, data.episodes)
+    with renamed("dataset.root", "dataset.more"):
+        others = [sampler(each, None) for each in more]
     return InTurn(first, others) if others else first
 
 

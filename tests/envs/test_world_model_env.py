@@ -325,18 +325,6 @@ def test_episodes_begin_in_saved_frames_as_in_those_of_the_dataset(config, env, 
         replace(config, dataset=replace(config.dataset, frames=path)).create_tensor_env(2)
 
 
-def test_episodes_begin_in_several_datasets(config, make_synthetic_dataset, tmp_path):
-    """Each has its share of the starts; what chooses episodes by number is meant for the first."""
-    more = str(make_synthetic_dataset(tmp_path / "more", episodes=4).root)
-    source = replace(config.dataset, episodes=[0, 2], more=[more], max_starts=6)
-    both = replace(config, dataset=source).create_tensor_env(1).starts
-    alone = [replace(config, dataset=each).create_tensor_env(1).starts for each in source.each()]
-    assert [len(starts) for starts in alone] == [2, 3]
-    assert torch.equal(both.frames.tokens, torch.cat([starts.frames.tokens for starts in alone]))
-    assert torch.equal(both.frames.state, torch.cat([starts.frames.state for starts in alone]))
-    assert both.instructions == alone[0].instructions + alone[1].instructions
-
-
 def test_lerobot_eval_gets_an_environment_for_each_task(config, make_synthetic_dataset, tmp_path):
     """Episodes of two tasks; both environments share their models."""
     dataset = make_synthetic_dataset(tmp_path / "two", episodes=6)
@@ -375,7 +363,6 @@ def test_models_that_do_not_fit_together_are_refused(config, small_dataset, trai
     ({"resets": 2, "split": "validation,ood"}, r"split=validation,ood: .*ManiSkill.* ind or ood"),
     ({"resets": -1}, r"^dataset\.resets=-1: must be at least 1"),
     ({"resets": 2, "branches": 1}, r"^dataset\.branches=1: .*; saved frames and resets are first frames"),
-    ({"resets": 2, "more": ["data"]}, r"^dataset\.more=\['data'\]: further datasets need a first one"),
     ({"root": "data", "branches": -1}, r"^dataset\.branches=-1: .* branch off from episodes of a dataset"),
 ])  # fmt: skip
 def test_what_starts_cannot_be_chosen_by_is_refused(config, given, message):

@@ -52,7 +52,7 @@ def test_a_dataset_that_the_ledger_does_not_know_stops_the_study(
     """With the flag of any command."""
     given = (f"data={small_dataset.root}",)
     for flags in (
-        "--dataset.root=$data", "--dataset.more=[$data]", "--env.dataset.more=[$data]",
+        "--dataset.root=$data", "--dataset.more=[$data]",
         "--gate.dataset.root=$data",
     ):  # fmt: skip
         fair = study(tmp_path, "true", f"true && true {flags}", given=given)

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -21,7 +22,7 @@ from lerobot_wmrl.common.presets import preset_settings
 from lerobot_wmrl.data.episodes import ChosenEpisodes, read_episodes
 from lerobot_wmrl.improve import stages
 from lerobot_wmrl.improve.findings import Findings, few_decisions
-from lerobot_wmrl.improve.report import trust
+from lerobot_wmrl.improve.report import trust, verdict
 from lerobot_wmrl.improve.stages import ImproveConfig, Improvement
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 from lerobot_wmrl.world_models.configuration_world_model import AnchoredConfig
@@ -60,14 +61,17 @@ def test_with_a_real_environment_its_rollouts_are_learnt_from_and_success_is_mea
     assert "size tiny: about a minute on two cores, plus the time in pusht" in first.stdout
     assert "failures: 0. The world model will hardly tell them" in first.stdout
     report = (folder / "report.md").read_text()
-    assert "Success in pusht: 0 % (0 of 2" in report
-    assert report.count("dataset.more=") == 3  # tokenizer, world model and starts
+    assert report.count(": 0 % (0 of 2; 0–66 %), `") == 3, "three policies"
+    assert "improved in imagination, against trained further on the successes: 0 starts gained" in report
+    assert "Leave out columns" not in report
+    merged = f"dataset.root={folder / 'merged'}"
+    assert report.count(merged) == 5, "cloning, tokenizer, world model, imagined starts twice"
     last = Path("checkpoints/last/pretrained_model")
     trained = json.loads((folder / "tokenizer" / last / "config.json").read_text())
     assert trained["tokenizer"]["frame_sizes"] == [[96, 96]]
     assert (folder / "rl" / last).exists()
     again = run(tmp_path, demonstrations, *real)
-    assert "[6/6] Compare the policy before and after: done in" in again.stdout
+    assert "[9/9] Compare the policies: done in" in again.stdout
 
 
 def test_without_one_the_report_says_that_it_is_a_belief(demonstrations: Path, tmp_path: Path) -> None:
@@ -164,16 +168,82 @@ def test_rollouts_are_checked_on_if_they_tell_more_than_the_dataset(
 ) -> None:  # fmt: skip
     number = np.arange(rollouts)
     success = {BOTH: (number + number // 20) % 2 == 0, EARLY: number > 9, NEITHER: number >= 0}[outcomes]
-    table = SimpleNamespace(success=success, validation=number % 20 == 19)
-    monkeypatch.setattr(stages, "open_dataset", Path)
-    monkeypatch.setattr(stages, "read_episodes", {tmp_path / "rollouts": table}.__getitem__)
+    table = SimpleNamespace(
+        success=np.append(np.ones(40, bool), success),
+        validation=np.append(np.ones(40, bool), number % 20 == 19),
+    )
+    monkeypatch.setattr(stages, "read_episodes", lambda dataset: table)
+    monkeypatch.setattr(ChosenEpisodes, "open", lambda self: self.root)
     improvement = improvement_of(tmp_path, held_out=held_out)
     improvement.config.rollouts, improvement.config.real_env = rollouts, PushtEnv()
-    commands = {stage.name: stage.command() for stage in improvement.stages()}
-    folder = root if root == "data" else tmp_path / root
-    assert {f"--dataset.root={folder}", f"--split={split}"} <= {*commands["check"]}
-    assert f"--env.dataset.more=[{tmp_path / 'rollouts'}]" in commands["rl"]
-    assert "--max_frames=80" in commands["rollouts"]  # twice the longest episode
+    merged = {"dataset.root": str(tmp_path / "merged"), "dataset.episodes": [*range(40, 40 + rollouts)]}
+    wanted = {"data": {"dataset.root": "data"}, "rollouts": merged}[root]
+    assert improvement.checked() == (wanted, split)
+
+
+@pytest.mark.parametrize("better", [None, "before"])
+def test_rollouts_are_merged_and_successes_cloned_before_rl(
+    better: str | None, make_synthetic_dataset: Any, tmp_path: Path
+) -> None:
+    """Two of four episodes are chosen, and two rollouts; RL begins with the cloned policy, unless the world
+    model decides that the policy before is better."""
+    folder = tmp_path / "improve"
+    improvement = improvement_of(
+        folder, total=4, failures=2, columns=["observation.image", "observation.state", "action", "effort"]
+    )
+    config = improvement.config
+    config.rollouts, config.real_env, config.dataset.episodes = 2, PushtEnv(), [0, 3]
+    before, cloned, improved = improvement.policies
+    results = {
+        "finished": True, "policies": {"a": {"share": 0.1}, "b": {"share": 0.9}},
+        "pairs": [{"before": "a", "after": "b", "better": better and "b"}],
+    }  # fmt: skip
+    write_json(folder / "start" / "comparison.json", results)
+    stages = iter(improvement.stages())
+    commands = {stage.name: stage.command() for stage in islice(stages, 3)}
+    success = read_episodes(make_synthetic_dataset(folder / "merged", episodes=6)).success
+    commands |= {stage.name: stage.command() for stage in stages}
+    assert {"--root=data", f"--new_root={folder / 'columns'}", "--operation.feature_names=['effort']"} <= {
+        *commands["columns"]
+    }
+    assert {f"--like.root={folder / 'columns'}", "--max_frames=80"} <= {*commands["rollouts"]}
+    assert f"--operation.roots=['{folder / 'columns'}', '{folder / 'rollouts'}']" in commands["merged"]
+    episodes = [episode for episode in (0, 3, 4, 5) if success[episode]]
+    assert 0 < len(episodes) < 4
+    assert {f"--policy.path={before}", f"--dataset.episodes={episodes}".replace(" ", "")} <= {
+        *commands["cloned"]
+    }
+    learnt = {f"--dataset.root={folder / 'merged'}", "--dataset.episodes=[0,3,4,5]"}
+    assert learnt <= {*commands["tokenizer"]}
+    assert learnt <= {*commands["world_model"]}
+    starts = {flag.replace("--", "--env.", 1) for flag in learnt}
+    assert {*starts, f"--policies=[{cloned},{before}]", "--n_episodes=4"} <= {*commands["start"]}
+    assert {*starts, f"--policy.path={before if better else cloned}"} <= {*commands["rl"]}
+    assert {f"--policies=[{before},{cloned},{improved}]", "--against=all"} <= {*commands["comparison"]}
+
+
+def test_the_report_compares_with_the_policy_cloned_from_the_successes(tmp_path: Path) -> None:
+    improvement = improvement_of(tmp_path, failures=20)
+    improvement.config.real_env = PushtEnv()
+    cloned = improvement.policies[1]
+
+    def pair(first: str, second: str, better: str | None) -> dict[str, Any]:
+        return {"before": first, "after": second, "better": better, "gained": 3, "lost": 1, "p_value": 0.04}
+
+    write_json(tmp_path / "comparison" / "comparison.json", {
+        "policies": {name: {"k": k, "n": 10} for name, k in (("x", 4), ("y", 6), ("z", 5))},
+        "pairs": [pair("x", "y", "y"), pair("x", "z", None), pair("y", "z", "y")],
+    })  # fmt: skip
+    said = verdict(improvement)
+    assert f"- trained further on the successes: 60 % (6 of 10; 31–83 %), `{cloned}`" in said
+    assert (
+        "- trained further on the successes, against as it was: 3 starts gained, 1 lost, p = 0.04: better"
+        in said
+    )
+    assert (
+        "- improved in imagination, against as it was: 3 starts gained, 1 lost, p = 0.04: not decided" in said
+    )
+    assert "against trained further on the successes: 3 starts gained, 1 lost, p = 0.04: worse" in said
 
 
 def test_where_the_strict_threshold_recognises_nothing_the_check_s_own_is_taken(tmp_path: Path) -> None:
@@ -206,7 +276,7 @@ def test_the_report_says_that_success_was_taken_for_less(tmp_path: Path) -> None
         "recall": share,
     }
     found = {"true_positives": 0, "successes": 4, "failures": 9, "false_positives": 0, "auc": 0.9}
-    found |= {"dataset": str(tmp_path / "rollouts"), "split": "all", "seen_auc": 0.44}
+    found |= {"dataset": str(tmp_path / "merged"), "split": "all", "seen_auc": 0.44}
     write_json(tmp_path / "check" / "metrics.json", found | {"operating_point": point})
     said = trust(improvement_of(tmp_path))
     assert "imagination took done_threshold=0.5 and done_frames=1, chosen on the same episodes" in said
@@ -224,10 +294,12 @@ def improvement_of(
     policy = policy or CnnConfig(device="cpu", pretrained_path=folder)
     data = {
         "frame_side": 96, "pixels": 96**2, "episodes": 40, "held_out": 2, "fewest": 40, "longest": 40,
-        "usual": 40, "success_frames": 1000, "held": 2,
+        "usual": 40, "success_frames": 1000, "failures": 0, "total": 40, "held": 2,
     }  # fmt: skip
     config = ImproveConfig(policy=policy, dataset=ChosenEpisodes("data"), size=size, output_dir=folder)
-    return Improvement(config, Findings([], [], ["top"], **(data | found)))
+    return Improvement(
+        config, Findings([], [], ["top"], **{**data, "root": Path("data"), "columns": [], **found})
+    )
 
 
 def made_commands(folder: Path, *given: Any, **found: Any) -> dict[str, list[str]]:

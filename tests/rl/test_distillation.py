@@ -145,13 +145,6 @@ def test_recorded_successes_are_labels_as_they_were_recorded(small_dataset: LeRo
         assert part.instructions[episode] == row["task"]
 
 
-def test_successes_of_further_datasets_are_labels_too(small_dataset: LeRobotDataset) -> None:
-    camera, root = "observation.images.third_view", str(small_dataset.root)
-    (part,) = recorded_successes(StartFrames(root=root), [camera], state_size=0, chunk=0)
-    parts = recorded_successes(StartFrames(root=root, more=[root]), [camera], state_size=0, chunk=0)
-    assert [len(each) for each in parts] == [len(part)] * 2
-
-
 def test_recorded_successes_are_learnt_too_and_a_resumed_training_reads_them_again(
     imagined: list[str], small_dataset: LeRobotDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
