@@ -24,7 +24,7 @@ from lerobot_wmrl.data.budget import Ledger, spending
 from lerobot_wmrl.data.episodes import open_dataset, read_episodes
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.envs.start_frames import check_starts
-from lerobot_wmrl.rl.recorders import RolloutRecorder
+from lerobot_wmrl.rl.recorders import RolloutRecorder, describe_alike
 
 SETTINGS_FILE: Final = Path("meta/rollouts.json")
 """The settings that decide the episodes."""
@@ -127,6 +127,8 @@ def merge(config: RecordConfig, work: Path, content: Mapping[str, Any]) -> None:
     merge_folders(sorted(work.glob("part-*")), merged, config.dataset_id)
     if problem := find_damage(merged, config.num_episodes):
         raise ValueError(f"{work}: merging failed: {problem}; remove the folder and record again")
+    if config.like.given and config.like_columns:
+        describe_alike(merged, config.like.open().features)
     write_json(merged / SETTINGS_FILE, dict(content))
     merged.replace(config.root)
     print(summary(config.root))

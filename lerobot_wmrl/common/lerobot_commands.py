@@ -4,22 +4,18 @@ import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from lerobot.utils.constants import PRETRAINED_MODEL_DIR
-
-from lerobot_wmrl.common.checkpoints import LAST_CHECKPOINT, latest_checkpoint
+from lerobot_wmrl.common.checkpoints import LAST_CHECKPOINT, last_checkpoint
 from lerobot_wmrl.common.presets import Flags, format_flags
 
 
 def train_command(folder: Path, flags: Sequence[str]) -> list[str]:
     """Return lerobot-train with these flags and this output folder, begun or continued.
 
-    It continues by other flags, and refuses a folder without checkpoints, which is therefore removed. It
-    points `last` at a checkpoint that is whole, but a kill can come between the two.
+    It continues by other flags, from the checkpoint that `last` points to once it is whole. It refuses a
+    folder without one, which is therefore removed.
     """
-    last = folder / LAST_CHECKPOINT
-    newest = last if last.exists() else latest_checkpoint(folder)
-    if newest is not None:
-        trained = newest / PRETRAINED_MODEL_DIR / "train_config.json"
+    if (folder / LAST_CHECKPOINT).exists():
+        trained = last_checkpoint(folder) / "train_config.json"
         return ["lerobot-train", *format_flags({"config_path": str(trained), "resume": True})]
     shutil.rmtree(folder, ignore_errors=True)
     return ["lerobot-train", *flags, *format_flags({"output_dir": str(folder)})]

@@ -21,8 +21,8 @@ VALIDATION_EVERY: Final = 20
 """Every twentieth episode is held out from the training of tokenizers and world models."""
 
 SOLVED_FRAMES: Final = 2
-"""Last frames of an episode that are taken for solved where episodes end as soon as they succeed. The picture
-after the last action, which shows it, is not recorded."""
+"""Last frames of an episode that are taken for solved if it, as most of its dataset, ends as soon as it
+succeeds. The picture after the last action, which shows it, is not recorded."""
 
 SUCCESS: Final = "next.success"
 SUCCESS_COLUMNS: Final = (SUCCESS, DONE)
@@ -258,15 +258,15 @@ def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
     frames = len(rows["episode_index"])
     _, start, length = np.unique(rows["episode_index"], return_index=True, return_counts=True)
     done = np.asarray(rows[success]).reshape(-1).astype(bool) if success else np.zeros(frames, bool)
-    filled = None
+    filled, ending = None, end_at_success(done, start, length)
     # next.done may say no more than that episodes end
-    if success != DONE and end_at_success(done, start, length):
+    if success != DONE and 2 * ending.sum() > np.logical_or.reduceat(done, start).sum():
         logging.warning(
-            "%s: episodes end as soon as they succeed, so that no frame shows success. The last %d frames of "
-            "those that succeed are taken for solved; record a few more, if you can",
+            "%s: most episodes end as soon as they succeed, so that no frame shows success. The last %d "
+            "frames of those that do are taken for solved; record a few more, if you can",
             dataset.root, SOLVED_FRAMES,
         )  # fmt: skip
-        filled = solved_at_end(done, start, length)
+        filled = solved_at_end(done, start[ending], length[ending])
     return EpisodeTable(
         dataset=dataset,
         state=as_columns(rows[OBS_STATE]) if OBS_STATE in rows else np.zeros((frames, 0), np.float32),
@@ -280,19 +280,18 @@ def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
     )
 
 
-def end_at_success(done: np.ndarray, start: np.ndarray, length: np.ndarray) -> bool:
-    """Say whether some episodes succeed, (N,) frames of E episodes, and all that do with their last action:
-    the picture after it is not recorded."""
-    last = np.zeros_like(done)
-    last[start + length - 1] = True
-    return bool(done.any() and not (done & ~last).any())
+def end_at_success(done: np.ndarray, start: np.ndarray, length: np.ndarray) -> np.ndarray:
+    """Return which of E episodes succeed with their last action, done (N,): the picture after it is not
+    recorded. (E,)"""
+    return done[start + length - 1] & (np.add.reduceat(done, start) == 1)
 
 
 def solved_at_end(done: np.ndarray, start: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """Mark the last action of successful episodes and those before the last `SOLVED_FRAMES` frames. (N,)"""
+    """Mark, in episodes that end at success, the last action and those before the last `SOLVED_FRAMES`
+    frames too. (N,)"""
     solved = done.copy()
     for first, after in zip(start, start + length, strict=True):
-        solved[max(first, after - 1 - SOLVED_FRAMES) : after] = done[after - 1]
+        solved[max(first, after - 1 - SOLVED_FRAMES) : after] = True
     return solved
 
 

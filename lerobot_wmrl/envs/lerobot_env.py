@@ -32,8 +32,8 @@ def runs_in_processes(config: EnvConfig) -> bool:
     """Return whether copies of an environment can run in processes of their own.
 
     This project's can, and so can the benchmarks that LeRobot makes itself, such as Meta-World. Those that it
-    takes from Gymnasium's registry, such as PushT, need not have `task_description`: LeRobot's rollout asks
-    for it, and an asynchronous environment that lacks it does not survive the question.
+    takes from Gymnasium's registry, such as PushT, or from the hub may lack `task_description`. LeRobot's
+    rollout asks for it, and an asynchronous environment without it does not survive the question.
     """
     return is_own(config) or type(config).create_envs is not EnvConfig.create_envs
 

@@ -107,13 +107,18 @@ def opened(config: EnvConfig, n_envs: int, trust_remote_code: bool, policies: in
     """Make the environments of that many policies, for `n_envs` episodes at once; close them in the end.
 
     This project's own are shared. LeRobot's are not: in LIBERO the number of resets so far, and not the seed,
-    chooses the start.
+    chooses the start. Those of several tasks stay in this process: all of them are open at the same time.
     """
-    own = is_own(config)
-    made = [
-        make_env(config, n_envs, runs_in_processes(config), trust_remote_code=trust_remote_code)
-        for _ in range(1 if own else policies)
-    ]
+    own, parallel = is_own(config), runs_in_processes(config)
+
+    def make() -> Envs:
+        return make_env(config, n_envs, parallel, trust_remote_code=trust_remote_code)
+
+    made = [make()]
+    if parallel and not own and len(_flat(made[0])) > 1:
+        close_envs(made.pop())
+        parallel = False
+    made += [make() for _ in range(len(made), 1 if own else policies)]
     try:
         yield made * policies if own else made
     finally:

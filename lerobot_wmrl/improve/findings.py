@@ -44,7 +44,7 @@ class Findings:
         failures: how many episodes fail.
         root: folder of the dataset.
         total: how many episodes it has, chosen or not.
-        columns: names of its columns.
+        columns: its columns, by name, and how LeRobot stores each.
         held: frames in which success holds in a successful episode, the median.
     """
 
@@ -62,7 +62,7 @@ class Findings:
     failures: int
     root: Path
     total: int
-    columns: list[str]
+    columns: dict[str, str]
     held: int
 
     def __str__(self) -> str:
@@ -117,7 +117,7 @@ def look(table: EpisodeTable, policy: PreTrainedConfig, episodes: Sequence[int] 
         ),
         success_frames=int(table.length[success].sum()), failures=int((~success).sum()),
         root=Path(root), total=total,
-        columns=list(features),
+        columns={name: feature["dtype"] for name, feature in features.items()},
         held=int(np.median(np.array(done)[success])),
     )  # fmt: skip
 

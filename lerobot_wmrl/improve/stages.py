@@ -11,7 +11,7 @@ import torch
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import env_to_policy_features
-from lerobot.utils.constants import ACTION, DEFAULT_FEATURES, DONE, OBS_STATE, REWARD
+from lerobot.utils.constants import ACTION, DEFAULT_FEATURES, DONE, REWARD
 
 from lerobot_wmrl.common.checkpoints import last_checkpoint
 from lerobot_wmrl.common.command_line import RunConfig
@@ -63,9 +63,12 @@ CHANNELS: Final = 3
 """Of a frame, a byte each."""
 
 PASS_PIXELS: Final = 2**23
-"""Pixels of observations in one forward and backward pass of PPO at most."""
+"""Pixels of observations in one forward and backward pass of PPO or cloning at most."""
 
-ROLLOUT_COLUMNS: Final = (*DEFAULT_FEATURES, ACTION, OBS_STATE, REWARD, SUCCESS, DONE, START_SEED, START_KIND)
+CLONING_BATCH: Final = 32
+"""The presets' batch of cloning."""
+
+ROLLOUT_COLUMNS: Final = (*DEFAULT_FEATURES, ACTION, REWARD, SUCCESS, DONE, START_SEED, START_KIND)
 """Columns of recorded rollouts, beside those that the policy sees and the environment declares."""
 
 CLONING_PRESETS: Final = {"tiny": "tiny"}
@@ -100,8 +103,8 @@ class ImproveConfig(RunConfig):
 
     The command looks at the data and says what it has and lacks. It trains the policy further on all episodes
     that succeed, and trains a frame tokenizer, a world model and, in imagination, the policy. In the end it
-    compares the policy before, cloned from the successes, and improved: in `real_env` if there is one, else
-    in imagination, which proves nothing about the real world. Every stage is a command that you could call
+    compares the policy before, trained further, and improved: in `real_env` if there is one, else in
+    imagination, which proves nothing about the real world. Every stage is a command that you could call
     yourself; it is printed. Running the same command again continues.
 
     Args:
@@ -116,7 +119,7 @@ class ImproveConfig(RunConfig):
         size: how large models are and how long they train: `demo` (an hour on two cores), `cpu` (several),
             `tiny` (a minute, to try the command), or `auto`.
         iterations: of RL; by default those of the size.
-        eval_episodes: starts on which both policies are compared.
+        eval_episodes: starts on which the policies are compared.
         seed: of recording and training. Evaluation has seeds of its own, from 1,000,000 on.
         output_dir: folder of everything; `report.md` is the page to read.
     """
@@ -347,12 +350,17 @@ class Improvement:
         tasks = table.column(START_TASK)[table.among(self.data.episodes)]
         return int(np.unique(tasks, return_counts=True)[1].min())
 
+    def _batch(self) -> Flags:
+        """Return the batch of cloning where frames are large."""
+        fits = max(1, PASS_PIXELS // self.found.pixels)
+        return {"batch_size": fits} if fits < CLONING_BATCH else {}
+
     def _columns(self) -> list[str]:
-        names = f"local/{self.found.root.name}"
+        name = f"local/{self.found.root.name}"
         command = edit_command(
             self._dataset, "remove_feature", {"operation.feature_names": str(self.extra_columns)}
         )
-        return [*command, f"--repo_id={names}", f"--root={self.found.root}"]
+        return [*command, f"--repo_id={name}", f"--root={self.found.root}"]
 
     @property
     def _dataset(self) -> Path:
@@ -363,7 +371,8 @@ class Improvement:
         like: Flags = {"like.root": str(self._dataset), "max_frames": SLOWEST * self.found.longest}
         flags: Flags = {
             "policy.path": self.policy, **self._real_env("env"), **({} if self._in_maniskill else like),
-            "video": False, "num_episodes": self.config.rollouts, "exploration": self.config.exploration,
+            "video": "video" in self.found.columns.values(), "num_episodes": self.config.rollouts,
+            "exploration": self.config.exploration,
             "seed": self.config.seed, "output_dir": str(self.out / "rollouts"),
         }  # fmt: skip
         return ["lerobot-wmrl-record", *format_flags(flags)]
@@ -380,10 +389,13 @@ class Improvement:
         table = self._table()
         successes = np.flatnonzero(table.success & table.among(self.data.episodes)).tolist()
         preset = CLONING_PRESETS.get(self.config.preset, "demo")
+        # LeRobot keeps loaded adapters, but writes no policy's configuration beside them without the flag
+        assert self.config.policy is not None
+        adapters: Flags = {"peft.method_type": "LORA"} if self.config.policy.use_peft else {}
         return train_command(self.out / "cloned", [
             *preset_flags(preset, "sft", ["filtered"]),
             *format_flags({
-                "policy.path": self.policy, "policy.push_to_hub": False,
+                "policy.path": self.policy, "policy.push_to_hub": False, **self._batch(), **adapters,
                 "dataset.repo_id": f"local/{table.dataset.root.name}",
                 "dataset.root": str(table.dataset.root), "dataset.episodes": successes,
                 "seed": self.config.seed,

@@ -10,6 +10,7 @@ import draccus
 import numpy as np
 import torch
 from lerobot.configs import PreTrainedConfig
+from lerobot.datasets.io_utils import load_info, write_info
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs import make_env, make_env_pre_post_processors
 from lerobot.envs.configs import EnvConfig
@@ -305,6 +306,24 @@ def matched(own: Mapping[str, Any], columns: Mapping[str, Any]) -> dict[str, Any
         if "info" in feature and feature["dtype"] == "video":
             feature.pop("info")  # the encoder's, which LeRobot writes
     return wanted
+
+
+def describe_alike(root: Path, columns: Mapping[str, Any]) -> None:
+    """Describe the columns of a whole recording as another dataset does, word for word.
+
+    LeRobot merges no datasets whose descriptions differ, in notes of an earlier version too. Videos keep
+    theirs if they are encoded in another way.
+    """
+
+    def encoding(feature: Mapping[str, Any]) -> list[Any]:
+        known = feature.get("info") or feature.get("video_info") or {}
+        return [known.get(f"video.{name}") for name in ("codec", "pix_fmt")]
+
+    info = load_info(root)
+    for name, feature in info.features.items():
+        if feature["dtype"] != "video" or encoding(feature) == encoding(columns[name]):
+            info.features[name] = dict(columns[name])
+    write_info(info, root)
 
 
 def robot_of(config: EnvConfig, env: Any, like: Any | None) -> Embodiment:

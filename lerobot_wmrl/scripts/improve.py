@@ -6,16 +6,21 @@
         --rollouts=200 --output_dir=outputs/improve
 
 It looks at the data and says what it has and lacks; trains the policy further on the episodes that succeed,
-which needs no world model, so it is the rival; trains a frame tokenizer and a world model; checks
-the world model on held-out episodes; trains the better policy in imagination; and compares all three, in
+which needs no world model: imagination has to beat it; trains a frame tokenizer and a world model; checks
+the world model on held-out episodes; trains that policy in imagination; and compares the policies, in
 `--real_env` if there is one. With `--rollouts` it first records rollouts of the policy there, and learns from
 them too. Every stage is one console command, which it prints. Running the same command again continues where
 it stopped. It ends with a summary and `report.md`.
 """
 
+from typing import TYPE_CHECKING
+
 import draccus
 
 from lerobot_wmrl.improve.stages import ImproveConfig, Improvement
+
+if TYPE_CHECKING:
+    from lerobot_wmrl.common.stages import Stage
 
 
 def improve(cfg: ImproveConfig) -> None:
@@ -31,18 +36,19 @@ def improve(cfg: ImproveConfig) -> None:
     improvement = Improvement(cfg, look(table, cfg.policy, cfg.dataset.episodes))
     print(f"{cfg.dataset.name}:\n{improvement.found}\n  {improvement.duration}")
     stages = improvement.stages()
-    with claimed(cfg.output_dir, settings(cfg)):
+    with claimed(cfg.output_dir, settings(cfg, stages)):
         run_stages(stages, cfg.output_dir)
         page = write_report(improvement, stages)
     print(f"\n{verdict(improvement)}\nThe report: {page}")
 
 
-def settings(cfg: ImproveConfig) -> dict[str, object]:
+def settings(cfg: ImproveConfig, stages: "list[Stage]") -> dict[str, object]:
     """Return what decides the result, as JSON."""
     assert cfg.policy is not None
     given = {name: value for name, value in draccus.encode(cfg).items() if name != "policy"}
     return given | {
-        "policy": str(cfg.policy.pretrained_path), "size": cfg.preset, "output_dir": str(cfg.output_dir)
+        "policy": str(cfg.policy.pretrained_path), "size": cfg.preset, "output_dir": str(cfg.output_dir),
+        "stages": [stage.name for stage in stages],
     }  # fmt: skip
 
 

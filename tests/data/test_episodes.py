@@ -53,8 +53,9 @@ def test_where_episodes_merely_end_nothing_is_added(tmp_path: Path) -> None:
         ([[0, 0, 0, 0, 1], [0, 1, 1]], [[0, 0, 0, 0, 1], [0, 1, 1]]),
         ([[0, 0, 0, 1, 0], [0, 0, 1]], [[0, 0, 0, 1, 0], [0, 0, 1]]),
         ([[0, 0], [0]], [[0, 0], [0]]),
+        ([[0, 0, 0, 0, 1], [0, 0, 0, 1], [0, 0, 1, 1]], [[0, 0, 1, 1, 1], [0, 1, 1, 1], [0, 0, 1, 1]]),
     ],
-    ids=["all end at success", "one holds it", "one goes on", "none succeeds"],
+    ids=["all end at success", "one holds it", "one goes on", "none succeeds", "most end at success"],
 )
 def test_where_no_frame_shows_success_the_last_ones_are_taken_for_it(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, recorded: list[list[int]], read: list[list[int]]

@@ -1,10 +1,13 @@
 """Policies compared on the same starts, in environments that LeRobot makes and evaluates."""
 
 import json
+import sys
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
+import cloudpickle
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -12,6 +15,7 @@ import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig, PushtEnv
+from lerobot.envs.utils import _LazyAsyncVectorEnv
 from lerobot.policies.factory import make_pre_post_processors
 
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
@@ -21,6 +25,7 @@ from lerobot_wmrl.common.checkpoints import link_checkpoint
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
+from lerobot_wmrl.envs.lerobot_env import runs_in_processes
 from lerobot_wmrl.evaluation import compare as running
 from lerobot_wmrl.evaluation.compare import checkpoint_name, opened
 from lerobot_wmrl.evaluation.comparison import Comparison, Episode
@@ -65,6 +70,7 @@ class ThresholdConfig(EnvConfig):
     """Two suites of tasks, as LeRobot's benchmarks have them."""
 
     harder: float = 0.0
+    suites: list[str] = field(default_factory=lambda: [*TASKS])
     features: dict[str, PolicyFeature] = field(
         default_factory=lambda: {"action": PolicyFeature(FeatureType.ACTION, (3,))}
     )
@@ -73,14 +79,14 @@ class ThresholdConfig(EnvConfig):
     def gym_kwargs(self) -> dict[str, Any]:
         return {}
 
-    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, SyncVectorEnv]]:
-        def make(suite: str, task: int) -> SyncVectorEnv:
-            return SyncVectorEnv(
-                [lambda: ThresholdEnv(suite, task, self.harder)] * n_envs,
-                autoreset_mode=AutoresetMode.SAME_STEP,
-            )
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, Any]]:
+        def make(suite: str, task: int) -> Any:
+            copies = [partial(ThresholdEnv, suite, task, self.harder)] * n_envs
+            if use_async_envs:
+                return _LazyAsyncVectorEnv(copies)
+            return SyncVectorEnv(copies, autoreset_mode=AutoresetMode.SAME_STEP)
 
-        return {suite: {task: make(suite, task) for task in tasks} for suite, tasks in TASKS.items()}
+        return {suite: {task: make(suite, task) for task in TASKS[suite]} for suite in self.suites}
 
 
 @pytest.fixture
@@ -285,22 +291,27 @@ def test_policies_are_compared_in_maniskill(tmp_path, caplog):
     assert "Success by scene" not in caplog.text
 
 
-@pytest.mark.parametrize(
-    ("env", "parallel"), [(ThresholdConfig(), True), (PushtEnv(episode_length=2), False)]
-)
-def test_benchmarks_run_in_processes_and_environments_that_may_lack_an_instruction_do_not(
-    env: EnvConfig, parallel: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[bool] = []
+def test_a_single_task_of_a_benchmark_runs_in_processes_to_the_same_result(config, monkeypatch):
+    """That of several tasks, whose processes would all be open at once, runs in this one."""
+    reset, parallel = _LazyAsyncVectorEnv.reset, []
 
-    def create_envs(config: EnvConfig, n_envs: int, use_async_envs: bool) -> dict[str, Any]:
-        asked.append(use_async_envs)
-        return {}
+    def noted(env: Any, **given: Any) -> Any:
+        parallel.append(env.num_envs)
+        return reset(env, **given)
 
-    owner = next(each for each in type(env).__mro__ if "create_envs" in vars(each))
-    monkeypatch.setattr(owner, "create_envs", create_envs)
-    with opened(env, 2, False, policies=1):
-        assert asked == [parallel]
+    monkeypatch.setattr(_LazyAsyncVectorEnv, "reset", noted)
+    cloudpickle.register_pickle_by_value(sys.modules[__name__])  # a new process cannot import a test
+    config.policies, config.n_episodes, config.batch_size = config.policies[:2], 4, 2
+    several = results_of(config)
+    assert not parallel
+    config.env, config.output_dir = ThresholdConfig(suites=["push"]), config.output_dir / "alone"
+    alone = results_of(config)
+    assert parallel == [2] * 4, "two policies, two batches"
+    assert alone["episodes"] == [each for each in several["episodes"] if each["suite"] == "push"]
+
+
+def test_environments_of_other_packages_stay_in_this_process() -> None:
+    assert not runs_in_processes(PushtEnv())
 
 
 def test_each_policy_has_environments_of_its_own_where_resets_may_be_counted(imagination: WorldModelEnv):

@@ -206,7 +206,7 @@ def test_rollouts_are_merged_and_successes_cloned_before_rl(
     assert {"--root=data", f"--new_root={folder / 'columns'}", "--operation.feature_names=['effort']"} <= {
         *commands["columns"]
     }
-    assert {f"--like.root={folder / 'columns'}", "--max_frames=80"} <= {*commands["rollouts"]}
+    assert {f"--like.root={folder / 'columns'}", "--max_frames=80", "--video=true"} <= {*commands["rollouts"]}
     assert f"--operation.roots=['{folder / 'columns'}', '{folder / 'rollouts'}']" in commands["merged"]
     episodes = [episode for episode in (0, 3, 4, 5) if success[episode]]
     assert 0 < len(episodes) < 4
@@ -220,6 +220,22 @@ def test_rollouts_are_merged_and_successes_cloned_before_rl(
     assert {*starts, f"--policies=[{cloned},{before}]", "--n_episodes=4"} <= {*commands["start"]}
     assert {*starts, f"--policy.path={before if better else cloned}"} <= {*commands["rl"]}
     assert {f"--policies=[{before},{cloned},{improved}]", "--against=all"} <= {*commands["comparison"]}
+
+
+@pytest.mark.parametrize(("adapters", "pixels", "flags"), [
+    (False, 2 * 64**2, []), (True, 480 * 640, ["--batch_size=27", "--peft.method_type=LORA"]),
+])  # fmt: skip
+def test_cloning_suits_the_policy_and_its_frames(
+    adapters: bool, pixels: int, flags: list[str], small_dataset: Any, tmp_path: Path
+) -> None:
+    """Without the flag LeRobot writes adapters without the policy's configuration."""
+    policy = CnnConfig(device="cpu", pretrained_path=tmp_path, use_peft=adapters)
+    improvement = improvement_of(tmp_path, policy=policy, pixels=pixels, failures=2)
+    improvement.config.dataset.root = str(small_dataset.root)
+    (command,) = (stage.command() for stage in improvement.stages() if stage.name == "cloned")
+    given = [flag for flag in command if flag.startswith(("--batch_size=", "--peft"))]
+    assert given == ["--batch_size=32", *flags]
+    assert "--dataset.episodes=[0,1,3,4]" in command
 
 
 def test_the_report_compares_with_the_policy_cloned_from_the_successes(tmp_path: Path) -> None:
@@ -298,7 +314,7 @@ def improvement_of(
     }  # fmt: skip
     config = ImproveConfig(policy=policy, dataset=ChosenEpisodes("data"), size=size, output_dir=folder)
     return Improvement(
-        config, Findings([], [], ["top"], **{**data, "root": Path("data"), "columns": [], **found})
+        config, Findings([], [], ["top"], **{**data, "root": Path("data"), "columns": {}, **found})
     )
 
 

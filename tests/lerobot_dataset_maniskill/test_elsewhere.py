@@ -1,5 +1,7 @@
 """Rollouts in an environment of LeRobot's, recorded so that they can be merged with demonstrations."""
 
+import json
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -52,6 +54,25 @@ def test_they_have_the_columns_of_the_demonstrations_and_can_be_merged(
     assert len({tuple(table.state[start]) for start in table.start}) == 3
     merge_folders([demonstrations, config.root], tmp_path / "merged", "local/merged")
     assert len(read_episodes(open_dataset(tmp_path / "merged")).length) == 4
+
+
+def test_they_can_be_merged_with_a_dataset_that_is_described_in_other_words(
+    config: RecordConfig, demonstrations: Path, tmp_path: Path
+) -> None:
+    """Of a robot that has a name, converted from an earlier version, which noted the frame rate twice."""
+    older = tmp_path / "older"
+    shutil.copytree(demonstrations, older)
+    info = json.loads((older / "meta" / "info.json").read_text())
+    info["robot_type"] = "pusher"
+    for feature in info["features"].values():
+        feature["fps"] = info["fps"]
+    (older / "meta" / "info.json").write_text(json.dumps(info))
+    config.like = DatasetSource(str(older))
+    record_elsewhere(config)
+    merge_folders([older, config.root], tmp_path / "merged", "local/merged")
+    merged = read_episodes(open_dataset(tmp_path / "merged"))
+    assert len(merged.length) == 4
+    assert merged.dataset.meta.robot_type == "pusher"
 
 
 @pytest.mark.parametrize(("limit", "frames"), [(4, 4), (STEPS + 1, STEPS)])

@@ -13,7 +13,6 @@ from safetensors.torch import load_file
 from lerobot_wmrl.data.episodes import DatasetSource
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
-from lerobot_wmrl.rl import dyna
 from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.callbacks import Callbacks
 from lerobot_wmrl.rl.configuration_callbacks import DynaConfig, NewRollouts
@@ -77,16 +76,6 @@ def test_a_round_refreshes_the_world_model_and_a_killed_one_goes_on(
     settings = json.loads((checkpoints / "last" / "pretrained_model" / "train_config.json").read_text())
     assert settings["model"]["pretrained_path"].startswith(str(trained_models["action_world_model"]))
     assert settings["dataset"]["more"] == [str(small_dataset.root)]
-
-
-def test_a_round_does_not_forget_the_further_datasets_of_the_starts(
-    rounds: DynaRounds, small_dataset: LeRobotDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    commands: list[list[str]] = []
-    monkeypatch.setattr(dyna, "run_subcommand", commands.append)
-    rounds.learnt = StartFrames(root=str(small_dataset.root), more=["further"])
-    rounds._train(3, ["new"], tmp_path)
-    assert "--dataset.more=['further', 'new']" in commands[0]
 
 
 class CopyingRecorder:
