@@ -188,8 +188,9 @@ def test_rollouts_are_merged_and_successes_cloned_before_rl(
     """Two of four episodes are chosen, and two rollouts; RL begins with the cloned policy, unless the world
     model decides that the policy before is better."""
     folder = tmp_path / "improve"
+    numbers = dict.fromkeys(("observation.state", "action", "effort"), "float32")
     improvement = improvement_of(
-        folder, total=4, failures=2, columns=["observation.image", "observation.state", "action", "effort"]
+        folder, total=4, failures=2, columns={"observation.image": "video", **numbers}
     )
     config = improvement.config
     config.rollouts, config.real_env, config.dataset.episodes = 2, PushtEnv(), [0, 3]

@@ -30,6 +30,9 @@ from lerobot_wmrl.common.policies import (
     unwrapped,
 )
 from lerobot_wmrl.common.tracking import read_metrics
+from lerobot_wmrl.data.episodes import ChosenEpisodes, read_episodes
+from lerobot_wmrl.improve.findings import look
+from lerobot_wmrl.improve.stages import ImproveConfig, Improvement
 from lerobot_wmrl.rl.algorithm import frozen_copy
 from lerobot_wmrl.scripts.convert_openvla import ConvertOpenVLAConfig, convert
 from lerobot_wmrl.scripts.train import main
@@ -127,6 +130,22 @@ def test_fine_tuning_writes_adapters_and_the_datasets_statistics(
     lowest = postprocess(torch.full((1, 7), 575))[0]
     assert torch.allclose(lowest[:6], torch.tensor(statistics["action"]["q01"])[:6], atol=1e-3)
     assert lowest[6] == pytest.approx(-1, abs=1 / 255)
+
+
+def test_adapters_are_trained_further_as_the_command_improve_does_it(
+    tuned: Path, small_dataset: LeRobotDataset, tmp_path: Path
+) -> None:
+    config = ImproveConfig(
+        policy=read_policy_config(str(tuned), []), dataset=ChosenEpisodes(str(small_dataset.root)),
+        size="tiny", output_dir=tmp_path,
+    )  # fmt: skip
+    found = look(read_episodes(small_dataset), config.policy, None)
+    (command,) = (stage.command() for stage in Improvement(config, found).stages() if stage.name == "cloned")
+    run(*command, "--policy.device=cpu", "--steps=2", "--save_freq=2")
+    before, after = (load_file(folder / LAST / ADAPTERS) for folder in (tuned, tmp_path / "cloned"))
+    assert after.keys() == before.keys()
+    assert any(not torch.equal(after[name], value) for name, value in before.items() if "lora_B" in name)
+    assert load(tmp_path / "cloned").select_action(observe()).shape == (4, 7)
 
 
 def test_improve_reload_and_evaluate(tuned: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
