@@ -22,7 +22,7 @@ POLICIES: Final = {
     "further": "trained further on all successes, the expert's and its own",
     "improve": "improved in imagination",
 }
-"""Folder of a policy in the study → what it is."""
+"""Names of the policies, in the order of the study's comparison → what they are."""
 
 TIMED: Final = ("data", "cloned", "improve", "comparison")
 

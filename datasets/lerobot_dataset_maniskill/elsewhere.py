@@ -128,7 +128,8 @@ def merge(config: RecordConfig, work: Path, content: Mapping[str, Any]) -> None:
     if problem := find_damage(merged, config.num_episodes):
         raise ValueError(f"{work}: merging failed: {problem}; remove the folder and record again")
     if config.like.given and config.like_columns:
-        describe_alike(merged, config.like.open().features)
+        with within("like"):
+            describe_alike(merged, config.like.open().features)
     write_json(merged / SETTINGS_FILE, dict(content))
     merged.replace(config.root)
     print(summary(config.root))

@@ -4,18 +4,23 @@ import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from lerobot_wmrl.common.checkpoints import LAST_CHECKPOINT, last_checkpoint
+from lerobot.utils.constants import CHECKPOINTS_DIR, PRETRAINED_MODEL_DIR
+
+from lerobot_wmrl.common.checkpoints import LAST_CHECKPOINT
 from lerobot_wmrl.common.presets import Flags, format_flags
 
 
 def train_command(folder: Path, flags: Sequence[str]) -> list[str]:
     """Return lerobot-train with these flags and this output folder, begun or continued.
 
-    It continues by other flags, from the checkpoint that `last` points to once it is whole. It refuses a
-    folder without one, which is therefore removed.
+    It continues by other flags from a whole checkpoint, and refuses a folder without one, which is therefore
+    removed. Whole are the one that `last` points to and, where a kill left no link, all but the newest.
     """
-    if (folder / LAST_CHECKPOINT).exists():
-        trained = last_checkpoint(folder) / "train_config.json"
+    steps = sorted(each for each in (folder / CHECKPOINTS_DIR).glob("*") if each.name.isdigit())
+    last = folder / LAST_CHECKPOINT
+    whole = [last] if last.exists() else steps[-2:-1]
+    if whole:
+        trained = whole[0] / PRETRAINED_MODEL_DIR / "train_config.json"
         return ["lerobot-train", *format_flags({"config_path": str(trained), "resume": True})]
     shutil.rmtree(folder, ignore_errors=True)
     return ["lerobot-train", *flags, *format_flags({"output_dir": str(folder)})]

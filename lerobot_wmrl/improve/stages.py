@@ -24,7 +24,7 @@ from lerobot_wmrl.common.policies import (
     require_single_observations,
     require_trained,
 )
-from lerobot_wmrl.common.presets import Flags, format_flags, preset_flags, preset_settings
+from lerobot_wmrl.common.presets import Flags, format_flags, preset_settings
 from lerobot_wmrl.common.stages import Stage
 from lerobot_wmrl.data.episodes import SUCCESS, ChosenEpisodes, EpisodeTable, read_episodes
 from lerobot_wmrl.evaluation.comparison import RESULTS, chosen_policy
@@ -64,9 +64,6 @@ CHANNELS: Final = 3
 
 PASS_PIXELS: Final = 2**23
 """Pixels of observations in one forward and backward pass of PPO or cloning at most."""
-
-CLONING_BATCH: Final = 32
-"""The presets' batch of cloning."""
 
 ROLLOUT_COLUMNS: Final = (*DEFAULT_FEATURES, ACTION, REWARD, SUCCESS, DONE, START_SEED, START_KIND)
 """Columns of recorded rollouts, beside those that the policy sees and the environment declares."""
@@ -350,10 +347,11 @@ class Improvement:
         tasks = table.column(START_TASK)[table.among(self.data.episodes)]
         return int(np.unique(tasks, return_counts=True)[1].min())
 
-    def _batch(self) -> Flags:
-        """Return the batch of cloning where frames are large."""
+    def _cloning(self) -> dict[str, Any]:
+        """Return the preset of cloning, with smaller batches where frames are large."""
+        settings = preset_settings(CLONING_PRESETS.get(self.config.preset, "demo"), "sft", ["filtered"])
         fits = max(1, PASS_PIXELS // self.found.pixels)
-        return {"batch_size": fits} if fits < CLONING_BATCH else {}
+        return settings | {"batch_size": min(fits, settings["batch_size"])}
 
     def _columns(self) -> list[str]:
         name = f"local/{self.found.root.name}"
@@ -388,14 +386,13 @@ class Improvement:
     def _cloned(self) -> list[str]:
         table = self._table()
         successes = np.flatnonzero(table.success & table.among(self.data.episodes)).tolist()
-        preset = CLONING_PRESETS.get(self.config.preset, "demo")
         # LeRobot keeps loaded adapters, but writes no policy's configuration beside them without the flag
         assert self.config.policy is not None
         adapters: Flags = {"peft.method_type": "LORA"} if self.config.policy.use_peft else {}
         return train_command(self.out / "cloned", [
-            *preset_flags(preset, "sft", ["filtered"]),
+            *format_flags(self._cloning()),
             *format_flags({
-                "policy.path": self.policy, "policy.push_to_hub": False, **self._batch(), **adapters,
+                "policy.path": self.policy, "policy.push_to_hub": False, **adapters,
                 "dataset.repo_id": f"local/{table.dataset.root.name}",
                 "dataset.root": str(table.dataset.root), "dataset.episodes": successes,
                 "seed": self.config.seed,

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import draccus
 import numpy as np
 import torch
-from lerobot.configs import PreTrainedConfig
+from lerobot.configs import PreTrainedConfig, RGBEncoderConfig
 from lerobot.datasets.io_utils import load_info, write_info
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs import make_env, make_env_pre_post_processors
@@ -162,6 +162,11 @@ class RolloutRecorder:
             for each in self.envs:
                 each.set_attr(FRAME_LIMIT, min(max_frames, each.get_attr(FRAME_LIMIT)[0]))
         self.robot = robot or robot_of(env, self.envs[0], like)
+        if like is not None and like_columns and like.fps != env.fps:
+            raise FieldError(
+                "like.root", like.root, f"has {like.fps} frames a second, the environment {env.fps}",
+                "give a dataset of the same rate, or `like_columns=false` if nothing is to be merged",
+            )  # fmt: skip
 
     def close(self) -> None:
         """Close the environments."""
@@ -209,7 +214,7 @@ class RolloutRecorder:
         features = own if self.columns is None else matched(own, self.columns)
         return LeRobotDataset.create(
             f"local/{folder.name.strip('.')}", self.config.fps, features, root=folder,
-            robot_type=self.robot_type,
+            robot_type=self.robot_type, rgb_encoder=encoder_of(self.columns or {}),
             use_videos=any(feature["dtype"] == "video" for feature in features.values()),
             image_writer_threads=IMAGE_WRITERS,
         )  # fmt: skip
@@ -308,16 +313,26 @@ def matched(own: Mapping[str, Any], columns: Mapping[str, Any]) -> dict[str, Any
     return wanted
 
 
+def video_info(feature: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a dataset, also of an earlier version, says of its videos."""
+    return feature.get("info") or feature.get("video_info") or {}
+
+
+def encoder_of(columns: Mapping[str, Any]) -> RGBEncoderConfig | None:
+    """Return the encoder of a dataset's videos, with which others can be merged; None if it has none."""
+    videos = [feature for feature in columns.values() if feature["dtype"] == "video"]
+    return RGBEncoderConfig.from_video_info(video_info(videos[0])) if videos else None
+
+
 def describe_alike(root: Path, columns: Mapping[str, Any]) -> None:
     """Describe the columns of a whole recording as another dataset does, word for word.
 
-    LeRobot merges no datasets whose descriptions differ, in notes of an earlier version too. Videos keep
-    theirs if they are encoded in another way.
+    LeRobot merges no datasets whose descriptions differ, be it in notes of an earlier version. Videos that
+    are encoded in another way keep theirs: they must not be merged.
     """
 
     def encoding(feature: Mapping[str, Any]) -> list[Any]:
-        known = feature.get("info") or feature.get("video_info") or {}
-        return [known.get(f"video.{name}") for name in ("codec", "pix_fmt")]
+        return [video_info(feature).get(f"video.{name}") for name in ("codec", "pix_fmt")]
 
     info = load_info(root)
     for name, feature in info.features.items():

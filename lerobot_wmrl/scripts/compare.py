@@ -42,9 +42,9 @@ class CompareConfig(RunConfig):
         env: `--env.type=wmrl_maniskill`, `world_model` or one of LeRobot's environments, and its settings.
         against: pairs that are compared: every policy with the `first` one, or with `all` others.
         n_episodes: most episodes of each policy, in each task of the environment.
-        batch_size: environments of one policy that run at once. A single task of LeRobot's benchmarks runs in
-            as many processes, and every policy has its own. After every batch it is checked whether all is
-            decided.
+        batch_size: environments of one policy that run at once. If there are several, a single task of
+            LeRobot's benchmarks runs in as many processes for each policy. After every batch it is checked
+            whether all is decided.
         seed: seed of the first episode; each further one adds one.
         alpha: probability of calling equal policies different, for all pairs together (Bonferroni).
         stop_early: stop when every pair is decided. Then the sequential p-value decides, which is valid

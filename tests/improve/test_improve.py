@@ -19,11 +19,13 @@ from lerobot.utils.constants import OBS_IMAGE
 from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.presets import preset_settings
+from lerobot_wmrl.common.stages import claimed
 from lerobot_wmrl.data.episodes import ChosenEpisodes, read_episodes
 from lerobot_wmrl.improve import stages
 from lerobot_wmrl.improve.findings import Findings, few_decisions
 from lerobot_wmrl.improve.report import trust, verdict
 from lerobot_wmrl.improve.stages import ImproveConfig, Improvement
+from lerobot_wmrl.scripts.improve import settings
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 from lerobot_wmrl.world_models.configuration_world_model import AnchoredConfig
 from tests.pusht import record_pusht
@@ -122,8 +124,8 @@ def test_frames_of_any_size_make_a_grid_that_the_transformer_divides(
 ) -> None:
     command = made_commands(tmp_path, size, frame_side=side)["tokenizer"]
     (given,) = (flag for flag in command if flag.startswith("--model.tokenizer.image_size="))
-    settings = preset_settings(size, "train-world-model", ["frame_tokenizer"])
-    sizes = {name.rpartition(".")[2]: value for name, value in settings.items() if "tokenizer." in name}
+    preset = preset_settings(size, "train-world-model", ["frame_tokenizer"])
+    sizes = {name.rpartition(".")[2]: value for name, value in preset.items() if "tokenizer." in name}
     tokenizer = TokenizerConfig(**{**sizes, "image_size": int(given.partition("=")[2])})
     dynamics = preset_settings(size, "train-world-model", ["action_world_model"])
     grid = tokenizer.image_size // tokenizer.downsample
@@ -224,7 +226,8 @@ def test_rollouts_are_merged_and_successes_cloned_before_rl(
 
 
 @pytest.mark.parametrize(("adapters", "pixels", "flags"), [
-    (False, 2 * 64**2, []), (True, 480 * 640, ["--batch_size=27", "--peft.method_type=LORA"]),
+    (False, 2 * 64**2, ["--batch_size=32"]),
+    (True, 480 * 640, ["--batch_size=27", "--peft.method_type=LORA"]),
 ])  # fmt: skip
 def test_cloning_suits_the_policy_and_its_frames(
     adapters: bool, pixels: int, flags: list[str], small_dataset: Any, tmp_path: Path
@@ -235,8 +238,17 @@ def test_cloning_suits_the_policy_and_its_frames(
     improvement.config.dataset.root = str(small_dataset.root)
     (command,) = (stage.command() for stage in improvement.stages() if stage.name == "cloned")
     given = [flag for flag in command if flag.startswith(("--batch_size=", "--peft"))]
-    assert given == ["--batch_size=32", *flags]
+    assert given == flags
     assert "--dataset.episodes=[0,1,3,4]" in command
+
+
+def test_a_folder_that_was_begun_with_other_stages_is_refused(tmp_path: Path) -> None:
+    """As by a version that did not clone."""
+    improvement = improvement_of(tmp_path, failures=2)
+    given = settings(improvement.config, improvement.stages())
+    write_json(tmp_path / "settings.json", {**given, "stages": ["tokenizer", "world_model", "check", "rl"]})
+    with pytest.raises(ValueError, match="stages"), claimed(tmp_path, given):
+        pass
 
 
 def test_the_report_compares_with_the_policy_cloned_from_the_successes(tmp_path: Path) -> None:

@@ -9,14 +9,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from lerobot.configs import RGBEncoderConfig
 from lerobot.datasets.dataset_tools import remove_feature
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import PushtEnv
-from lerobot.utils.constants import OBS_IMAGE
+from lerobot.utils.constants import DEFAULT_FEATURES, OBS_IMAGE
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.elsewhere import record_elsewhere
 from lerobot_dataset_maniskill.merging import merge_folders
 from lerobot_wmrl.common.constants import START_SEED
+from lerobot_wmrl.common.images import to_bytes
 from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.data.episodes import DatasetSource, open_dataset, read_episodes
 from lerobot_wmrl.rl.recorders import RolloutRecorder, matched
@@ -73,6 +76,44 @@ def test_they_can_be_merged_with_a_dataset_that_is_described_in_other_words(
     merged = read_episodes(open_dataset(tmp_path / "merged"))
     assert len(merged.length) == 4
     assert merged.dataset.meta.robot_type == "pusher"
+
+
+@pytest.mark.parametrize(("codec", "key"), [("h264", "info"), ("libsvtav1", "video_info")])
+def test_videos_are_encoded_as_those_of_the_dataset(
+    config: RecordConfig, demonstrations: Path, tmp_path: Path, codec: str, key: str
+) -> None:
+    """An earlier version described them under another name."""
+    given = open_dataset(demonstrations)
+    own = {name: dict(each) for name, each in given.features.items() if name not in DEFAULT_FEATURES}
+    own[OBS_IMAGE]["dtype"] = "video"
+    videos = LeRobotDataset.create(
+        "local/videos", given.fps, own, root=tmp_path / "videos", rgb_encoder=RGBEncoderConfig(vcodec=codec)
+    )
+    for row in range(2):
+        frame = {name: value for name, value in given[row].items() if name in {*own, "task"}}
+        frame |= {name: value.reshape(1) for name, value in frame.items() if name.startswith("next.")}
+        videos.add_frame({**frame, OBS_IMAGE: to_bytes(frame[OBS_IMAGE]).permute(1, 2, 0).numpy()})
+    videos.save_episode()
+    videos.finalize()
+    file = videos.root / "meta" / "info.json"
+    info = json.loads(file.read_text())
+    info["features"][OBS_IMAGE][key] = info["features"][OBS_IMAGE].pop("info")
+    file.write_text(json.dumps(info))
+    config.like = DatasetSource(str(videos.root))
+    record_elsewhere(config)
+    merge_folders([videos.root, config.root], tmp_path / "merged", "local/merged")
+    assert len(read_episodes(open_dataset(tmp_path / "merged")).length) == 4
+
+
+def test_a_dataset_of_another_rate_is_refused(
+    config: RecordConfig, demonstrations: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(demonstrations, tmp_path / "faster")
+    file = tmp_path / "faster" / "meta" / "info.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"fps": 20}))
+    config.like = DatasetSource(str(tmp_path / "faster"))
+    with pytest.raises(ValueError, match="has 20 frames a second, the environment 10"):
+        record_elsewhere(config)
 
 
 @pytest.mark.parametrize(("limit", "frames"), [(4, 4), (STEPS + 1, STEPS)])
