@@ -98,6 +98,11 @@ class Outcomes:
         """Return the episodes where `kept` (E,) is True."""
         return Outcomes(self.episodes[kept], self.probability[kept], self.done[kept], self.held)
 
+    def within(self, frames: int | None) -> "Outcomes":
+        """Return the first frames of every episode, all without a number: what succeeds later has not
+        succeeded in them, and what is predicted later is never imagined in episodes of that length."""
+        return Outcomes(self.episodes, self.probability[:, :frames], self.done[:, :frames], self.held)
+
     @property
     def length(self) -> np.ndarray:
         """Actions of each episode, (E,)."""

@@ -114,8 +114,17 @@ class Report(NamedTuple):
     page: str
 
 
-def evaluate(model: ActionWorldModelRewardModel, recording: Recording, episodes: np.ndarray) -> Evaluation:
+def evaluate(
+    model: ActionWorldModelRewardModel, recording: Recording, episodes: np.ndarray,
+    episode_length: int | None = None,
+) -> Evaluation:  # fmt: skip
     """Replay and measure the episodes, keeping the measures and only two replays' frames.
+
+    Args:
+        model: the world model.
+        recording: what was recorded.
+        episodes: which of it. (E,)
+        episode_length: frames of each that outcomes are judged by; by default all.
 
     Raises:
         FieldError: there is nothing to predict, because every episode has a single frame.
@@ -135,7 +144,7 @@ def evaluate(model: ActionWorldModelRewardModel, recording: Recording, episodes:
         if recording.table.column(START_KIND)[run.episode] != KINDS.index(PLAY) and len(run.done) > 1:
             shown.setdefault("success" if run.done.any() else "failure", run)
     accuracy.sort(key=lambda each: each.episode)
-    outcomes = Outcomes.stack(replays).attempts(recording.table)
+    outcomes = Outcomes.stack(replays).attempts(recording.table).within(episode_length)
     known = outcomes.where(np.full(len(outcomes.episodes), recording.table.done_known))
     return Evaluation(accuracy, outcomes.episodes, known, shown)
 

@@ -421,7 +421,8 @@ class Improvement:
         data, split = self.checked()
         flags: Flags = {
             "model.path": str(self.out / "world_model"), **data, "split": split,
-            **self._done(), "max_episodes": 200, "output_dir": str(self.out / "check"),
+            "episode_length": self.length, **self._done(), "max_episodes": 200,
+            "output_dir": str(self.out / "check"),
         }  # fmt: skip
         return ["lerobot-wmrl-eval-world-model", *format_flags(flags)]
 

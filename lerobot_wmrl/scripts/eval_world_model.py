@@ -62,6 +62,8 @@ class EvalWorldModelConfig(RunConfig):
             model was trained on; `ind` or `ood`, the recorder's training scenes and its held-out scenes. A
             comma means both: `validation,ind`.
         max_episodes: largest number of episodes, chosen evenly over the dataset.
+        episode_length: frames of every episode by which its outcome is judged; by default all. Success comes
+            later in some: then it has not come. Give the environment the same (`--env.episode_length`).
         done_threshold: predicted success probability at which a frame counts as done. Give the environment
             the same (`--env.done_threshold`).
         done_frames: consecutive done frames that make an imagined success. Give the environment the same
@@ -83,6 +85,7 @@ class EvalWorldModelConfig(RunConfig):
     dataset: ChosenEpisodes = field(default_factory=ChosenEpisodes)
     split: str = "all"
     max_episodes: int = 200
+    episode_length: int | None = None
     done_threshold: float = 0.5
     done_frames: int = 3
     reward: GeneralConfig = field(default_factory=GeneralConfig)
@@ -96,6 +99,8 @@ class EvalWorldModelConfig(RunConfig):
     def check(self) -> None:
         """Raise FieldError for a setting that cannot be."""
         require_at_least(self, 1, "max_episodes", "done_frames", "policy_episodes")
+        if self.episode_length is not None:
+            require_at_least(self, 1, "episode_length")
         if not 0 < self.done_threshold < 1:
             raise FieldError("done_threshold", self.done_threshold, "must be a probability between 0 and 1")
         if self.push_to_hub and Path(self.model.path).exists():
@@ -136,7 +141,7 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     episodes = choose_episodes(table, cfg.split, cfg.max_episodes, scenes, chosen)
     claim_output_dir(cfg.output_dir, draccus.encode(cfg))
     recording = Recording.read(table, model)
-    evaluation = evaluate(model, recording, episodes)
+    evaluation = evaluate(model, recording, episodes, cfg.episode_length)
     reports = [
         report_action_model(model, recording, evaluation, cfg.done_threshold, cfg.done_frames, cfg.output_dir)
     ]

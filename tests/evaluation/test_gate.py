@@ -83,6 +83,18 @@ def test_where_episodes_end_at_success_their_last_frames_count_as_lasting():
     assert gate_at(seen_out, 0.5, 3).recall.k == 0
 
 
+def test_what_comes_later_than_an_imagined_episode_is_not_judged():
+    """A success after three frames is none within two; what is predicted later is not counted."""
+    probability = np.array([[0.1, 0.1, 0.9], [0.9, 0.1, 0.1], [0.1, 0.1, 0.9]])
+    done = np.array([[False, False, True], [True, True, True], [False] * 3])
+    whole = Outcomes(np.arange(3), probability, done)
+    for outcomes, failures, mistakes, found in ((whole, 1, 1, 2), (whole.within(2), 2, 0, 1)):
+        gate = gate_at(outcomes, 0.5, 1)
+        assert (gate.false_positives.n, gate.false_positives.k) == (failures, mistakes)
+        assert (gate.recall.n, gate.recall.k) == (3 - failures, found)
+    assert whole.within(None).length.tolist() == [3, 3, 3]
+
+
 def test_auc_is_the_share_of_pairs_in_the_right_order(outcomes):
     """Scores over three frames: successes 0.9, 0.8, 0.1; failures 0.7, 0.1. One pair ties."""
     assert outcomes.scores(3).tolist() == [0.9, 0.8, 0.1, 0.7, 0.1]

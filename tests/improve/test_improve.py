@@ -109,6 +109,7 @@ def test_long_episodes_are_imagined_in_parts(
     """From frames all over them, as many as it takes to cover them."""
     commands = made_commands(tmp_path, longest=longest, usual=longest)
     assert f"--model.clip_length={clip}" in commands["world_model"]
+    assert f"--episode_length={length}" in commands["check"]
     for stage in ("rl", "comparison"):
         assert {f"--env.episode_length={length}", f"--env.dataset.branches={branches}"} <= {*commands[stage]}
 

@@ -11,7 +11,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot_wmrl.data.episodes import DatasetSource
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
-from lerobot_wmrl.evaluation.gate import success_gate
+from lerobot_wmrl.evaluation.gate import gate_at, labelled_recording, predict_outcomes
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.configuration_callbacks import GateConfig
@@ -27,7 +27,7 @@ def env(small_dataset: LeRobotDataset, trained_models: dict[str, Path]) -> Any:
     config = WorldModelEnv(
         world_model_path=str(trained_models["action_world_model"]),
         dataset=StartFrames(root=str(small_dataset.root)), reward=GeneralConfig(alpha=1.0),
-        done_threshold=BELIEVES_ALL, done_frames=2, episode_length=4, device="cpu",
+        done_threshold=BELIEVES_ALL, done_frames=2, episode_length=20, device="cpu",
     )  # fmt: skip
     return config.create_tensor_env(2)
 
@@ -47,13 +47,23 @@ def test_a_verdict_is_the_evaluations_own(
 ) -> None:
     gate = make_gate(BELIEVES_ALL)
     found = gate.run(0, tmp_path, tmp_path / "gate")
-    asked = success_gate(env.model, small_dataset.root, BELIEVES_ALL, frames=2)
-    assert found["labelled"] == asked.as_json()
+    outcomes = predict_outcomes(env.model, labelled_recording(env.model, small_dataset))
+    assert found["labelled"] == gate_at(outcomes, BELIEVES_ALL, 2).as_json()
     assert found["labelled"]["false_positive_rate"]["share"] == 1.0
     assert found["failed"]
     assert found["real_steps"] == 0
     strips = {path.name for path in (tmp_path / "gate").glob("*.png")}
     assert strips == {"labelled_success.png", "labelled_failure.png"}
+
+
+def test_outcomes_are_judged_by_as_many_frames_as_are_imagined(
+    make_gate: Any, env: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """None of the episodes succeeds within four."""
+    gate = make_gate(BELIEVES_ALL)
+    monkeypatch.setattr(env, "config", replace(env.config, episode_length=4))
+    found = gate.run(0, tmp_path, tmp_path / "gate")["labelled"]
+    assert (found["recall"]["n"], found["false_positive_rate"]["n"]) == (0, 6)
 
 
 def test_above_the_limit_it_stops_or_warns_with_advice(
