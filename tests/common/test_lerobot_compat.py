@@ -40,6 +40,7 @@ UNDOCUMENTED = {
     "lerobot.datasets.dataset_tools": {"add_features"},
     "lerobot.datasets.depth_utils": {"MM_PER_METRE", "dequantize_depth"},
     "lerobot.datasets.factory": {"resolve_delta_timestamps"},
+    "lerobot.datasets.io_utils": {"load_info", "write_info"},
     "lerobot.datasets.video_utils": {"decode_video_frames"},
     "lerobot.envs.utils": {
         "NEW_ROLLOUT_OPTION", "FreezeAfterEpisodeEnd", "env_to_policy_features", "preprocess_observation",

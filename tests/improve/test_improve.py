@@ -17,6 +17,7 @@ from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
 from lerobot.utils.constants import OBS_IMAGE
 
 from lerobot_policy_cnn.configuration_cnn import CnnConfig
+from lerobot_wmrl.common.command_line import run_command
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.presets import preset_settings
 from lerobot_wmrl.common.stages import claimed
@@ -25,7 +26,7 @@ from lerobot_wmrl.improve import stages
 from lerobot_wmrl.improve.findings import Findings, few_decisions
 from lerobot_wmrl.improve.report import trust, verdict
 from lerobot_wmrl.improve.stages import ImproveConfig, Improvement
-from lerobot_wmrl.scripts.improve import settings
+from lerobot_wmrl.scripts.improve import improve, settings
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 from lerobot_wmrl.world_models.configuration_world_model import AnchoredConfig
 from tests.pusht import record_pusht
@@ -40,17 +41,23 @@ def demonstrations(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return record_pusht(root, f"--num_episodes={EPISODES}", "--steps=150", "--noise", "2")
 
 
-def run(folder: Path, demonstrations: Path, *flags: str) -> subprocess.CompletedProcess[str]:
-    """Run the command in a process of its own: it forks, which a test's process with its threads must not."""
+def arguments(folder: Path, demonstrations: Path, *flags: str) -> list[str]:
+    """Return those of the command, for an untrained policy."""
     policy = folder / "policy"
     if not policy.exists():
         save_untrained_policy(policy, OBS_IMAGE, size=96, actions=2, constant=250.0)
-    argv = [
-        sys.executable, "-m", "lerobot_wmrl.scripts.improve",
+    return [
         f"--policy.path={policy}", f"--dataset.root={demonstrations}", "--size=tiny", "--iterations=1",
         "--eval_episodes=2", f"--output_dir={folder / 'improve'}", *flags,
     ]  # fmt: skip
-    return subprocess.run(argv, capture_output=True, text=True)
+
+
+def run(folder: Path, demonstrations: Path, *flags: str) -> subprocess.CompletedProcess[str]:
+    """Run the command in a process of its own: it forks, which a test's process with its threads must not."""
+    given = arguments(folder, demonstrations, *flags)
+    return subprocess.run(
+        [sys.executable, "-m", "lerobot_wmrl.scripts.improve", *given], capture_output=True, text=True
+    )
 
 
 def test_with_a_real_environment_its_rollouts_are_learnt_from_and_success_is_measured_there(
@@ -94,11 +101,14 @@ def test_without_one_the_report_says_that_it_is_a_belief(demonstrations: Path, t
     (["--dataset.root=nowhere"], "no LeRobotDataset there"),
 ])  # fmt: skip
 def test_bad_settings_are_named_and_nothing_is_made(
-    flags: list[str], message: str, demonstrations: Path, tmp_path: Path
-) -> None:
-    refused = run(tmp_path, demonstrations, *flags)
-    assert refused.returncode != 0
-    assert message in refused.stderr
+    flags: list[str], message: str, demonstrations: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.setattr(sys, "argv", ["lerobot-wmrl-improve", *arguments(tmp_path, demonstrations, *flags)])
+    with pytest.raises(SystemExit) as stopped:
+        run_command(improve, ImproveConfig, list)
+    assert stopped.value.code == 1
+    assert message in capsys.readouterr().err
     assert not (tmp_path / "improve").exists()
 
 
