@@ -99,8 +99,8 @@ class Outcomes:
         return Outcomes(self.episodes[kept], self.probability[kept], self.done[kept], self.held)
 
     def within(self, frames: int | None) -> "Outcomes":
-        """Return the first frames of every episode, all without a number: what succeeds later has not
-        succeeded in them, and what is predicted later is never imagined in episodes of that length."""
+        """Return the outcomes by the first frames of every episode, by all if `frames` is None. A later
+        success does not count, and neither does what is predicted for later frames."""
         return Outcomes(self.episodes, self.probability[:, :frames], self.done[:, :frames], self.held)
 
     @property

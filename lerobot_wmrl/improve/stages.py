@@ -355,9 +355,8 @@ class Improvement:
 
     def _columns(self) -> list[str]:
         name = f"local/{self.found.root.name}"
-        command = edit_command(
-            self._dataset, "remove_feature", {"operation.feature_names": str(self.extra_columns)}
-        )
+        names: Flags = {"operation.feature_names": str(self.extra_columns)}
+        command = edit_command(self.out / "columns", "remove_feature", names)
         return [*command, f"--repo_id={name}", f"--root={self.found.root}"]
 
     @property

@@ -62,8 +62,8 @@ class EvalWorldModelConfig(RunConfig):
             model was trained on; `ind` or `ood`, the recorder's training scenes and its held-out scenes. A
             comma means both: `validation,ind`.
         max_episodes: largest number of episodes, chosen evenly over the dataset.
-        episode_length: frames of every episode by which its outcome is judged; by default all. Success comes
-            later in some: then it has not come. Give the environment the same (`--env.episode_length`).
+        episode_length: frames of every episode by which its outcome is judged, by default all; a later
+            success does not count. Give the environment the same (`--env.episode_length`).
         done_threshold: predicted success probability at which a frame counts as done. Give the environment
             the same (`--env.done_threshold`).
         done_frames: consecutive done frames that make an imagined success. Give the environment the same
