@@ -1,7 +1,7 @@
 """How fast the planner plans, against imagining its sequences frame by frame and what the machine allows.
 
     python benchmarks/planning.py --sizes=demo
-    python benchmarks/planning.py --world_model=outputs/demo/action_world_model --searches 1 64
+    python benchmarks/planning.py --world_model=outputs/demo/improve/world_model --searches 1 64
 
 At each number of searches at once, measured in turns: plans of three settings (those of `wm_mpc` by default,
 those of `distillation`, and a few changes of a policy's actions), what the policy would do (the frames that

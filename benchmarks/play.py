@@ -1,7 +1,7 @@
 """How long the page of lerobot-wmrl-play waits for the next frame, from a key to a picture to show.
 
-    python benchmarks/play.py --world_model=outputs/demo/action_world_model \\
-        --dataset.root=outputs/demo/dataset --maniskill --exported=outputs/page
+    python benchmarks/play.py --world_model=outputs/demo/improve/world_model \\
+        --dataset.root=outputs/demo/improve/merged --maniskill --exported=outputs/page
 
 The steps of one visitor, over the page's socket on this machine, as fast as they come: from the message until
 the picture is decoded, without the browser itself. Beside it, in turns: a step of the environment alone, the

@@ -1,6 +1,6 @@
 """How fast a world model learns and imagines, against what the machine allows and against ManiSkill.
 
-    python benchmarks/world_model.py --world_model=outputs/demo/action_world_model
+    python benchmarks/world_model.py --world_model=outputs/demo/improve/world_model
     python benchmarks/world_model.py --sizes=gpu --no_maniskill
     python benchmarks/world_model.py --sizes=cpu --model.dynamics=autoregressive --output=autoregressive.json
 

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lerobot_wmrl.demo.report.figures import tidy
+from lerobot_wmrl.improve.report.figures import tidy
 
 COLOURS: Final = ("#2b6cb0", "#dd6b20", "#2f855a", "#805ad5")
 PLACES: Final = {"imagined": "PPO in imagination", "simulated": "PPO in ManiSkill"}

@@ -4,34 +4,38 @@ from collections.abc import Mapping
 from typing import Any
 
 from experiments.cells import DOMAINS, Load, counted, paired, percents, points, share, table
-from lerobot_wmrl.demo.report.page import POLICY_TITLES
+from lerobot_wmrl.improve.stages import CLONED, DISTILLED
 
 
 def demo(load: Load) -> str:
     found = load("demo")["runs"]
     rows = [
-        [
-            run["seed"],
-            POLICY_TITLES[policy],
-            *(share(row[where]) for where in ("known", "unseen", "imagined")),
-        ]
+        [run["seed"], policy, *(share(place["policies"][policy]) for place in run["places"].values())]
         for run in found
-        for policy, row in run["policies"].items()
+        for policy in next(iter(run["places"].values()))["policies"]
     ]
     changes = ". ".join(
-        f"Seed {run['seed']}, {run['seconds'] / 60:.0f} minutes: {paired(run['changes']['known'])} in known "
-        f"scenes, {paired(run['changes']['unseen'])} in unseen ones; of the failures before PPO, the world "
-        f"model predicts {counted(run['replayed']['filtered']['false_positive_rate'])} as successes"
+        f"Seed {run['seed']}, {run['seconds'] / 60:.0f} minutes: "
+        + "; ".join(f"{where} {paired(gained(place))}" for where, place in run["places"].items())
+        + f"; of the failures of the policy that PPO begins with, the world model predicts "
+        f"{counted(run['gate']['false_positive_rate'])} as successes"
         for run in found
     )
-    last = POLICY_TITLES[next(reversed(found[0]["policies"]))]
-    return f"""The last policy ({last}) against that which PPO begins with, which is cloned from the same
+    places = found[0]["places"]
+    n = next(iter(places.values()))["policies"][CLONED]["n"]
+    return f"""The last policy ({DISTILLED}) against its rival, the first policy trained further on the same
 data's successes, on the same starts. {changes}.
 
-{table(["seed", "policy", "known scenes", "unseen scenes", "in the world model"], rows)}
+{table(["seed", "policy", *places], rows)}
 
-Each rate is over {found[0]["policies"]["rl"]["known"]["n"]} starts. One training a row; [a
-study](#value_push) compares more methods on more data."""
+Each rate is over {n} starts. One training a row; [a study](#value_push) compares more methods on more
+data."""
+
+
+def gained(place: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return what the last policy gained over the rival on the same data."""
+    (found,) = (each for each in place["changes"] if each["after"] == DISTILLED and each["before"] == CLONED)
+    return found
 
 
 def cloning_control(load: Load) -> str:

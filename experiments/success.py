@@ -170,12 +170,9 @@ def policies(study: Study) -> Results:
 
 
 def demo(study: Study) -> Results:
-    """Return the summary that each run of the demo wrote, without its stages."""
-    runs = []
-    for seed in study.variables["seeds"]:
-        summary = json.loads((study.folder / f"demo_{seed}" / "summary.json").read_text())
-        runs.append({name: value for name, value in summary.items() if name != "stages"})
-    return {"demo": {"runs": runs}}
+    """Return the summary that each run of the demo wrote."""
+    folders = [study.folder / f"demo_{seed}" for seed in study.variables["seeds"]]
+    return {"demo": {"runs": [json.loads((folder / "summary.json").read_text()) for folder in folders]}}
 
 
 def cloning_control(study: Study) -> Results:

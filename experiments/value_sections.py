@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from experiments.cells import DOMAINS, Load, paired, points, table
 from experiments.study import ROOT, read_cells
 from lerobot_wmrl.common.statistics import PairedChange, RunsMean
-from lerobot_wmrl.demo.report.figures import COLOURS, tidy
+from lerobot_wmrl.improve.report.figures import COLOURS, tidy
 
 TITLES: Final = {
     "cloning": "BC of the demonstrations",

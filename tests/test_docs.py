@@ -41,10 +41,15 @@ def test_the_readmes_python_runs(
     trained_models: dict[str, Path], small_dataset: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (code,) = blocks(ROOT / "README.md", "python")
-    for name in ("action_world_model", "text_world_model"):
-        assert f"outputs/demo/{name}" in code
-        code = code.replace(f"outputs/demo/{name}", str(trained_models[name]))
-    exec(code.replace("outputs/demo/dataset", str(small_dataset.root)), {})
+    paths = {
+        "outputs/demo/improve/world_model": trained_models["action_world_model"],
+        "outputs/demo/text_world_model": trained_models["text_world_model"],
+        "outputs/demo/improve/merged": small_dataset.root,
+    }
+    for written, made in paths.items():
+        assert written in code
+        code = code.replace(written, str(made))
+    exec(code, {})
     assert "torch.Size([16, 3, 32, 32]) tensor([" in capsys.readouterr().out
 
 
@@ -95,10 +100,12 @@ def test_the_readme_says_what_was_measured() -> None:
     for title, methods in rows.items():
         shown = " | ".join(known_and_unseen(cells, methods) for cells in budgets.values())
         assert f"| {title} | {shown} |" in text
-    policies = json.loads((results / "demo.json").read_text())["runs"][0]["policies"].values()
+    places = json.loads((results / "demo.json").read_text())["runs"][0]["places"]
     unseen, known = (
-        "{}, {}, {} and {} %".format(*(round(100 * policy[where]["share"]) for policy in policies))
-        for where in ("unseen", "known")
+        "{}, {}, {} and {} %".format(
+            *(round(100 * rate["share"]) for rate in places[where]["policies"].values())
+        )
+        for where in ("in unseen scenes", "in known scenes")
     )
     assert f"{unseen} in unseen scenes, {known} in known ones" in text
     best = json.loads((results / "cloning_control.json").read_text())["cloned_from"]["180"]

@@ -2,38 +2,32 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import Any, Final
 
 import numpy as np
-import torch
-from lerobot.configs import PreTrainedConfig, parser
-from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import env_to_policy_features
 from lerobot.utils.constants import ACTION, DEFAULT_FEATURES, DONE, REWARD
 
 from lerobot_wmrl.common.checkpoints import last_checkpoint
-from lerobot_wmrl.common.command_line import RunConfig
 from lerobot_wmrl.common.constants import EVALUATION_SEED, START_KIND, START_SEED, START_TASK
-from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
 from lerobot_wmrl.common.lerobot_commands import edit_command, merge_command, train_command
-from lerobot_wmrl.common.policies import (
-    read_policy_config,
-    require_chunks,
-    require_single_observations,
-    require_trained,
-)
 from lerobot_wmrl.common.presets import Flags, format_flags, preset_settings
 from lerobot_wmrl.common.stages import Stage
 from lerobot_wmrl.data.episodes import SUCCESS, ChosenEpisodes, EpisodeTable, read_episodes
 from lerobot_wmrl.evaluation.comparison import RESULTS, chosen_policy
+from lerobot_wmrl.improve.configuration_improve import ROLLOUT_SEED_OFFSET, ImproveConfig
 from lerobot_wmrl.improve.findings import LONGEST_IMAGINATION, Findings
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.recorders import env_flags
 
-SIZES: Final = ("auto", "tiny", "demo", "cpu")
-"""Presets of the stages; `auto` is `cpu` with CUDA and `demo` without."""
+AS_IT_WAS: Final = "as it was"
+CLONED: Final = "trained further on the successes"
+PPO: Final = "PPO in imagination"
+FITTED: Final = "fitted to a planner in imagination"
+DISTILLED: Final = "PPO, then fitted to a planner"
+"""What the compared policies are."""
 
 DURATIONS: Final = {
     "tiny": "about a minute on two cores", "demo": "about an hour on two cores",
@@ -71,104 +65,20 @@ ROLLOUT_COLUMNS: Final = (*DEFAULT_FEATURES, ACTION, REWARD, SUCCESS, DONE, STAR
 CLONING_PRESETS: Final = {"tiny": "tiny"}
 """Presets of cloning at the sizes where it is not `demo`, which trains for as long as it helps."""
 
-ALGORITHMS: Final[dict[str, Flags]] = {
-    "cnn": {"algorithm.type": "ppo", "algorithm.train_encoder": False},
-    "act": {"algorithm.type": "ppo", "algorithm.policy_lr": 1e-5, "algorithm.initial_std": 0.1},
-    "openvla": {"algorithm.type": "ppo", "algorithm.initial_std": "null"},
-}
-"""How policies of a type are trained."""
-
-OTHERS: Final[Flags] = {"algorithm.type": "distillation"}
-"""How all others are: they are fitted to a planner in the world model."""
-
 MINIBATCH: Final = PPOConfig.minibatch_size
 """Decisions in an optimizer step of PPO."""
 
 IMAGINED_STARTS: Final = 256
 """Imagined episodes of each policy that choose which one to improve, at most."""
 
+PROCESSES: Final = 2
+"""In which ManiSkill runs when policies are compared in it."""
+
 DONE_FRAMES: Final = 2
 """Consecutive done frames that make an imagined success, if the data shows that many."""
 
 DONE_THRESHOLD: Final = 0.95
 """RL finds every failure that the world model takes for a success: the threshold is strict."""
-
-
-@dataclass
-class ImproveConfig(RunConfig):
-    """Improve a policy with a dataset, inside a world model that learns from it.
-
-    The command looks at the data and says what it has and lacks. It trains the policy further on all episodes
-    that succeed, and trains a frame tokenizer, a world model and, in imagination, the policy. In the end it
-    compares the policy before, trained further, and improved: in `real_env` if there is one, else in
-    imagination, which proves nothing about the real world. Every stage is a command that you could call
-    yourself; it is printed. Running the same command again continues.
-
-    Args:
-        policy: `--policy.path=FOLDER` or a name on the hub: the policy to improve, cloned from such data.
-        dataset: `--dataset.repo_id=USER/NAME` or `--dataset.root=FOLDER`: episodes with actions, the cameras
-            that the policy sees, and next.success. Failures belong into it.
-        real_env: `--real_env.type=…` and its settings: one of LeRobot's environments or wmrl_maniskill, to
-            record rollouts and to measure success in.
-        rollouts: rollouts of the policy that are recorded in `real_env` first, and learnt from. Columns of
-            the dataset that these lack are left out of what is learnt from.
-        exploration: noise on the actions of these rollouts, as a share of half their range.
-        size: how large models are and how long they train: `demo` (an hour on two cores), `cpu` (several),
-            `tiny` (a minute, to try the command), or `auto`.
-        iterations: of RL; by default those of the size.
-        eval_episodes: starts on which the policies are compared.
-        seed: of recording and training. Evaluation has seeds of its own, from 1,000,000 on.
-        output_dir: folder of everything; `report.md` is the page to read.
-    """
-
-    path_fields: ClassVar[list[str]] = ["policy"]
-
-    policy: PreTrainedConfig | None = None
-    dataset: ChosenEpisodes = field(default_factory=ChosenEpisodes)
-    real_env: EnvConfig | None = None
-    rollouts: int = 0
-    exploration: float = 0.2
-    size: str = "auto"
-    iterations: int | None = None
-    eval_episodes: int = 100
-    seed: int = 0
-    output_dir: Path = Path("outputs/improve")
-
-    def check(self) -> None:
-        """Read the policy's configuration. FieldError for a setting that cannot be."""
-        path = parser.get_path_arg("policy")
-        if path:
-            for flag in parser.get_cli_overrides("policy") or []:
-                name, _, value = flag.removeprefix("--").partition("=")
-                raise FieldError(
-                    f"policy.{name}", value, "would hold for some of the commands only",
-                    "set it in the policy's config.json",
-                )  # fmt: skip
-            self.policy = read_policy_config(path, [])
-        if self.policy is None:
-            raise FieldError("policy.path", None, "is missing", "give the policy to improve")
-        require_trained(self.policy)
-        if self.policy.type not in ALGORITHMS:
-            require_single_observations(self.policy)
-        if self.policy.type == "act":
-            require_chunks(self.policy)
-        if not self.dataset.given:
-            raise FieldError("dataset.root", "", "is missing", "give `dataset.root` or `dataset.repo_id`")
-        require_choice(self, "size", SIZES)
-        require_at_least(self, 0, "rollouts")
-        require_at_least(self, 1, "eval_episodes")
-        if self.rollouts and self.real_env is None:
-            raise FieldError(
-                "rollouts", self.rollouts, "are recorded in a real environment", "give `real_env.type`"
-            )
-        if not 0 <= self.seed < EVALUATION_SEED:
-            raise FieldError("seed", self.seed, f"must be from 0 to {EVALUATION_SEED - 1}")
-
-    @property
-    def preset(self) -> str:
-        """The stages' preset."""
-        automatic = "cpu" if torch.cuda.is_available() else "demo"
-        return automatic if self.size == "auto" else self.size
 
 
 @dataclass(frozen=True)
@@ -190,18 +100,28 @@ class Improvement:
             "check": "Check the world model on recorded episodes",
             "start": "Choose in imagination which policy to improve",
             "rl": "Train it in imagination",
+            "distilled": "Fit it to a planner in imagination",
             "comparison": "Compare the policies",
         }
         needless = {
             *(() if self.extra_columns else ("columns",)),
             *(() if self.config.rollouts else ("rollouts", "merged")),
             *(() if self.clones else ("cloned", "start")),
+            *(() if self.config.distils else ("distilled",)),
         }
         return [
             Stage(name, title, getattr(self, f"_{name}"))
             for name, title in steps.items()
             if name not in needless
         ]
+
+    def drive(self) -> list[str]:
+        """Return the command that shows the world model in the browser."""
+        real = {} if self.config.real_env is None else self._real_env("real_env")
+        return ["lerobot-wmrl-play", *format_flags({
+            "world_model.path": str(self.out / "world_model"), **self.data.flags(),
+            "policy.path": str(self.improved), **real, **self._success_criterion(),
+        })]  # fmt: skip
 
     @property
     def duration(self) -> str:
@@ -222,8 +142,8 @@ class Improvement:
 
     @property
     def improved(self) -> Path:
-        """Folder of the improved policy's checkpoint."""
-        return last_checkpoint(self.out / "rl")
+        """Folder of the last policy's checkpoint."""
+        return last_checkpoint(self.out / ("distilled" if self.config.distils else "rl"))
 
     @property
     def clones(self) -> bool:
@@ -231,10 +151,16 @@ class Improvement:
         return bool(self.config.rollouts or self.found.failures)
 
     @property
-    def policies(self) -> list[str]:
-        """Paths of the policies that are compared in the end."""
-        cloned = [str(last_checkpoint(self.out / "cloned"))] if self.clones else []
-        return [self.policy, *cloned, str(self.improved)]
+    def policies(self) -> dict[str, str]:
+        """Paths of the policies that are compared in the end, by what they are."""
+        trained = {AS_IT_WAS: self.policy}
+        if self.clones:
+            trained[CLONED] = str(last_checkpoint(self.out / "cloned"))
+        fitted = self.config.algorithm["algorithm.type"] == "distillation"
+        trained[FITTED if fitted else PPO] = str(last_checkpoint(self.out / "rl"))
+        if self.config.distils:
+            trained[DISTILLED] = str(last_checkpoint(self.out / "distilled"))
+        return trained
 
     @property
     def data(self) -> ChosenEpisodes:
@@ -244,10 +170,10 @@ class Improvement:
             return given
         chosen = given.episodes
         if chosen is not None:
-            chosen = [*chosen, *self._rollout_numbers()]
+            chosen = [*chosen, *self.rollout_numbers()]
         return ChosenEpisodes(root=str(self.out / "merged"), episodes=chosen)
 
-    def _rollout_numbers(self) -> range:
+    def rollout_numbers(self) -> range:
         """Return the numbers of the rollouts among the merged episodes."""
         return range(self.found.total, self.found.total + self.config.rollouts)
 
@@ -282,7 +208,7 @@ class Improvement:
         data = self.config.dataset.flags(), "validation" if holds_out else "all"
         if self.config.rollouts < ENOUGH_HELD_OUT:
             return data
-        table, numbers = self._table(), list(self._rollout_numbers())
+        table, numbers = self.table(), list(self.rollout_numbers())
         success, validation = table.success[numbers], table.validation[numbers]
         held_out = success[validation]
         rollouts = replace(self.data, episodes=numbers).flags()
@@ -327,7 +253,8 @@ class Improvement:
         given = env_flags(self.config.real_env)
         return {name.replace("env.", f"{prefix}.", 1): value for name, value in given.items()}
 
-    def _imagination(self) -> Flags:
+    def imagination(self) -> Flags:
+        """Return the environment that the world model makes."""
         return {
             "env.type": "world_model", "env.world_model_path": str(self.out / "world_model"),
             **{f"env.{name}": value for name, value in self.data.flags().items()},
@@ -343,7 +270,7 @@ class Improvement:
         """Return the number of episodes that are learnt from, of the task that has the fewest."""
         if not self.config.rollouts:
             return self.found.fewest
-        table = self._table()
+        table = self.table()
         tasks = table.column(START_TASK)[table.among(self.data.episodes)]
         return int(np.unique(tasks, return_counts=True)[1].min())
 
@@ -370,7 +297,7 @@ class Improvement:
             "policy.path": self.policy, **self._real_env("env"), **({} if self._in_maniskill else like),
             "video": "video" in self.found.columns.values(), "num_episodes": self.config.rollouts,
             "exploration": self.config.exploration,
-            "seed": self.config.seed, "output_dir": str(self.out / "rollouts"),
+            "seed": self.config.seed + ROLLOUT_SEED_OFFSET, "output_dir": str(self.out / "rollouts"),
         }  # fmt: skip
         return ["lerobot-wmrl-record", *format_flags(flags)]
 
@@ -378,12 +305,12 @@ class Improvement:
         parts = {"dataset": self._dataset, "rollouts": self.out / "rollouts"}
         return merge_command(self.out / "merged", parts)
 
-    def _table(self) -> EpisodeTable:
+    def table(self) -> EpisodeTable:
         """Read the episodes that are learnt from."""
         return read_episodes(self.data.open())
 
     def _cloned(self) -> list[str]:
-        table = self._table()
+        table = self.table()
         successes = np.flatnonzero(table.success & table.among(self.data.episodes)).tolist()
         # LeRobot keeps loaded adapters, but writes no policy's configuration beside them without the flag
         assert self.config.policy is not None
@@ -426,8 +353,8 @@ class Improvement:
         return ["lerobot-wmrl-eval-world-model", *format_flags(flags)]
 
     def _start(self) -> list[str]:
-        before, cloned, _ = self.policies
-        return self._compare("start", [cloned, before], IMAGINED_STARTS, self.config.seed, imagined=True)
+        both = [self.policies[CLONED], self.policy]
+        return self.compare(self.out / "start", self.imagination(), IMAGINED_STARTS, both, self.config.seed)
 
     @property
     def _chosen(self) -> str:
@@ -436,36 +363,42 @@ class Improvement:
         if not self.clones:
             return self.policy
         found = json.loads((self.out / "start" / RESULTS).read_text())
-        before, cloned, _ = self.policies
-        return [cloned, before][list(found["policies"]).index(chosen_policy(found))]
+        both = [self.policies[CLONED], self.policy]
+        return both[list(found["policies"]).index(chosen_policy(found))]
 
     def _rl(self) -> list[str]:
-        assert self.config.policy is not None
         real = {} if self.config.real_env is None else self._real_env("real_env")
-        flags: dict[str, str | int | float | bool] = {
-            "policy.path": self._chosen, **self._imagination(), **real,
-            "gate.action": "warn" if real else "off", "gate.freq": 0,
-            "gate.n_episodes": min(50, self.config.eval_episodes),
-            **ALGORITHMS.get(self.config.policy.type, OTHERS), **self._memory(), "seed": self.config.seed,
-            "output_dir": str(self.out / "rl"),
-        }  # fmt: skip
-        if self.config.iterations is not None:
-            flags["iterations"] = self.config.iterations
-        return self._command("lerobot-wmrl-train", flags)
+        given = self.config.iterations
+        return self._train("rl", self._chosen, {
+            **real, "gate.action": "warn" if real else "off", "gate.freq": 0,
+            "gate.n_episodes": min(50, self.config.eval_episodes), **self.config.algorithm,
+            **({} if given is None else {"iterations": given}),
+        })  # fmt: skip
 
-    def _memory(self) -> Flags:
+    def _distilled(self) -> list[str]:
+        path = str(last_checkpoint(self.out / "rl"))
+        return self._train("distilled", path, {
+            "gate.action": "off", "algorithm.type": "distillation", "algorithm.recorded": False,
+        })  # fmt: skip
+
+    def _train(self, folder: str, policy: str, flags: Flags) -> list[str]:
+        return self._command("lerobot-wmrl-train", {
+            "policy.path": policy, **self.imagination(), **self._memory(flags), **flags,
+            "seed": self.config.seed, "output_dir": str(self.out / folder),
+        })  # fmt: skip
+
+    def _memory(self, training: Flags) -> Flags:
         """Return what keeps the frames that a policy sees in memory, where they are large."""
-        assert self.config.policy is not None
-        algorithm = ALGORITHMS.get(self.config.policy.type, OTHERS)["algorithm.type"]
+        algorithm = training["algorithm.type"]
         distils, pixels = algorithm == "distillation", self.found.pixels
         preset = preset_settings(self.config.preset, "train", [str(algorithm)])
-        kept = self.config.iterations or preset["iterations"] if distils else 1
+        kept = int(training.get("iterations", preset["iterations"])) if distils else 1
         flags: dict[str, bool | int] = {}
         if (fits := max(1, ROLLOUT_BYTES // (kept * self.length * pixels * CHANNELS))) < preset["num_envs"]:
             flags["num_envs"] = fits
         recorded = self.found.success_frames
         if distils and self.config.rollouts:
-            table = self._table()
+            table = self.table()
             recorded = int(table.length[table.success & table.among(self.data.episodes)].sum())
         if distils and recorded * pixels * CHANNELS > ROLLOUT_BYTES:
             flags["algorithm.recorded"] = False
@@ -475,19 +408,21 @@ class Improvement:
 
     def _comparison(self) -> list[str]:
         imagined = self.config.real_env is None
-        return self._compare(
-            "comparison", self.policies, self.config.eval_episodes, EVALUATION_SEED, imagined
-        )
+        env = self.imagination() if imagined else self._real_env("env")
+        return self.compare(self.out / "comparison", env, self.config.eval_episodes)
 
-    def _compare(
-        self, folder: str, policies: Sequence[str], starts: int, seed: int, imagined: bool
-    ) -> list[str]:
-        env = self._imagination() if imagined else self._real_env("env")
+    def compare(
+        self, folder: Path, env: Flags, starts: int, policies: Sequence[str] = (),
+        seed: int = EVALUATION_SEED,
+    ) -> list[str]:  # fmt: skip
+        """Return the command that compares policies, by default all, each pair on the same starts."""
+        imagined = env["env.type"] == "world_model"
         if imagined:  # none twice: there are at least as many as episodes
             starts = min(starts, self._fewest())
+        at_once = 16 if imagined else PROCESSES if self._in_maniskill else 1
         flags: Flags = {
-            "policies": f"[{','.join(policies)}]", "against": "all", **env, "n_episodes": starts,
-            "batch_size": min(16 if imagined else 1, starts), "stop_early": False, "seed": seed,
-            "output_dir": str(self.out / folder),
+            "policies": f"[{','.join(policies or self.policies.values())}]", "against": "all", **env,
+            "n_episodes": starts, "batch_size": min(at_once, starts), "stop_early": False, "seed": seed,
+            "output_dir": str(folder),
         }  # fmt: skip
         return ["lerobot-wmrl-compare", *format_flags(flags)]

@@ -1,19 +1,18 @@
-"""lerobot-wmrl-demo: the whole loop with one command, and a page that shows what it did.
+"""lerobot-wmrl-demo: from nothing to a better policy with one command, and a page that shows what it did.
 
     lerobot-wmrl-demo --preset=demo --output_dir=outputs/demo
 
-It records demonstrations of a task in ManiSkill, clones a policy, records that policy's rollouts, and learns
-from these alone: a policy cloned again with the successful rollouts, world models, and that policy trained by
-PPO inside them and then fitted to a planner. All policies are measured on the same held-out starts in
-ManiSkill. Every stage is one console command, which it prints. Running the same command again continues an
-interrupted demo. It ends with a summary and `report.html`.
+It records demonstrations of a task in ManiSkill, clones a policy, and calls lerobot-wmrl-improve, which
+learns from these and from rollouts of that policy alone. In the end it compares the policies on held-out
+starts in unseen scenes too. Every stage is one console command, which it prints. Running the same command
+again continues an interrupted demo. It ends with a summary and `report.html`.
 """
 
 from collections.abc import Sequence
 from dataclasses import asdict
 
 from lerobot_wmrl.common.presets import expand_preset
-from lerobot_wmrl.demo.stages import DemoConfig, demo_stages
+from lerobot_wmrl.demo.stages import Demo, DemoConfig, conclusion
 
 
 def run_demo(cfg: DemoConfig) -> None:
@@ -21,13 +20,12 @@ def run_demo(cfg: DemoConfig) -> None:
     from lerobot_wmrl.common.stages import claimed, run_stages
 
     cfg.check()
-    stages = demo_stages(cfg)
+    demo = Demo(cfg)
     with claimed(cfg.output_dir, {**asdict(cfg), "output_dir": str(cfg.output_dir)}):
-        run_stages(stages, cfg.output_dir, ["lerobot_wmrl.maniskill.simulation"], offline=True)
-        from lerobot_wmrl.demo.report.page import conclusion, write_report
-
-        page = write_report(cfg, [stage.name for stage in stages])
-    print(f"\n{conclusion(cfg, page)}")
+        run_stages(demo.stages(), cfg.output_dir, ["lerobot_wmrl.maniskill.simulation"], offline=True)
+        page = demo.page()
+        path = page.write(cfg.output_dir)
+    print(f"\n{conclusion(page, path)}")
 
 
 def with_preset(argv: Sequence[str]) -> list[str]:

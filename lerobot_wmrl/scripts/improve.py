@@ -10,14 +10,15 @@ which needs no world model: imagination has to beat it; trains a frame tokenizer
 the world model on held-out episodes; trains that policy in imagination; and compares the policies, in
 `--real_env` if there is one. With `--rollouts` it first records rollouts of the policy there, and learns from
 them too. Every stage is one console command, which it prints. Running the same command again continues where
-it stopped. It ends with a summary and `report.md`.
+it stopped. It ends with a summary and `report.html`.
 """
 
 from typing import TYPE_CHECKING
 
 import draccus
 
-from lerobot_wmrl.improve.stages import ImproveConfig, Improvement
+from lerobot_wmrl.improve.configuration_improve import ImproveConfig
+from lerobot_wmrl.improve.stages import Improvement
 
 if TYPE_CHECKING:
     from lerobot_wmrl.common.stages import Stage
@@ -25,10 +26,11 @@ if TYPE_CHECKING:
 
 def improve(cfg: ImproveConfig) -> None:
     """Run every stage, write the report, and say what came of it."""
-    from lerobot_wmrl.common.stages import claimed, run_stages
+    from lerobot_wmrl.common.stages import claimed, read_record, run_stages
     from lerobot_wmrl.data.episodes import read_episodes
     from lerobot_wmrl.improve.findings import look
-    from lerobot_wmrl.improve.report import verdict, write_report
+    from lerobot_wmrl.improve.report.page import Page
+    from lerobot_wmrl.improve.report.words import verdict
 
     cfg.check()
     assert cfg.policy is not None
@@ -38,8 +40,9 @@ def improve(cfg: ImproveConfig) -> None:
     stages = improvement.stages()
     with claimed(cfg.output_dir, settings(cfg, stages)):
         run_stages(stages, cfg.output_dir)
-        page = write_report(improvement, stages)
-    print(f"\n{verdict(improvement)}\nThe report: {page}")
+        page = Page.of(improvement, [read_record(cfg.output_dir, stage) for stage in stages])
+        path = page.write(cfg.output_dir)
+    print(f"\n{verdict(improvement, page.places)}\n\nThe report: {path}")
 
 
 def settings(cfg: ImproveConfig, stages: "list[Stage]") -> dict[str, object]:

@@ -5,7 +5,6 @@ from pathlib import Path
 import draccus
 import pytest
 from draccus.wrappers import docstring
-from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.configs.train import TrainPipelineConfig
 
 import lerobot_env_wmrl  # noqa: F401
@@ -18,8 +17,7 @@ from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig
 
 CONFIGS = {
     "demo": DemoConfig, "train-world-model": TrainWorldModelConfig, "eval-world-model": EvalWorldModelConfig,
-    "train": TrainConfig, "sft": TrainPipelineConfig, "eval": EvalPipelineConfig,
-    "eval-imagined": EvalPipelineConfig,
+    "train": TrainConfig, "sft": TrainPipelineConfig,
 }  # fmt: skip
 REQUIRED = {TrainPipelineConfig: ["--dataset.repo_id=local/data"]}
 FILES = sorted(presets.FOLDER.glob("*/*.yaml"))

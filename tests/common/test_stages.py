@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from lerobot_wmrl.common import stages as runner
+from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.stages import (
     Stage,
     StageError,
@@ -21,7 +22,8 @@ from lerobot_wmrl.common.stages import (
     run_stages,
     tree_memory,
 )
-from lerobot_wmrl.demo.stages import DemoConfig, demo_stages
+from lerobot_wmrl.demo.stages import Demo, DemoConfig
+from lerobot_wmrl.improve.configuration_improve import ROLLOUT_SEED_OFFSET
 
 
 def run_code() -> None:
@@ -138,17 +140,16 @@ def test_impossible_settings_are_named(flags: dict[str, int]) -> None:
 
 def test_training_and_evaluation_seeds_are_disjoint() -> None:
     """Whatever the demo's seed, at a distance that no stage's number of episodes bridges."""
-    trained, held_out = set(), set()
+    trained = set()
     for seed in range(10):
-        for stage in demo_stages(DemoConfig(seed=seed)):
-            if stage.name not in ("filtered", "merge"):  # the first one's command needs the dataset
-                seeds = {
+        for stage in Demo(DemoConfig(seed=seed)).stages():
+            if stage.name not in ("unseen", "imagined"):  # they need a dataset, and have the evaluation's
+                seeds = [
                     int(flag.partition("=")[2]) for flag in stage.command() if flag.startswith("--seed=")
-                }
-                (held_out if stage.name.startswith(("eval", "imagine", "checked")) else trained).update(seeds)
-    assert len(trained) == 20
-    assert len(held_out) == 2
-    assert min(held_out) - max(trained) >= 50_000
+                ]
+                trained.update(seeds)
+    assert trained == {100_000 * seed for seed in range(10)}
+    assert EVALUATION_SEED - max(trained) >= 2 * ROLLOUT_SEED_OFFSET
 
 
 def test_with_cuda_a_stage_is_a_fresh_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

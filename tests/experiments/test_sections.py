@@ -4,6 +4,7 @@ from typing import Any
 
 from experiments.policy_sections import demo
 from lerobot_wmrl.common.statistics import PairedChange, Proportion
+from lerobot_wmrl.improve.stages import CLONED, DISTILLED
 
 
 def test_the_demo_s_section_says_what_ppo_added_to_the_rival() -> None:
@@ -11,13 +12,18 @@ def test_the_demo_s_section_says_what_ppo_added_to_the_rival() -> None:
     run: dict[str, Any] = {
         "seed": 0,
         "seconds": 2400.0,
-        "policies": {
-            policy: {"known": rate, "unseen": rate, "imagined": rate}
-            for policy in ("cloned", "filtered", "rl", "distilled")
+        "places": {
+            "in known scenes": {
+                "policies": dict.fromkeys(("as it was", CLONED, DISTILLED), rate),
+                "changes": [
+                    {"after": CLONED, "before": "as it was", "gained": 9, "lost": 9, "p_value": 1.0},
+                    {"after": DISTILLED, "before": CLONED, **change},
+                ],
+            }
         },
-        "changes": {"known": change, "unseen": change},
-        "replayed": {"filtered": {"false_positive_rate": rate}},
+        "gate": {"false_positive_rate": rate},
     }
     text = demo(lambda stem: {"demo": {"runs": [run]}}[stem])
-    assert "Seed 0, 40 minutes: 5 gained, 1 lost (p = 0.2) in known scenes" in text
-    assert "| 0 | cloned with successful rollouts | 40 % (17–69) | 40 % (17–69) | 40 % (17–69) |" in text
+    assert "Seed 0, 40 minutes: in known scenes 5 gained, 1 lost (p = 0.2)" in text
+    assert "begins with, the world model predicts 4 of 10 as successes" in text
+    assert f"| 0 | {CLONED} | 40 % (17–69) |" in text

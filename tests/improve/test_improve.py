@@ -23,12 +23,13 @@ from lerobot_wmrl.common.presets import preset_settings
 from lerobot_wmrl.common.stages import claimed
 from lerobot_wmrl.data.episodes import ChosenEpisodes, read_episodes
 from lerobot_wmrl.improve import stages
-from lerobot_wmrl.improve.findings import Findings, few_decisions
-from lerobot_wmrl.improve.report import trust, verdict
-from lerobot_wmrl.improve.stages import ImproveConfig, Improvement
+from lerobot_wmrl.improve.configuration_improve import ImproveConfig
+from lerobot_wmrl.improve.findings import few_decisions
+from lerobot_wmrl.improve.stages import CLONED, DISTILLED, FITTED, PPO
 from lerobot_wmrl.scripts.improve import improve, settings
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 from lerobot_wmrl.world_models.configuration_world_model import AnchoredConfig
+from tests.improve.made_up import improvement_of, made_commands
 from tests.pusht import record_pusht
 from tests.rl.checkpoints import save_untrained_policy
 
@@ -69,33 +70,36 @@ def test_with_a_real_environment_its_rollouts_are_learnt_from_and_success_is_mea
     assert "observation.image 96x96" in first.stdout
     assert "size tiny: about a minute on two cores, plus the time in pusht" in first.stdout
     assert "failures: 0. The world model will hardly tell them" in first.stdout
-    report = (folder / "report.md").read_text()
-    assert report.count(": 0 % (0 of 2; 0–66 %), `") == 3, "three policies"
-    assert "improved in imagination, against trained further on the successes: 0 starts gained" in report
+    report = (folder / "report.html").read_text()
+    assert report.count("<td>0 % (0 of 2; 0–66 %)</td>") == 4, "four policies"
+    assert f"{DISTILLED}, against {CLONED}: 0 starts gained" in report
+    assert f"{DISTILLED}, against {CLONED}: 0 starts gained" in first.stdout
+    assert "2 rollouts of the policy in pusht: 0 succeed" in report
     assert "Leave out columns" not in report
     merged = f"dataset.root={folder / 'merged'}"
-    assert report.count(merged) == 5, "cloning, tokenizer, world model, imagined starts twice"
+    assert report.count(merged) == 7, "cloning, tokenizer, world model, imagined starts thrice, driving"
     last = Path("checkpoints/last/pretrained_model")
     trained = json.loads((folder / "tokenizer" / last / "config.json").read_text())
     assert trained["tokenizer"]["frame_sizes"] == [[96, 96]]
-    assert (folder / "rl" / last).exists()
+    assert (folder / "distilled" / last).exists()
     again = run(tmp_path, demonstrations, *real)
-    assert "[9/9] Compare the policies: done in" in again.stdout
+    assert "[10/10] Compare the policies: done in" in again.stdout
 
 
 def test_without_one_the_report_says_that_it_is_a_belief(demonstrations: Path, tmp_path: Path) -> None:
     done = run(tmp_path, demonstrations, "--dataset.episodes=[0,2]")
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
-    report = (tmp_path / "improve" / "report.md").read_text()
+    report = (tmp_path / "improve" / "report.html").read_text()
     assert "Success in imagination" in report
     assert "shows nothing about the real world" in report
     assert "most of which it has learnt from" in report
     assert "2 episodes, " in done.stdout
-    assert report.count("dataset.episodes=[0,2]") == 5
+    assert report.count("dataset.episodes=[0,2]") == 7
 
 
 @pytest.mark.parametrize(("flags", "message"), [
     (["--rollouts=2"], "--rollouts=2: are recorded in a real environment; give --real_env.type"),
+    (["--real_env.type=pusht", "--rollouts=2", "--seed=949999"], "--seed=949999: must be from 0 to 949998"),
     (["--size=huge"], "--size=huge: choose one of auto, tiny, demo, cpu"),
     (["--policy.n_action_steps=8"], "--policy.n_action_steps=8: would hold for some of the commands only"),
     (["--dataset.root=nowhere"], "no LeRobotDataset there"),
@@ -207,7 +211,7 @@ def test_rollouts_are_merged_and_successes_cloned_before_rl(
     )
     config = improvement.config
     config.rollouts, config.real_env, config.dataset.episodes = 2, PushtEnv(), [0, 3]
-    before, cloned, improved = improvement.policies
+    before, cloned, ppo, distilled = improvement.policies.values()
     results = {
         "finished": True, "policies": {"a": {"share": 0.1}, "b": {"share": 0.9}},
         "pairs": [{"before": "a", "after": "b", "better": better and "b"}],
@@ -220,7 +224,9 @@ def test_rollouts_are_merged_and_successes_cloned_before_rl(
     assert {"--root=data", f"--new_root={folder / 'columns'}", "--operation.feature_names=['effort']"} <= {
         *commands["columns"]
     }
-    assert {f"--like.root={folder / 'columns'}", "--max_frames=80", "--video=true"} <= {*commands["rollouts"]}
+    assert {f"--like.root={folder / 'columns'}", "--max_frames=80", "--video=true", "--seed=50000"} <= {
+        *commands["rollouts"]
+    }
     assert f"--operation.roots=['{folder / 'columns'}', '{folder / 'rollouts'}']" in commands["merged"]
     episodes = [episode for episode in (0, 3, 4, 5) if success[episode]]
     assert 0 < len(episodes) < 4
@@ -233,7 +239,23 @@ def test_rollouts_are_merged_and_successes_cloned_before_rl(
     starts = {flag.replace("--", "--env.", 1) for flag in learnt}
     assert {*starts, f"--policies=[{cloned},{before}]", "--n_episodes=4"} <= {*commands["start"]}
     assert {*starts, f"--policy.path={before if better else cloned}"} <= {*commands["rl"]}
-    assert {f"--policies=[{before},{cloned},{improved}]", "--against=all"} <= {*commands["comparison"]}
+    planner = {"--algorithm.type=distillation", "--algorithm.recorded=false", "--gate.action=off"}
+    assert {*starts, *planner, f"--policy.path={ppo}"} <= {*commands["distilled"]}
+    assert {f"--policies=[{before},{cloned},{ppo},{distilled}]", "--against=all"} <= {*commands["comparison"]}
+
+
+@pytest.mark.parametrize(("kind", "names"), [
+    (CnnConfig, ["as it was", PPO, DISTILLED]),
+    (ACTConfig, ["as it was", PPO]),
+    (VQBeTConfig, ["as it was", FITTED]),
+])  # fmt: skip
+def test_only_policies_for_which_it_was_measured_are_fitted_to_a_planner_after_ppo(
+    kind: type[PreTrainedConfig], names: list[str], tmp_path: Path
+) -> None:
+    improvement = improvement_of(tmp_path, policy=kind(device="cpu", pretrained_path=tmp_path))
+    assert [*improvement.policies] == names
+    assert ("distilled" in [stage.name for stage in improvement.stages()]) == (DISTILLED in names)
+    assert str(improvement.improved) == improvement.policies[names[-1]]
 
 
 @pytest.mark.parametrize(("adapters", "pixels", "flags"), [
@@ -262,30 +284,6 @@ def test_a_folder_that_was_begun_with_other_stages_is_refused(tmp_path: Path) ->
         pass
 
 
-def test_the_report_compares_with_the_policy_cloned_from_the_successes(tmp_path: Path) -> None:
-    improvement = improvement_of(tmp_path, failures=20)
-    improvement.config.real_env = PushtEnv()
-    cloned = improvement.policies[1]
-
-    def pair(first: str, second: str, better: str | None) -> dict[str, Any]:
-        return {"before": first, "after": second, "better": better, "gained": 3, "lost": 1, "p_value": 0.04}
-
-    write_json(tmp_path / "comparison" / "comparison.json", {
-        "policies": {name: {"k": k, "n": 10} for name, k in (("x", 4), ("y", 6), ("z", 5))},
-        "pairs": [pair("x", "y", "y"), pair("x", "z", None), pair("y", "z", "y")],
-    })  # fmt: skip
-    said = verdict(improvement)
-    assert f"- trained further on the successes: 60 % (6 of 10; 31–83 %), `{cloned}`" in said
-    assert (
-        "- trained further on the successes, against as it was: 3 starts gained, 1 lost, p = 0.04: better"
-        in said
-    )
-    assert (
-        "- improved in imagination, against as it was: 3 starts gained, 1 lost, p = 0.04: not decided" in said
-    )
-    assert "against trained further on the successes: 3 starts gained, 1 lost, p = 0.04: worse" in said
-
-
 def test_where_the_strict_threshold_recognises_nothing_the_check_s_own_is_taken(tmp_path: Path) -> None:
     point = {"done_threshold": 0.5, "done_frames": 1}
     for hits, found in ((0, point), (3, None)):
@@ -305,43 +303,3 @@ def test_a_policy_that_seldom_decides_is_named(make_synthetic_dataset: Any, tmp_
         "act takes 100 actions at a time, and an imagined episode has about 98 frames"
         in (few_decisions(ACTConfig(device="cpu"), table)[0])
     )
-
-
-def test_the_report_says_that_success_was_taken_for_less(tmp_path: Path) -> None:
-    share = {"k": 3, "n": 4}
-    point = {
-        "done_threshold": 0.5,
-        "done_frames": 1,
-        "false_positive_rate": {"k": 0, "n": 9},
-        "recall": share,
-    }
-    found = {"true_positives": 0, "successes": 4, "failures": 9, "false_positives": 0, "auc": 0.9}
-    found |= {"dataset": str(tmp_path / "merged"), "split": "all", "seen_auc": 0.44}
-    write_json(tmp_path / "check" / "metrics.json", found | {"operating_point": point})
-    said = trust(improvement_of(tmp_path))
-    assert "imagination took done_threshold=0.5 and done_frames=1, chosen on the same episodes" in said
-    assert "3 of 4" in said
-    assert "the success classifier has an AUC of 0.44: it hardly sees success in them" in said
-    assert "`--size=cpu` has larger frames" in said
-    assert "larger" not in trust(improvement_of(tmp_path, frame_side=64))
-    assert "On 13 rollouts (most of which it has learnt from): false" in said
-
-
-def improvement_of(
-    folder: Path, size: str = "demo", policy: PreTrainedConfig | None = None, **found: int
-) -> Improvement:
-    """Return the stages for data of which this was found: 40 short episodes unless something else is said."""
-    policy = policy or CnnConfig(device="cpu", pretrained_path=folder)
-    data = {
-        "frame_side": 96, "pixels": 96**2, "episodes": 40, "held_out": 2, "fewest": 40, "longest": 40,
-        "usual": 40, "success_frames": 1000, "failures": 0, "total": 40, "held": 2,
-    }  # fmt: skip
-    config = ImproveConfig(policy=policy, dataset=ChosenEpisodes("data"), size=size, output_dir=folder)
-    return Improvement(
-        config, Findings([], [], ["top"], **{**data, "root": Path("data"), "columns": {}, **found})
-    )
-
-
-def made_commands(folder: Path, *given: Any, **found: Any) -> dict[str, list[str]]:
-    """Return the commands of such stages by name."""
-    return {stage.name: stage.command() for stage in improvement_of(folder, *given, **found).stages()}

@@ -31,8 +31,9 @@ from lerobot_wmrl.common.policies import (
 )
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data.episodes import ChosenEpisodes, read_episodes
+from lerobot_wmrl.improve.configuration_improve import ImproveConfig
 from lerobot_wmrl.improve.findings import look
-from lerobot_wmrl.improve.stages import ImproveConfig, Improvement
+from lerobot_wmrl.improve.stages import Improvement
 from lerobot_wmrl.rl.algorithm import frozen_copy
 from lerobot_wmrl.scripts.convert_openvla import ConvertOpenVLAConfig, convert
 from lerobot_wmrl.scripts.train import main

@@ -67,7 +67,7 @@ ROLL_OUT = ["--policy.path={policy}", *SIMULATOR, "--num_episodes=1"]
     (convert_openvla, [*IMPORT, NEW], "policy: tokenizer.json is missing beside"),
     (convert_openvla, ["--direction=export", "--source={policy}", NEW], "of type cnn"),
     (demo, ["--preset=huge"], "--preset=huge: unknown preset"),
-    (demo, ["--stage_preset=huge"], "--preset=huge: unknown preset"),
+    (demo, ["--size=huge"], "--size=huge: choose one of tiny, demo"),
     (demo, ["--output_dir={foreign}"], "holds what this command did not make"),
     (demo, ["--sead=1"], "--sead"),
 ])  # fmt: skip

@@ -1,5 +1,6 @@
 """The whole loop at the size `tiny`: real commands, killed once on the way, and what they leave behind."""
 
+import html
 import json
 import re
 import signal
@@ -14,20 +15,27 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.presets import preset_settings
 from lerobot_wmrl.common.tracking import read_metrics
-from lerobot_wmrl.demo.stages import MEASURED, DemoConfig, demo_stages
+from lerobot_wmrl.demo.stages import Demo, DemoConfig
+from lerobot_wmrl.improve.stages import CLONED, DISTILLED, PPO
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
-KILLED_STAGE = "rollouts"
-STAGES = [stage.name for stage in demo_stages(DemoConfig())]
+KILLED_STAGE = "improve/rollouts"
+STAGES = [stage.name for stage in Demo(DemoConfig()).stages()]
+IMPROVED = (
+    "rollouts", "merged", "cloned", "tokenizer", "world_model", "check", "start", "rl", "distilled",
+    "comparison",
+)  # fmt: skip
+PLACES = ("in known scenes", "in unseen scenes", "in imagination")
 HEADINGS = (
     "Success on the same data",
+    "The data",
     "Can the world model be trusted?",
     "Recorded beside imagined",
     "Goal frames",
     "The reward along recorded episodes",
     "Drive it",
 )
-FOLDED = ("Training", "The data", "Time and memory", "The commands")
+FOLDED = ("Training", "Time and memory", "The commands")
 
 
 def start_demo(folder: Path) -> subprocess.Popen[str]:
@@ -36,7 +44,9 @@ def start_demo(folder: Path) -> subprocess.Popen[str]:
 
 
 def stage_record(demo: Path, name: str) -> dict[str, object]:
-    path = demo / "stages" / f"{name}.json"
+    """Return what is known of a stage, `improve/<name>` of those of the improvement."""
+    *folder, name = name.split("/")
+    path = Path(demo, *folder, "stages", f"{name}.json")
     return json.loads(path.read_text()) if path.exists() else {}
 
 
@@ -57,12 +67,18 @@ def outputs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     return folder / "demo", printed
 
 
+def all_stages() -> list[str]:
+    return [*STAGES, *(f"improve/{name}" for name in IMPROVED)]
+
+
 def test_a_killed_run_continues_after_its_last_finished_stage(outputs: tuple[Path, str]) -> None:
+    """Within the improvement too."""
     demo, printed = outputs
-    number = STAGES.index(KILLED_STAGE) + 1
+    number = STAGES.index("improve") + 1
     assert re.search(rf"^\[{number - 1}/{len(STAGES)}\] .*: done in \d+ s$", printed, re.MULTILINE)
     assert re.search(rf"^\[{number}/{len(STAGES)}\] [^:]*$", printed, re.MULTILINE)
-    assert all(stage_record(demo, name)["finished"] for name in STAGES)
+    assert f"[1/{len(IMPROVED)}] Record rollouts of the policy\n" in printed
+    assert all(stage_record(demo, name)["finished"] for name in all_stages())
 
 
 def test_a_finished_run_does_nothing_again(outputs: tuple[Path, str]) -> None:
@@ -82,80 +98,65 @@ def written(demo: Path) -> dict[Path, int]:
 
 def test_the_dataset_reopens_and_holds_successes_and_failures(outputs: tuple[Path, str]) -> None:
     demo, _ = outputs
-    dataset = LeRobotDataset("local/demo", root=demo / "dataset")
+    root = demo / "improve" / "merged"
+    dataset = LeRobotDataset("local/merged", root=root)
     frame = dataset[len(dataset) - 1]
     assert frame["observation.images.third_view"].shape[0] == 3
     assert frame["observation.state"].shape == (8,)
     assert frame["action"].shape == (7,)
-    success = recorded_episodes(demo / "dataset")["success"]
-    assert len(success) == dataset.num_episodes
+    given = preset_settings("tiny", "demo")
+    success = recorded_episodes(root)["success"]
+    assert len(success) == dataset.num_episodes == given["demonstrations"] + given["rollouts"]
     assert 0 < success.sum() < len(success)
 
 
 def test_no_held_out_seed_is_trained_on(outputs: tuple[Path, str]) -> None:
     demo, _ = outputs
-    for dataset in ("demonstrations", "rollouts", "dataset"):
-        assert recorded_episodes(demo / dataset)["seed"].max() < EVALUATION_SEED
-    for policy in ("filtered", "distilled"):
-        rollouts = recorded_episodes(demo / f"checked_{policy}")["seed"]
-        evaluated = range(
-            EVALUATION_SEED, EVALUATION_SEED + int(preset_settings("tiny", "demo")["eval_episodes"])
-        )
-        assert rollouts.min() >= EVALUATION_SEED
-        assert not set(rollouts.tolist()) & set(evaluated)
+    assert recorded_episodes(demo / "improve" / "merged")["seed"].max() < EVALUATION_SEED
+    for stage in ("improve/comparison", "unseen", "imagined"):
+        assert f"--seed={EVALUATION_SEED} " in str(stage_record(demo, stage)["command"])
 
 
-@pytest.mark.parametrize("where", ["known", "unseen"])
-def test_all_policies_meet_the_same_held_out_starts(outputs: tuple[Path, str], where: str) -> None:
+def test_all_policies_meet_the_same_starts_everywhere(outputs: tuple[Path, str]) -> None:
     demo, _ = outputs
     commands = [
-        {*str(stage_record(demo, f"eval_{where}_{policy}")["command"]).split()} for policy in MEASURED
+        str(stage_record(demo, stage)["command"]).split()
+        for stage in ("improve/comparison", "unseen", "imagined")
     ]
-    for other in commands[1:]:
-        assert {flag.partition("=")[0] for flag in commands[0] ^ other} == {"--policy.path", "--output_dir"}
-
-
-def test_everything_learns_from_the_demonstrations_and_the_rollouts(outputs: tuple[Path, str]) -> None:
-    demo, _ = outputs
-    given = preset_settings("tiny", "demo")
-    table = recorded_episodes(demo / "dataset")
-    assert len(table["episode"]) == given["demonstrations"] + given["rollouts"]
-    for stage in ("filtered", "frame_tokenizer", "action_world_model", "text_world_model", "rl", "distilled"):
-        assert "dataset.root=demo/dataset" in str(stage_record(demo, stage)["command"])
-
-
-def test_the_summary_counts_what_was_evaluated(outputs: tuple[Path, str]) -> None:
-    demo, _ = outputs
+    (policies,) = {flag for command in commands for flag in command if "--policies" in flag}
+    assert policies.count(",") == 3
     summary = json.loads((demo / "summary.json").read_text())
     n = preset_settings("tiny", "demo")["eval_episodes"]
-    for policy in MEASURED:
-        assert {row["n"] for row in summary["policies"][policy].values()} == {n}
-    for policy in ("filtered", "distilled"):
-        replayed = summary["replayed"][policy]
-        assert replayed["false_positive_rate"]["n"] + replayed["recall"]["n"] == len(
-            recorded_episodes(demo / f"checked_{policy}")["episode"]
-        )
+    assert [*summary["places"]] == [*PLACES]
+    for place in summary["places"].values():
+        assert [*place["policies"]] == ["as it was", CLONED, PPO, DISTILLED]
+        assert {rate["n"] for rate in place["policies"].values()} == {n}
     assert summary["peak_memory_bytes"] < 8e9
 
 
 def test_training_left_metrics_and_whole_checkpoints(outputs: tuple[Path, str]) -> None:
     demo, _ = outputs
-    for folder in ("frame_tokenizer", "action_world_model", "text_world_model", "rl", "distilled"):
+    improved = ("tokenizer", "world_model", "rl", "distilled")
+    models = ("text_world_model", *(f"improve/{name}" for name in improved))
+    for folder in models:
         assert read_metrics(demo / folder), f"{folder} has no metrics"
     whole = {"config.json", "model.safetensors", "train_config.json"}
-    for folder in ("frame_tokenizer", "action_world_model", "text_world_model", *MEASURED):
+    for folder in (*models, "cloned", "improve/cloned"):
         checkpoint = demo / folder / "checkpoints" / "last" / "pretrained_model"
         assert whole <= {path.name for path in checkpoint.iterdir()}
 
 
 def test_the_page_stands_alone_and_shows_every_part(outputs: tuple[Path, str]) -> None:
-    demo, _ = outputs
+    demo, printed = outputs
     page = (demo / "report.html").read_text()
     assert not re.findall(r"""(?:src|href)=["'](?!data:)""", page), "the page needs other files"
+    for place in PLACES:
+        assert f"<h3>Success {place}</h3>" in page
     for heading in HEADINGS:
         assert f"<h2>{heading}</h2>" in page
     for heading in FOLDED:
         assert f"<summary>{heading}</summary>" in page
     assert page.count("data:image/") >= 12
-    for name in STAGES:
-        assert str(stage_record(demo, name)["title"]) in page
+    for name in all_stages():
+        assert name == "improve" or str(stage_record(demo, name)["command"]) in html.unescape(page)
+    assert "The report: demo/report.html" in printed

@@ -2,13 +2,12 @@
 
 import base64
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from matplotlib.figure import Figure
 
 from lerobot_wmrl.common.statistics import Proportion
-from lerobot_wmrl.demo.report.results import Curve
 
 COLOURS = ("#2b6cb0", "#dd6b20", "#2f855a", "#805ad5")
 
@@ -28,15 +27,14 @@ def drawn(figure: Figure) -> str:
     return data_url(buffer.getvalue(), "png")
 
 
-def success_bars(rates: Mapping[str, Mapping[str, Proportion]]) -> str:
+def success_bars(places: Mapping[str, Mapping[str, Proportion]]) -> str:
     """Draw each policy's success with 95 % intervals, a bar a place."""
     figure = Figure(figsize=(8, 3.4))
     axes = figure.subplots()
-    places = list(next(iter(rates.values())))
     width = 0.8 / len(places)
-    for offset, place in enumerate(places):
-        for group, row in enumerate(rates.values()):
-            rate, x = row[place], group + (offset - (len(places) - 1) / 2) * width
+    for offset, (place, rates) in enumerate(places.items()):
+        for group, rate in enumerate(rates.values()):
+            x = group + (offset - (len(places) - 1) / 2) * width
             low, high = rate.interval
             label = place if group == 0 else None
             axes.bar(x, rate.share, width=0.92 * width, color=COLOURS[offset], label=label)
@@ -44,20 +42,20 @@ def success_bars(rates: Mapping[str, Mapping[str, Proportion]]) -> str:
             axes.annotate(
                 f"{100 * rate.share:.0f} %", (x, high), (0, 3), textcoords="offset points", ha="center"
             )
-    axes.set_xticks(range(len(rates)), list(rates))
+    titles = [title.replace(" ", "\n", 1) for title in next(iter(places.values()))]
+    axes.set_xticks(range(len(titles)), titles)
     axes.set_ylim(0, 1.3)
     axes.set_ylabel("success rate")
     return drawn(tidy(figure))
 
 
-def curves(named: Mapping[str, Curve], title: str, xlabel: str = "step") -> str:
-    """Draw one panel with a line a name."""
+def curve(steps: Sequence[float], values: Sequence[float], title: str) -> str:
+    """Draw a line."""
     figure = Figure(figsize=(4.6, 2.9))
     axes = figure.subplots()
-    for colour, (name, (steps, values)) in zip(COLOURS * 4, named.items(), strict=False):
-        axes.plot(steps, values, color=colour, label=name, linewidth=1.4)
+    axes.plot(steps, values, color=COLOURS[0], linewidth=1.4)
     axes.set_title(title, fontsize=11)
-    axes.set_xlabel(xlabel)
+    axes.set_xlabel("step")
     return drawn(tidy(figure))
 
 

@@ -1,0 +1,132 @@
+"""Configuration of lerobot-wmrl-improve."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import ClassVar, Final
+
+import torch
+from lerobot.configs import PreTrainedConfig, parser
+from lerobot.envs.configs import EnvConfig
+
+from lerobot_wmrl.common.command_line import RunConfig
+from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
+from lerobot_wmrl.common.policies import (
+    read_policy_config,
+    require_chunks,
+    require_single_observations,
+    require_trained,
+)
+from lerobot_wmrl.common.presets import Flags
+from lerobot_wmrl.data.episodes import ChosenEpisodes
+
+SIZES: Final = ("auto", "tiny", "demo", "cpu")
+"""Presets of the stages; `auto` is `cpu` with CUDA and `demo` without."""
+
+ROLLOUT_SEED_OFFSET: Final = 50_000
+"""Offset of the seeds of rollouts: episodes of the dataset may have been recorded with the same seed."""
+
+ALGORITHMS: Final[dict[str, Flags]] = {
+    "cnn": {"algorithm.type": "ppo", "algorithm.train_encoder": False},
+    "act": {"algorithm.type": "ppo", "algorithm.policy_lr": 1e-5, "algorithm.initial_std": 0.1},
+    "openvla": {"algorithm.type": "ppo", "algorithm.initial_std": "null"},
+}
+"""How policies of a type are trained."""
+
+OTHERS: Final[Flags] = {"algorithm.type": "distillation"}
+"""How all others are: they are fitted to a planner in the world model."""
+
+DISTILLED: Final = ("cnn",)
+"""Types that are fitted to a planner after PPO too. Others were not measured."""
+
+
+@dataclass
+class ImproveConfig(RunConfig):
+    """Improve a policy with a dataset, inside a world model that learns from it.
+
+    The command looks at the data and says what it has and lacks. It trains the policy further on all episodes
+    that succeed, and trains a frame tokenizer, a world model and, in imagination, the policy. In the end it
+    compares the policy before, trained further, and improved: in `real_env` if there is one, else in
+    imagination, which proves nothing about the real world. Every stage is a command that you could call
+    yourself; it is printed. Running the same command again continues. The page to read is `report.html`.
+
+    Args:
+        policy: `--policy.path=FOLDER` or a name on the hub: the policy to improve, cloned from such data.
+        dataset: `--dataset.repo_id=USER/NAME` or `--dataset.root=FOLDER`: episodes with actions, the cameras
+            that the policy sees, and next.success. Failures belong into it.
+        real_env: `--real_env.type=…` and its settings: one of LeRobot's environments or wmrl_maniskill, to
+            record rollouts and to measure success in.
+        rollouts: rollouts of the policy that are recorded in `real_env` first, and learnt from. Columns of
+            the dataset that these lack are left out of what is learnt from.
+        exploration: noise on the actions of these rollouts, as a share of half their range.
+        size: how large models are and how long they train: `demo` (an hour on two cores), `cpu` (several),
+            `tiny` (a minute, to try the command), or `auto`.
+        iterations: of PPO, or of distillation if the policy is not trained by PPO; by default those of the
+            size.
+        eval_episodes: starts on which the policies are compared.
+        seed: of recording and training. Evaluation has seeds of its own, from 1,000,000 on.
+        output_dir: folder of everything.
+    """
+
+    path_fields: ClassVar[list[str]] = ["policy"]
+
+    policy: PreTrainedConfig | None = None
+    dataset: ChosenEpisodes = field(default_factory=ChosenEpisodes)
+    real_env: EnvConfig | None = None
+    rollouts: int = 0
+    exploration: float = 0.2
+    size: str = "auto"
+    iterations: int | None = None
+    eval_episodes: int = 100
+    seed: int = 0
+    output_dir: Path = Path("outputs/improve")
+
+    def check(self) -> None:
+        """Read the policy's configuration. FieldError for a setting that cannot be."""
+        path = parser.get_path_arg("policy")
+        if path:
+            for flag in parser.get_cli_overrides("policy") or []:
+                name, _, value = flag.removeprefix("--").partition("=")
+                raise FieldError(
+                    f"policy.{name}", value, "would hold for some of the commands only",
+                    "set it in the policy's config.json",
+                )  # fmt: skip
+            self.policy = read_policy_config(path, [])
+        if self.policy is None:
+            raise FieldError("policy.path", None, "is missing", "give the policy to improve")
+        require_trained(self.policy)
+        if self.policy.type not in ALGORITHMS:
+            require_single_observations(self.policy)
+        if self.policy.type == "act":
+            require_chunks(self.policy)
+        if not self.dataset.given:
+            raise FieldError("dataset.root", "", "is missing", "give `dataset.root` or `dataset.repo_id`")
+        require_choice(self, "size", SIZES)
+        require_at_least(self, 0, "rollouts")
+        require_at_least(self, 1, "eval_episodes")
+        if self.rollouts and self.real_env is None:
+            raise FieldError(
+                "rollouts", self.rollouts, "are recorded in a real environment", "give `real_env.type`"
+            )
+        last = EVALUATION_SEED - ROLLOUT_SEED_OFFSET - max(1, self.rollouts)
+        if not 0 <= self.seed <= last:
+            raise FieldError(
+                "seed", self.seed, f"must be from 0 to {last}, so that no evaluation seed is trained on"
+            )
+
+    @property
+    def preset(self) -> str:
+        """The stages' preset."""
+        automatic = "cpu" if torch.cuda.is_available() else "demo"
+        return automatic if self.size == "auto" else self.size
+
+    @property
+    def algorithm(self) -> Flags:
+        """How a policy of this type is trained."""
+        assert self.policy is not None
+        return ALGORITHMS.get(self.policy.type, OTHERS)
+
+    @property
+    def distils(self) -> bool:
+        """Whether the policy is fitted to a planner after PPO."""
+        return self.policy is not None and self.policy.type in DISTILLED

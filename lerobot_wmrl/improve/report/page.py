@@ -1,0 +1,137 @@
+"""The page: `report.html`, which needs no other file, and `summary.json`."""
+
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jinja2
+
+from lerobot_wmrl.common.files import write_json, write_text
+from lerobot_wmrl.improve.report import figures
+from lerobot_wmrl.improve.report.results import Place, read_check, read_gate, training_curves
+from lerobot_wmrl.improve.report.words import compared, gate_line, reservation, rollouts_line, trust
+from lerobot_wmrl.improve.stages import Improvement
+
+PAGE = "report.html"
+
+CHECKED = ("false_positives", "failures", "true_positives", "successes")
+"""What the check counted."""
+
+PICTURE_SECTIONS = (
+    (
+        "comparison",
+        "Recorded beside imagined",
+        "The same episode twice, from the same first frame and with the same actions: above as it was "
+        "recorded, below as the world model imagined it.",
+    ),
+    (
+        "goal",
+        "Goal frames",
+        "What the text world model expects the scene to look like when the task is done.",
+    ),
+    (
+        "reward",
+        "The reward along recorded episodes",
+        "A successful and a failed episode, with the reward that the world models give each frame.",
+    ),
+    (
+        "accuracy",
+        "How long the imagination stays true",
+        "The distance between imagined and recorded frames, by the number of frames imagined so far.",
+    ),
+)
+"""Start of the pictures' file names, heading, and what to look for."""
+
+
+@dataclass(frozen=True)
+class Page:
+    """A page about an improvement.
+
+    Args:
+        improvement: what was done.
+        records: of the stages that were run, in order.
+        title: the page's heading.
+        places: where the policies were compared.
+        replays: folders with pictures of replayed episodes, by whose they are.
+    """
+
+    improvement: Improvement
+    records: Sequence[dict[str, Any]]
+    title: str
+    places: Sequence[Place]
+    replays: Mapping[str, Path] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, improvement: Improvement, records: Sequence[dict[str, Any]]) -> "Page":
+        """Return the page of an improvement by itself."""
+        title = f"{improvement.policy}, improved in imagination"
+        replays = {"episodes of the check": improvement.out / "check"}
+        return cls(improvement, records, title, [compared(improvement)], replays)
+
+    def write(self, folder: Path) -> Path:
+        """Write summary.json and the page into a folder; return the page."""
+        summary = self.summary()
+        write_json(folder / "summary.json", summary)
+        write_text(folder / PAGE, self._render(summary))
+        return folder / PAGE
+
+    def summary(self) -> dict[str, Any]:
+        """Return every headline number as JSON."""
+        config = self.improvement.config
+        check, gate = read_check(self.improvement), read_gate(self.improvement)
+        return {
+            "size": config.preset,
+            "seed": config.seed,
+            "places": {place.name: place.as_json() for place in self.places},
+            "check": {
+                name: check[name] for name in ("false_positives", "failures", "true_positives", "successes")
+            },
+            "gate": gate and gate["fresh"],
+            "seconds": sum(record["seconds"] for record in self.records),
+            "peak_memory_bytes": max(record["peak_memory_bytes"] for record in self.records),
+        }
+
+    def _render(self, summary: Mapping[str, Any]) -> str:
+        """Fill the template, with every picture inside the page."""
+        environment = jinja2.Environment(
+            loader=jinja2.PackageLoader("lerobot_wmrl.improve.report", "."),
+            autoescape=True,
+            undefined=jinja2.StrictUndefined,
+        )
+        gate = read_gate(self.improvement)
+        return environment.get_template("template.html").render(
+            title=self.title,
+            size=summary["size"],
+            seed=summary["seed"],
+            minutes=round(summary["seconds"] / 60, 1),
+            peak_memory=f"{summary['peak_memory_bytes'] / 1e9:.1f}",
+            paths=self.improvement.policies,
+            places=self.places,
+            reservations=reservation(self.improvement),
+            bars=figures.success_bars({place.name: place.rates for place in self.places}),
+            data=[*self.improvement.found.lines, *rollouts_line(self.improvement)],
+            missing=self.improvement.found.missing,
+            trust=[line for line in (trust(self.improvement), gate_line(self.improvement)) if line],
+            warning=gate and gate["warning"],
+            pictures=picture_sections(self.replays),
+            curves=[figures.curve(*line, title) for title, line in training_curves(self.improvement).items()],
+            drive=shlex.join(self.improvement.drive()),
+            stages=self.records,
+        )
+
+
+def picture_sections(replays: Mapping[str, Path]) -> list[dict[str, Any]]:
+    """Collect the pictures of the replays by section, `<folder>/<section>*.png|gif`."""
+    sections = []
+    for stem, title, text in PICTURE_SECTIONS:
+        images = [
+            {"url": figures.picture(path), "caption": f"{whose}: {path.stem.replace('_', ' ')}"}
+            for whose, folder in replays.items()
+            for path in sorted(folder.glob(f"{stem}*"))
+            if path.suffix in (".png", ".gif")
+        ]
+        if images:
+            sections.append({"title": title, "text": text, "images": images})
+    return sections

@@ -1,0 +1,152 @@
+"""Results of an improvement, read from what its commands wrote: success, training curves, the gate."""
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lerobot_wmrl.common.statistics import PairedChange, Proportion
+from lerobot_wmrl.common.tracking import read_metrics
+from lerobot_wmrl.evaluation.comparison import RESULTS
+from lerobot_wmrl.improve.stages import Improvement
+
+MODELS = {"tokenizer": "Frame tokenizer", "world_model": "World model"}
+"""Models that are trained, by their folders."""
+
+PANELS = {
+    "ppo": {
+        "success_rate": "PPO: imagined success",
+        "reward": "PPO: reward a step",
+        "reference_kl": "PPO: KL to the policy that it began with",
+    },
+    "distillation": {
+        "success_rate": "Planner: imagined success after the policy's first steps",
+        "policy_loss": "Fitting to the planner: loss",
+    },
+}
+"""Columns of each algorithm's metrics, and their titles."""
+
+type Curve = tuple[list[float], list[float]]
+"""Steps and values."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """What one policy gained over another on the same starts."""
+
+    after: str
+    before: str
+    change: PairedChange
+    decision: str
+
+    def __str__(self) -> str:
+        return (
+            f"{self.after}, against {self.before}: {self.change.gained} starts gained, {self.change.lost} "
+            f"lost, p = {self.change.p_value:.2g}: {self.decision}"
+        )
+
+
+@dataclass(frozen=True)
+class Place:
+    """Success of the policies in one place, on the same starts.
+
+    Args:
+        name: the place, as a phrase: `in pusht`.
+        rates: success of each policy.
+        changes: of each pair.
+        outcomes: success of each policy from each start.
+    """
+
+    name: str
+    rates: Mapping[str, Proportion]
+    changes: Sequence[Change]
+    outcomes: Mapping[str, Sequence[bool]]
+
+    def as_json(self) -> dict[str, Any]:
+        return {
+            "policies": {title: rate.as_json() for title, rate in self.rates.items()},
+            "changes": [
+                {"after": each.after, "before": each.before, "decision": each.decision,
+                 **each.change.as_json()}
+                for each in self.changes
+            ],
+            "outcomes": dict(self.outcomes),
+        }  # fmt: skip
+
+
+def read_place(name: str, folder: Path, titles: Sequence[str]) -> Place:
+    """Read a comparison of policies, which have these titles, in this order."""
+    found = read_json(folder / RESULTS)
+    named = dict(zip(found["policies"], titles, strict=True))
+    rates = {named[path]: Proportion(rate["k"], rate["n"]) for path, rate in found["policies"].items()}
+    changes = [
+        Change(
+            named[pair["after"]],
+            named[pair["before"]],
+            PairedChange(pair["gained"], pair["lost"]),
+            decision(pair),
+        )
+        for pair in found["pairs"]
+    ]
+    outcomes = {
+        title: [episode["successes"][index] for episode in found["episodes"]]
+        for index, title in enumerate(titles)
+    }
+    return Place(name, rates, changes, outcomes)
+
+
+def decision(pair: Mapping[str, Any]) -> str:
+    """Say whether the second policy of a pair is decided to be better or worse than the first."""
+    if pair["better"] is None:
+        return "not decided"
+    return "better" if pair["better"] == pair["after"] else "worse"
+
+
+def read_check(improvement: Improvement) -> dict[str, Any]:
+    """Read what the world model says of recorded episodes."""
+    return read_json(improvement.out / "check" / "metrics.json")
+
+
+def read_gate(improvement: Improvement) -> dict[str, Any] | None:
+    """Read what the gate found before RL; None if there was none."""
+    records = sorted((improvement.out / "rl" / "gate").glob("*/record.json"))
+    return read_json(records[-1]) if records else None
+
+
+def training_curves(improvement: Improvement) -> dict[str, Curve]:
+    """Read losses, and what RL logs, by title."""
+    out = improvement.out
+    found = {title: curve(read_metrics(out / folder), "loss") for folder, title in MODELS.items()}
+    if improvement.clones:
+        found["Cloning"] = lerobot_train_curve(out / "logs" / "cloned.log")
+    runs = {"rl": str(improvement.config.algorithm["algorithm.type"])}
+    runs |= {"distilled": "distillation"} if improvement.config.distils else {}
+    for folder, algorithm in runs.items():
+        rows = read_metrics(out / folder)
+        found |= {title: curve(rows, column) for column, title in PANELS[algorithm].items()}
+    return {title: each for title, each in found.items() if each[0]}
+
+
+def curve(metrics: Sequence[Mapping[str, Any]], name: str) -> Curve:
+    """Return a column of a metrics file without rows that lack it."""
+    rows = [(row["step"], row[name]) for row in metrics if isinstance(row.get(name), int | float)]
+    return [float(step) for step, _ in rows], [float(value) for _, value in rows]
+
+
+def lerobot_train_curve(log: Path, name: str = "loss") -> Curve:
+    """Read the log lines of lerobot-train, `… step:200 … loss:0.123 …`: it keeps its numbers nowhere else.
+
+    After a resume the later line of a step wins.
+    """
+    found: dict[float, float] = {}
+    for step, value in re.findall(rf"step:(\d+K?)\b.*?\b{name}:([-\d.e]+)", log.read_text(errors="replace")):
+        found[float(step.rstrip("K")) * (1000 if step.endswith("K") else 1)] = float(value)
+    return sorted(found), [found[step] for step in sorted(found)]
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read what a stage wrote."""
+    found: dict[str, Any] = json.loads(path.read_text())
+    return found

@@ -1,0 +1,103 @@
+"""What the report and the command say: what was gained, and whether the world model can be trusted."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from lerobot_wmrl.common.statistics import Proportion
+from lerobot_wmrl.evaluation.gate import DOUBTFUL_AUC
+from lerobot_wmrl.evaluation.report import seen_line
+from lerobot_wmrl.improve.report.results import Place, read_check, read_gate, read_place
+from lerobot_wmrl.improve.stages import DONE_THRESHOLD, Improvement
+
+
+def compared(improvement: Improvement) -> Place:
+    """Read the comparison that ends an improvement."""
+    real = improvement.config.real_env
+    where = "in imagination, from frames of the dataset" if real is None else f"in {real.type}"
+    return read_place(where, improvement.out / "comparison", [*improvement.policies])
+
+
+def rollouts_line(improvement: Improvement) -> list[str]:
+    """Say how many of the recorded rollouts succeed; nothing without rollouts."""
+    real = improvement.config.real_env
+    if real is None or not improvement.config.rollouts:
+        return []
+    success = improvement.table().success[[*improvement.rollout_numbers()]]
+    return [f"{len(success)} rollouts of the policy in {real.type}: {success.sum()} succeed"]
+
+
+def verdict(improvement: Improvement, places: Sequence[Place]) -> str:
+    """Say in a few lines what the last policy gained over each other one, and where."""
+    paths = improvement.policies
+    *_, last = paths
+    said = []
+    for place in places:
+        rates = [f"- {title}: {rate}, `{paths[title]}`" for title, rate in place.rates.items()]
+        changes = [f"- {change}" for change in place.changes if change.after == last]
+        said.append("\n".join([f"Success {place.name}:", *rates, "On the same starts:", *changes]))
+    return "\n\n".join([*said, *reservation(improvement)])
+
+
+def reservation(improvement: Improvement) -> list[str]:
+    """Say that a success in imagination alone is no success yet; nothing with a real environment."""
+    if improvement.config.real_env is not None:
+        return []
+    return [
+        "This is what the world model predicts, and shows nothing about the real world. Run the policies "
+        "there, label what they did, and run the command again on all episodes."
+    ]
+
+
+def trust(improvement: Improvement) -> str:
+    """Say how well the world model tells recorded successes from failures."""
+    found = read_check(improvement)
+    wins, losses = found["successes"], found["failures"]
+    whose = "rollouts" if Path(found["dataset"]) == improvement.out / "merged" else "episodes"
+    held_out = found["split"] == "validation"
+    kind = f"held-out {whose}" if held_out else f"{whose} (most of which it has learnt from)"
+    if not wins or not losses:
+        return (
+            f"Unknown: of the {kind} {wins} succeed and {losses} fail, and both are needed. Record more."
+            f"{taken_instead(improvement)}"
+        )
+    false, recall = Proportion(found["false_positives"], losses), Proportion(found["true_positives"], wins)
+    said = (
+        f"On {wins + losses} {kind}: false positives {false}, recall {recall}, AUC {found['auc']:.2f} (the "
+        "probability that a success scores higher than a failure; 0.5 is chance)."
+    )
+    if found["auc"] < DOUBTFUL_AUC:
+        said += " That is not enough to trust its reward: record more episodes, failures above all."
+    if (seen := found.get("seen_auc")) is not None:
+        larger = " `--size=cpu` has larger frames." if improvement.could_be_larger else ""
+        said += f" {seen_line(seen, larger)}"
+    return said + taken_instead(improvement)
+
+
+def gate_line(improvement: Improvement) -> str | None:
+    """Say how well it judged fresh rollouts in the real environment before RL; None without any."""
+    record = read_gate(improvement)
+    if record is None:
+        return None
+    fresh = record["fresh"]
+    false, recall = (
+        Proportion(fresh[name]["k"], fresh[name]["n"]) for name in ("false_positive_rate", "recall")
+    )
+    return (
+        f"On {false.n + recall.n} fresh rollouts of the policy that RL began with: false positives {false}, "
+        f"recall {recall}."
+    )
+
+
+def taken_instead(improvement: Improvement) -> str:
+    """Say where imagination saw success, if not at the strict threshold."""
+    point = improvement.relaxed_criterion()
+    if point is None:
+        return ""
+    false, recall = (
+        Proportion(point[name]["k"], point[name]["n"]) for name in ("false_positive_rate", "recall")
+    )
+    return (
+        f" No success is recognised at done_threshold={DONE_THRESHOLD}: imagination took "
+        f"done_threshold={point['done_threshold']} and done_frames={point['done_frames']}, chosen on the "
+        f"same episodes (false positives {false}, recall {recall})."
+    )

@@ -1,0 +1,32 @@
+"""Improvements of data that does not exist."""
+
+from pathlib import Path
+from typing import Any
+
+from lerobot.configs import PreTrainedConfig
+
+from lerobot_policy_cnn.configuration_cnn import CnnConfig
+from lerobot_wmrl.data.episodes import ChosenEpisodes
+from lerobot_wmrl.improve.configuration_improve import ImproveConfig
+from lerobot_wmrl.improve.findings import Findings
+from lerobot_wmrl.improve.stages import Improvement
+
+
+def improvement_of(
+    folder: Path, size: str = "demo", policy: PreTrainedConfig | None = None, **found: int
+) -> Improvement:
+    """Return the stages for data of which this was found: 40 short episodes unless something else is said."""
+    policy = policy or CnnConfig(device="cpu", pretrained_path=folder)
+    data = {
+        "frame_side": 96, "pixels": 96**2, "episodes": 40, "held_out": 2, "fewest": 40, "longest": 40,
+        "usual": 40, "success_frames": 1000, "failures": 0, "total": 40, "held": 2,
+    }  # fmt: skip
+    config = ImproveConfig(policy=policy, dataset=ChosenEpisodes("data"), size=size, output_dir=folder)
+    return Improvement(
+        config, Findings([], [], ["top"], **{**data, "root": Path("data"), "columns": {}, **found})
+    )
+
+
+def made_commands(folder: Path, *given: Any, **found: Any) -> dict[str, list[str]]:
+    """Return the commands of such stages by name."""
+    return {stage.name: stage.command() for stage in improvement_of(folder, *given, **found).stages()}
