@@ -36,6 +36,9 @@ from lerobot_wmrl.common.processes import die_with, find_program, own_progress_l
 
 MARKER = "settings.json"
 
+FAILED = "failed"
+"""In the record of an optional stage that failed."""
+
 SAMPLE_SECONDS = 1.0
 """Seconds between two samples of memory and two reports of progress."""
 
@@ -50,12 +53,13 @@ class Stage:
     """One console command.
 
     The command is made when the stage starts: some of its flags depend on what earlier stages left, and what
-    an interrupted call left may have to be removed first.
+    an interrupted call left may have to be removed first. If an optional stage fails, the others go on.
     """
 
     name: str
     title: str
     command: Callable[[], list[str]]
+    optional: bool = False
 
 
 class StageError(RuntimeError):
@@ -131,10 +135,12 @@ def run_stages(
     """
     preload(modules, offline)
     for number, stage in enumerate(stages, start=1):
-        record = read_record(output_dir, stage)
+        record = read_record(output_dir, stage.name)
         heading = f"[{number}/{len(stages)}] {stage.title}"
         if record.get("finished"):
             print(f"{heading}: done in {record['seconds']:.0f} s", flush=True)
+        elif record.get(FAILED):
+            print(f"{heading}: failed, and is left out", flush=True)
         else:
             run_stage(stage, heading, output_dir, record)
 
@@ -153,12 +159,17 @@ def run_stage(stage: Stage, heading: str, output_dir: Path, record: dict[str, An
             "finished": finished,
         }
         record.update(measured)
-        write_json(record_path(output_dir, stage), record)
+        write_json(record_path(output_dir, stage.name), record)
 
     print(f"\n{heading}\n$ {shlex.join(command)}", flush=True)
     log = output_dir / "logs" / f"{stage.name}.log"
     log.parent.mkdir(parents=True, exist_ok=True)
     status = run_measured(command, log, save)
+    if status != 0 and stage.optional:
+        record[FAILED] = True
+        save(record["seconds"] - seconds, record["peak_memory_bytes"])
+        print(f"{stage.title}: exit status {status}. It is left out; its output is in {log}.", flush=True)
+        return
     if status != 0:
         raise StageError(
             f"{stage.title}: exit status {status}. Its output is in {log}; run the same command again to "
@@ -167,13 +178,13 @@ def run_stage(stage: Stage, heading: str, output_dir: Path, record: dict[str, An
     save(record["seconds"] - seconds, record["peak_memory_bytes"], finished=True)
 
 
-def record_path(output_dir: Path, stage: Stage) -> Path:
-    return output_dir / "stages" / f"{stage.name}.json"
+def record_path(output_dir: Path, name: str) -> Path:
+    return output_dir / "stages" / f"{name}.json"
 
 
-def read_record(output_dir: Path, stage: Stage) -> dict[str, Any]:
-    """Return what is known of a stage, nothing before its first second."""
-    path = record_path(output_dir, stage)
+def read_record(output_dir: Path, name: str) -> dict[str, Any]:
+    """Return what is known of the stage of that name, nothing before its first second."""
+    path = record_path(output_dir, name)
     return json.loads(path.read_text()) if path.exists() else {}
 
 

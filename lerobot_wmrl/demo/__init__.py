@@ -1,1 +1,1 @@
-"""The demo: console commands one after another, measured and resumable, and a report."""
+"""The whole loop as a demonstration: a policy from nothing, and its improvement."""

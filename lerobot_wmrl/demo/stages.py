@@ -12,13 +12,14 @@ from lerobot_wmrl.common.errors import FieldError, require_at_least, require_cho
 from lerobot_wmrl.common.lerobot_commands import train_command
 from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.common.presets import Flags, format_flags, preset_flags, presets_of
-from lerobot_wmrl.common.stages import Stage, read_record
-from lerobot_wmrl.data.episodes import ChosenEpisodes, read_episodes
+from lerobot_wmrl.common.stages import Stage
+from lerobot_wmrl.common.tracking import read_metrics
+from lerobot_wmrl.data.episodes import VALIDATION_EVERY, ChosenEpisodes, read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
-from lerobot_wmrl.improve.configuration_improve import ImproveConfig
+from lerobot_wmrl.improve.configuration_improve import ROLLOUT_SEED_OFFSET, ImproveConfig
 from lerobot_wmrl.improve.findings import look
-from lerobot_wmrl.improve.report.page import Page
-from lerobot_wmrl.improve.report.results import read_place
+from lerobot_wmrl.improve.report.page import Page, stage_records
+from lerobot_wmrl.improve.report.results import curve, lerobot_train_curve, read_place
 from lerobot_wmrl.improve.report.words import verdict
 from lerobot_wmrl.improve.stages import Improvement
 from lerobot_wmrl.rl.recorders import env_flags
@@ -55,7 +56,7 @@ class DemoConfig(RunConfig):
     Args:
         output_dir: folder of everything the demo makes.
         seed: seed of recording, training and PPO. The evaluation seeds stay the same.
-        size: of the stages, as in lerobot-wmrl-improve.
+        size: of every stage, `tiny` or `demo`.
         demonstrations: planned episodes with a human's pauses and detours that the first policy is cloned
             from.
         rollouts: noisy rollouts of that policy, labelled as successes and failures.
@@ -77,7 +78,13 @@ class DemoConfig(RunConfig):
             raise FieldError(
                 "seed", self.seed, f"must be from 0 to {last}, so that no evaluation seed is trained on"
             )
-        require_at_least(self, 1, "demonstrations", "rollouts", "eval_episodes")
+        require_at_least(self, 1, "demonstrations", "eval_episodes")
+        fewest, most = VALIDATION_EVERY - self.demonstrations, SEED_STRIDE - ROLLOUT_SEED_OFFSET
+        if not max(1, fewest) <= self.rollouts <= most:
+            raise FieldError(
+                "rollouts", self.rollouts, f"must be from {max(1, fewest)}, so that an episode is held out, "
+                f"to {most}, the seeds there are",
+            )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -107,14 +114,15 @@ class Demo:
             "in unseen scenes": self.out / "unseen",
             "in imagination": self.out / "imagined",
         }
-        done = [(self.out, stage) for stage in self.stages()]
-        at = [stage.name for _, stage in done].index("improve")
-        done[at : at + 1] = [(self.improved, stage) for stage in improvement.stages()]
         return Page(
-            improvement, [read_record(folder, stage) for folder, stage in done],
-            "Is the world model worth it?",
+            improvement, "Is the world model worth it?", self.config.seed,
+            stage_records(self.out, self.stages()),
             [read_place(where, folder, titles) for where, folder in folders.items()],
-            {"rollouts": self.improved / "check", "recorded, held out": self.out / "replay"},
+            {"held out": self.out / "replay"},
+            {
+                "BC of the demonstrations": lerobot_train_curve(self.out / "logs" / "cloned.log"),
+                "Text world model": curve(read_metrics(self.out / "text_world_model"), "loss"),
+            },
         )  # fmt: skip
 
     @property
@@ -137,7 +145,8 @@ class Demo:
             real_env=WmrlManiSkillEnv(**KNOWN), exploration=EXPLORATION, **self._given,
         )  # fmt: skip
         assert given.policy is not None
-        return Improvement(given, look(read_episodes(given.dataset.open()), given.policy, None))
+        table = read_episodes(given.dataset.open())
+        return Improvement(given, look(table, given.policy, None, given.rollouts))
 
     @property
     def _given(self) -> dict[str, Any]:

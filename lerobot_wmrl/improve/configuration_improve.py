@@ -45,10 +45,11 @@ class ImproveConfig(RunConfig):
     """Improve a policy with a dataset, inside a world model that learns from it.
 
     The command looks at the data and says what it has and lacks. It trains the policy further on all episodes
-    that succeed, and trains a frame tokenizer, a world model and, in imagination, the policy. In the end it
-    compares the policy before, trained further, and improved: in `real_env` if there is one, else in
-    imagination, which proves nothing about the real world. Every stage is a command that you could call
-    yourself; it is printed. Running the same command again continues. The page to read is `report.html`.
+    that succeed, and trains a frame tokenizer, a world model and, in imagination, the policy. A `cnn` is then
+    fitted to a planner in imagination (distillation). In the end it compares the policy before, trained
+    further, and improved: in `real_env` if there is one, else in imagination, which proves nothing about the
+    real world. Every stage is a command that you could call yourself; it is printed. Running the same command
+    again continues. The page to read is `report.html`.
 
     Args:
         policy: `--policy.path=FOLDER` or a name on the hub: the policy to improve, cloned from such data.
@@ -108,7 +109,7 @@ class ImproveConfig(RunConfig):
             raise FieldError(
                 "rollouts", self.rollouts, "are recorded in a real environment", "give `real_env.type`"
             )
-        last = EVALUATION_SEED - ROLLOUT_SEED_OFFSET - max(1, self.rollouts)
+        last = EVALUATION_SEED - (self.rollouts and ROLLOUT_SEED_OFFSET + self.rollouts)
         if not 0 <= self.seed <= last:
             raise FieldError(
                 "seed", self.seed, f"must be from 0 to {last}, so that no evaluation seed is trained on"

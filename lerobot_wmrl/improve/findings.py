@@ -69,8 +69,12 @@ class Findings:
         return "\n".join([*(f"  {line}" for line in self.lines), *(f"  ! {line}" for line in self.missing)])
 
 
-def look(table: EpisodeTable, policy: PreTrainedConfig, episodes: Sequence[int] | None) -> Findings:
+def look(
+    table: EpisodeTable, policy: PreTrainedConfig, episodes: Sequence[int] | None, rollouts: int = 0
+) -> Findings:
     """Describe the chosen episodes of a dataset, and check that a policy can be improved with them.
+
+    rollouts: that will be recorded too, so that it does not matter how many episodes fail.
 
     Raises:
         FieldError: the policy cannot be improved with it.
@@ -107,7 +111,11 @@ def look(table: EpisodeTable, policy: PreTrainedConfig, episodes: Sequence[int] 
     tasks = np.unique(table.column(START_TASK), return_counts=True)[1]
     done = [table.taught[rows].sum() for rows in table.rows(range(len(success)))]
     return Findings(
-        lines=lines, missing=[*missing(table), *few_decisions(policy, table)], cameras=camera_names(keys),
+        lines=lines,
+        missing=[
+            *missing_labels(table), *([] if rollouts else few_failures(table)), *few_decisions(policy, table)
+        ],
+        cameras=camera_names(keys),
         frame_side=min(map(min, sizes.values())), pixels=sum(h * w for h, w in sizes.values()),
         episodes=len(success),
         held_out=held_out, fewest=int(tasks.min()), longest=int(table.length.max()),
@@ -122,21 +130,26 @@ def look(table: EpisodeTable, policy: PreTrainedConfig, episodes: Sequence[int] 
     )  # fmt: skip
 
 
-def missing(table: EpisodeTable) -> list[str]:
-    """Return what a dataset lacks, and what that costs."""
-    failures, found = int((~table.success).sum()), []
-    if success_column(table.dataset.features) == DONE:
-        found.append(
-            "next.done is taken for success: there is no next.success (lerobot-wmrl-label adds it)"
-            + ("" if failures else ". It is in every episode: label those that failed")
-        )
-    if failures < FEW_FAILURES:
-        found.append(
-            f"failures: {failures}. The world model will hardly tell them from successes, and the policy "
-            "learns what it takes for one. Record rollouts of the policy (--rollouts, with "
-            "--real_env), and leave the failures in"
-        )
-    return found
+def missing_labels(table: EpisodeTable) -> list[str]:
+    """Say so if success is read from a column that is not about it."""
+    if success_column(table.dataset.features) != DONE:
+        return []
+    everywhere = ". It is in every episode: label those that failed" if table.success.all() else ""
+    return [
+        f"next.done is taken for success: there is no next.success (lerobot-wmrl-label adds it){everywhere}"
+    ]
+
+
+def few_failures(table: EpisodeTable) -> list[str]:
+    """Say so if few episodes fail, and what that costs."""
+    failures = int((~table.success).sum())
+    if failures >= FEW_FAILURES:
+        return []
+    return [
+        f"failures: {failures}. The world model will hardly tell them from successes, and the policy learns "
+        "what it takes for one. Record rollouts of the policy (--rollouts, with --real_env), and leave the "
+        "failures in"
+    ]
 
 
 def few_decisions(policy: PreTrainedConfig, table: EpisodeTable) -> list[str]:

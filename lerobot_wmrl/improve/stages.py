@@ -14,19 +14,19 @@ from lerobot_wmrl.common.checkpoints import last_checkpoint
 from lerobot_wmrl.common.constants import EVALUATION_SEED, START_KIND, START_SEED, START_TASK
 from lerobot_wmrl.common.lerobot_commands import edit_command, merge_command, train_command
 from lerobot_wmrl.common.presets import Flags, format_flags, preset_settings
-from lerobot_wmrl.common.stages import Stage
-from lerobot_wmrl.data.episodes import SUCCESS, ChosenEpisodes, EpisodeTable, read_episodes
+from lerobot_wmrl.common.stages import FAILED, Stage, read_record
+from lerobot_wmrl.data.episodes import SUCCESS, ChosenEpisodes, DatasetSource, EpisodeTable, read_episodes
 from lerobot_wmrl.evaluation.comparison import RESULTS, chosen_policy
 from lerobot_wmrl.improve.configuration_improve import ROLLOUT_SEED_OFFSET, ImproveConfig
 from lerobot_wmrl.improve.findings import LONGEST_IMAGINATION, Findings
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.recorders import env_flags
 
-AS_IT_WAS: Final = "as it was"
-CLONED: Final = "trained further on the successes"
+SFT: Final = "SFT policy"
+CLONED: Final = "further BC on successes"
 PPO: Final = "PPO in imagination"
-FITTED: Final = "fitted to a planner in imagination"
-DISTILLED: Final = "PPO, then fitted to a planner"
+FITTED: Final = "planner distilled"
+DISTILLED: Final = "PPO, then planner distilled"
 """What the compared policies are."""
 
 DURATIONS: Final = {
@@ -71,8 +71,8 @@ MINIBATCH: Final = PPOConfig.minibatch_size
 IMAGINED_STARTS: Final = 256
 """Imagined episodes of each policy that choose which one to improve, at most."""
 
-PROCESSES: Final = 2
-"""In which ManiSkill runs when policies are compared in it."""
+MANISKILL_PROCESSES: Final = 2
+"""Processes that simulate ManiSkill while policies are compared."""
 
 DONE_FRAMES: Final = 2
 """Consecutive done frames that make an imagined success, if the data shows that many."""
@@ -99,8 +99,8 @@ class Improvement:
             "world_model": "Train the world model",
             "check": "Check the world model on recorded episodes",
             "start": "Choose in imagination which policy to improve",
-            "rl": "Train it in imagination",
-            "distilled": "Fit it to a planner in imagination",
+            "rl": "Train the policy in imagination",
+            "distilled": "Fit the policy to a planner in imagination",
             "comparison": "Compare the policies",
         }
         needless = {
@@ -110,7 +110,7 @@ class Improvement:
             *(() if self.config.distils else ("distilled",)),
         }
         return [
-            Stage(name, title, getattr(self, f"_{name}"))
+            Stage(name, title, getattr(self, f"_{name}"), optional=name == "distilled")
             for name, title in steps.items()
             if name not in needless
         ]
@@ -119,7 +119,7 @@ class Improvement:
         """Return the command that shows the world model in the browser."""
         real = {} if self.config.real_env is None else self._real_env("real_env")
         return ["lerobot-wmrl-play", *format_flags({
-            "world_model.path": str(self.out / "world_model"), **self.data.flags(),
+            "world_model.path": str(self.out / "world_model"), **DatasetSource.flags(self.data),
             "policy.path": str(self.improved), **real, **self._success_criterion(),
         })]  # fmt: skip
 
@@ -143,7 +143,12 @@ class Improvement:
     @property
     def improved(self) -> Path:
         """Folder of the last policy's checkpoint."""
-        return last_checkpoint(self.out / ("distilled" if self.config.distils else "rl"))
+        return last_checkpoint(self.out / ("distilled" if self.distilled else "rl"))
+
+    @property
+    def distilled(self) -> bool:
+        """Whether the policy is fitted to a planner after PPO, and that has not failed."""
+        return self.config.distils and not read_record(self.out, "distilled").get(FAILED)
 
     @property
     def clones(self) -> bool:
@@ -153,12 +158,12 @@ class Improvement:
     @property
     def policies(self) -> dict[str, str]:
         """Paths of the policies that are compared in the end, by what they are."""
-        trained = {AS_IT_WAS: self.policy}
+        trained = {SFT: self.policy}
         if self.clones:
             trained[CLONED] = str(last_checkpoint(self.out / "cloned"))
         fitted = self.config.algorithm["algorithm.type"] == "distillation"
         trained[FITTED if fitted else PPO] = str(last_checkpoint(self.out / "rl"))
-        if self.config.distils:
+        if self.distilled:
             trained[DISTILLED] = str(last_checkpoint(self.out / "distilled"))
         return trained
 
@@ -356,20 +361,18 @@ class Improvement:
         both = [self.policies[CLONED], self.policy]
         return self.compare(self.out / "start", self.imagination(), IMAGINED_STARTS, both, self.config.seed)
 
-    @property
-    def _chosen(self) -> str:
-        """The policy that RL begins with: the one that was cloned from the successes, unless the world model
-        decides that the one before is better."""
+    def start(self) -> str:
+        """Return which policy RL begins with: the one that was cloned from the successes, unless the world
+        model decides that the one before is better."""
         if not self.clones:
-            return self.policy
+            return SFT
         found = json.loads((self.out / "start" / RESULTS).read_text())
-        both = [self.policies[CLONED], self.policy]
-        return both[list(found["policies"]).index(chosen_policy(found))]
+        return (CLONED, SFT)[list(found["policies"]).index(chosen_policy(found))]
 
     def _rl(self) -> list[str]:
         real = {} if self.config.real_env is None else self._real_env("real_env")
         given = self.config.iterations
-        return self._train("rl", self._chosen, {
+        return self._train("rl", self.policies[self.start()], {
             **real, "gate.action": "warn" if real else "off", "gate.freq": 0,
             "gate.n_episodes": min(50, self.config.eval_episodes), **self.config.algorithm,
             **({} if given is None else {"iterations": given}),
@@ -396,12 +399,13 @@ class Improvement:
         flags: dict[str, bool | int] = {}
         if (fits := max(1, ROLLOUT_BYTES // (kept * self.length * pixels * CHANNELS))) < preset["num_envs"]:
             flags["num_envs"] = fits
-        recorded = self.found.success_frames
-        if distils and self.config.rollouts:
-            table = self.table()
-            recorded = int(table.length[table.success & table.among(self.data.episodes)].sum())
-        if distils and recorded * pixels * CHANNELS > ROLLOUT_BYTES:
-            flags["algorithm.recorded"] = False
+        if distils and "algorithm.recorded" not in training:
+            recorded = self.found.success_frames
+            if self.config.rollouts:
+                table = self.table()
+                recorded = int(table.length[table.success & table.among(self.data.episodes)].sum())
+            if recorded * pixels * CHANNELS > ROLLOUT_BYTES:
+                flags["algorithm.recorded"] = False
         if not distils and (fits := max(1, PASS_PIXELS // pixels)) < MINIBATCH:
             flags["algorithm.micro_batch_size"] = fits
         return flags
@@ -419,7 +423,7 @@ class Improvement:
         imagined = env["env.type"] == "world_model"
         if imagined:  # none twice: there are at least as many as episodes
             starts = min(starts, self._fewest())
-        at_once = 16 if imagined else PROCESSES if self._in_maniskill else 1
+        at_once = 16 if imagined else MANISKILL_PROCESSES if self._in_maniskill else 1
         flags: Flags = {
             "policies": f"[{','.join(policies or self.policies.values())}]", "against": "all", **env,
             "n_episodes": starts, "batch_size": min(at_once, starts), "stop_early": False, "seed": seed,

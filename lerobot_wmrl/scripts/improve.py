@@ -6,11 +6,11 @@
         --rollouts=200 --output_dir=outputs/improve
 
 It looks at the data and says what it has and lacks; trains the policy further on the episodes that succeed,
-which needs no world model: imagination has to beat it; trains a frame tokenizer and a world model; checks
-the world model on held-out episodes; trains that policy in imagination; and compares the policies, in
-`--real_env` if there is one. With `--rollouts` it first records rollouts of the policy there, and learns from
-them too. Every stage is one console command, which it prints. Running the same command again continues where
-it stopped. It ends with a summary and `report.html`.
+which needs no world model: imagination has to beat it; trains a frame tokenizer and a world model; checks the
+world model on held-out episodes; trains that policy in imagination; fits it to a planner there, if it is a
+`cnn` (distillation); and compares the policies, in `--real_env` if there is one. With `--rollouts` it first
+records rollouts of the policy there, and learns from them too. Every stage is one console command, which it
+prints. Running the same command again continues where it stopped. It ends with a summary and `report.html`.
 """
 
 from typing import TYPE_CHECKING
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 def improve(cfg: ImproveConfig) -> None:
     """Run every stage, write the report, and say what came of it."""
-    from lerobot_wmrl.common.stages import claimed, read_record, run_stages
+    from lerobot_wmrl.common.stages import claimed, run_stages
     from lerobot_wmrl.data.episodes import read_episodes
     from lerobot_wmrl.improve.findings import look
     from lerobot_wmrl.improve.report.page import Page
@@ -35,12 +35,12 @@ def improve(cfg: ImproveConfig) -> None:
     cfg.check()
     assert cfg.policy is not None
     table = read_episodes(cfg.dataset.open())
-    improvement = Improvement(cfg, look(table, cfg.policy, cfg.dataset.episodes))
+    improvement = Improvement(cfg, look(table, cfg.policy, cfg.dataset.episodes, cfg.rollouts))
     print(f"{cfg.dataset.name}:\n{improvement.found}\n  {improvement.duration}")
     stages = improvement.stages()
     with claimed(cfg.output_dir, settings(cfg, stages)):
         run_stages(stages, cfg.output_dir)
-        page = Page.of(improvement, [read_record(cfg.output_dir, stage) for stage in stages])
+        page = Page.of(improvement)
         path = page.write(cfg.output_dir)
     print(f"\n{verdict(improvement, page.places)}\n\nThe report: {path}")
 

@@ -7,6 +7,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,7 @@ from lerobot_wmrl.common.stages import (
     StageError,
     claimed,
     entry_point,
+    read_record,
     run_measured,
     run_stages,
     tree_memory,
@@ -54,6 +56,23 @@ def test_finished_stages_are_not_repeated_and_a_failed_one_is(tmp_path: Path) ->
     assert file.read_text() == "a"
     run_stages([appending("a", file), appending("b", file), appending("c", file)], tmp_path)
     assert file.read_text() == "abc"
+
+
+def test_an_optional_stage_that_fails_is_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Also by a second call, whose later stages may build on there being nothing."""
+    file, fails = tmp_path / "ran", replace(python("b", "raise SystemExit(3)"), optional=True)
+    stages = [appending("a", file), fails, appending("c", file)]
+    run_stages(stages, tmp_path)
+    assert file.read_text() == "ac"
+    assert f"b: exit status 3. It is left out; its output is in {tmp_path / 'logs' / 'b.log'}" in (
+        capsys.readouterr().out
+    )
+    record = read_record(tmp_path, "b")
+    assert record["failed"]
+    assert not record["finished"]
+    run_stages(stages, tmp_path)
+    assert "[2/3] b: failed, and is left out" in capsys.readouterr().out
+    assert file.read_text() == "ac"
 
 
 def test_time_of_interrupted_attempts_counts(tmp_path: Path) -> None:
@@ -132,17 +151,23 @@ def test_two_runs_do_not_share_a_folder(tmp_path: Path) -> None:
         pass
 
 
-@pytest.mark.parametrize("flags", [{"seed": -1}, {"seed": 10}, {"eval_episodes": 0}, {"rollouts": 0}])
+@pytest.mark.parametrize(
+    "flags",
+    [
+        {"seed": -1}, {"seed": 10}, {"eval_episodes": 0}, {"rollouts": 0}, {"rollouts": 50_001},
+        {"rollouts": 11, "demonstrations": 8},
+    ],
+)  # fmt: skip
 def test_impossible_settings_are_named(flags: dict[str, int]) -> None:
     with pytest.raises(ValueError, match=f"{next(iter(flags))}="):
         DemoConfig(**flags).check()
 
 
-def test_training_and_evaluation_seeds_are_disjoint() -> None:
+def test_training_and_evaluation_seeds_are_disjoint(tmp_path: Path) -> None:
     """Whatever the demo's seed, at a distance that no stage's number of episodes bridges."""
     trained = set()
     for seed in range(10):
-        for stage in Demo(DemoConfig(seed=seed)).stages():
+        for stage in Demo(DemoConfig(tmp_path, seed)).stages():
             if stage.name not in ("unseen", "imagined"):  # they need a dataset, and have the evaluation's
                 seeds = [
                     int(flag.partition("=")[2]) for flag in stage.command() if flag.startswith("--seed=")

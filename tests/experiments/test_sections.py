@@ -4,7 +4,7 @@ from typing import Any
 
 from experiments.policy_sections import demo
 from lerobot_wmrl.common.statistics import PairedChange, Proportion
-from lerobot_wmrl.improve.stages import CLONED, DISTILLED
+from lerobot_wmrl.improve.stages import CLONED, DISTILLED, SFT
 
 
 def test_the_demo_s_section_says_what_ppo_added_to_the_rival() -> None:
@@ -14,9 +14,9 @@ def test_the_demo_s_section_says_what_ppo_added_to_the_rival() -> None:
         "seconds": 2400.0,
         "places": {
             "in known scenes": {
-                "policies": dict.fromkeys(("as it was", CLONED, DISTILLED), rate),
+                "policies": dict.fromkeys((SFT, CLONED, DISTILLED), rate),
                 "changes": [
-                    {"after": CLONED, "before": "as it was", "gained": 9, "lost": 9, "p_value": 1.0},
+                    {"after": CLONED, "before": SFT, "gained": 9, "lost": 9, "p_value": 1.0},
                     {"after": DISTILLED, "before": CLONED, **change},
                 ],
             }
@@ -25,5 +25,5 @@ def test_the_demo_s_section_says_what_ppo_added_to_the_rival() -> None:
     }
     text = demo(lambda stem: {"demo": {"runs": [run]}}[stem])
     assert "Seed 0, 40 minutes: in known scenes 5 gained, 1 lost (p = 0.2)" in text
-    assert "begins with, the world model predicts 4 of 10 as successes" in text
+    assert "begins with, the world model predicts 4 of 10, 40 % (17–69) as successes" in text
     assert f"| 0 | {CLONED} | 40 % (17–69) |" in text

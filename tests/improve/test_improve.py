@@ -25,7 +25,7 @@ from lerobot_wmrl.data.episodes import ChosenEpisodes, read_episodes
 from lerobot_wmrl.improve import stages
 from lerobot_wmrl.improve.configuration_improve import ImproveConfig
 from lerobot_wmrl.improve.findings import few_decisions
-from lerobot_wmrl.improve.stages import CLONED, DISTILLED, FITTED, PPO
+from lerobot_wmrl.improve.stages import CLONED, DISTILLED, FITTED, PPO, SFT
 from lerobot_wmrl.scripts.improve import improve, settings
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 from lerobot_wmrl.world_models.configuration_world_model import AnchoredConfig
@@ -69,12 +69,13 @@ def test_with_a_real_environment_its_rollouts_are_learnt_from_and_success_is_mea
     assert first.returncode == 0, first.stdout[-3000:] + first.stderr[-3000:]
     assert "observation.image 96x96" in first.stdout
     assert "size tiny: about a minute on two cores, plus the time in pusht" in first.stdout
-    assert "failures: 0. The world model will hardly tell them" in first.stdout
     report = (folder / "report.html").read_text()
     assert report.count("<td>0 % (0 of 2; 0–66 %)</td>") == 4, "four policies"
     assert f"{DISTILLED}, against {CLONED}: 0 starts gained" in report
     assert f"{DISTILLED}, against {CLONED}: 0 starts gained" in first.stdout
-    assert "2 rollouts of the policy in pusht: 0 succeed" in report
+    assert "2 rollouts of the SFT policy in pusht: 0 succeed" in report
+    assert "failures: 2. The world model will hardly tell them" in report
+    assert "failures: " not in first.stdout, "there are rollouts to come"
     assert "Leave out columns" not in report
     merged = f"dataset.root={folder / 'merged'}"
     assert report.count(merged) == 7, "cloning, tokenizer, world model, imagined starts thrice, driving"
@@ -94,12 +95,14 @@ def test_without_one_the_report_says_that_it_is_a_belief(demonstrations: Path, t
     assert "shows nothing about the real world" in report
     assert "most of which it has learnt from" in report
     assert "2 episodes, " in done.stdout
-    assert report.count("dataset.episodes=[0,2]") == 7
+    assert report.count("dataset.episodes=[0,2]") == 6
+    assert "failures: 0. The world model will hardly tell them" in done.stdout
 
 
 @pytest.mark.parametrize(("flags", "message"), [
     (["--rollouts=2"], "--rollouts=2: are recorded in a real environment; give --real_env.type"),
     (["--real_env.type=pusht", "--rollouts=2", "--seed=949999"], "--seed=949999: must be from 0 to 949998"),
+    (["--seed=1000001"], "--seed=1000001: must be from 0 to 1000000"),
     (["--size=huge"], "--size=huge: choose one of auto, tiny, demo, cpu"),
     (["--policy.n_action_steps=8"], "--policy.n_action_steps=8: would hold for some of the commands only"),
     (["--dataset.root=nowhere"], "no LeRobotDataset there"),
@@ -162,6 +165,12 @@ def test_large_frames_are_trained_on_in_smaller_numbers(
     )["rl"]
     limits = ("--num_envs=", "--algorithm.micro_batch_size=", "--algorithm.recorded=")
     assert {flag for flag in command if flag.startswith(limits)} == flags
+
+
+def test_labels_of_large_frames_are_those_of_fewer_episodes_after_ppo_too(tmp_path: Path) -> None:
+    """Distillation keeps those of all six iterations, PPO the frames of one."""
+    command = made_commands(tmp_path, pixels=480 * 640, longest=98, usual=98)["distilled"]
+    assert "--num_envs=3" in command
 
 
 @pytest.mark.parametrize(("held_out", "split"), [(0, "all"), (9, "all"), (10, "validation")])
@@ -245,9 +254,9 @@ def test_rollouts_are_merged_and_successes_cloned_before_rl(
 
 
 @pytest.mark.parametrize(("kind", "names"), [
-    (CnnConfig, ["as it was", PPO, DISTILLED]),
-    (ACTConfig, ["as it was", PPO]),
-    (VQBeTConfig, ["as it was", FITTED]),
+    (CnnConfig, [SFT, PPO, DISTILLED]),
+    (ACTConfig, [SFT, PPO]),
+    (VQBeTConfig, [SFT, FITTED]),
 ])  # fmt: skip
 def test_only_policies_for_which_it_was_measured_are_fitted_to_a_planner_after_ppo(
     kind: type[PreTrainedConfig], names: list[str], tmp_path: Path

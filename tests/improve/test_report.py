@@ -1,29 +1,31 @@
 """The page and the words from a small made-up run, whose numbers are known."""
 
+import html
 import json
 import re
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from lerobot.envs.configs import PushtEnv
 from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
 from PIL import Image
 
 from lerobot_wmrl.common.files import write_json
-from lerobot_wmrl.common.stages import read_record
 from lerobot_wmrl.common.tracking import append_metrics
 from lerobot_wmrl.improve.report import figures
 from lerobot_wmrl.improve.report.page import Page
 from lerobot_wmrl.improve.report.results import curve, lerobot_train_curve, training_curves
 from lerobot_wmrl.improve.report.words import compared, trust, verdict
-from lerobot_wmrl.improve.stages import CLONED, DISTILLED, PPO, Improvement
+from lerobot_wmrl.improve.stages import CLONED, DISTILLED, PPO, SFT, Improvement
 from tests.experiments.typed import check
 from tests.improve.made_up import improvement_of
 
-SUCCESSES = {"as it was": 4, CLONED: 6, PPO: 5, DISTILLED: 9}
+SUCCESSES = {SFT: 4, CLONED: 6, PPO: 5, DISTILLED: 9}
 
 
 @pytest.fixture
@@ -31,12 +33,9 @@ def finished(tmp_path: Path) -> Improvement:
     """An output folder as ten starts of each policy and nine replayed episodes would leave it."""
     improvement, out = improvement_of(tmp_path, failures=20), tmp_path
     improvement.config.real_env = PushtEnv()
-    for stage in improvement.stages():
-        write_json(out / "stages" / f"{stage.name}.json", {
-            "name": stage.name, "title": stage.title, "command": f"run-{stage.name}", "seconds": 3.0,
-            "peak_memory_bytes": 2e9,
-        })  # fmt: skip
+    write_records(improvement)
     write_json(out / "comparison" / "comparison.json", comparison([*SUCCESSES.values()]))
+    write_json(out / "start" / "comparison.json", comparison([7, 6], finished=True))
     write_json(out / "check" / "metrics.json", {
         "false_positives": 2, "failures": 5, "true_positives": 3, "successes": 4, "auc": 0.9,
         "dataset": "data", "split": "validation",
@@ -50,8 +49,18 @@ def finished(tmp_path: Path) -> Improvement:
     return improvement
 
 
-def comparison(successes: Sequence[int]) -> dict[str, Any]:
-    """Return what a comparison of policies on ten starts would have written; the first is decided."""
+def write_records(improvement: Improvement) -> None:
+    """Write those of finished stages."""
+    for stage in improvement.stages():
+        write_json(improvement.out / "stages" / f"{stage.name}.json", {
+            "name": stage.name, "title": stage.title, "command": f"run-{stage.name}", "seconds": 3.0,
+            "peak_memory_bytes": 2e9,
+        })  # fmt: skip
+
+
+def comparison(successes: Sequence[int], **more: Any) -> dict[str, Any]:
+    """Return what a comparison of policies on ten starts would have written; pairs with the first one are
+    decided."""
     names = [f"policy_{number}" for number in range(len(successes))]
     pairs = [
         {"before": before, "after": after, "gained": 3, "lost": 1, "better": after if first == 0 else None}
@@ -59,14 +68,19 @@ def comparison(successes: Sequence[int]) -> dict[str, Any]:
         for after in names[first + 1 :]
     ]
     return {
-        "policies": {name: {"k": k, "n": 10} for name, k in zip(names, successes, strict=True)},
+        "alpha": 0.06,
+        "policies": {
+            name: {"k": k, "n": 10, "share": k / 10} for name, k in zip(names, successes, strict=True)
+        },
         "pairs": pairs,
         "episodes": [{"successes": [start < k for k in successes]} for start in range(10)],
+        **more,
     }
 
 
-def page_of(improvement: Improvement) -> Page:
-    return Page.of(improvement, [read_record(improvement.out, stage) for stage in improvement.stages()])
+def text_of(improvement: Improvement) -> str:
+    """Return the page."""
+    return Page.of(improvement).write(improvement.out).read_text()
 
 
 @pytest.fixture
@@ -76,64 +90,94 @@ def without_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_page_is_self_contained_and_says_the_numbers(finished: Improvement) -> None:
-    page = page_of(finished).write(finished.out).read_text()
+    page = text_of(finished)
     assert not re.findall(r"""(?:src|href)=["'](?!data:)""", page), "the page needs other files"
     assert "<h3>Success in pusht</h3>" in page
     assert f"<td>{CLONED}</td><td>60 % (6 of 10; 31–83 %)</td>" in page
     changed = "3 starts gained, 1 lost, p = 0.62"
-    assert f"<li>{DISTILLED}, against as it was: {changed}: better</li>" in page
+    assert f"<li>{DISTILLED}, against {SFT}: {changed}: better</li>" in page
     assert f"<li>{DISTILLED}, against {PPO}: {changed}: not decided</li>" in page
+    assert "decides a pair where p is at most 0.01: 0.06 over the number of pairs" in page
+    began = f"RL began with: {SFT} (success in imagination: {CLONED} 70 % (7 of 10; 40–89 %), {SFT} 60 %"
+    assert began in page
     for stage in finished.stages():
         assert f"<pre>run-{stage.name}</pre>" in page
     assert page.count("data:image/png;base64,") == 8, "bars, the replayed episode, and six curves"
 
 
 @pytest.mark.usefixtures("without_drawing")
+def test_failures_among_the_rollouts_count(finished: Improvement, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Demonstrations alone lack them, and that was said before there were rollouts."""
+    finished.config.rollouts = 20
+    write_records(finished)
+    for failures, lacking in ((3, True), (20, False)):
+        table = SimpleNamespace(success=np.arange(60) < 60 - failures, among=lambda episodes: None)
+        monkeypatch.setattr(table, "subset", lambda among, table=table: table, raising=False)
+        monkeypatch.setattr(Improvement, "table", lambda improvement, table=table: table)
+        page = text_of(finished)
+        assert f"20 rollouts of the SFT policy in pusht: {20 - failures} succeed" in page
+        assert ("failures: 3. The world model will hardly tell them from successes" in page) == lacking
+
+
+@pytest.mark.usefixtures("without_drawing")
+def test_a_planner_that_could_not_be_distilled_is_left_out(finished: Improvement) -> None:
+    write_json(finished.out / "stages" / "distilled.json", {
+        "name": "distilled", "title": "Fit", "command": "run", "seconds": 1.0, "peak_memory_bytes": 1e9,
+        "failed": True,
+    })  # fmt: skip
+    write_json(finished.out / "comparison" / "comparison.json", comparison([4, 6, 5]))
+    said = f"Fitting the policy to a planner failed ({finished.out}/logs/distilled.log)"
+    assert said in text_of(finished)
+    assert said in verdict(finished, [compared(finished)])
+    assert [*finished.policies] == [SFT, CLONED, PPO]
+    assert finished.improved == Path(finished.policies[PPO])
+    assert "Fitting to the planner: loss" not in training_curves(finished)
+
+
+@pytest.mark.usefixtures("without_drawing")
 def test_a_success_in_imagination_is_said_to_be_a_belief(finished: Improvement) -> None:
     warned = "shows nothing about the real world"
-    assert warned not in page_of(finished).write(finished.out).read_text()
+    assert warned not in text_of(finished)
     finished.config.real_env = None
-    page = page_of(finished)
-    assert warned in page.write(finished.out).read_text()
-    assert (
-        "<h3>Success in imagination, from frames of the dataset</h3>" in page.write(finished.out).read_text()
-    )
-    assert warned in verdict(finished, page.places)
+    page = text_of(finished)
+    assert warned in page
+    assert "<h3>Success in imagination, from frames of the dataset</h3>" in page
+    assert warned in verdict(finished, [compared(finished)])
 
 
 @pytest.mark.usefixtures("without_drawing")
 def test_the_command_that_drives_the_world_model_takes_its_flags(finished: Improvement) -> None:
+    finished.config.dataset.episodes = [0, 2]
     command = shlex.join(finished.drive())
     check(command)
+    assert "--dataset.root=data " in command
     assert "--done_threshold=0.95" in command
     assert "--real_env.type=pusht" in command
     assert f"--policy.path={finished.out}/distilled/" in command
-    assert command in page_of(finished).write(finished.out).read_text()
+    assert html.escape(command).replace("&#x27;", "&#39;") in text_of(finished)
 
 
 @pytest.mark.usefixtures("without_drawing")
 def test_what_the_gate_found_is_shown_and_its_last_warning_in_red(finished: Improvement) -> None:
     fresh = {"false_positive_rate": {"k": 1, "n": 10}, "recall": {"k": 3, "n": 4}}
     gate, shown = finished.out / "rl" / "gate", '<p class="warning">'
-    assert shown not in page_of(finished).write(finished.out).read_text()
+    assert shown not in text_of(finished)
     write_json(gate / "000000" / "record.json", {"warning": "many false positives", "fresh": fresh})
-    page = page_of(finished).write(finished.out).read_text()
+    page = text_of(finished)
     assert f"{shown}many false positives." in page
     assert "On 14 fresh rollouts of the policy that RL began with: false positives 10 % (1 of 10;" in page
     write_json(gate / "000010" / "record.json", {"warning": None, "fresh": fresh})
-    assert shown not in page_of(finished).write(finished.out).read_text()
+    assert shown not in text_of(finished)
 
 
 @pytest.mark.usefixtures("without_drawing")
 def test_the_summary_holds_every_headline_number(finished: Improvement) -> None:
-    page_of(finished).write(finished.out)
+    text_of(finished)
     summary = json.loads((finished.out / "summary.json").read_text())
     place = summary["places"]["in pusht"]
     assert {title: rate["k"] for title, rate in place["policies"].items()} == SUCCESSES
     assert sum(place["outcomes"][PPO]) == SUCCESSES[PPO]
-    (change,) = (
-        each for each in place["changes"] if (each["after"], each["before"]) == (CLONED, "as it was")
-    )
+    (change,) = (each for each in place["changes"] if (each["after"], each["before"]) == (CLONED, SFT))
     assert (change["gained"], change["lost"], change["decision"]) == (3, 1, "better")
     assert summary["check"] == {
         "false_positives": 2,
@@ -149,7 +193,7 @@ def test_the_command_says_what_the_last_policy_gained_over_each_other_one(finish
     said = verdict(finished, [compared(finished)])
     path = finished.policies[CLONED]
     assert f"- {CLONED}: 60 % (6 of 10; 31–83 %), `{path}`" in said
-    for other, decided in (("as it was", "better"), (CLONED, "not decided"), (PPO, "not decided")):
+    for other, decided in ((SFT, "better"), (CLONED, "not decided"), (PPO, "not decided")):
         assert f"- {DISTILLED}, against {other}: 3 starts gained, 1 lost, p = 0.62: {decided}" in said
     assert said.count("starts gained") == 3
 
@@ -166,12 +210,12 @@ def test_a_policy_that_loses_is_said_to_be_worse(finished: Improvement) -> None:
 def test_the_curves_are_those_of_the_algorithms(finished: Improvement) -> None:
     """PPO and distillation log different things; columns that are missing have no curve."""
     assert training_curves(finished) == {
-        "Frame tokenizer": ([1.0], [1.0]),
-        "World model": ([1.0], [1.0]),
-        "Cloning": ([1.0, 2.0], [2.0, 1.0]),
-        "PPO: imagined success": ([1.0], [0.5]),
-        "Planner: imagined success after the policy's first steps": ([1.0], [0.5]),
-        "Fitting to the planner: loss": ([1.0], [2.0]),
+        "Frame tokenizer": ([1.0], [1.0], "step"),
+        "World model": ([1.0], [1.0], "step"),
+        "Further BC": ([1.0, 2.0], [2.0, 1.0], "step"),
+        "PPO: imagined success": ([1.0], [0.5], "iteration"),
+        "Planner: imagined success after the policy's first steps": ([1.0], [0.5], "iteration"),
+        "Fitting to the planner: loss": ([1.0], [2.0], "iteration"),
     }
     fitted = improvement_of(
         finished.out, policy=VQBeTConfig(device="cpu", pretrained_path=finished.out), failures=20
@@ -179,7 +223,7 @@ def test_the_curves_are_those_of_the_algorithms(finished: Improvement) -> None:
     assert [*training_curves(fitted)] == [
         "Frame tokenizer",
         "World model",
-        "Cloning",
+        "Further BC",
         "Planner: imagined success after the policy's first steps",
         "Fitting to the planner: loss",
     ]
@@ -191,12 +235,12 @@ def test_curve_from_lerobots_log_lines(tmp_path: Path) -> None:
         "INFO ot_train.py:1 step:200 smpl:2K ep:3 epch:0.10 loss:0.250 grdn:1.2 lr:1.0e-04\n"
         "Training:  10%|\rINFO step:1K smpl:9K ep:9 epch:0.20 loss:1.5e-02 grdn:1.1 lr:1.0e-04\n"
     )
-    assert lerobot_train_curve(log) == ([200.0, 1000.0], [0.25, 0.015])
+    assert lerobot_train_curve(log) == ([200.0, 1000.0], [0.25, 0.015], "step")
 
 
 def test_curves_skip_rows_that_lack_the_column() -> None:
     rows = [{"step": 1, "loss": 2.0}, {"step": 2, "speed": 9.0}, {"step": 3, "loss": 1.0}]
-    assert curve(rows, "loss") == ([1.0, 3.0], [2.0, 1.0])
+    assert curve(rows, "loss") == ([1.0, 3.0], [2.0, 1.0], "step")
 
 
 def test_the_report_says_that_success_was_taken_for_less(tmp_path: Path) -> None:
@@ -211,7 +255,7 @@ def test_the_report_says_that_success_was_taken_for_less(tmp_path: Path) -> None
     found |= {"dataset": str(tmp_path / "merged"), "split": "all", "seen_auc": 0.44}
     write_json(tmp_path / "check" / "metrics.json", found | {"operating_point": point})
     said = trust(improvement_of(tmp_path))
-    assert "imagination took done_threshold=0.5 and done_frames=1, chosen on the same episodes" in said
+    assert "Recall is 0 at done_threshold=0.95: imagination took done_threshold=0.5 and done_frames=1" in said
     assert "3 of 4" in said
     assert "the success classifier has an AUC of 0.44: it hardly sees success in them" in said
     assert "`--size=cpu` has larger frames" in said

@@ -16,9 +16,10 @@ from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.presets import preset_settings
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.demo.stages import Demo, DemoConfig
-from lerobot_wmrl.improve.stages import CLONED, DISTILLED, PPO
+from lerobot_wmrl.improve.stages import CLONED, DISTILLED, PPO, SFT
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
+ROOT = Path(__file__).parents[2]
 KILLED_STAGE = "improve/rollouts"
 STAGES = [stage.name for stage in Demo(DemoConfig()).stages()]
 IMPROVED = (
@@ -129,7 +130,7 @@ def test_all_policies_meet_the_same_starts_everywhere(outputs: tuple[Path, str])
     n = preset_settings("tiny", "demo")["eval_episodes"]
     assert [*summary["places"]] == [*PLACES]
     for place in summary["places"].values():
-        assert [*place["policies"]] == ["as it was", CLONED, PPO, DISTILLED]
+        assert [*place["policies"]] == [SFT, CLONED, PPO, DISTILLED]
         assert {rate["n"] for rate in place["policies"].values()} == {n}
     assert summary["peak_memory_bytes"] < 8e9
 
@@ -146,6 +147,14 @@ def test_training_left_metrics_and_whole_checkpoints(outputs: tuple[Path, str]) 
         assert whole <= {path.name for path in checkpoint.iterdir()}
 
 
+def test_what_the_docs_say_of_the_demos_folders_is_there(outputs: tuple[Path, str]) -> None:
+    demo, _ = outputs
+    pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
+    named = {path for page in pages for path in re.findall(r"outputs/demo/([\w/.]+)", page.read_text())}
+    assert "improve/world_model" in named
+    assert not [path for path in named if not (demo / path).exists()]
+
+
 def test_the_page_stands_alone_and_shows_every_part(outputs: tuple[Path, str]) -> None:
     demo, printed = outputs
     page = (demo / "report.html").read_text()
@@ -158,5 +167,8 @@ def test_the_page_stands_alone_and_shows_every_part(outputs: tuple[Path, str]) -
         assert f"<summary>{heading}</summary>" in page
     assert page.count("data:image/") >= 12
     for name in all_stages():
-        assert name == "improve" or str(stage_record(demo, name)["command"]) in html.unescape(page)
+        assert str(stage_record(demo, name)["command"]) in html.unescape(page)
+    summary = json.loads((demo / "summary.json").read_text())
+    seconds = [stage_record(demo, name)["seconds"] for name in STAGES]
+    assert summary["seconds"] == pytest.approx(sum(seconds)), "those of the improvement are within its stage"
     assert "The report: demo/report.html" in printed

@@ -2,12 +2,13 @@
 
 import base64
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 from matplotlib.figure import Figure
 
 from lerobot_wmrl.common.statistics import Proportion
+from lerobot_wmrl.improve.report.results import Curve
 
 COLOURS = ("#2b6cb0", "#dd6b20", "#2f855a", "#805ad5")
 
@@ -49,13 +50,13 @@ def success_bars(places: Mapping[str, Mapping[str, Proportion]]) -> str:
     return drawn(tidy(figure))
 
 
-def curve(steps: Sequence[float], values: Sequence[float], title: str) -> str:
-    """Draw a line."""
+def line(curve: Curve, title: str) -> str:
+    """Draw a curve."""
     figure = Figure(figsize=(4.6, 2.9))
     axes = figure.subplots()
-    axes.plot(steps, values, color=COLOURS[0], linewidth=1.4)
+    axes.plot(curve.x, curve.y, color=COLOURS[0], linewidth=1.4)
     axes.set_title(title, fontsize=11)
-    axes.set_xlabel("step")
+    axes.set_xlabel(curve.unit)
     return drawn(tidy(figure))
 
 

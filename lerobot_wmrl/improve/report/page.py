@@ -9,9 +9,19 @@ from typing import Any
 import jinja2
 
 from lerobot_wmrl.common.files import write_json, write_text
+from lerobot_wmrl.common.stages import Stage, read_record
 from lerobot_wmrl.improve.report import figures
-from lerobot_wmrl.improve.report.results import Place, read_check, read_gate, training_curves
-from lerobot_wmrl.improve.report.words import compared, gate_line, reservation, rollouts_line, trust
+from lerobot_wmrl.improve.report.results import Curve, Place, read_check, read_gate, training_curves
+from lerobot_wmrl.improve.report.words import (
+    compared,
+    decided_at,
+    gate_line,
+    lacks,
+    reservations,
+    rollouts_line,
+    start_line,
+    trust,
+)
 from lerobot_wmrl.improve.stages import Improvement
 
 PAGE = "report.html"
@@ -51,24 +61,30 @@ class Page:
 
     Args:
         improvement: what was done.
-        records: of the stages that were run, in order.
         title: the page's heading.
+        seed: that the command was given.
+        records: of the command's stages, in order.
         places: where the policies were compared.
         replays: folders with pictures of replayed episodes, by whose they are.
+        curves: of trainings beside those of the improvement, by title.
     """
 
     improvement: Improvement
-    records: Sequence[dict[str, Any]]
     title: str
+    seed: int
+    records: Sequence[dict[str, Any]]
     places: Sequence[Place]
-    replays: Mapping[str, Path] = field(default_factory=dict)
+    replays: Mapping[str, Path]
+    curves: Mapping[str, Curve] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, improvement: Improvement, records: Sequence[dict[str, Any]]) -> "Page":
+    def of(cls, improvement: Improvement) -> "Page":
         """Return the page of an improvement by itself."""
-        title = f"{improvement.policy}, improved in imagination"
-        replays = {"episodes of the check": improvement.out / "check"}
-        return cls(improvement, records, title, [compared(improvement)], replays)
+        return cls(
+            improvement, f"{improvement.policy}, improved in imagination", improvement.config.seed,
+            stage_records(improvement.out, improvement.stages()), [compared(improvement)],
+            {"check": improvement.out / "check"},
+        )  # fmt: skip
 
     def write(self, folder: Path) -> Path:
         """Write summary.json and the page into a folder; return the page."""
@@ -79,19 +95,26 @@ class Page:
 
     def summary(self) -> dict[str, Any]:
         """Return every headline number as JSON."""
-        config = self.improvement.config
         check, gate = read_check(self.improvement), read_gate(self.improvement)
         return {
-            "size": config.preset,
-            "seed": config.seed,
+            "size": self.improvement.config.preset,
+            "seed": self.seed,
             "places": {place.name: place.as_json() for place in self.places},
-            "check": {
-                name: check[name] for name in ("false_positives", "failures", "true_positives", "successes")
-            },
+            "check": {name: check[name] for name in CHECKED},
             "gate": gate and gate["fresh"],
             "seconds": sum(record["seconds"] for record in self.records),
             "peak_memory_bytes": max(record["peak_memory_bytes"] for record in self.records),
         }
+
+    def _all_records(self) -> list[dict[str, Any]]:
+        """Return the records of all stages: behind that of lerobot-wmrl-improve, if it is one, its own."""
+        found = []
+        for record in self.records:
+            found.append(record)
+            if shlex.split(record["command"])[0] == "lerobot-wmrl-improve":
+                own = stage_records(self.improvement.out, self.improvement.stages())
+                found += [{**each, "title": f"– {each['title']}"} for each in own]
+        return found
 
     def _render(self, summary: Mapping[str, Any]) -> str:
         """Fill the template, with every picture inside the page."""
@@ -100,26 +123,34 @@ class Page:
             autoescape=True,
             undefined=jinja2.StrictUndefined,
         )
-        gate = read_gate(self.improvement)
+        improvement, gate = self.improvement, read_gate(self.improvement)
+        curves = {**self.curves, **training_curves(improvement)}
         return environment.get_template("template.html").render(
             title=self.title,
             size=summary["size"],
-            seed=summary["seed"],
+            seed=self.seed,
             minutes=round(summary["seconds"] / 60, 1),
             peak_memory=f"{summary['peak_memory_bytes'] / 1e9:.1f}",
-            paths=self.improvement.policies,
+            paths=improvement.policies,
             places=self.places,
-            reservations=reservation(self.improvement),
+            decided_at=decided_at,
+            reservations=reservations(improvement),
+            start=start_line(improvement),
             bars=figures.success_bars({place.name: place.rates for place in self.places}),
-            data=[*self.improvement.found.lines, *rollouts_line(self.improvement)],
-            missing=self.improvement.found.missing,
-            trust=[line for line in (trust(self.improvement), gate_line(self.improvement)) if line],
+            data=[*improvement.found.lines, *rollouts_line(improvement)],
+            missing=lacks(improvement),
+            trust=[trust(improvement), *gate_line(improvement)],
             warning=gate and gate["warning"],
             pictures=picture_sections(self.replays),
-            curves=[figures.curve(*line, title) for title, line in training_curves(self.improvement).items()],
-            drive=shlex.join(self.improvement.drive()),
-            stages=self.records,
+            curves=[figures.line(curve, title) for title, curve in curves.items()],
+            drive=shlex.join(improvement.drive()),
+            stages=self._all_records(),
         )
+
+
+def stage_records(folder: Path, stages: Sequence[Stage]) -> list[dict[str, Any]]:
+    """Read the records of finished stages."""
+    return [read_record(folder, stage.name) for stage in stages]
 
 
 def picture_sections(replays: Mapping[str, Path]) -> list[dict[str, Any]]:

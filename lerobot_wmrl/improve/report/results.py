@@ -5,7 +5,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from lerobot_wmrl.common.statistics import PairedChange, Proportion
 from lerobot_wmrl.common.tracking import read_metrics
@@ -14,6 +14,9 @@ from lerobot_wmrl.improve.stages import Improvement
 
 MODELS = {"tokenizer": "Frame tokenizer", "world_model": "World model"}
 """Models that are trained, by their folders."""
+
+STEP, ITERATION = "step", "iteration"
+"""What the progress of a training is counted in."""
 
 PANELS = {
     "ppo": {
@@ -28,8 +31,19 @@ PANELS = {
 }
 """Columns of each algorithm's metrics, and their titles."""
 
-type Curve = tuple[list[float], list[float]]
-"""Steps and values."""
+
+class Curve(NamedTuple):
+    """A number that a training logs, as it goes on.
+
+    Args:
+        x: the training's progress.
+        y: the number.
+        unit: of the progress, `step` or `iteration`.
+    """
+
+    x: list[float]
+    y: list[float]
+    unit: str = STEP
 
 
 @dataclass(frozen=True)
@@ -55,18 +69,21 @@ class Place:
     Args:
         name: the place, as a phrase: `in pusht`.
         rates: success of each policy.
+        level: p-value up to which a pair is decided.
         changes: of each pair.
         outcomes: success of each policy from each start.
     """
 
     name: str
     rates: Mapping[str, Proportion]
+    level: float
     changes: Sequence[Change]
     outcomes: Mapping[str, Sequence[bool]]
 
     def as_json(self) -> dict[str, Any]:
         return {
             "policies": {title: rate.as_json() for title, rate in self.rates.items()},
+            "level": self.level,
             "changes": [
                 {"after": each.after, "before": each.before, "decision": each.decision,
                  **each.change.as_json()}
@@ -94,7 +111,7 @@ def read_place(name: str, folder: Path, titles: Sequence[str]) -> Place:
         title: [episode["successes"][index] for episode in found["episodes"]]
         for index, title in enumerate(titles)
     }
-    return Place(name, rates, changes, outcomes)
+    return Place(name, rates, found["alpha"] / len(changes), changes, outcomes)
 
 
 def decision(pair: Mapping[str, Any]) -> str:
@@ -120,19 +137,19 @@ def training_curves(improvement: Improvement) -> dict[str, Curve]:
     out = improvement.out
     found = {title: curve(read_metrics(out / folder), "loss") for folder, title in MODELS.items()}
     if improvement.clones:
-        found["Cloning"] = lerobot_train_curve(out / "logs" / "cloned.log")
+        found["Further BC"] = lerobot_train_curve(out / "logs" / "cloned.log")
     runs = {"rl": str(improvement.config.algorithm["algorithm.type"])}
-    runs |= {"distilled": "distillation"} if improvement.config.distils else {}
+    runs |= {"distilled": "distillation"} if improvement.distilled else {}
     for folder, algorithm in runs.items():
         rows = read_metrics(out / folder)
-        found |= {title: curve(rows, column) for column, title in PANELS[algorithm].items()}
-    return {title: each for title, each in found.items() if each[0]}
+        found |= {title: curve(rows, column, ITERATION) for column, title in PANELS[algorithm].items()}
+    return {title: each for title, each in found.items() if each.x}
 
 
-def curve(metrics: Sequence[Mapping[str, Any]], name: str) -> Curve:
+def curve(metrics: Sequence[Mapping[str, Any]], name: str, unit: str = STEP) -> Curve:
     """Return a column of a metrics file without rows that lack it."""
     rows = [(row["step"], row[name]) for row in metrics if isinstance(row.get(name), int | float)]
-    return [float(step) for step, _ in rows], [float(value) for _, value in rows]
+    return Curve([float(step) for step, _ in rows], [float(value) for _, value in rows], unit)
 
 
 def lerobot_train_curve(log: Path, name: str = "loss") -> Curve:
@@ -143,7 +160,7 @@ def lerobot_train_curve(log: Path, name: str = "loss") -> Curve:
     found: dict[float, float] = {}
     for step, value in re.findall(rf"step:(\d+K?)\b.*?\b{name}:([-\d.e]+)", log.read_text(errors="replace")):
         found[float(step.rstrip("K")) * (1000 if step.endswith("K") else 1)] = float(value)
-    return sorted(found), [found[step] for step in sorted(found)]
+    return Curve(sorted(found), [found[step] for step in sorted(found)])
 
 
 def read_json(path: Path) -> dict[str, Any]:

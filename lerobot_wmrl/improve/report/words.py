@@ -6,8 +6,9 @@ from pathlib import Path
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.evaluation.gate import DOUBTFUL_AUC
 from lerobot_wmrl.evaluation.report import seen_line
+from lerobot_wmrl.improve.findings import few_failures
 from lerobot_wmrl.improve.report.results import Place, read_check, read_gate, read_place
-from lerobot_wmrl.improve.stages import DONE_THRESHOLD, Improvement
+from lerobot_wmrl.improve.stages import CLONED, DONE_THRESHOLD, SFT, Improvement
 
 
 def compared(improvement: Improvement) -> Place:
@@ -23,7 +24,16 @@ def rollouts_line(improvement: Improvement) -> list[str]:
     if real is None or not improvement.config.rollouts:
         return []
     success = improvement.table().success[[*improvement.rollout_numbers()]]
-    return [f"{len(success)} rollouts of the policy in {real.type}: {success.sum()} succeed"]
+    return [f"{len(success)} rollouts of the SFT policy in {real.type}: {success.sum()} succeed"]
+
+
+def lacks(improvement: Improvement) -> list[str]:
+    """Say what the data lacks, rollouts included."""
+    found = improvement.found.missing
+    if not improvement.config.rollouts:
+        return found
+    table = improvement.table()
+    return [*found, *few_failures(table.subset(table.among(improvement.data.episodes)))]
 
 
 def verdict(improvement: Improvement, places: Sequence[Place]) -> str:
@@ -34,18 +44,39 @@ def verdict(improvement: Improvement, places: Sequence[Place]) -> str:
     for place in places:
         rates = [f"- {title}: {rate}, `{paths[title]}`" for title, rate in place.rates.items()]
         changes = [f"- {change}" for change in place.changes if change.after == last]
-        said.append("\n".join([f"Success {place.name}:", *rates, "On the same starts:", *changes]))
-    return "\n\n".join([*said, *reservation(improvement)])
+        said.append("\n".join([f"Success {place.name}:", *rates, *changes, decided_at(place)]))
+    return "\n\n".join([*said, *reservations(improvement)])
 
 
-def reservation(improvement: Improvement) -> list[str]:
-    """Say that a success in imagination alone is no success yet; nothing with a real environment."""
-    if improvement.config.real_env is not None:
+def decided_at(place: Place) -> str:
+    """Say how the pairs of policies are decided."""
+    return (
+        f"All on the same starts. McNemar's exact test decides a pair where p is at most {place.level:.2g}: "
+        f"{place.level * len(place.changes):.2g} over the number of pairs."
+    )
+
+
+def reservations(improvement: Improvement) -> list[str]:
+    """Say what a reader must know beside the success rates."""
+    found = []
+    if improvement.config.real_env is None:
+        found.append(
+            "This is what the world model predicts, and shows nothing about the real world. Run the policies "
+            "there, label what they did, and run the command again on all episodes."
+        )
+    if improvement.config.distils and not improvement.distilled:
+        log = improvement.out / "logs" / "distilled.log"
+        found.append(f"Fitting the policy to a planner failed ({log}), so PPO's policy is the last one.")
+    return found
+
+
+def start_line(improvement: Improvement) -> list[str]:
+    """Say which policy RL began with, and why; nothing if there was no choice."""
+    if not improvement.clones:
         return []
-    return [
-        "This is what the world model predicts, and shows nothing about the real world. Run the policies "
-        "there, label what they did, and run the command again on all episodes."
-    ]
+    rates = read_place("in imagination", improvement.out / "start", [CLONED, SFT]).rates
+    shown = ", ".join(f"{title} {rate}" for title, rate in rates.items())
+    return [f"RL began with: {improvement.start()} (success in imagination: {shown})."]
 
 
 def trust(improvement: Improvement) -> str:
@@ -73,19 +104,19 @@ def trust(improvement: Improvement) -> str:
     return said + taken_instead(improvement)
 
 
-def gate_line(improvement: Improvement) -> str | None:
-    """Say how well it judged fresh rollouts in the real environment before RL; None without any."""
+def gate_line(improvement: Improvement) -> list[str]:
+    """Say how well it judged fresh rollouts in the real environment before RL; nothing without any."""
     record = read_gate(improvement)
     if record is None:
-        return None
+        return []
     fresh = record["fresh"]
     false, recall = (
         Proportion(fresh[name]["k"], fresh[name]["n"]) for name in ("false_positive_rate", "recall")
     )
-    return (
+    return [
         f"On {false.n + recall.n} fresh rollouts of the policy that RL began with: false positives {false}, "
         f"recall {recall}."
-    )
+    ]
 
 
 def taken_instead(improvement: Improvement) -> str:
@@ -97,7 +128,7 @@ def taken_instead(improvement: Improvement) -> str:
         Proportion(point[name]["k"], point[name]["n"]) for name in ("false_positive_rate", "recall")
     )
     return (
-        f" No success is recognised at done_threshold={DONE_THRESHOLD}: imagination took "
+        f" Recall is 0 at done_threshold={DONE_THRESHOLD}: imagination took "
         f"done_threshold={point['done_threshold']} and done_frames={point['done_frames']}, chosen on the "
         f"same episodes (false positives {false}, recall {recall})."
     )
