@@ -91,7 +91,7 @@ def test_without_one_the_report_says_that_it_is_a_belief(demonstrations: Path, t
     done = run(tmp_path, demonstrations, "--dataset.episodes=[0,2]")
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     report = (tmp_path / "improve" / "report.html").read_text()
-    assert "Success in imagination" in report
+    assert "Changes in imagination" in report
     assert "shows nothing about the real world" in report
     assert "most of which it has learnt from" in report
     assert "2 episodes, " in done.stdout

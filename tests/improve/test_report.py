@@ -92,8 +92,9 @@ def without_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_page_is_self_contained_and_says_the_numbers(finished: Improvement) -> None:
     page = text_of(finished)
     assert not re.findall(r"""(?:src|href)=["'](?!data:)""", page), "the page needs other files"
-    assert "<h3>Success in pusht</h3>" in page
-    assert f"<td>{CLONED}</td><td>60 % (6 of 10; 31–83 %)</td>" in page
+    assert "<h3>Changes in pusht, on the same starts</h3>" in page
+    path = finished.policies[CLONED]
+    assert f"<td>{CLONED}</td><td>60 % (6 of 10; 31–83 %)</td><td><code>{path}</code></td>" in page
     changed = "3 starts gained, 1 lost, p = 0.62"
     assert f"<li>{DISTILLED}, against {SFT}: {changed}: better</li>" in page
     assert f"<li>{DISTILLED}, against {PPO}: {changed}: not decided</li>" in page
@@ -141,7 +142,7 @@ def test_a_success_in_imagination_is_said_to_be_a_belief(finished: Improvement) 
     finished.config.real_env = None
     page = text_of(finished)
     assert warned in page
-    assert "<h3>Success in imagination, from frames of the dataset</h3>" in page
+    assert "<h3>Changes in imagination, from frames of the dataset, on the same starts</h3>" in page
     assert warned in verdict(finished, [compared(finished)])
 
 

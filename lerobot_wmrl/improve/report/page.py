@@ -133,7 +133,7 @@ class Page:
             peak_memory=f"{summary['peak_memory_bytes'] / 1e9:.1f}",
             paths=improvement.policies,
             places=self.places,
-            decided_at=decided_at,
+            decided_at=decided_at(self.places),
             reservations=reservations(improvement),
             start=start_line(improvement),
             bars=figures.success_bars({place.name: place.rates for place in self.places}),

@@ -44,15 +44,16 @@ def verdict(improvement: Improvement, places: Sequence[Place]) -> str:
     for place in places:
         rates = [f"- {title}: {rate}, `{paths[title]}`" for title, rate in place.rates.items()]
         changes = [f"- {change}" for change in place.changes if change.after == last]
-        said.append("\n".join([f"Success {place.name}:", *rates, *changes, decided_at(place)]))
-    return "\n\n".join([*said, *reservations(improvement)])
+        said.append("\n".join([f"Success {place.name}, on the same starts:", *rates, *changes]))
+    return "\n\n".join([*said, decided_at(places), *reservations(improvement)])
 
 
-def decided_at(place: Place) -> str:
-    """Say how the pairs of policies are decided."""
+def decided_at(places: Sequence[Place]) -> str:
+    """Say how the pairs of policies are decided, everywhere alike."""
+    level, pairs = places[0].level, len(places[0].changes)
     return (
-        f"All on the same starts. McNemar's exact test decides a pair where p is at most {place.level:.2g}: "
-        f"{place.level * len(place.changes):.2g} over the number of pairs."
+        f"McNemar's exact test decides a pair where p is at most {level:.2g}: {level * pairs:.2g} over the "
+        f"number of pairs."
     )
 
 
