@@ -34,7 +34,7 @@ data."""
 
 def gained(place: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return what the last policy gained over the rival on the same data."""
-    (found,) = (each for each in place["changes"] if each["after"] == DISTILLED and each["before"] == CLONED)
+    (found,) = (each for each in place["pairs"] if each["after"] == DISTILLED and each["before"] == CLONED)
     return found
 
 

@@ -12,6 +12,7 @@ from experiments.tables import loader
 from experiments.value_sections import BASELINES, best, groups, outcomes
 from lerobot_wmrl.common.statistics import RunsMean
 from lerobot_wmrl.common.stored_help import FOLDER
+from lerobot_wmrl.improve.stages import CLONED, DISTILLED, PPO, SFT
 from tests.experiments.typed import ROOT, check
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -101,13 +102,11 @@ def test_the_readme_says_what_was_measured() -> None:
         shown = " | ".join(known_and_unseen(cells, methods) for cells in budgets.values())
         assert f"| {title} | {shown} |" in text
     places = json.loads((results / "demo.json").read_text())["runs"][0]["places"]
-    unseen, known = (
-        "{}, {}, {} and {} %".format(
-            *(round(100 * rate["share"]) for rate in places[where]["policies"].values())
-        )
-        for where in ("in unseen scenes", "in known scenes")
-    )
-    assert f"{unseen} in unseen scenes, {known} in known ones" in text
+    known, unseen = (places[where]["policies"] for where in ("in known scenes", "in unseen scenes"))
+    said = {SFT: " % before", CLONED: " after further BC", PPO: " after PPO", DISTILLED: " after a planner"}
+    for policy, words in said.items():
+        shares = (round(100 * rates[policy]["share"]) for rates in (known, unseen))
+        assert f"{'/'.join(map(str, shares))}{words}" in text
     best = json.loads((results / "cloning_control.json").read_text())["cloned_from"]["180"]
     known, unseen = (round(100 * best[domain]["share"]) for domain in ("ind", "ood"))
     assert f"{known} % in known and {unseen} % in unseen scenes" in text

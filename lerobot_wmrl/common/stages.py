@@ -53,7 +53,8 @@ class Stage:
     """One console command.
 
     The command is made when the stage starts: some of its flags depend on what earlier stages left, and what
-    an interrupted call left may have to be removed first. If an optional stage fails, the others go on.
+    an interrupted call left may have to be removed first. If an optional stage fails, the others go on; it
+    is tried again only as long as none of them has begun.
     """
 
     name: str
@@ -139,7 +140,7 @@ def run_stages(
         heading = f"[{number}/{len(stages)}] {stage.title}"
         if record.get("finished"):
             print(f"{heading}: done in {record['seconds']:.0f} s", flush=True)
-        elif record.get(FAILED):
+        elif record.get(FAILED) and any(read_record(output_dir, later.name) for later in stages[number:]):
             print(f"{heading}: failed, and is left out", flush=True)
         else:
             run_stage(stage, heading, output_dir, record)
@@ -165,7 +166,7 @@ def run_stage(stage: Stage, heading: str, output_dir: Path, record: dict[str, An
     log = output_dir / "logs" / f"{stage.name}.log"
     log.parent.mkdir(parents=True, exist_ok=True)
     status = run_measured(command, log, save)
-    if status != 0 and stage.optional:
+    if status > 0 and stage.optional:  # below 0 it was killed
         record[FAILED] = True
         save(record["seconds"] - seconds, record["peak_memory_bytes"])
         print(f"{stage.title}: exit status {status}. It is left out; its output is in {log}.", flush=True)

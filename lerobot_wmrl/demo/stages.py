@@ -47,7 +47,7 @@ class DemoConfig(RunConfig):
     A few demonstrations, and labelled rollouts of the policy cloned from them, are all that is learnt from.
     Beside the policies trained in imagination stands one that was trained further on the same successes,
     without a world model. All are compared in ManiSkill on the same held-out starts, in known and in unseen
-    scenes, and in imagination.
+    scenes, and in imagination, from frames of the dataset.
 
     Running the same command again continues after the last finished piece of work. `--preset=demo` (the
     default) takes less than an hour on two cores, `--preset=tiny` a few minutes and shows only that
@@ -60,7 +60,7 @@ class DemoConfig(RunConfig):
         demonstrations: planned episodes with a human's pauses and detours that the first policy is cloned
             from.
         rollouts: noisy rollouts of that policy, labelled as successes and failures.
-        eval_episodes: held-out episodes behind each success rate.
+        eval_episodes: episodes behind each success rate, in ManiSkill from held-out starts.
     """
 
     output_dir: Path = Path("outputs/demo")
@@ -112,7 +112,7 @@ class Demo:
         folders = {
             "in known scenes": self.improved / "comparison",
             "in unseen scenes": self.out / "unseen",
-            "in imagination": self.out / "imagined",
+            "in imagination, from frames of the dataset": self.out / "imagined",
         }
         return Page(
             improvement, "Is the world model worth it?", self.config.seed,
@@ -180,10 +180,9 @@ class Demo:
         return train_command(self.out / "cloned", flags)
 
     def _improve(self) -> list[str]:
-        real = env_flags(WmrlManiSkillEnv(**KNOWN))
         return ["lerobot-wmrl-improve", *format_flags({
             "policy.path": self._policy, "dataset.root": self._recorded,
-            **{name.replace("env.", "real_env.", 1): value for name, value in real.items()},
+            **env_flags(WmrlManiSkillEnv(**KNOWN), "real_env"),
             "exploration": EXPLORATION, **self._given, "output_dir": str(self.improved),
         })]  # fmt: skip
 

@@ -36,7 +36,7 @@ ALGORITHMS: Final[dict[str, Flags]] = {
 OTHERS: Final[Flags] = {"algorithm.type": "distillation"}
 """How all others are: they are fitted to a planner in the world model."""
 
-DISTILLED: Final = ("cnn",)
+DISTILLED_TYPES: Final = ("cnn",)
 """Types that are fitted to a planner after PPO too. Others were not measured."""
 
 
@@ -109,7 +109,7 @@ class ImproveConfig(RunConfig):
             raise FieldError(
                 "rollouts", self.rollouts, "are recorded in a real environment", "give `real_env.type`"
             )
-        last = EVALUATION_SEED - (self.rollouts and ROLLOUT_SEED_OFFSET + self.rollouts)
+        last = EVALUATION_SEED - (self.rollouts + ROLLOUT_SEED_OFFSET if self.rollouts else 1)
         if not 0 <= self.seed <= last:
             raise FieldError(
                 "seed", self.seed, f"must be from 0 to {last}, so that no evaluation seed is trained on"
@@ -130,4 +130,4 @@ class ImproveConfig(RunConfig):
     @property
     def distils(self) -> bool:
         """Whether the policy is fitted to a planner after PPO."""
-        return self.policy is not None and self.policy.type in DISTILLED
+        return self.policy is not None and self.policy.type in DISTILLED_TYPES

@@ -74,7 +74,7 @@ def look(
 ) -> Findings:
     """Describe the chosen episodes of a dataset, and check that a policy can be improved with them.
 
-    rollouts: that will be recorded too, so that it does not matter how many episodes fail.
+    rollouts: that will be recorded too; failures are counted when they are there.
 
     Raises:
         FieldError: the policy cannot be improved with it.
@@ -140,15 +140,16 @@ def missing_labels(table: EpisodeTable) -> list[str]:
     ]
 
 
-def few_failures(table: EpisodeTable) -> list[str]:
-    """Say so if few episodes fail, and what that costs."""
+def few_failures(
+    table: EpisodeTable, remedy: str = "Record rollouts of the policy (--rollouts, with --real_env)"
+) -> list[str]:
+    """Say so if few episodes fail, what that costs, and what helps."""
     failures = int((~table.success).sum())
     if failures >= FEW_FAILURES:
         return []
     return [
         f"failures: {failures}. The world model will hardly tell them from successes, and the policy learns "
-        "what it takes for one. Record rollouts of the policy (--rollouts, with --real_env), and leave the "
-        "failures in"
+        f"what it takes for one. {remedy}, and leave the failures in"
     ]
 
 

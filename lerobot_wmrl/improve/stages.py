@@ -20,6 +20,7 @@ from lerobot_wmrl.evaluation.comparison import RESULTS, chosen_policy
 from lerobot_wmrl.improve.configuration_improve import ROLLOUT_SEED_OFFSET, ImproveConfig
 from lerobot_wmrl.improve.findings import LONGEST_IMAGINATION, Findings
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
+from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
 from lerobot_wmrl.rl.recorders import env_flags
 
 SFT: Final = "SFT policy"
@@ -143,10 +144,10 @@ class Improvement:
     @property
     def improved(self) -> Path:
         """Folder of the last policy's checkpoint."""
-        return last_checkpoint(self.out / ("distilled" if self.distilled else "rl"))
+        return last_checkpoint(self.out / ("distilled" if self.has_distilled else "rl"))
 
     @property
-    def distilled(self) -> bool:
+    def has_distilled(self) -> bool:
         """Whether the policy is fitted to a planner after PPO, and that has not failed."""
         return self.config.distils and not read_record(self.out, "distilled").get(FAILED)
 
@@ -163,7 +164,7 @@ class Improvement:
             trained[CLONED] = str(last_checkpoint(self.out / "cloned"))
         fitted = self.config.algorithm["algorithm.type"] == "distillation"
         trained[FITTED if fitted else PPO] = str(last_checkpoint(self.out / "rl"))
-        if self.distilled:
+        if self.has_distilled:
             trained[DISTILLED] = str(last_checkpoint(self.out / "distilled"))
         return trained
 
@@ -255,8 +256,7 @@ class Improvement:
 
     def _real_env(self, prefix: str) -> Flags:
         assert self.config.real_env is not None
-        given = env_flags(self.config.real_env)
-        return {name.replace("env.", f"{prefix}.", 1): value for name, value in given.items()}
+        return env_flags(self.config.real_env, prefix)
 
     def imagination(self) -> Flags:
         """Return the environment that the world model makes."""
@@ -397,8 +397,9 @@ class Improvement:
         preset = preset_settings(self.config.preset, "train", [str(algorithm)])
         kept = int(training.get("iterations", preset["iterations"])) if distils else 1
         flags: dict[str, bool | int] = {}
-        if (fits := max(1, ROLLOUT_BYTES // (kept * self.length * pixels * CHANNELS))) < preset["num_envs"]:
-            flags["num_envs"] = fits
+        envs = max(1, ROLLOUT_BYTES // (kept * self.length * pixels * CHANNELS))
+        if envs < preset["num_envs"]:
+            flags["num_envs"] = envs
         if distils and "algorithm.recorded" not in training:
             recorded = self.found.success_frames
             if self.config.rollouts:
@@ -406,7 +407,10 @@ class Improvement:
                 recorded = int(table.length[table.success & table.among(self.data.episodes)].sum())
             if recorded * pixels * CHANNELS > ROLLOUT_BYTES:
                 flags["algorithm.recorded"] = False
-        if not distils and (fits := max(1, PASS_PIXELS // pixels)) < MINIBATCH:
+        fits = max(1, PASS_PIXELS // pixels)
+        if distils and fits < preset.get("algorithm.batch_size", DistillationConfig.batch_size):
+            flags["algorithm.batch_size"] = fits
+        if not distils and fits < MINIBATCH:
             flags["algorithm.micro_batch_size"] = fits
         return flags
 

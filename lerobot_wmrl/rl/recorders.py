@@ -413,8 +413,11 @@ def budget_flags(budget: Path | None) -> Flags:
     return {} if budget is None else {"budget": str(budget)}
 
 
-def env_flags(env: EnvConfig) -> Flags:
-    """Return `env.type` and the settings that differ from their defaults, as a command takes them."""
+def env_flags(env: EnvConfig, prefix: str = "env") -> Flags:
+    """Return `env.type` and the settings that differ from their defaults, as a command takes them.
+
+    prefix: of the flags, `env` or `real_env`.
+    """
     given, default = (flatten_dict(draccus.encode(each, EnvConfig), sep=".") for each in (env, type(env)()))
     differing = [name for name in given if given[name] != default.get(name)]
     chosen = {
@@ -423,4 +426,4 @@ def env_flags(env: EnvConfig) -> Flags:
         if name.endswith(".type") and any(each.startswith(name.removesuffix("type")) for each in differing)
     }
     kept = [name for name in given if name in {*differing, *chosen} and name.split(".")[0] not in DERIVED]
-    return {"env.type": env.type, **{f"env.{name}": given[name] for name in kept}}
+    return {f"{prefix}.type": env.type, **{f"{prefix}.{name}": given[name] for name in kept}}

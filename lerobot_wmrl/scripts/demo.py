@@ -8,8 +8,8 @@ starts in unseen scenes too. Every stage is one console command, which it prints
 again continues an interrupted demo. It ends with a summary and `report.html`.
 """
 
-from collections.abc import Sequence
 from dataclasses import asdict
+from functools import partial
 
 from lerobot_wmrl.common.presets import expand_preset
 from lerobot_wmrl.demo.stages import Demo, DemoConfig, conclusion
@@ -28,17 +28,11 @@ def run_demo(cfg: DemoConfig) -> None:
     print(f"\n{conclusion(page, path)}")
 
 
-def with_preset(argv: Sequence[str]) -> list[str]:
-    """Expand the preset, `demo` if none is given."""
-    given = any(argument.startswith("--preset") for argument in argv)
-    return expand_preset(argv if given else ["--preset=demo", *argv], "demo")
-
-
 def main() -> None:
     """Run the console command."""
     from lerobot_wmrl.common.stages import run_stage_command
 
-    run_stage_command(run_demo, DemoConfig, with_preset)
+    run_stage_command(run_demo, DemoConfig, partial(expand_preset, command="demo"))
 
 
 if __name__ == "__main__":

@@ -75,6 +75,21 @@ def test_an_optional_stage_that_fails_is_left_out(tmp_path: Path, capsys: pytest
     assert file.read_text() == "ac"
 
 
+def test_an_optional_stage_is_tried_again_before_others_build_on_its_failure(tmp_path: Path) -> None:
+    file, fails = tmp_path / "ran", replace(python("b", "raise SystemExit(3)"), optional=True)
+    run_stages([fails], tmp_path)
+    run_stages([replace(appending("b", file), optional=True), appending("c", file)], tmp_path)
+    assert file.read_text() == "bc"
+    assert "failed" not in read_record(tmp_path, "b")
+
+
+def test_an_optional_stage_that_was_killed_has_not_failed(tmp_path: Path) -> None:
+    kill = "import os, signal; os.kill(os.getpid(), signal.SIGKILL)"
+    with pytest.raises(StageError, match="exit status -9"):
+        run_stages([replace(python("b", kill), optional=True)], tmp_path)
+    assert "failed" not in read_record(tmp_path, "b")
+
+
 def test_time_of_interrupted_attempts_counts(tmp_path: Path) -> None:
     stage = python("slow", "import time; time.sleep(0.5)")
     with pytest.raises(StageError):

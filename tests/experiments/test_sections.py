@@ -15,7 +15,7 @@ def test_the_demo_s_section_says_what_ppo_added_to_the_rival() -> None:
         "places": {
             "in known scenes": {
                 "policies": dict.fromkeys((SFT, CLONED, DISTILLED), rate),
-                "changes": [
+                "pairs": [
                     {"after": CLONED, "before": SFT, "gained": 9, "lost": 9, "p_value": 1.0},
                     {"after": DISTILLED, "before": CLONED, **change},
                 ],

@@ -17,6 +17,7 @@ from PIL import Image
 
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.tracking import append_metrics
+from lerobot_wmrl.evaluation.comparison import Comparison, Episode
 from lerobot_wmrl.improve.report import figures
 from lerobot_wmrl.improve.report.page import Page
 from lerobot_wmrl.improve.report.results import curve, lerobot_train_curve, training_curves
@@ -25,17 +26,18 @@ from lerobot_wmrl.improve.stages import CLONED, DISTILLED, PPO, SFT, Improvement
 from tests.experiments.typed import check
 from tests.improve.made_up import improvement_of
 
-SUCCESSES = {SFT: 4, CLONED: 6, PPO: 5, DISTILLED: 9}
+SUCCESSES = {SFT: 16, CLONED: 24, PPO: 20, DISTILLED: 36}
+"""Of 40 starts."""
 
 
 @pytest.fixture
 def finished(tmp_path: Path) -> Improvement:
-    """An output folder as ten starts of each policy and nine replayed episodes would leave it."""
+    """An output folder as 40 starts of each policy and nine replayed episodes would leave it."""
     improvement, out = improvement_of(tmp_path, failures=20), tmp_path
     improvement.config.real_env = PushtEnv()
     write_records(improvement)
     write_json(out / "comparison" / "comparison.json", comparison([*SUCCESSES.values()]))
-    write_json(out / "start" / "comparison.json", comparison([7, 6], finished=True))
+    write_json(out / "start" / "comparison.json", comparison([7, 9], 10))
     write_json(out / "check" / "metrics.json", {
         "false_positives": 2, "failures": 5, "true_positives": 3, "successes": 4, "auc": 0.9,
         "dataset": "data", "split": "validation",
@@ -58,24 +60,11 @@ def write_records(improvement: Improvement) -> None:
         })  # fmt: skip
 
 
-def comparison(successes: Sequence[int], **more: Any) -> dict[str, Any]:
-    """Return what a comparison of policies on ten starts would have written; pairs with the first one are
-    decided."""
+def comparison(successes: Sequence[int], starts: int = 40) -> dict[str, Any]:
+    """Return what a comparison of policies would have written: each succeeds from the first starts."""
     names = [f"policy_{number}" for number in range(len(successes))]
-    pairs = [
-        {"before": before, "after": after, "gained": 3, "lost": 1, "better": after if first == 0 else None}
-        for first, before in enumerate(names)
-        for after in names[first + 1 :]
-    ]
-    return {
-        "alpha": 0.06,
-        "policies": {
-            name: {"k": k, "n": 10, "share": k / 10} for name, k in zip(names, successes, strict=True)
-        },
-        "pairs": pairs,
-        "episodes": [{"successes": [start < k for k in successes]} for start in range(10)],
-        **more,
-    }
+    episodes = [Episode("env", 0, seed, [seed < k for k in successes]) for seed in range(starts)]
+    return Comparison(names, starts, "all", 0.06, stop_early=False, episodes=episodes).as_json()
 
 
 def text_of(improvement: Improvement) -> str:
@@ -94,13 +83,13 @@ def test_the_page_is_self_contained_and_says_the_numbers(finished: Improvement) 
     assert not re.findall(r"""(?:src|href)=["'](?!data:)""", page), "the page needs other files"
     assert "<h3>Changes in pusht, on the same starts</h3>" in page
     path = finished.policies[CLONED]
-    assert f"<td>{CLONED}</td><td>60 % (6 of 10; 31–83 %)</td><td><code>{path}</code></td>" in page
-    changed = "3 starts gained, 1 lost, p = 0.62"
-    assert f"<li>{DISTILLED}, against {SFT}: {changed}: better</li>" in page
-    assert f"<li>{DISTILLED}, against {PPO}: {changed}: not decided</li>" in page
+    assert f"<td>{CLONED}</td><td>60 % (24 of 40; 45–74 %)</td><td><code>{path}</code></td>" in page
+    assert f"<li>{DISTILLED}, against {SFT}: 20 starts gained, 0 lost, p = 1.9e-06: better</li>" in page
+    assert f"<li>{PPO}, against {CLONED}: 0 starts gained, 4 lost, p = 0.12: not decided</li>" in page
     assert "decides a pair where p is at most 0.01: 0.06 over the number of pairs" in page
-    began = f"RL began with: {SFT} (success in imagination: {CLONED} 70 % (7 of 10; 40–89 %), {SFT} 60 %"
-    assert began in page
+    assert (
+        f"RL began with: {CLONED}. Success in imagination, from frames of the dataset: {CLONED} 70 %" in page
+    )
     for stage in finished.stages():
         assert f"<pre>run-{stage.name}</pre>" in page
     assert page.count("data:image/png;base64,") == 8, "bars, the replayed episode, and six curves"
@@ -116,8 +105,11 @@ def test_failures_among_the_rollouts_count(finished: Improvement, monkeypatch: p
         monkeypatch.setattr(table, "subset", lambda among, table=table: table, raising=False)
         monkeypatch.setattr(Improvement, "table", lambda improvement, table=table: table)
         page = text_of(finished)
-        assert f"20 rollouts of the SFT policy in pusht: {20 - failures} succeed" in page
-        assert ("failures: 3. The world model will hardly tell them from successes" in page) == lacking
+        assert f"20 rollouts of the {SFT} in pusht, exploration 0.2: {20 - failures} succeed" in page
+        said = verdict(finished, [compared(finished)])
+        for text in (page, said):
+            assert ("failures: 3. The world model will hardly tell them from successes" in text) == lacking
+            assert ("Record more rollouts" in text) == lacking
 
 
 @pytest.mark.usefixtures("without_drawing")
@@ -126,9 +118,11 @@ def test_a_planner_that_could_not_be_distilled_is_left_out(finished: Improvement
         "name": "distilled", "title": "Fit", "command": "run", "seconds": 1.0, "peak_memory_bytes": 1e9,
         "failed": True,
     })  # fmt: skip
-    write_json(finished.out / "comparison" / "comparison.json", comparison([4, 6, 5]))
+    write_json(finished.out / "comparison" / "comparison.json", comparison([16, 24, 20]))
     said = f"Fitting the policy to a planner failed ({finished.out}/logs/distilled.log)"
-    assert said in text_of(finished)
+    page = text_of(finished)
+    assert said in page
+    assert "<td>Fit, failed</td>" in page
     assert said in verdict(finished, [compared(finished)])
     assert [*finished.policies] == [SFT, CLONED, PPO]
     assert finished.improved == Path(finished.policies[PPO])
@@ -177,9 +171,9 @@ def test_the_summary_holds_every_headline_number(finished: Improvement) -> None:
     summary = json.loads((finished.out / "summary.json").read_text())
     place = summary["places"]["in pusht"]
     assert {title: rate["k"] for title, rate in place["policies"].items()} == SUCCESSES
-    assert sum(place["outcomes"][PPO]) == SUCCESSES[PPO]
-    (change,) = (each for each in place["changes"] if (each["after"], each["before"]) == (CLONED, SFT))
-    assert (change["gained"], change["lost"], change["decision"]) == (3, 1, "better")
+    assert sum(episode["successes"][2] for episode in place["episodes"]) == SUCCESSES[PPO]
+    (pair,) = (each for each in place["pairs"] if (each["after"], each["before"]) == (CLONED, SFT))
+    assert (pair["gained"], pair["lost"], pair["better"]) == (8, 0, CLONED)
     assert summary["check"] == {
         "false_positives": 2,
         "failures": 5,
@@ -193,18 +187,14 @@ def test_the_summary_holds_every_headline_number(finished: Improvement) -> None:
 def test_the_command_says_what_the_last_policy_gained_over_each_other_one(finished: Improvement) -> None:
     said = verdict(finished, [compared(finished)])
     path = finished.policies[CLONED]
-    assert f"- {CLONED}: 60 % (6 of 10; 31–83 %), `{path}`" in said
-    for other, decided in ((SFT, "better"), (CLONED, "not decided"), (PPO, "not decided")):
-        assert f"- {DISTILLED}, against {other}: 3 starts gained, 1 lost, p = 0.62: {decided}" in said
-    assert said.count("starts gained") == 3
+    assert f"- {CLONED}: 60 % (24 of 40; 45–74 %), `{path}`" in said
+    for other, gained in ((SFT, 20), (CLONED, 12), (PPO, 16)):
+        assert f"- {DISTILLED}, against {other}: {gained} starts gained, 0 lost, p = " in said
+    assert said.count("starts gained") == said.count(": better") == 3
 
 
 def test_a_policy_that_loses_is_said_to_be_worse(finished: Improvement) -> None:
-    path = finished.out / "comparison" / "comparison.json"
-    found = json.loads(path.read_text())
-    for pair in found["pairs"]:
-        pair["better"] = pair["before"]
-    write_json(path, found)
+    write_json(finished.out / "comparison" / "comparison.json", comparison([36, 36, 36, 16]))
     assert verdict(finished, [compared(finished)]).count(": worse") == 3
 
 

@@ -26,7 +26,7 @@ IMPROVED = (
     "rollouts", "merged", "cloned", "tokenizer", "world_model", "check", "start", "rl", "distilled",
     "comparison",
 )  # fmt: skip
-PLACES = ("in known scenes", "in unseen scenes", "in imagination")
+PLACES = ("in known scenes", "in unseen scenes", "in imagination, from frames of the dataset")
 HEADINGS = (
     "Success on the same data",
     "The data",

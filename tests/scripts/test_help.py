@@ -15,7 +15,9 @@ from lerobot_wmrl.scripts import (
     convert_openvla,
     demo,
     eval_world_model,
+    improve,
     label,
+    play,
     resample,
     train,
     train_world_model,
@@ -31,11 +33,16 @@ COMMANDS = {
     "lerobot-wmrl-train-world-model": (
         train_world_model.train_world_model, train_world_model.TrainWorldModelConfig,
     ),
+    "lerobot-wmrl-improve": (improve.improve, improve.ImproveConfig),
+    "lerobot-wmrl-play": (play.play, play.PlayConfig),
     "lerobot-wmrl-compare": (compare.compare, compare.CompareConfig),
     "lerobot-wmrl-label": (label.label, label.LabelConfig),
     "lerobot-wmrl-resample": (resample.resample, resample.ResampleConfig),
     "lerobot-wmrl-convert-openvla": (convert_openvla.convert, convert_openvla.ConvertOpenVLAConfig),
 }  # fmt: skip
+
+
+WITHOUT_PRESET = ("compare", "improve", "label", "openvla", "play", "resample")
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -45,7 +52,7 @@ def test_help_explains_and_shows_no_source_code(command: str, monkeypatch: pytes
     text = help_of(function, config_class)
     assert text.startswith(f"{command}: ")
     assert f"    {command} --" in text  # an example
-    assert "--preset=" in text or command.endswith(("compare", "label", "openvla", "resample"))
+    assert "--preset=" in text or command.endswith(WITHOUT_PRESET)
     assert "def " not in text
     assert "default_factory" not in text
     settings = list(settings_of(config_class))

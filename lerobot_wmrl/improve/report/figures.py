@@ -46,6 +46,7 @@ def success_bars(places: Mapping[str, Mapping[str, Proportion]]) -> str:
     titles = [title.replace(" ", "\n", 1) for title in next(iter(places.values()))]
     axes.set_xticks(range(len(titles)), titles)
     axes.set_ylim(0, 1.3)
+    axes.set_yticks([0, 0.2, 0.4, 0.6, 0.8, 1])
     axes.set_ylabel("success rate")
     return drawn(tidy(figure))
 

@@ -17,6 +17,7 @@ from lerobot_wmrl.improve.report.words import (
     decided_at,
     gate_line,
     lacks,
+    pair_lines,
     reservations,
     rollouts_line,
     start_line,
@@ -49,7 +50,7 @@ PICTURE_SECTIONS = (
     (
         "accuracy",
         "How long the imagination stays true",
-        "The distance between imagined and recorded frames, by the number of frames imagined so far.",
+        "How close imagined frames are to recorded ones, by the number of frames imagined so far.",
     ),
 )
 """Start of the pictures' file names, heading, and what to look for."""
@@ -83,7 +84,7 @@ class Page:
         return cls(
             improvement, f"{improvement.policy}, improved in imagination", improvement.config.seed,
             stage_records(improvement.out, improvement.stages()), [compared(improvement)],
-            {"check": improvement.out / "check"},
+            {"recorded": improvement.out / "check"},
         )  # fmt: skip
 
     def write(self, folder: Path) -> Path:
@@ -99,7 +100,7 @@ class Page:
         return {
             "size": self.improvement.config.preset,
             "seed": self.seed,
-            "places": {place.name: place.as_json() for place in self.places},
+            "places": {place.name: place.comparison.as_json() for place in self.places},
             "check": {name: check[name] for name in CHECKED},
             "gate": gate and gate["fresh"],
             "seconds": sum(record["seconds"] for record in self.records),
@@ -133,6 +134,7 @@ class Page:
             peak_memory=f"{summary['peak_memory_bytes'] / 1e9:.1f}",
             paths=improvement.policies,
             places=self.places,
+            changes={place.name: pair_lines(place) for place in self.places},
             decided_at=decided_at(self.places),
             reservations=reservations(improvement),
             start=start_line(improvement),

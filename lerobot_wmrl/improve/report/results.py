@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lerobot_wmrl.common.statistics import PairedChange, Proportion
+from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.common.tracking import read_metrics
-from lerobot_wmrl.evaluation.comparison import RESULTS
+from lerobot_wmrl.evaluation.comparison import RESULTS, Comparison, read_episodes
 from lerobot_wmrl.improve.stages import Improvement
 
 MODELS = {"tokenizer": "Frame tokenizer", "world_model": "World model"}
@@ -47,78 +47,29 @@ class Curve(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Change:
-    """What one policy gained over another on the same starts."""
-
-    after: str
-    before: str
-    change: PairedChange
-    decision: str
-
-    def __str__(self) -> str:
-        return (
-            f"{self.after}, against {self.before}: {self.change.gained} starts gained, {self.change.lost} "
-            f"lost, p = {self.change.p_value:.2g}: {self.decision}"
-        )
-
-
-@dataclass(frozen=True)
 class Place:
-    """Success of the policies in one place, on the same starts.
+    """Policies compared in one place.
 
     Args:
         name: the place, as a phrase: `in pusht`.
-        rates: success of each policy.
-        level: p-value up to which a pair is decided.
-        changes: of each pair.
-        outcomes: success of each policy from each start.
+        comparison: of the policies, by what they are.
     """
 
     name: str
-    rates: Mapping[str, Proportion]
-    level: float
-    changes: Sequence[Change]
-    outcomes: Mapping[str, Sequence[bool]]
+    comparison: Comparison
 
-    def as_json(self) -> dict[str, Any]:
-        return {
-            "policies": {title: rate.as_json() for title, rate in self.rates.items()},
-            "level": self.level,
-            "changes": [
-                {"after": each.after, "before": each.before, "decision": each.decision,
-                 **each.change.as_json()}
-                for each in self.changes
-            ],
-            "outcomes": dict(self.outcomes),
-        }  # fmt: skip
+    @property
+    def rates(self) -> dict[str, Proportion]:
+        """Success of each policy."""
+        return self.comparison.rates()
 
 
 def read_place(name: str, folder: Path, titles: Sequence[str]) -> Place:
-    """Read a comparison of policies, which have these titles, in this order."""
+    """Read a finished comparison of policies, which have these titles, in this order."""
     found = read_json(folder / RESULTS)
-    named = dict(zip(found["policies"], titles, strict=True))
-    rates = {named[path]: Proportion(rate["k"], rate["n"]) for path, rate in found["policies"].items()}
-    changes = [
-        Change(
-            named[pair["after"]],
-            named[pair["before"]],
-            PairedChange(pair["gained"], pair["lost"]),
-            decision(pair),
-        )
-        for pair in found["pairs"]
-    ]
-    outcomes = {
-        title: [episode["successes"][index] for episode in found["episodes"]]
-        for index, title in enumerate(titles)
-    }
-    return Place(name, rates, found["alpha"] / len(changes), changes, outcomes)
-
-
-def decision(pair: Mapping[str, Any]) -> str:
-    """Say whether the second policy of a pair is decided to be better or worse than the first."""
-    if pair["better"] is None:
-        return "not decided"
-    return "better" if pair["better"] == pair["after"] else "worse"
+    episodes = read_episodes(found)
+    starts = len({episode.seed for episode in episodes})
+    return Place(name, Comparison(titles, starts, "all", found["alpha"], stop_early=False, episodes=episodes))
 
 
 def read_check(improvement: Improvement) -> dict[str, Any]:
@@ -139,7 +90,7 @@ def training_curves(improvement: Improvement) -> dict[str, Curve]:
     if improvement.clones:
         found["Further BC"] = lerobot_train_curve(out / "logs" / "cloned.log")
     runs = {"rl": str(improvement.config.algorithm["algorithm.type"])}
-    runs |= {"distilled": "distillation"} if improvement.distilled else {}
+    runs |= {"distilled": "distillation"} if improvement.has_distilled else {}
     for folder, algorithm in runs.items():
         rows = read_metrics(out / folder)
         found |= {title: curve(rows, column, ITERATION) for column, title in PANELS[algorithm].items()}

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lerobot_wmrl.common.statistics import Proportion
+from lerobot_wmrl.evaluation.comparison import Pair
 from lerobot_wmrl.evaluation.gate import DOUBTFUL_AUC
 from lerobot_wmrl.evaluation.report import seen_line
 from lerobot_wmrl.improve.findings import few_failures
@@ -24,7 +25,10 @@ def rollouts_line(improvement: Improvement) -> list[str]:
     if real is None or not improvement.config.rollouts:
         return []
     success = improvement.table().success[[*improvement.rollout_numbers()]]
-    return [f"{len(success)} rollouts of the SFT policy in {real.type}: {success.sum()} succeed"]
+    noise = improvement.config.exploration
+    return [
+        f"{len(success)} rollouts of the {SFT} in {real.type}, exploration {noise}: {success.sum()} succeed"
+    ]
 
 
 def lacks(improvement: Improvement) -> list[str]:
@@ -33,7 +37,8 @@ def lacks(improvement: Improvement) -> list[str]:
     if not improvement.config.rollouts:
         return found
     table = improvement.table()
-    return [*found, *few_failures(table.subset(table.among(improvement.data.episodes)))]
+    chosen = table.subset(table.among(improvement.data.episodes))
+    return [*found, *few_failures(chosen, "Record more rollouts, with more exploration")]
 
 
 def verdict(improvement: Improvement, places: Sequence[Place]) -> str:
@@ -43,16 +48,34 @@ def verdict(improvement: Improvement, places: Sequence[Place]) -> str:
     said = []
     for place in places:
         rates = [f"- {title}: {rate}, `{paths[title]}`" for title, rate in place.rates.items()]
-        changes = [f"- {change}" for change in place.changes if change.after == last]
+        changes = [f"- {line}" for line in pair_lines(place, last)]
         said.append("\n".join([f"Success {place.name}, on the same starts:", *rates, *changes]))
-    return "\n\n".join([*said, decided_at(places), *reservations(improvement)])
+    return "\n\n".join([*said, decided_at(places), *lacks(improvement), *reservations(improvement)])
+
+
+def pair_lines(place: Place, last: str | None = None) -> list[str]:
+    """Say what the policies gained over one another; only the `last` one, if it is given."""
+    return [
+        f"{pair.after}, against {pair.before}: {pair.change.gained} starts gained, {pair.change.lost} lost, "
+        f"p = {pair.p_value:.2g}: {decision(pair)}"
+        for pair in place.comparison.pairs()
+        if last in (None, pair.after)
+    ]
+
+
+def decision(pair: Pair) -> str:
+    """Say whether the second policy of a pair is decided to be better or worse than the first."""
+    if pair.better is None:
+        return "not decided"
+    return "better" if pair.better == pair.after else "worse"
 
 
 def decided_at(places: Sequence[Place]) -> str:
     """Say how the pairs of policies are decided, everywhere alike."""
-    level, pairs = places[0].level, len(places[0].changes)
+    comparison = places[0].comparison
+    level = comparison.pairs()[0].level
     return (
-        f"McNemar's exact test decides a pair where p is at most {level:.2g}: {level * pairs:.2g} over the "
+        f"McNemar's exact test decides a pair where p is at most {level:.2g}: {comparison.alpha} over the "
         f"number of pairs."
     )
 
@@ -65,9 +88,12 @@ def reservations(improvement: Improvement) -> list[str]:
             "This is what the world model predicts, and shows nothing about the real world. Run the policies "
             "there, label what they did, and run the command again on all episodes."
         )
-    if improvement.config.distils and not improvement.distilled:
+    if improvement.config.distils and not improvement.has_distilled:
         log = improvement.out / "logs" / "distilled.log"
-        found.append(f"Fitting the policy to a planner failed ({log}), so PPO's policy is the last one.")
+        found.append(
+            f"Fitting the policy to a planner failed ({log}), so PPO's policy is the last one. To try again, "
+            "choose another output_dir."
+        )
     return found
 
 
@@ -77,7 +103,10 @@ def start_line(improvement: Improvement) -> list[str]:
         return []
     rates = read_place("in imagination", improvement.out / "start", [CLONED, SFT]).rates
     shown = ", ".join(f"{title} {rate}" for title, rate in rates.items())
-    return [f"RL began with: {improvement.start()} (success in imagination: {shown})."]
+    return [
+        f"RL began with: {improvement.start()}. Success in imagination, from frames of the dataset: {shown}. "
+        f"The {SFT} is taken only if it is better by the same test."
+    ]
 
 
 def trust(improvement: Improvement) -> str:
