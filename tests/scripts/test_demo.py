@@ -28,7 +28,7 @@ IMPROVED = (
 )  # fmt: skip
 PLACES = ("in known scenes", "in unseen scenes", "in imagination, from frames of the dataset")
 HEADINGS = (
-    "Success on the same data",
+    "Success",
     "The data",
     "Can the world model be trusted?",
     "Recorded beside imagined",
