@@ -8,9 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lerobot_wmrl.improve.report.figures import tidy
+from lerobot_wmrl.improve.report.figures import COLOURS, tidy
 
-COLOURS: Final = ("#2b6cb0", "#dd6b20", "#2f855a", "#805ad5")
 PLACES: Final = {"imagined": "PPO in imagination", "simulated": "PPO in ManiSkill"}
 DOMAINS: Final = {"ind": "known scenes", "ood": "unseen scenes", "drawn": "known scenes, tokens drawn"}
 CURVES: Final = (("data", "episodes"), ("time", "minutes"), ("size", "parameters"))

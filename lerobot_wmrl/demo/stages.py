@@ -14,10 +14,9 @@ from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.common.presets import Flags, format_flags, preset_flags, presets_of
 from lerobot_wmrl.common.stages import Stage
 from lerobot_wmrl.common.tracking import read_metrics
-from lerobot_wmrl.data.episodes import VALIDATION_EVERY, ChosenEpisodes, read_episodes
+from lerobot_wmrl.data.episodes import VALIDATION_EVERY, ChosenEpisodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.improve.configuration_improve import ROLLOUT_SEED_OFFSET, ImproveConfig
-from lerobot_wmrl.improve.findings import look
 from lerobot_wmrl.improve.report.page import Page, stage_records
 from lerobot_wmrl.improve.report.results import curve, lerobot_train_curve, read_place
 from lerobot_wmrl.improve.report.words import verdict
@@ -140,20 +139,17 @@ class Demo:
 
     def improvement(self) -> Improvement:
         """Return what the stage `improve` does, once there is a policy to improve."""
-        given = ImproveConfig(
+        return Improvement.of(ImproveConfig(
             policy=read_policy_config(self._policy, []), dataset=ChosenEpisodes(root=self._recorded),
-            real_env=WmrlManiSkillEnv(**KNOWN), exploration=EXPLORATION, **self._given,
-        )  # fmt: skip
-        assert given.policy is not None
-        table = read_episodes(given.dataset.open())
-        return Improvement(given, look(table, given.policy, None, given.rollouts))
+            real_env=WmrlManiSkillEnv(**KNOWN), **self._given,
+        ))  # fmt: skip
 
     @property
     def _given(self) -> dict[str, Any]:
-        """Settings of the improvement that are the demo's own."""
+        """Settings of the improvement beside policy, dataset and environment."""
         return {
-            "rollouts": self.config.rollouts, "size": self.config.size, "output_dir": self.improved,
-            "eval_episodes": self.config.eval_episodes, "seed": self.first_seed,
+            "rollouts": self.config.rollouts, "exploration": EXPLORATION, "size": self.config.size,
+            "eval_episodes": self.config.eval_episodes, "seed": self.first_seed, "output_dir": self.improved,
         }  # fmt: skip
 
     @property
@@ -182,8 +178,8 @@ class Demo:
     def _improve(self) -> list[str]:
         return ["lerobot-wmrl-improve", *format_flags({
             "policy.path": self._policy, "dataset.root": self._recorded,
-            **env_flags(WmrlManiSkillEnv(**KNOWN), "real_env"),
-            "exploration": EXPLORATION, **self._given, "output_dir": str(self.improved),
+            **env_flags(WmrlManiSkillEnv(**KNOWN), "real_env"), **self._given,
+            "output_dir": str(self.improved),
         })]  # fmt: skip
 
     def _text_world_model(self) -> list[str]:
@@ -201,14 +197,13 @@ class Demo:
         })  # fmt: skip
 
     def _unseen(self) -> list[str]:
-        return self._compare("unseen", env_flags(WmrlManiSkillEnv(**UNSEEN)))
+        env = env_flags(WmrlManiSkillEnv(**UNSEEN))
+        return self.improvement().compare(self.out / "unseen", env, self.config.eval_episodes)
 
     def _imagined(self) -> list[str]:
-        return self._compare("imagined", self.improvement().imagination())
-
-    def _compare(self, folder: str, env: Flags) -> list[str]:
-        """Compare all policies on the same starts."""
-        return self.improvement().compare(self.out / folder, env, self.config.eval_episodes)
+        improvement = self.improvement()
+        env = improvement.imagination()
+        return improvement.compare(self.out / "imagined", env, self.config.eval_episodes)
 
     def _command(self, program: str, flags: Flags) -> list[str]:
         """Return a command of this package, at the demo's size."""

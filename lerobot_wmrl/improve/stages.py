@@ -18,7 +18,7 @@ from lerobot_wmrl.common.stages import FAILED, Stage, read_record
 from lerobot_wmrl.data.episodes import SUCCESS, ChosenEpisodes, DatasetSource, EpisodeTable, read_episodes
 from lerobot_wmrl.evaluation.comparison import RESULTS, chosen_policy
 from lerobot_wmrl.improve.configuration_improve import ROLLOUT_SEED_OFFSET, ImproveConfig
-from lerobot_wmrl.improve.findings import LONGEST_IMAGINATION, Findings
+from lerobot_wmrl.improve.findings import LONGEST_IMAGINATION, Findings, look
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
 from lerobot_wmrl.rl.recorders import env_flags
@@ -58,7 +58,7 @@ CHANNELS: Final = 3
 """Of a frame, a byte each."""
 
 PASS_PIXELS: Final = 2**23
-"""Pixels of observations in one forward and backward pass of PPO or cloning at most."""
+"""Pixels of observations in one forward and backward pass at most."""
 
 ROLLOUT_COLUMNS: Final = (*DEFAULT_FEATURES, ACTION, REWARD, SUCCESS, DONE, START_SEED, START_KIND)
 """Columns of recorded rollouts, beside those that the policy sees and the environment declares."""
@@ -88,6 +88,13 @@ class Improvement:
 
     config: ImproveConfig
     found: Findings
+
+    @classmethod
+    def of(cls, config: ImproveConfig) -> "Improvement":
+        """Look at the dataset. FieldError if the policy cannot be improved with it."""
+        assert config.policy is not None
+        table = read_episodes(config.dataset.open())
+        return cls(config, look(table, config.policy, config.dataset.episodes, config.rollouts))
 
     def stages(self) -> list[Stage]:
         """List every stage in order."""
@@ -279,11 +286,15 @@ class Improvement:
         tasks = table.column(START_TASK)[table.among(self.data.episodes)]
         return int(np.unique(tasks, return_counts=True)[1].min())
 
+    @property
+    def _pass_observations(self) -> int:
+        """Observations in one pass at most."""
+        return max(1, PASS_PIXELS // self.found.pixels)
+
     def _cloning(self) -> dict[str, Any]:
         """Return the preset of cloning, with smaller batches where frames are large."""
         settings = preset_settings(CLONING_PRESETS.get(self.config.preset, "demo"), "sft", ["filtered"])
-        fits = max(1, PASS_PIXELS // self.found.pixels)
-        return settings | {"batch_size": min(fits, settings["batch_size"])}
+        return settings | {"batch_size": min(self._pass_observations, settings["batch_size"])}
 
     def _columns(self) -> list[str]:
         name = f"local/{self.found.root.name}"
@@ -407,7 +418,7 @@ class Improvement:
                 recorded = int(table.length[table.success & table.among(self.data.episodes)].sum())
             if recorded * pixels * CHANNELS > ROLLOUT_BYTES:
                 flags["algorithm.recorded"] = False
-        fits = max(1, PASS_PIXELS // pixels)
+        fits = self._pass_observations
         if distils and fits < preset.get("algorithm.batch_size", DistillationConfig.batch_size):
             flags["algorithm.batch_size"] = fits
         if not distils and fits < MINIBATCH:

@@ -27,15 +27,11 @@ if TYPE_CHECKING:
 def improve(cfg: ImproveConfig) -> None:
     """Run every stage, write the report, and say what came of it."""
     from lerobot_wmrl.common.stages import claimed, run_stages
-    from lerobot_wmrl.data.episodes import read_episodes
-    from lerobot_wmrl.improve.findings import look
     from lerobot_wmrl.improve.report.page import Page
     from lerobot_wmrl.improve.report.words import verdict
 
     cfg.check()
-    assert cfg.policy is not None
-    table = read_episodes(cfg.dataset.open())
-    improvement = Improvement(cfg, look(table, cfg.policy, cfg.dataset.episodes, cfg.rollouts))
+    improvement = Improvement.of(cfg)
     print(f"{cfg.dataset.name}:\n{improvement.found}\n  {improvement.duration}")
     stages = improvement.stages()
     with claimed(cfg.output_dir, settings(cfg, stages)):

@@ -99,3 +99,8 @@ def test_every_file_is_a_configuration_of_its_command(path: Path, as_flags: bool
 
 def read_settings_of(config: object) -> dict[str, object]:
     return dict(presets._flat(draccus.encode(config), ()))
+
+
+def test_the_demos_defaults_are_those_of_its_preset() -> None:
+    """`--preset=demo` and no preset are the same."""
+    assert DemoConfig(**presets.preset_settings("demo", "demo")) == DemoConfig()

@@ -1,7 +1,8 @@
 """What the report and the command say: what was gained, and whether the world model can be trusted."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.evaluation.comparison import Pair
@@ -76,7 +77,7 @@ def decided_at(places: Sequence[Place]) -> str:
     level = comparison.pairs()[0].level
     return (
         f"McNemar's exact test decides a pair where p is at most {level:.2g}: {comparison.alpha} over the "
-        f"number of pairs."
+        "number of pairs."
     )
 
 
@@ -139,14 +140,16 @@ def gate_line(improvement: Improvement) -> list[str]:
     record = read_gate(improvement)
     if record is None:
         return []
-    fresh = record["fresh"]
-    false, recall = (
-        Proportion(fresh[name]["k"], fresh[name]["n"]) for name in ("false_positive_rate", "recall")
-    )
+    false, recall = gate_rates(record["fresh"])
     return [
         f"On {false.n + recall.n} fresh rollouts of the policy that RL began with: false positives {false}, "
         f"recall {recall}."
     ]
+
+
+def gate_rates(gate: Mapping[str, Any]) -> list[Proportion]:
+    """Return false positive rate and recall of a gate, as JSON has it."""
+    return [Proportion(gate[name]["k"], gate[name]["n"]) for name in ("false_positive_rate", "recall")]
 
 
 def taken_instead(improvement: Improvement) -> str:
@@ -154,9 +157,7 @@ def taken_instead(improvement: Improvement) -> str:
     point = improvement.relaxed_criterion()
     if point is None:
         return ""
-    false, recall = (
-        Proportion(point[name]["k"], point[name]["n"]) for name in ("false_positive_rate", "recall")
-    )
+    false, recall = gate_rates(point)
     return (
         f" Recall is 0 at done_threshold={DONE_THRESHOLD}: imagination took "
         f"done_threshold={point['done_threshold']} and done_frames={point['done_frames']}, chosen on the "
