@@ -48,8 +48,9 @@ class ImproveConfig(RunConfig):
     that succeed, and trains a frame tokenizer, a world model and, in imagination, the policy. A `cnn` is then
     fitted to a planner in imagination (distillation). In the end it compares the policy before, trained
     further, and improved: in `real_env` if there is one, else in imagination, which proves nothing about the
-    real world. Every stage is a command that you could call yourself; it is printed. Running the same command
-    again continues. The page to read is `report.html`.
+    real world. In `real_env` it also chooses the policy to use, on other starts: training in imagination can
+    make a policy worse. Every stage is a command that you could call yourself; it is printed. Running the
+    same command again continues. The page to read is `report.html`.
 
     Args:
         policy: `--policy.path=FOLDER` or a name on the hub: the policy to improve, cloned from such data.
@@ -64,7 +65,8 @@ class ImproveConfig(RunConfig):
             `tiny` (a minute, to try the command), or `auto`.
         iterations: of PPO, or of distillation if the policy is not trained by PPO; by default those of the
             size.
-        eval_episodes: starts on which the policies are compared.
+        eval_episodes: starts on which the policies are compared. In `real_env` half as many others choose the
+            policy to use.
         seed: of recording and training. Evaluation has seeds of its own, from 1,000,000 on.
         output_dir: folder of everything.
     """

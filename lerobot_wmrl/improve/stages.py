@@ -11,7 +11,13 @@ from lerobot.envs.utils import env_to_policy_features
 from lerobot.utils.constants import ACTION, DEFAULT_FEATURES, DONE, REWARD
 
 from lerobot_wmrl.common.checkpoints import last_checkpoint
-from lerobot_wmrl.common.constants import EVALUATION_SEED, START_KIND, START_SEED, START_TASK
+from lerobot_wmrl.common.constants import (
+    EVALUATION_SEED,
+    SELECTION_SEED,
+    START_KIND,
+    START_SEED,
+    START_TASK,
+)
 from lerobot_wmrl.common.lerobot_commands import edit_command, merge_command, train_command
 from lerobot_wmrl.common.presets import Flags, format_flags, preset_settings
 from lerobot_wmrl.common.stages import FAILED, Stage, read_record
@@ -109,6 +115,7 @@ class Improvement:
             "start": "Choose in imagination which policy to improve",
             "rl": "Train the policy in imagination",
             "distilled": "Fit the policy to a planner in imagination",
+            "choice": "Choose the policy to use, on other starts than those reported",
             "comparison": "Compare the policies",
         }
         needless = {
@@ -116,6 +123,7 @@ class Improvement:
             *(() if self.config.rollouts else ("rollouts", "merged")),
             *(() if self.clones else ("cloned", "start")),
             *(() if self.config.distils else ("distilled",)),
+            *(() if self.config.real_env else ("choice",)),
         }
         return [
             Stage(name, title, getattr(self, f"_{name}"), optional=name == "distilled")
@@ -128,7 +136,7 @@ class Improvement:
         real = {} if self.config.real_env is None else self._real_env("real_env")
         return ["lerobot-wmrl-play", *format_flags({
             "world_model.path": str(self.out / "world_model"), **DatasetSource.flags(self.data),
-            "policy.path": str(self.improved), **real, **self._success_criterion(),
+            "policy.path": self.policies[self.chosen()], **real, **self._success_criterion(),
         })]  # fmt: skip
 
     @property
@@ -147,11 +155,6 @@ class Improvement:
         """Path or name of the policy that is improved."""
         assert self.config.policy is not None
         return str(self.config.policy.pretrained_path)
-
-    @property
-    def improved(self) -> Path:
-        """Folder of the last policy's checkpoint."""
-        return last_checkpoint(self.out / ("distilled" if self.has_distilled else "rl"))
 
     @property
     def has_distilled(self) -> bool:
@@ -371,6 +374,20 @@ class Improvement:
     def _start(self) -> list[str]:
         both = [self.policies[CLONED], self.policy]
         return self.compare(self.out / "start", self.imagination(), IMAGINED_STARTS, both, self.config.seed)
+
+    def _choice(self) -> list[str]:
+        starts = max(1, self.config.eval_episodes // 2)
+        return self.compare(self.out / "choice", self._real_env("env"), starts, seed=SELECTION_SEED)
+
+    def chosen(self) -> str:
+        """Return which policy to use: the most successful one in the real environment, on starts of its own,
+        or the earliest of equally good ones; without such an environment the last one."""
+        *_, last = titles = [*self.policies]
+        if self.config.real_env is None:
+            return last
+        rates = json.loads((self.out / "choice" / RESULTS).read_text())["policies"]
+        shares = [rate["share"] for rate in rates.values()]
+        return titles[shares.index(max(shares))]
 
     def start(self) -> str:
         """Return which policy RL begins with: the one that was cloned from the successes, unless the world

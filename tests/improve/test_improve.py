@@ -72,10 +72,11 @@ def test_with_a_real_environment_its_rollouts_are_learnt_from_and_success_is_mea
     report = (folder / "report.html").read_text()
     assert report.count("<td>0 % (0 of 2; 0–66 %)</td>") == 4, "four policies"
     assert f"{DISTILLED}, against {CLONED}: 0 starts gained" in report
-    assert f"{DISTILLED}, against {CLONED}: 0 starts gained" in first.stdout
+    assert f"{DISTILLED}, against {SFT}: 0 starts gained" in first.stdout
+    assert f"Policy to use: {SFT}, " in first.stdout, "none ever succeeds, and this one costs no training"
     assert "2 rollouts of the SFT policy in pusht, exploration 0.2: 0 succeed" in report
     assert "failures: 2. The world model will hardly tell them" in report
-    assert "failures: " not in first.stdout.partition("[1/10]")[0], "there are rollouts to come"
+    assert "failures: " not in first.stdout.partition("[1/11]")[0], "there are rollouts to come"
     assert "Leave out columns" not in report
     merged = f"dataset.root={folder / 'merged'}"
     assert report.count(merged) == 7, "cloning, tokenizer, world model, imagined starts thrice, driving"
@@ -84,7 +85,7 @@ def test_with_a_real_environment_its_rollouts_are_learnt_from_and_success_is_mea
     assert trained["tokenizer"]["frame_sizes"] == [[96, 96]]
     assert (folder / "distilled" / last).exists()
     again = run(tmp_path, demonstrations, *real)
-    assert "[10/10] Compare the policies: done in" in again.stdout
+    assert "[11/11] Compare the policies: done in" in again.stdout
 
 
 def test_without_one_the_report_says_that_it_is_a_belief(demonstrations: Path, tmp_path: Path) -> None:
@@ -252,7 +253,9 @@ def test_rollouts_are_merged_and_successes_cloned_before_rl(
     assert {*starts, f"--policy.path={before if better else cloned}"} <= {*commands["rl"]}
     planner = {"--algorithm.type=distillation", "--algorithm.recorded=false", "--gate.action=off"}
     assert {*starts, *planner, f"--policy.path={ppo}"} <= {*commands["distilled"]}
-    assert {f"--policies=[{before},{cloned},{ppo},{distilled}]", "--against=all"} <= {*commands["comparison"]}
+    everything = {f"--policies=[{before},{cloned},{ppo},{distilled}]", "--against=all", "--env.type=pusht"}
+    assert {*everything, "--n_episodes=100", "--seed=1000000"} <= {*commands["comparison"]}
+    assert {*everything, "--n_episodes=50", "--seed=2000000"} <= {*commands["choice"]}
 
 
 @pytest.mark.parametrize(("kind", "names"), [
@@ -267,7 +270,7 @@ def test_only_policies_for_which_it_was_measured_are_fitted_to_a_planner_after_p
     assert [*improvement.policies] == names
     optional = [stage.name for stage in improvement.stages() if stage.optional]
     assert optional == (["distilled"] if DISTILLED in names else [])
-    assert str(improvement.improved) == improvement.policies[names[-1]]
+    assert improvement.chosen() == names[-1]
 
 
 @pytest.mark.parametrize(("adapters", "pixels", "flags"), [

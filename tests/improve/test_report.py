@@ -38,6 +38,7 @@ def finished(tmp_path: Path) -> Improvement:
     write_records(improvement)
     write_json(out / "comparison" / "comparison.json", comparison([*SUCCESSES.values()]))
     write_json(out / "start" / "comparison.json", comparison([7, 9], 10))
+    write_json(out / "choice" / "comparison.json", comparison([10, 12, 13, 18], 20))
     write_json(out / "check" / "metrics.json", {
         "false_positives": 2, "failures": 5, "true_positives": 3, "successes": 4, "auc": 0.9,
         "dataset": "data", "split": "validation",
@@ -83,7 +84,8 @@ def test_the_page_is_self_contained_and_says_the_numbers(finished: Improvement) 
     assert not re.findall(r"""(?:src|href)=["'](?!data:)""", page), "the page needs other files"
     assert "<h3>Changes in pusht, on the same starts</h3>" in page
     path = finished.policies[CLONED]
-    assert f"<td>{CLONED}</td><td>60 % (24 of 40; 45–74 %)</td><td><code>{path}</code></td>" in page
+    assert f"<tr><td>{CLONED}</td><td>60 % (24 of 40; 45–74 %)</td><td><code>{path}</code></td>" in page
+    assert f'<tr class="chosen"><td>{DISTILLED}</td>' in page
     assert f"<li>{DISTILLED}, against {SFT}: 20 starts gained, 0 lost, p = 1.9e-06: better</li>" in page
     assert f"<li>{PPO}, against {CLONED}: 0 starts gained, 4 lost, p = 0.12: not decided</li>" in page
     assert "decides a pair where p is at most 0.01: 0.06 over the number of pairs" in page
@@ -119,13 +121,14 @@ def test_a_planner_that_could_not_be_distilled_is_left_out(finished: Improvement
         "failed": True,
     })  # fmt: skip
     write_json(finished.out / "comparison" / "comparison.json", comparison([16, 24, 20]))
+    write_json(finished.out / "choice" / "comparison.json", comparison([10, 12, 13], 20))
     said = f"Fitting the policy to a planner failed ({finished.out}/logs/distilled.log)"
     page = text_of(finished)
     assert said in page
     assert "<td>Fit, failed</td>" in page
     assert said in verdict(finished, [compared(finished)])
     assert [*finished.policies] == [SFT, CLONED, PPO]
-    assert finished.improved == Path(finished.policies[PPO])
+    assert finished.chosen() == PPO
     assert "Fitting to the planner: loss" not in training_curves(finished)
 
 
@@ -137,6 +140,7 @@ def test_a_success_in_imagination_is_said_to_be_a_belief(finished: Improvement) 
     page = text_of(finished)
     assert warned in page
     assert "<h3>Changes in imagination, from frames of the dataset, on the same starts</h3>" in page
+    assert f"Policy to use: {DISTILLED}, {finished.policies[DISTILLED]}, the last one: nothing real" in page
     assert warned in verdict(finished, [compared(finished)])
 
 
@@ -181,10 +185,28 @@ def test_the_summary_holds_every_headline_number(finished: Improvement) -> None:
         "successes": 4,
     }
     assert summary["gate"] is None
+    assert summary["chosen"] == DISTILLED
     assert summary["seconds"] == 3.0 * len(finished.stages())
 
 
-def test_the_command_says_what_the_last_policy_gained_over_each_other_one(finished: Improvement) -> None:
+@pytest.mark.parametrize(("successes", "chosen"), [
+    ([10, 12, 13, 18], DISTILLED),
+    ([10, 12, 6, 12], CLONED),
+    ([13, 12, 6, 13], SFT),
+])  # fmt: skip
+def test_the_policy_to_use_is_the_best_one_on_other_starts(
+    successes: list[int], chosen: str, finished: Improvement
+) -> None:
+    """Of equally good ones the one with the least training, whatever the reported starts say."""
+    write_json(finished.out / "choice" / "comparison.json", comparison(successes, 20))
+    said, path = verdict(finished, [compared(finished)]), finished.policies[chosen]
+    assert f"Policy to use: {chosen}, {path}, the most successful in pusht on other starts than" in said
+    assert said.count(": better") + said.count(": worse") + said.count(": not decided") == 3
+    assert said.count(f"{chosen}, against ") + said.count(f", against {chosen}:") == 3
+    assert f"--policy.path={path}" in finished.drive()
+
+
+def test_the_command_says_what_the_chosen_policy_gained_over_each_other_one(finished: Improvement) -> None:
     said = verdict(finished, [compared(finished)])
     path = finished.policies[CLONED]
     assert f"- {CLONED}: 60 % (24 of 40; 45–74 %), `{path}`" in said

@@ -13,6 +13,7 @@ from lerobot_wmrl.common.stages import Stage, read_record
 from lerobot_wmrl.improve.report import figures
 from lerobot_wmrl.improve.report.results import Curve, Place, read_check, read_gate, training_curves
 from lerobot_wmrl.improve.report.words import (
+    choice_line,
     compared,
     decided_at,
     gate_line,
@@ -103,6 +104,7 @@ class Page:
             "places": {place.name: place.comparison.as_json() for place in self.places},
             "check": {name: check[name] for name in CHECKED},
             "gate": gate and gate["fresh"],
+            "chosen": self.improvement.chosen(),
             "seconds": sum(record["seconds"] for record in self.records),
             "peak_memory_bytes": max(record["peak_memory_bytes"] for record in self.records),
         }
@@ -138,6 +140,8 @@ class Page:
             decided_at=decided_at(self.places),
             reservations=reservations(improvement),
             start=start_line(improvement),
+            choice=choice_line(improvement),
+            chosen=summary["chosen"],
             bars=figures.success_bars({place.name: place.rates for place in self.places}),
             data=[*improvement.found.lines, *rollouts_line(improvement)],
             missing=lacks(improvement),

@@ -43,24 +43,38 @@ def lacks(improvement: Improvement) -> list[str]:
 
 
 def verdict(improvement: Improvement, places: Sequence[Place]) -> str:
-    """Say in a few lines what the last policy gained over each other one, and where."""
-    paths = improvement.policies
-    *_, last = paths
+    """Say in a few lines which policy to use, and what it gained over each other one, and where."""
+    paths, chosen = improvement.policies, improvement.chosen()
     said = []
     for place in places:
         rates = [f"- {title}: {rate}, `{paths[title]}`" for title, rate in place.rates.items()]
-        changes = [f"- {line}" for line in pair_lines(place, last)]
+        changes = [f"- {line}" for line in pair_lines(place, chosen)]
         said.append("\n".join([f"Success {place.name}, on the same starts:", *rates, *changes]))
-    return "\n\n".join([*said, decided_at(places), *lacks(improvement), *reservations(improvement)])
+    return "\n\n".join([
+        *said, decided_at(places), *lacks(improvement), *reservations(improvement), choice_line(improvement),
+    ])  # fmt: skip
 
 
-def pair_lines(place: Place, last: str | None = None) -> list[str]:
-    """Say what the policies gained over one another; only the `last` one, if it is given."""
+def choice_line(improvement: Improvement) -> str:
+    """Say which policy to use, and why."""
+    chosen = improvement.chosen()
+    said = f"Policy to use: {chosen}, {improvement.policies[chosen]}"
+    if improvement.config.real_env is None:
+        return f"{said}, the last one: nothing real has compared them."
+    found = read_place(
+        f"in {improvement.config.real_env.type}", improvement.out / "choice", [*improvement.policies]
+    )
+    shown = ", ".join(f"{title} {rate}" for title, rate in found.rates.items())
+    return f"{said}, the most successful {found.name} on other starts than those above: {shown}."
+
+
+def pair_lines(place: Place, about: str | None = None) -> list[str]:
+    """Say what the policies gained over one another; only pairs with the one it is `about`, if given."""
     return [
         f"{pair.after}, against {pair.before}: {pair.change.gained} starts gained, {pair.change.lost} lost, "
         f"p = {pair.p_value:.2g}: {decision(pair)}"
         for pair in place.comparison.pairs()
-        if last in (None, pair.after)
+        if about in (None, pair.before, pair.after)
     ]
 
 
