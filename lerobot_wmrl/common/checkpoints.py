@@ -48,6 +48,11 @@ def last_checkpoint(folder: Path) -> Path:
     return folder / LAST_CHECKPOINT / PRETRAINED_MODEL_DIR
 
 
+def best_checkpoint(folder: Path) -> Path:
+    """Return the model of the best checkpoint of a training with selection that writes to `folder`."""
+    return folder / CHECKPOINTS_DIR / BEST_CHECKPOINT_LINK / PRETRAINED_MODEL_DIR
+
+
 def write_checkpoint(output_dir: Path, total_steps: int, step: int, write: Callable[[Path], None]) -> Path:
     """Let `write` fill a temporary folder, then move it to `checkpoints/<step>` and point `last` at it."""
     target = checkpoint_dir(output_dir, step, total_steps)

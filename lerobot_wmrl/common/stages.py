@@ -48,19 +48,24 @@ Progress = Callable[[float, int], None]
 """Called about once a second with the seconds since the start and the peak memory so far in bytes."""
 
 
+def required() -> bool:
+    """Say of a stage that nothing goes on without it."""
+    return False
+
+
 @dataclass(frozen=True)
 class Stage:
     """One console command.
 
     The command is made when the stage starts: some of its flags depend on what earlier stages left, and what
-    an interrupted call left may have to be removed first. If an optional stage fails, the others go on; it
-    is tried again only as long as none of them has begun.
+    an interrupted call left may have to be removed first. If a stage fails that is optional, asked then, the
+    others go on; it is tried again only as long as none of them has begun.
     """
 
     name: str
     title: str
     command: Callable[[], list[str]]
-    optional: bool = False
+    optional: Callable[[], bool] = required
 
 
 class StageError(RuntimeError):
@@ -141,7 +146,7 @@ def run_stages(
         if record.get("finished"):
             print(f"{heading}: done in {record['seconds']:.0f} s", flush=True)
         elif record.get(FAILED) and any(read_record(output_dir, later.name) for later in stages[number:]):
-            print(f"{heading}: failed, and is left out", flush=True)
+            print(f"{heading}: failed, and the others went on", flush=True)
         else:
             run_stage(stage, heading, output_dir, record)
 
@@ -166,10 +171,10 @@ def run_stage(stage: Stage, heading: str, output_dir: Path, record: dict[str, An
     log = output_dir / "logs" / f"{stage.name}.log"
     log.parent.mkdir(parents=True, exist_ok=True)
     status = run_measured(command, log, save)
-    if status > 0 and stage.optional:  # below 0 it was killed
+    if status > 0 and stage.optional():  # below 0 it was killed
         record[FAILED] = True
         save(record["seconds"] - seconds, record["peak_memory_bytes"])
-        print(f"{stage.title}: exit status {status}. It is left out; its output is in {log}.", flush=True)
+        print(f"{stage.title}: exit status {status}. Its output is in {log}; the others go on.", flush=True)
         return
     if status != 0:
         raise StageError(

@@ -146,10 +146,12 @@ class Demo:
 
     @property
     def _given(self) -> dict[str, Any]:
-        """Settings of the improvement beside policy, dataset and environment."""
+        """Settings of the improvement beside policy, dataset and environment. No episode in ManiSkill chooses
+        anything: what is compared has learnt from the same episodes."""
         return {
             "rollouts": self.config.rollouts, "exploration": EXPLORATION, "size": self.config.size,
-            "eval_episodes": self.config.eval_episodes, "seed": self.first_seed, "output_dir": self.improved,
+            "selection_episodes": 0, "eval_episodes": self.config.eval_episodes, "seed": self.first_seed,
+            "output_dir": self.improved,
         }  # fmt: skip
 
     @property

@@ -65,8 +65,9 @@ class ImproveConfig(RunConfig):
             `tiny` (a minute, to try the command), or `auto`.
         iterations: of PPO, or of distillation if the policy is not trained by PPO; by default those of the
             size.
-        eval_episodes: starts on which the policies are compared. In `real_env` half as many others choose the
-            policy to use.
+        selection_episodes: starts in `real_env` that choose the policy to use. Half as many choose the
+            checkpoint of RL, of five. 0: the last policy and checkpoint.
+        eval_episodes: starts on which the policies are compared. They choose nothing.
         seed: of recording and training. Evaluation has seeds of its own, from 1,000,000 on.
         output_dir: folder of everything.
     """
@@ -80,6 +81,7 @@ class ImproveConfig(RunConfig):
     exploration: float = 0.2
     size: str = "auto"
     iterations: int | None = None
+    selection_episodes: int = 50
     eval_episodes: int = 100
     seed: int = 0
     output_dir: Path = Path("outputs/improve")
@@ -105,7 +107,7 @@ class ImproveConfig(RunConfig):
         if not self.dataset.given:
             raise FieldError("dataset.root", "", "is missing", "give `dataset.root` or `dataset.repo_id`")
         require_choice(self, "size", SIZES)
-        require_at_least(self, 0, "rollouts")
+        require_at_least(self, 0, "rollouts", "selection_episodes")
         require_at_least(self, 1, "eval_episodes")
         if self.rollouts and self.real_env is None:
             raise FieldError(
@@ -122,6 +124,11 @@ class ImproveConfig(RunConfig):
         """The stages' preset."""
         automatic = "cpu" if torch.cuda.is_available() else "demo"
         return automatic if self.size == "auto" else self.size
+
+    @property
+    def selects(self) -> bool:
+        """Whether episodes in `real_env` choose checkpoint and policy."""
+        return self.real_env is not None and self.selection_episodes > 0
 
     @property
     def algorithm(self) -> Flags:

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import ceil
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,7 +11,7 @@ import numpy as np
 from lerobot.envs.utils import env_to_policy_features
 from lerobot.utils.constants import ACTION, DEFAULT_FEATURES, DONE, REWARD
 
-from lerobot_wmrl.common.checkpoints import last_checkpoint
+from lerobot_wmrl.common.checkpoints import best_checkpoint, last_checkpoint
 from lerobot_wmrl.common.constants import (
     EVALUATION_SEED,
     SELECTION_SEED,
@@ -20,7 +21,7 @@ from lerobot_wmrl.common.constants import (
 )
 from lerobot_wmrl.common.lerobot_commands import edit_command, merge_command, train_command
 from lerobot_wmrl.common.presets import Flags, format_flags, preset_settings
-from lerobot_wmrl.common.stages import FAILED, Stage, read_record
+from lerobot_wmrl.common.stages import FAILED, Stage, read_record, required
 from lerobot_wmrl.data.episodes import SUCCESS, ChosenEpisodes, DatasetSource, EpisodeTable, read_episodes
 from lerobot_wmrl.evaluation.comparison import RESULTS, chosen_policy
 from lerobot_wmrl.improve.configuration_improve import ROLLOUT_SEED_OFFSET, ImproveConfig
@@ -75,6 +76,9 @@ CLONING_PRESETS: Final = {"tiny": "tiny"}
 MINIBATCH: Final = PPOConfig.minibatch_size
 """Decisions in an optimizer step of PPO."""
 
+SELECTIONS: Final = 4
+"""Measurements of success in the real environment during RL, beside one before it."""
+
 IMAGINED_STARTS: Final = 256
 """Imagined episodes of each policy that choose which one to improve, at most."""
 
@@ -115,7 +119,7 @@ class Improvement:
             "start": "Choose in imagination which policy to improve",
             "rl": "Train the policy in imagination",
             "distilled": "Fit the policy to a planner in imagination",
-            "choice": "Choose the policy to use, on other starts than those reported",
+            "choice": "Choose the policy to use",
             "comparison": "Compare the policies",
         }
         needless = {
@@ -123,10 +127,11 @@ class Improvement:
             *(() if self.config.rollouts else ("rollouts", "merged")),
             *(() if self.clones else ("cloned", "start")),
             *(() if self.config.distils else ("distilled",)),
-            *(() if self.config.real_env else ("choice",)),
+            *(() if self.config.selects else ("choice",)),
         }
+        optional = {"rl": self.rl_checkpoint.exists, "distilled": lambda: True}
         return [
-            Stage(name, title, getattr(self, f"_{name}"), optional=name == "distilled")
+            Stage(name, title, getattr(self, f"_{name}"), optional.get(name, required))
             for name, title in steps.items()
             if name not in needless
         ]
@@ -157,6 +162,18 @@ class Improvement:
         return str(self.config.policy.pretrained_path)
 
     @property
+    def rl_checkpoint(self) -> Path:
+        """Folder of RL's policy, which a training that stops early leaves too: of the best checkpoint where
+        episodes in the real environment choose it, else of the last one."""
+        folder = self.out / "rl"
+        return best_checkpoint(folder) if self.config.selects else last_checkpoint(folder)
+
+    @property
+    def _rl_selection_episodes(self) -> int:
+        """Starts that choose RL's checkpoint, before those that choose the policy."""
+        return (self.config.selection_episodes + 1) // 2
+
+    @property
     def has_distilled(self) -> bool:
         """Whether the policy is fitted to a planner after PPO, and that has not failed."""
         return self.config.distils and not read_record(self.out, "distilled").get(FAILED)
@@ -173,7 +190,7 @@ class Improvement:
         if self.clones:
             trained[CLONED] = str(last_checkpoint(self.out / "cloned"))
         fitted = self.config.algorithm["algorithm.type"] == "distillation"
-        trained[FITTED if fitted else PPO] = str(last_checkpoint(self.out / "rl"))
+        trained[FITTED if fitted else PPO] = str(self.rl_checkpoint)
         if self.has_distilled:
             trained[DISTILLED] = str(last_checkpoint(self.out / "distilled"))
         return trained
@@ -376,14 +393,14 @@ class Improvement:
         return self.compare(self.out / "start", self.imagination(), IMAGINED_STARTS, both, self.config.seed)
 
     def _choice(self) -> list[str]:
-        starts = max(1, self.config.eval_episodes // 2)
-        return self.compare(self.out / "choice", self._real_env("env"), starts, seed=SELECTION_SEED)
+        starts, seed = self.config.selection_episodes, SELECTION_SEED + self._rl_selection_episodes
+        return self.compare(self.out / "choice", self._real_env("env"), starts, seed=seed)
 
     def chosen(self) -> str:
         """Return which policy to use: the most successful one in the real environment, on starts of its own,
-        or the earliest of equally good ones; without such an environment the last one."""
+        or the earliest of equally good ones; without such starts the last one."""
         *_, last = titles = [*self.policies]
-        if self.config.real_env is None:
+        if not self.config.selects:
             return last
         rates = json.loads((self.out / "choice" / RESULTS).read_text())["policies"]
         shares = [rate["share"] for rate in rates.values()]
@@ -398,17 +415,21 @@ class Improvement:
         return (CLONED, SFT)[list(found["policies"]).index(chosen_policy(found))]
 
     def _rl(self) -> list[str]:
-        real = {} if self.config.real_env is None else self._real_env("real_env")
+        real: Flags = {} if self.config.real_env is None else self._real_env("real_env")
         given = self.config.iterations
+        algorithm: Flags = {**self.config.algorithm, **({} if given is None else {"iterations": given})}
+        selection: Flags = {
+            "selection.freq": ceil(self._iterations(algorithm) / SELECTIONS),
+            "selection.n_episodes": self._rl_selection_episodes,
+        }
         return self._train("rl", self.policies[self.start()], {
             **real, "gate.action": "warn" if real else "off", "gate.freq": 0,
-            "gate.n_episodes": min(50, self.config.eval_episodes), **self.config.algorithm,
-            **({} if given is None else {"iterations": given}),
+            "gate.n_episodes": min(50, self.config.eval_episodes),
+            **(selection if self.config.selects else {}), **algorithm,
         })  # fmt: skip
 
     def _distilled(self) -> list[str]:
-        path = str(last_checkpoint(self.out / "rl"))
-        return self._train("distilled", path, {
+        return self._train("distilled", str(self.rl_checkpoint), {
             "gate.action": "off", "algorithm.type": "distillation", "algorithm.recorded": False,
         })  # fmt: skip
 
@@ -418,12 +439,17 @@ class Improvement:
             "seed": self.config.seed, "output_dir": str(self.out / folder),
         })  # fmt: skip
 
+    def _iterations(self, training: Flags) -> int:
+        """Return the iterations of a training with these flags."""
+        preset = preset_settings(self.config.preset, "train", [str(training["algorithm.type"])])
+        return int(training.get("iterations", preset["iterations"]))
+
     def _memory(self, training: Flags) -> Flags:
         """Return what keeps the frames that a policy sees in memory, where they are large."""
         algorithm = training["algorithm.type"]
         distils, pixels = algorithm == "distillation", self.found.pixels
         preset = preset_settings(self.config.preset, "train", [str(algorithm)])
-        kept = int(training.get("iterations", preset["iterations"])) if distils else 1
+        kept = self._iterations(training) if distils else 1
         flags: dict[str, bool | int] = {}
         envs = max(1, ROLLOUT_BYTES // (kept * self.length * pixels * CHANNELS))
         if envs < preset["num_envs"]:

@@ -60,33 +60,44 @@ def test_finished_stages_are_not_repeated_and_a_failed_one_is(tmp_path: Path) ->
 
 def test_an_optional_stage_that_fails_is_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Also by a second call, whose later stages may build on there being nothing."""
-    file, fails = tmp_path / "ran", replace(python("b", "raise SystemExit(3)"), optional=True)
+    file, fails = tmp_path / "ran", replace(python("b", "raise SystemExit(3)"), optional=lambda: True)
     stages = [appending("a", file), fails, appending("c", file)]
     run_stages(stages, tmp_path)
     assert file.read_text() == "ac"
-    assert f"b: exit status 3. It is left out; its output is in {tmp_path / 'logs' / 'b.log'}" in (
+    assert f"b: exit status 3. Its output is in {tmp_path / 'logs' / 'b.log'}; the others go on" in (
         capsys.readouterr().out
     )
     record = read_record(tmp_path, "b")
     assert record["failed"]
     assert not record["finished"]
     run_stages(stages, tmp_path)
-    assert "[2/3] b: failed, and is left out" in capsys.readouterr().out
+    assert "[2/3] b: failed, and the others went on" in capsys.readouterr().out
     assert file.read_text() == "ac"
 
 
 def test_an_optional_stage_is_tried_again_before_others_build_on_its_failure(tmp_path: Path) -> None:
-    file, fails = tmp_path / "ran", replace(python("b", "raise SystemExit(3)"), optional=True)
+    file, fails = tmp_path / "ran", replace(python("b", "raise SystemExit(3)"), optional=lambda: True)
     run_stages([fails], tmp_path)
-    run_stages([replace(appending("b", file), optional=True), appending("c", file)], tmp_path)
+    run_stages([replace(appending("b", file), optional=lambda: True), appending("c", file)], tmp_path)
     assert file.read_text() == "bc"
     assert "failed" not in read_record(tmp_path, "b")
+
+
+def test_a_stage_may_say_only_when_it_fails_that_it_is_optional(tmp_path: Path) -> None:
+    """As one that leaves something to go on with, or not."""
+    left, file = tmp_path / "left", tmp_path / "ran"
+    fails = replace(python("a", "raise SystemExit(3)"), optional=left.exists)
+    with pytest.raises(StageError, match="exit status 3"):
+        run_stages([fails, appending("b", file)], tmp_path)
+    left.touch()
+    run_stages([fails, appending("b", file)], tmp_path)
+    assert file.read_text() == "b"
 
 
 def test_an_optional_stage_that_was_killed_has_not_failed(tmp_path: Path) -> None:
     kill = "import os, signal; os.kill(os.getpid(), signal.SIGKILL)"
     with pytest.raises(StageError, match="exit status -9"):
-        run_stages([replace(python("b", kill), optional=True)], tmp_path)
+        run_stages([replace(python("b", kill), optional=lambda: True)], tmp_path)
     assert "failed" not in read_record(tmp_path, "b")
 
 

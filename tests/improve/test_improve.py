@@ -255,7 +255,31 @@ def test_rollouts_are_merged_and_successes_cloned_before_rl(
     assert {*starts, *planner, f"--policy.path={ppo}"} <= {*commands["distilled"]}
     everything = {f"--policies=[{before},{cloned},{ppo},{distilled}]", "--against=all", "--env.type=pusht"}
     assert {*everything, "--n_episodes=100", "--seed=1000000"} <= {*commands["comparison"]}
-    assert {*everything, "--n_episodes=50", "--seed=2000000"} <= {*commands["choice"]}
+    assert {*everything, "--n_episodes=50", "--seed=2000025"} <= {*commands["choice"]}
+    measured = {"--selection.freq=10", "--selection.n_episodes=25", "--real_env.type=pusht"}
+    assert measured <= {*commands["rl"]}
+    assert "checkpoints/best/" in ppo
+    assert "checkpoints/last/" in distilled
+
+
+def test_without_starts_to_select_on_the_last_checkpoint_and_policy_are_taken(tmp_path: Path) -> None:
+    improvement = improvement_of(tmp_path)
+    improvement.config.real_env, improvement.config.selection_episodes = PushtEnv(), 0
+    commands = {
+        stage.name: stage.command() for stage in improvement.stages() if stage.name in ("rl", "choice")
+    }
+    assert [*commands] == ["rl"]
+    assert not [flag for flag in commands["rl"] if "selection" in flag]
+    assert "checkpoints/last/" in improvement.policies[PPO]
+    assert improvement.chosen() == DISTILLED
+
+
+def test_rl_may_stop_early_if_it_leaves_a_checkpoint(tmp_path: Path) -> None:
+    improvement = improvement_of(tmp_path)
+    (rl,) = (stage for stage in improvement.stages() if stage.name == "rl")
+    assert not rl.optional()
+    Path(improvement.policies[PPO]).mkdir(parents=True)
+    assert rl.optional()
 
 
 @pytest.mark.parametrize(("kind", "names"), [
@@ -268,7 +292,7 @@ def test_only_policies_for_which_it_was_measured_are_fitted_to_a_planner_after_p
 ) -> None:
     improvement = improvement_of(tmp_path, policy=kind(device="cpu", pretrained_path=tmp_path))
     assert [*improvement.policies] == names
-    optional = [stage.name for stage in improvement.stages() if stage.optional]
+    optional = [stage.name for stage in improvement.stages() if stage.optional()]
     assert optional == (["distilled"] if DISTILLED in names else [])
     assert improvement.chosen() == names[-1]
 

@@ -39,6 +39,9 @@ def finished(tmp_path: Path) -> Improvement:
     write_json(out / "comparison" / "comparison.json", comparison([*SUCCESSES.values()]))
     write_json(out / "start" / "comparison.json", comparison([7, 9], 10))
     write_json(out / "choice" / "comparison.json", comparison([10, 12, 13, 18], 20))
+    for iteration, k in ((0, 5), (10, 8), (20, 6)):
+        record = {"real": {"k": k, "n": 10}, "imagined": {"k": iteration // 2, "n": 10}}
+        write_json(out / "rl" / "selection" / f"{iteration:06d}" / "record.json", record)
     write_json(out / "check" / "metrics.json", {
         "false_positives": 2, "failures": 5, "true_positives": 3, "successes": 4, "auc": 0.9,
         "dataset": "data", "split": "validation",
@@ -47,7 +50,7 @@ def finished(tmp_path: Path) -> Improvement:
     (out / "logs").mkdir()
     (out / "logs" / "cloned.log").write_text("INFO step:1 loss:2.0 \nINFO step:2 loss:1.0 \n")
     for folder in ("tokenizer", "world_model", "rl", "distilled"):
-        (out / folder).mkdir()
+        (out / folder).mkdir(exist_ok=True)
         append_metrics(out / folder, 1, {"loss": 1.0, "policy_loss": 2.0, "success_rate": 0.5})
     return improvement
 
@@ -92,6 +95,10 @@ def test_the_page_is_self_contained_and_says_the_numbers(finished: Improvement) 
     assert (
         f"RL began with: {CLONED}. Success in imagination, from frames of the dataset: {CLONED} 70 %" in page
     )
+    assert (
+        "RL&#39;s checkpoint is that of iteration 10, the most successful in pusht. Success by iteration, on "
+        "starts set aside for this: 0: 50 % (5 of 10; 24–76 %), 10: 80 % (8 of 10; " in page
+    )
     for stage in finished.stages():
         assert f"<pre>run-{stage.name}</pre>" in page
     assert page.count("data:image/png;base64,") == 8, "bars, the replayed episode, and six curves"
@@ -133,6 +140,16 @@ def test_a_planner_that_could_not_be_distilled_is_left_out(finished: Improvement
 
 
 @pytest.mark.usefixtures("without_drawing")
+def test_rl_that_stopped_early_is_named(finished: Improvement) -> None:
+    warned = f"RL stopped before its end ({finished.out}/logs/rl.log)"
+    assert warned not in text_of(finished)
+    record = json.loads((finished.out / "stages" / "rl.json").read_text())
+    write_json(finished.out / "stages" / "rl.json", {**record, "failed": True})
+    assert warned in text_of(finished)
+    assert warned in verdict(finished, [compared(finished)])
+
+
+@pytest.mark.usefixtures("without_drawing")
 def test_a_success_in_imagination_is_said_to_be_a_belief(finished: Improvement) -> None:
     warned = "shows nothing about the real world"
     assert warned not in text_of(finished)
@@ -140,7 +157,10 @@ def test_a_success_in_imagination_is_said_to_be_a_belief(finished: Improvement) 
     page = text_of(finished)
     assert warned in page
     assert "<h3>Changes in imagination, from frames of the dataset, on the same starts</h3>" in page
-    assert f"Policy to use: {DISTILLED}, {finished.policies[DISTILLED]}, the last one: nothing real" in page
+    assert (
+        f"Policy to use: {DISTILLED}, {finished.policies[DISTILLED]}, the last one. Nothing has chosen it"
+        in page
+    )
     assert warned in verdict(finished, [compared(finished)])
 
 
@@ -200,7 +220,7 @@ def test_the_policy_to_use_is_the_best_one_on_other_starts(
     """Of equally good ones the one with the least training, whatever the reported starts say."""
     write_json(finished.out / "choice" / "comparison.json", comparison(successes, 20))
     said, path = verdict(finished, [compared(finished)]), finished.policies[chosen]
-    assert f"Policy to use: {chosen}, {path}, the most successful in pusht on other starts than" in said
+    assert f"Policy to use: {chosen}, {path}, the most successful in pusht on starts set aside" in said
     assert said.count(": better") + said.count(": worse") + said.count(": not decided") == 3
     assert said.count(f"{chosen}, against ") + said.count(f", against {chosen}:") == 3
     assert f"--policy.path={path}" in finished.drive()

@@ -24,7 +24,7 @@ KILLED_STAGE = "improve/rollouts"
 STAGES = [stage.name for stage in Demo(DemoConfig()).stages()]
 IMPROVED = (
     "rollouts", "merged", "cloned", "tokenizer", "world_model", "check", "start", "rl", "distilled",
-    "choice", "comparison",
+    "comparison",
 )  # fmt: skip
 PLACES = ("in known scenes", "in unseen scenes", "in imagination, from frames of the dataset")
 HEADINGS = (

@@ -11,6 +11,7 @@ from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.evaluation.comparison import RESULTS, Comparison, read_episodes
 from lerobot_wmrl.improve.stages import Improvement
+from lerobot_wmrl.rl.callbacks import Record
 
 MODELS = {"tokenizer": "Frame tokenizer", "world_model": "World model"}
 """Models that are trained, by their folders."""
@@ -81,6 +82,12 @@ def read_gate(improvement: Improvement) -> dict[str, Any] | None:
     """Read what the gate found before RL; None if there was none."""
     records = sorted((improvement.out / "rl" / "gate").glob("*/record.json"))
     return read_json(records[-1]) if records else None
+
+
+def read_selection(improvement: Improvement) -> dict[int, Record]:
+    """Read how successful RL's checkpoints were, by iteration."""
+    folders = (improvement.out / "rl" / "selection").glob("*/record.json")
+    return {int(path.parent.name): read_json(path) for path in folders}
 
 
 def training_curves(improvement: Improvement) -> dict[str, Curve]:

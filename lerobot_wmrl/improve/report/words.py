@@ -4,13 +4,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from lerobot_wmrl.common.stages import FAILED, read_record
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.evaluation.comparison import Pair
 from lerobot_wmrl.evaluation.gate import DOUBTFUL_AUC
 from lerobot_wmrl.evaluation.report import seen_line
 from lerobot_wmrl.improve.findings import few_failures
-from lerobot_wmrl.improve.report.results import Place, read_check, read_gate, read_place
+from lerobot_wmrl.improve.report.results import Place, read_check, read_gate, read_place, read_selection
 from lerobot_wmrl.improve.stages import CLONED, DONE_THRESHOLD, SFT, Improvement
+from lerobot_wmrl.rl.selection import REAL, best_iteration, success
 
 
 def compared(improvement: Improvement) -> Place:
@@ -57,15 +59,28 @@ def verdict(improvement: Improvement, places: Sequence[Place]) -> str:
 
 def choice_line(improvement: Improvement) -> str:
     """Say which policy to use, and why."""
-    chosen = improvement.chosen()
+    chosen, config = improvement.chosen(), improvement.config
     said = f"Policy to use: {chosen}, {improvement.policies[chosen]}"
-    if improvement.config.real_env is None:
-        return f"{said}, the last one: nothing real has compared them."
-    found = read_place(
-        f"in {improvement.config.real_env.type}", improvement.out / "choice", [*improvement.policies]
-    )
-    shown = ", ".join(f"{title} {rate}" for title, rate in found.rates.items())
-    return f"{said}, the most successful {found.name} on other starts than those above: {shown}."
+    if config.real_env is None or not config.selects:
+        return f"{said}, the last one. Nothing has chosen it, and RL can make a policy worse."
+    where = f"in {config.real_env.type}"
+    rates = read_place(where, improvement.out / "choice", [*improvement.policies]).rates
+    shown = ", ".join(f"{title} {rate}" for title, rate in rates.items())
+    return f"{said}, the most successful {where} on starts set aside for this choice: {shown}."
+
+
+def rl_line(improvement: Improvement) -> list[str]:
+    """Say which checkpoint of RL is compared, and how others did; nothing if none was chosen."""
+    real = improvement.config.real_env
+    if real is None or not improvement.config.selects:
+        return []
+    records = read_selection(improvement)
+    best = best_iteration(records, REAL)
+    shown = ", ".join(f"{iteration}: {success(records[iteration], REAL)}" for iteration in sorted(records))
+    return [
+        f"RL's checkpoint is that of iteration {best}, the most successful in {real.type}. Success by "
+        f"iteration, on starts set aside for this: {shown}."
+    ]
 
 
 def pair_lines(place: Place, about: str | None = None) -> list[str]:
@@ -102,6 +117,12 @@ def reservations(improvement: Improvement) -> list[str]:
         found.append(
             "This is what the world model predicts, and shows nothing about the real world. Run the policies "
             "there, label what they did, and run the command again on all episodes."
+        )
+    if read_record(improvement.out, "rl").get(FAILED):
+        log = improvement.out / "logs" / "rl.log"
+        found.append(
+            f"RL stopped before its end ({log}), so a checkpoint from before that is compared. To try again, "
+            "choose another output_dir."
         )
     if improvement.config.distils and not improvement.has_distilled:
         log = improvement.out / "logs" / "distilled.log"
