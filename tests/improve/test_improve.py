@@ -49,7 +49,7 @@ def arguments(folder: Path, demonstrations: Path, *flags: str) -> list[str]:
         save_untrained_policy(policy, OBS_IMAGE, size=96, actions=2, constant=250.0)
     return [
         f"--policy.path={policy}", f"--dataset.root={demonstrations}", "--size=tiny", "--iterations=1",
-        "--eval_episodes=2", f"--output_dir={folder / 'improve'}", *flags,
+        "--selection_episodes=2", "--eval_episodes=2", f"--output_dir={folder / 'improve'}", *flags,
     ]  # fmt: skip
 
 
