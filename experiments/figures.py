@@ -8,18 +8,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.improve.report.figures import COLOURS, tidy
 
 PLACES: Final = {"imagined": "PPO in imagination", "simulated": "PPO in ManiSkill"}
 DOMAINS: Final = {"ind": "known scenes", "ood": "unseen scenes", "drawn": "known scenes, tokens drawn"}
 CURVES: Final = (("data", "episodes"), ("time", "minutes"), ("size", "parameters"))
 """How the names of a learning curve's trainings begin, and what they are drawn over."""
-
-
-def spread(rate: Mapping[str, Any]) -> list[list[float]]:
-    """Return the distances of a share to both ends of its interval, as errorbar wants them."""
-    low, high = rate["wilson_95"]
-    return [[rate["share"] - low], [high - rate["share"]]]
 
 
 def draw_comparison(results: Mapping[str, Any], path: Path) -> None:
@@ -59,8 +54,9 @@ def draw_improvement(found: Mapping[str, Any], path: Path) -> None:
         policies = numbers["policies"]
         for offset, (kind, title) in enumerate({"cloned": "SFT", "trained": "PPO in imagination"}.items()):
             for place, row in enumerate(policies.values()):
+                rate = Proportion(row[kind]["k"], row[kind]["n"])
                 axes.bar(
-                    place + 0.25 * offset, row[kind]["share"], 0.22, yerr=spread(row[kind]), capsize=3,
+                    place + 0.25 * offset, rate.share, 0.22, yerr=rate.whiskers, capsize=3,
                     color=COLOURS[offset], label=title if place == 0 and domain == list(found)[-1] else None,
                 )  # fmt: skip
         axes.set_xticks([place + 0.125 for place in range(len(policies))], list(policies))

@@ -37,6 +37,12 @@ class Proportion:
     def interval(self) -> tuple[float, float]:
         return wilson_interval(self.k, self.n)
 
+    @property
+    def whiskers(self) -> list[list[float]]:
+        """Distances of the share to both ends of its interval, as matplotlib's errorbar takes them."""
+        low, high = self.interval
+        return [[self.share - low], [high - self.share]]
+
     def __str__(self) -> str:
         if not self.n:
             return "no episode"

@@ -177,10 +177,8 @@ def save_picture(comparison: Comparison, path: Path) -> None:
     figure = Figure(figsize=(7, 1.2 + 0.5 * len(rates)), layout="constrained")
     axes = figure.subplots()
     for place, rate in enumerate(rates.values()):
-        low, high = rate.interval
         axes.barh(place, rate.share, 0.6, color="#2b6cb0")
-        distances = [[rate.share - low], [high - rate.share]]
-        axes.errorbar(rate.share, place, xerr=distances, color="#333", capsize=4)
+        axes.errorbar(rate.share, place, xerr=rate.whiskers, color="#333", capsize=4)
     axes.set_yticks(range(len(rates)), list(rates))
     axes.invert_yaxis()
     axes.set_xlim(0, 1)

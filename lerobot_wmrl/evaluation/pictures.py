@@ -140,8 +140,15 @@ def save_agreement(agreement: Agreement, path: Path) -> None:
     figure, axes = plt.subplots(figsize=(4.2, 4))
     axes.plot((0, 1), (0, 1), color="#999", linewidth=1, linestyle="--")
     for imagined, real in agreement.policies.values():
-        x, y = ([[abs(each.share - bound)] for bound in each.interval] for each in (imagined, real))
-        axes.errorbar(imagined.share, real.share, y, x, color="#2b6cb0", marker="o", capsize=2)
+        axes.errorbar(
+            imagined.share,
+            real.share,
+            real.whiskers,
+            imagined.whiskers,
+            color="#2b6cb0",
+            marker="o",
+            capsize=2,
+        )
     axes.set(xlim=(0, 1), ylim=(0, 1), xlabel="success in the world model", ylabel="success in real_env")
     _save(figure, path)
 

@@ -36,12 +36,15 @@ def success_bars(places: Mapping[str, Mapping[str, Proportion]]) -> str:
     for offset, (place, rates) in enumerate(places.items()):
         for group, rate in enumerate(rates.values()):
             x = group + (offset - (len(places) - 1) / 2) * width
-            low, high = rate.interval
             label = place if group == 0 else None
             axes.bar(x, rate.share, width=0.92 * width, color=COLOURS[offset], label=label)
-            axes.errorbar(x, rate.share, [[rate.share - low], [high - rate.share]], color="#333", capsize=4)
+            axes.errorbar(x, rate.share, rate.whiskers, color="#333", capsize=4)
             axes.annotate(
-                f"{100 * rate.share:.0f} %", (x, high), (0, 3), textcoords="offset points", ha="center"
+                f"{100 * rate.share:.0f} %",
+                (x, rate.interval[1]),
+                (0, 3),
+                textcoords="offset points",
+                ha="center",
             )
     titles = [title.replace(" ", "\n", 1) for title in next(iter(places.values()))]
     axes.set_xticks(range(len(titles)), titles)
