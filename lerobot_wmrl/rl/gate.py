@@ -88,10 +88,11 @@ class SuccessGate:
     def apply(self, records: Mapping[int, Record]) -> None:
         """Warn in red, or raise TrainingStopped, if the latest verdict is bad."""
         latest = records[max(records)]
+        said = f"{latest['warning']}. {REMEDIES}" if latest["failed"] else latest["warning"]
         if latest["failed"] and self.config.action == "stop":
-            raise TrainingStopped(f"{latest['warning']}; or train nonetheless with `gate.action` warn")
-        if latest["warning"]:
-            logging.warning(colored(latest["warning"], "red", attrs=["bold"]))
+            raise TrainingStopped(f"{said}; or train nonetheless with `gate.action` warn")
+        if said:
+            logging.warning(colored(said, "red", attrs=["bold"]))
 
     def _new_model(self, iteration: int) -> bool:
         return iteration == 0 or iteration in self.refreshed
@@ -113,7 +114,7 @@ class SuccessGate:
             counts = " and ".join(f"{v.false_positives} of {source} rollouts" for source, v in failed.items())
             return (
                 f"Gate, iteration {iteration}: the world model calls failures successes, {counts}, above "
-                f"`gate.limit` ({self.config.limit}). {REMEDIES}"
+                f"`gate.limit` ({self.config.limit})"
             )
         if not verdicts:
             return (

@@ -79,6 +79,8 @@ def test_above_the_limit_it_stops_or_warns_with_advice(
     with caplog.at_level(logging.WARNING):
         warning.apply(records)
     assert "the world model calls failures successes" in caplog.text
+    assert "dyna.rounds" in caplog.text
+    assert "dyna" not in records[0]["warning"], "what is shown of it elsewhere has its own advice"
     tolerant = make_gate(BELIEVES_ALL, limit=1.0)
     record = tolerant.run(0, tmp_path, tmp_path / "tolerant")
     assert (record["failed"], record["warning"]) == (False, None)
