@@ -20,14 +20,13 @@ from lerobot_wmrl.common.constants import (
     START_TASK,
 )
 from lerobot_wmrl.common.lerobot_commands import edit_command, merge_command, train_command
-from lerobot_wmrl.common.presets import Flags, format_flags, preset_settings
+from lerobot_wmrl.common.presets import Flags, format_flags
 from lerobot_wmrl.common.stages import FAILED, Stage, read_record, required
 from lerobot_wmrl.data.episodes import SUCCESS, ChosenEpisodes, DatasetSource, EpisodeTable, read_episodes
 from lerobot_wmrl.evaluation.comparison import RESULTS, chosen_policy
 from lerobot_wmrl.improve.configuration_improve import ROLLOUT_SEED_OFFSET, ImproveConfig
 from lerobot_wmrl.improve.findings import LONGEST_IMAGINATION, Findings, look
-from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
-from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
+from lerobot_wmrl.improve.sizes import Sizes
 from lerobot_wmrl.rl.recorders import env_flags
 
 SFT: Final = "SFT policy"
@@ -43,9 +42,6 @@ DURATIONS: Final = {
 }  # fmt: skip
 """How long all stages but those in `real_env` take."""
 
-SIDES: Final = {"tiny": 32, "demo": 64, "cpu": 128}
-"""Pixels a side of imagined frames at each size, unless the dataset's are smaller."""
-
 ENOUGH_HELD_OUT: Final = 10
 """If fewer episodes are held out, the check takes all, most of which were learnt from: a few say too little
 about a threshold."""
@@ -54,27 +50,8 @@ SLOWEST: Final = 2
 """A rollout may take this many times as long as the longest recorded episode: what a stuck one does beyond
 would fill the data."""
 
-SIDE_STEP: Final = 32
-"""A side is a multiple of this: at any of the sizes, the transformer's patches divide the token grid."""
-
-ROLLOUT_BYTES: Final = 2**31
-"""Bytes of frames, in the policy's size, that RL keeps at most: PPO those of an iteration, distillation those
-of all iterations."""
-
-CHANNELS: Final = 3
-"""Of a frame, a byte each."""
-
-PASS_PIXELS: Final = 2**23
-"""Pixels of observations in one forward and backward pass at most."""
-
 ROLLOUT_COLUMNS: Final = (*DEFAULT_FEATURES, ACTION, REWARD, SUCCESS, DONE, START_SEED, START_KIND)
 """Columns of recorded rollouts, beside those that the policy sees and the environment declares."""
-
-CLONING_PRESETS: Final = {"tiny": "tiny"}
-"""Presets of cloning at the sizes where it is not `demo`, which trains for as long as it helps."""
-
-MINIBATCH: Final = PPOConfig.minibatch_size
-"""Decisions in an optimizer step of PPO."""
 
 SELECTIONS: Final = 4
 """Measurements of success in the real environment during RL, beside one before it."""
@@ -257,13 +234,9 @@ class Improvement:
         return min(self.found.longest, LONGEST_IMAGINATION)
 
     @property
-    def could_be_larger(self) -> bool:
-        """Whether imagined frames are larger at the size `cpu`."""
-        return self._side("cpu") > self._side(self.config.preset)
-
-    def _side(self, size: str) -> int:
-        """Return the side of imagined frames in pixels."""
-        return max(SIDE_STEP, min(SIDES[size], self.found.frame_side) // SIDE_STEP * SIDE_STEP)
+    def sizes(self) -> Sizes:
+        """How large frames, batches and rollouts are."""
+        return Sizes(self.config.preset, self.found.frame_side, self.found.pixels, self.length)
 
     def _done(self) -> Flags:
         return {"done_threshold": DONE_THRESHOLD, "done_frames": min(DONE_FRAMES, max(1, self.found.held))}
@@ -306,16 +279,6 @@ class Improvement:
         tasks = table.column(START_TASK)[table.among(self.data.episodes)]
         return int(np.unique(tasks, return_counts=True)[1].min())
 
-    @property
-    def _pass_observations(self) -> int:
-        """Observations in one pass at most."""
-        return max(1, PASS_PIXELS // self.found.pixels)
-
-    def _cloning(self) -> dict[str, Any]:
-        """Return the preset of cloning, with smaller batches where frames are large."""
-        settings = preset_settings(CLONING_PRESETS.get(self.config.preset, "demo"), "sft", ["filtered"])
-        return settings | {"batch_size": min(self._pass_observations, settings["batch_size"])}
-
     def _columns(self) -> list[str]:
         name = f"local/{self.found.root.name}"
         names: Flags = {"operation.feature_names": str(self.extra_columns)}
@@ -352,7 +315,7 @@ class Improvement:
         assert self.config.policy is not None
         adapters: Flags = {"peft.method_type": "LORA"} if self.config.policy.use_peft else {}
         return train_command(self.out / "cloned", [
-            *format_flags(self._cloning()),
+            *format_flags(self.sizes.cloning()),
             *format_flags({
                 "policy.path": self.policy, "policy.push_to_hub": False, **adapters,
                 "dataset.repo_id": f"local/{table.dataset.root.name}",
@@ -370,7 +333,7 @@ class Improvement:
     def _tokenizer(self) -> list[str]:
         return self._learn("frame_tokenizer", {
             "model.tokenizer.cameras": f"[{','.join(self.found.cameras)}]",
-            "model.tokenizer.image_size": self._side(self.config.preset), "model.tokenizer.context": True,
+            "model.tokenizer.image_size": self.sizes.side, "model.tokenizer.context": True,
             "model.tokenizer.success": True,
         }, "tokenizer")  # fmt: skip
 
@@ -419,7 +382,7 @@ class Improvement:
         given = self.config.iterations
         algorithm: Flags = {**self.config.algorithm, **({} if given is None else {"iterations": given})}
         selection: Flags = {
-            "selection.freq": ceil(self._iterations(algorithm) / SELECTIONS),
+            "selection.freq": ceil(self.sizes.iterations(algorithm) / SELECTIONS),
             "selection.n_episodes": self._rl_selection_episodes,
         }
         return self._train("rl", self.policies[self.start()], {
@@ -434,39 +397,18 @@ class Improvement:
         })  # fmt: skip
 
     def _train(self, folder: str, policy: str, flags: Flags) -> list[str]:
+        fitting = self.sizes.rl(flags, self._success_frames)
         return self._command("lerobot-wmrl-train", {
-            "policy.path": policy, **self.imagination(), **self._memory(flags), **flags,
+            "policy.path": policy, **self.imagination(), **fitting, **flags,
             "seed": self.config.seed, "output_dir": str(self.out / folder),
         })  # fmt: skip
 
-    def _iterations(self, training: Flags) -> int:
-        """Return the iterations of a training with these flags."""
-        preset = preset_settings(self.config.preset, "train", [str(training["algorithm.type"])])
-        return int(training.get("iterations", preset["iterations"]))
-
-    def _memory(self, training: Flags) -> Flags:
-        """Return what keeps the frames that a policy sees in memory, where they are large."""
-        algorithm = training["algorithm.type"]
-        distils, pixels = algorithm == "distillation", self.found.pixels
-        preset = preset_settings(self.config.preset, "train", [str(algorithm)])
-        kept = self._iterations(training) if distils else 1
-        flags: dict[str, bool | int] = {}
-        envs = max(1, ROLLOUT_BYTES // (kept * self.length * pixels * CHANNELS))
-        if envs < preset["num_envs"]:
-            flags["num_envs"] = envs
-        if distils and "algorithm.recorded" not in training:
-            recorded = self.found.success_frames
-            if self.config.rollouts:
-                table = self.table()
-                recorded = int(table.length[table.success & table.among(self.data.episodes)].sum())
-            if recorded * pixels * CHANNELS > ROLLOUT_BYTES:
-                flags["algorithm.recorded"] = False
-        fits = self._pass_observations
-        if distils and fits < preset.get("algorithm.batch_size", DistillationConfig.batch_size):
-            flags["algorithm.batch_size"] = fits
-        if not distils and fits < MINIBATCH:
-            flags["algorithm.micro_batch_size"] = fits
-        return flags
+    def _success_frames(self) -> int:
+        """Return the frames of all successful episodes that are learnt from."""
+        if not self.config.rollouts:
+            return self.found.success_frames
+        table = self.table()
+        return int(table.length[table.success & table.among(self.data.episodes)].sum())
 
     def _comparison(self) -> list[str]:
         imagined = self.config.real_env is None

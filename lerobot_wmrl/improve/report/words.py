@@ -165,7 +165,7 @@ def trust(improvement: Improvement) -> str:
     if found["auc"] < DOUBTFUL_AUC:
         said += " That is not enough to trust its reward: record more episodes, failures above all."
     if (seen := found.get("seen_auc")) is not None:
-        larger = " `--size=cpu` has larger frames." if improvement.could_be_larger else ""
+        larger = " `--size=cpu` has larger frames." if improvement.sizes.could_be_larger else ""
         said += f" {seen_line(seen, larger)}"
     return said + taken_instead(improvement)
 
