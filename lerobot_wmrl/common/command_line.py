@@ -20,7 +20,7 @@ from lerobot.configs import parser
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import flatten_dict, init_logging
 
-from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.errors import STOPPED, FieldError, Stopped
 from lerobot_wmrl.common.files import foreign_files, write_json
 from lerobot_wmrl.common.presets import TYPE, format_value, read_settings
 from lerobot_wmrl.common.settings import (
@@ -62,7 +62,8 @@ def run_command[Config: RunConfig](
     config_class: type[Config],
     expand: Callable[[Sequence[str]], list[str]],
 ) -> None:
-    """Parse the command line for `function` and run it. Bad input ends in one clear line and exit code 1.
+    """Parse the command line for `function` and run it. Bad input ends in one clear line and exit code 1, a
+    command that stops by a rule of its own in one and STOPPED.
 
     Args:
         function: what the command does; the docstring of its module introduces `--help`.
@@ -80,7 +81,7 @@ def run_command[Config: RunConfig](
         function(parse_flags(config_class))
     except (ValueError, OSError, ParsingError) as error:
         print(f"error: {said_in_flags(cause(error), config_class, sys.argv[1:])}", file=sys.stderr)
-        sys.exit(1)
+        sys.exit(STOPPED if isinstance(error, Stopped) else 1)
 
 
 def help_of(function: Callable[..., None], config_class: type) -> str:

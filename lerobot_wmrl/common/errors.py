@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
+from typing import Final
 
 
 class FieldError(ValueError):
@@ -26,6 +27,14 @@ class FieldError(ValueError):
     def __str__(self) -> str:
         said = f"{self.field}={self.value}: {self.problem}"
         return f"{said}; {self.remedy}" if self.remedy else said
+
+
+STOPPED: Final = 3
+"""Exit status of a command that ends with `Stopped`; after other errors it is 1."""
+
+
+class Stopped(ValueError):
+    """A command ends before its work is done, by a rule of its own; what it has made so far is whole."""
 
 
 def first_line(error: BaseException) -> str:

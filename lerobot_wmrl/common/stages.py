@@ -37,7 +37,7 @@ from lerobot_wmrl.common.processes import die_with, find_program, own_progress_l
 MARKER = "settings.json"
 
 FAILED = "failed"
-"""In the record of an optional stage that failed."""
+"""In the record of an optional stage that failed: the last line of its output."""
 
 SAMPLE_SECONDS = 1.0
 """Seconds between two samples of memory and two reports of progress."""
@@ -48,8 +48,8 @@ Progress = Callable[[float, int], None]
 """Called about once a second with the seconds since the start and the peak memory so far in bytes."""
 
 
-def required() -> bool:
-    """Say of a stage that nothing goes on without it."""
+def never(status: int) -> bool:
+    """Return False."""
     return False
 
 
@@ -58,14 +58,16 @@ class Stage:
     """One console command.
 
     The command is made when the stage starts: some of its flags depend on what earlier stages left, and what
-    an interrupted call left may have to be removed first. If a stage fails that is optional, asked then, the
-    others go on; it is tried again only as long as none of them has begun.
+    an interrupted call left may have to be removed first.
+
+    `optional` is called with the exit status of a command that failed. If it returns True, the later stages
+    run, and this one is tried again only as long as none of them has begun.
     """
 
     name: str
     title: str
     command: Callable[[], list[str]]
-    optional: Callable[[], bool] = required
+    optional: Callable[[int], bool] = never
 
 
 class StageError(RuntimeError):
@@ -171,8 +173,8 @@ def run_stage(stage: Stage, heading: str, output_dir: Path, record: dict[str, An
     log = output_dir / "logs" / f"{stage.name}.log"
     log.parent.mkdir(parents=True, exist_ok=True)
     status = run_measured(command, log, save)
-    if status > 0 and stage.optional():  # below 0 it was killed
-        record[FAILED] = True
+    if status > 0 and stage.optional(status):  # below 0 it was killed
+        record[FAILED] = last_line(log)
         save(record["seconds"] - seconds, record["peak_memory_bytes"])
         print(f"{stage.title}: exit status {status}. Its output is in {log}; the others go on.", flush=True)
         return
@@ -182,6 +184,12 @@ def run_stage(stage: Stage, heading: str, output_dir: Path, record: dict[str, An
             "continue."
         )
     save(record["seconds"] - seconds, record["peak_memory_bytes"], finished=True)
+
+
+def last_line(log: Path) -> str:
+    """Return the last line of a command's output that is not empty."""
+    lines = log.read_text(errors="replace").split("\n")
+    return next((line.strip() for line in reversed(lines) if line.strip()), "no output")
 
 
 def record_path(output_dir: Path, name: str) -> Path:

@@ -13,13 +13,14 @@ RESAMPLES = 2000
 
 
 def wilson_interval(successes: int, n: int) -> tuple[float, float]:
-    """Return Wilson's 95 % score interval of a proportion; (0, 1) for n = 0 (Wilson 1927)."""
+    """Return Wilson's 95 % score interval of a proportion, which lies in it whatever is rounded; (0, 1) for
+    n = 0 (Wilson 1927)."""
     if n == 0:
         return 0.0, 1.0
     share, z2 = successes / n, Z_95**2
     centre = (share + z2 / (2 * n)) / (1 + z2 / n)
     half = Z_95 / (1 + z2 / n) * math.sqrt(share * (1 - share) / n + z2 / (4 * n * n))
-    return max(0.0, centre - half), min(1.0, centre + half)
+    return max(0.0, min(share, centre - half)), min(1.0, max(share, centre + half))
 
 
 @dataclass(frozen=True)

@@ -163,12 +163,28 @@ def chosen_policy(results: Mapping[str, Any]) -> str:
     Raises:
         ValueError: the comparison was interrupted.
     """
-    if not results["finished"]:
-        raise ValueError("the comparison is not finished: run its command again")
+    require_finished(results)
     first, *_ = policies = results["policies"]
     against = [pair for pair in results["pairs"] if pair["before"] == first]
     better = [pair["after"] for pair in against if pair["better"] == pair["after"]]
     return str(max(better, key=lambda name: policies[name]["share"], default=first))
+
+
+def most_successful(results: Mapping[str, Any]) -> str:
+    """Return which policy of a comparison, written as JSON, succeeds most often; of equal ones the first.
+
+    Raises:
+        ValueError: the comparison was interrupted.
+    """
+    require_finished(results)
+    policies = results["policies"]
+    return str(max(policies, key=lambda name: policies[name]["share"]))
+
+
+def require_finished(results: Mapping[str, Any]) -> None:
+    """Raise ValueError if a comparison, written as JSON, was interrupted."""
+    if not results["finished"]:
+        raise ValueError("the comparison is not finished: run its command again")
 
 
 def save_picture(comparison: Comparison, path: Path) -> None:

@@ -65,10 +65,12 @@ class ImproveConfig(RunConfig):
             `tiny` (a minute, to try the command), or `auto`.
         iterations: of PPO, or of distillation if the policy is not trained by PPO; by default those of the
             size.
-        selection_episodes: starts in `real_env` that choose the policy to use. Half as many choose the
-            checkpoint of RL, of five. 0: the last policy and checkpoint.
-        eval_episodes: starts on which the policies are compared. They choose nothing.
-        seed: of recording and training. Evaluation has seeds of its own, from 1,000,000 on.
+        selection_episodes: starts in `real_env` on which every policy is measured, to choose the one to use.
+            RL's checkpoint is chosen among at most five on half as many others. 0: take the last policy and
+            checkpoint. Nothing is trained on these episodes.
+        eval_episodes: starts of the comparison that is reported. No choice is made on them.
+        seed: of recording and training. Evaluation has seeds of its own, from 1,000,000 on, selection from
+            2,000,000, the gate from 3,000,000.
         output_dir: folder of everything.
     """
 

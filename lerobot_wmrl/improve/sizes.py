@@ -1,4 +1,4 @@
-"""How large frames, batches and rollouts are: what the dataset's frames leave room for."""
+"""Sizes of imagined frames, batches and rollouts, given the size of the frames that the policy sees."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ CLONING_PRESETS: Final = {"tiny": "tiny"}
 
 @dataclass(frozen=True)
 class Sizes:
-    """Sizes of what is trained.
+    """How large imagined frames, batches and rollouts are.
 
     Args:
         preset: the stages' preset.
@@ -65,7 +65,7 @@ class Sizes:
         """Observations in one pass at most."""
         return max(1, PASS_PIXELS // self.pixels)
 
-    def cloning(self) -> dict[str, Any]:
+    def cloning_settings(self) -> dict[str, Any]:
         """Return the preset of cloning, with smaller batches where frames are large."""
         settings = preset_settings(CLONING_PRESETS.get(self.preset, "demo"), "sft", ["filtered"])
         return settings | {"batch_size": min(self.pass_observations, settings["batch_size"])}
@@ -74,13 +74,13 @@ class Sizes:
         """Return the iterations of RL with these flags."""
         return int(training.get("iterations", self._preset(training)["iterations"]))
 
-    def rl(self, training: Flags, success_frames: Callable[[], int]) -> Flags:
-        """Return what keeps the frames that a policy sees in memory, where they are large.
+    def rl_flags(self, training: Flags, success_frames: Callable[[], int]) -> Flags:
+        """Return the flags that limit the memory of the frames that a policy sees, where they are large.
 
         Args:
-            training: flags of RL.
-            success_frames: returns the frames of all successful episodes. Asked by a distillation that labels
-                them too.
+            training: other flags of RL.
+            success_frames: returns the frames of all successful episodes. Called only for a distillation that
+                labels recorded episodes.
         """
         preset, frame = self._preset(training), self.pixels * CHANNELS
         distils = training["algorithm.type"] == "distillation"

@@ -19,11 +19,12 @@ from lerobot_wmrl.common.constants import (
     START_SEED,
     START_TASK,
 )
+from lerobot_wmrl.common.errors import STOPPED
 from lerobot_wmrl.common.lerobot_commands import edit_command, merge_command, train_command
 from lerobot_wmrl.common.presets import Flags, format_flags
-from lerobot_wmrl.common.stages import FAILED, Stage, read_record, required
+from lerobot_wmrl.common.stages import FAILED, Stage, never, read_record
 from lerobot_wmrl.data.episodes import SUCCESS, ChosenEpisodes, DatasetSource, EpisodeTable, read_episodes
-from lerobot_wmrl.evaluation.comparison import RESULTS, chosen_policy
+from lerobot_wmrl.evaluation.comparison import RESULTS, chosen_policy, most_successful
 from lerobot_wmrl.improve.configuration_improve import ROLLOUT_SEED_OFFSET, ImproveConfig
 from lerobot_wmrl.improve.findings import LONGEST_IMAGINATION, Findings, look
 from lerobot_wmrl.improve.sizes import Sizes
@@ -54,7 +55,7 @@ ROLLOUT_COLUMNS: Final = (*DEFAULT_FEATURES, ACTION, REWARD, SUCCESS, DONE, STAR
 """Columns of recorded rollouts, beside those that the policy sees and the environment declares."""
 
 SELECTIONS: Final = 4
-"""Measurements of success in the real environment during RL, beside one before it."""
+"""Measurements of success in the real environment during RL at most, beside one before it."""
 
 IMAGINED_STARTS: Final = 256
 """Imagined episodes of each policy that choose which one to improve, at most."""
@@ -106,9 +107,9 @@ class Improvement:
             *(() if self.config.distils else ("distilled",)),
             *(() if self.config.selects else ("choice",)),
         }
-        optional = {"rl": self.rl_checkpoint.exists, "distilled": lambda: True}
+        optional = {"rl": self._leaves_checkpoint, "distilled": lambda status: True}
         return [
-            Stage(name, title, getattr(self, f"_{name}"), optional.get(name, required))
+            Stage(name, title, getattr(self, f"_{name}"), optional.get(name, never))
             for name, title in steps.items()
             if name not in needless
         ]
@@ -140,14 +141,17 @@ class Improvement:
 
     @property
     def rl_checkpoint(self) -> Path:
-        """Folder of RL's policy, which a training that stops early leaves too: of the best checkpoint where
-        episodes in the real environment choose it, else of the last one."""
+        """RL's checkpoint: the best one with selection, else the last. It exists too if RL stopped early."""
         folder = self.out / "rl"
         return best_checkpoint(folder) if self.config.selects else last_checkpoint(folder)
 
+    def _leaves_checkpoint(self, status: int) -> bool:
+        """Return whether RL stopped by a rule of its own, and left a checkpoint."""
+        return status == STOPPED and self.rl_checkpoint.exists()
+
     @property
     def _rl_selection_episodes(self) -> int:
-        """Starts that choose RL's checkpoint, before those that choose the policy."""
+        """Starts on which RL's checkpoint is chosen. The policy is chosen on those after them."""
         return (self.config.selection_episodes + 1) // 2
 
     @property
@@ -315,7 +319,7 @@ class Improvement:
         assert self.config.policy is not None
         adapters: Flags = {"peft.method_type": "LORA"} if self.config.policy.use_peft else {}
         return train_command(self.out / "cloned", [
-            *format_flags(self.sizes.cloning()),
+            *format_flags(self.sizes.cloning_settings()),
             *format_flags({
                 "policy.path": self.policy, "policy.push_to_hub": False, **adapters,
                 "dataset.repo_id": f"local/{table.dataset.root.name}",
@@ -360,14 +364,13 @@ class Improvement:
         return self.compare(self.out / "choice", self._real_env("env"), starts, seed=seed)
 
     def chosen(self) -> str:
-        """Return which policy to use: the most successful one in the real environment, on starts of its own,
-        or the earliest of equally good ones; without such starts the last one."""
+        """Return which policy to use: the most successful in the real environment, of equally good ones the
+        earliest; without selection the last one."""
         *_, last = titles = [*self.policies]
         if not self.config.selects:
             return last
-        rates = json.loads((self.out / "choice" / RESULTS).read_text())["policies"]
-        shares = [rate["share"] for rate in rates.values()]
-        return titles[shares.index(max(shares))]
+        found = json.loads((self.out / "choice" / RESULTS).read_text())
+        return titles[list(found["policies"]).index(most_successful(found))]
 
     def start(self) -> str:
         """Return which policy RL begins with: the one that was cloned from the successes, unless the world
@@ -397,7 +400,7 @@ class Improvement:
         })  # fmt: skip
 
     def _train(self, folder: str, policy: str, flags: Flags) -> list[str]:
-        fitting = self.sizes.rl(flags, self._success_frames)
+        fitting = self.sizes.rl_flags(flags, self._success_frames)
         return self._command("lerobot-wmrl-train", {
             "policy.path": policy, **self.imagination(), **fitting, **flags,
             "seed": self.config.seed, "output_dir": str(self.out / folder),

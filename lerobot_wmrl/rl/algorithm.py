@@ -11,7 +11,7 @@ from lerobot.rl.algorithms.configs import TrainingStats
 from torch import Tensor, nn
 from torch.optim import AdamW, Optimizer
 
-from lerobot_wmrl.common.errors import FieldError, within
+from lerobot_wmrl.common.errors import FieldError, Stopped, within
 from lerobot_wmrl.common.policies import load_trained_weights
 from lerobot_wmrl.common.precision import require_exact_updates
 from lerobot_wmrl.rl.configuration_algorithms import PolicyGradientConfig
@@ -21,7 +21,7 @@ from lerobot_wmrl.rl.protocol import EncodingPolicy
 RATIO_ERROR, LOSS, NORM = "ratio_error", "_loss", "_grad_norm"
 
 
-class TrainingStopped(ValueError):
+class TrainingStopped(Stopped):
     """Training cannot go on; the last checkpoint is good."""
 
 

@@ -48,6 +48,7 @@ def settings(cfg: ImproveConfig, stages: "list[Stage]") -> dict[str, object]:
     given = {name: value for name, value in draccus.encode(cfg).items() if name != "policy"}
     return given | {
         "policy": str(cfg.policy.pretrained_path), "size": cfg.preset, "output_dir": str(cfg.output_dir),
+        "selection_episodes": cfg.selection_episodes if cfg.selects else 0,
         "stages": [stage.name for stage in stages],
     }  # fmt: skip
 

@@ -14,7 +14,7 @@ from lerobot_wmrl.common.statistics import (
 )
 
 
-@pytest.mark.parametrize(("k", "n"), [(0, 20), (7, 20), (53, 100), (100, 100)])
+@pytest.mark.parametrize(("k", "n"), [(0, 20), (0, 64), (7, 20), (53, 100), (80, 80), (100, 100)])
 def test_wilson_bounds_are_where_the_score_test_is_exactly_significant(k: int, n: int) -> None:
     """The definition: |p̂ − p| = z·sqrt(p(1−p)/n) at both bounds p (or the bound is 0 or 1 when k is)."""
     for bound in wilson_interval(k, n):
@@ -22,6 +22,9 @@ def test_wilson_bounds_are_where_the_score_test_is_exactly_significant(k: int, n
             assert abs(k / n - bound) == pytest.approx(Z_95 * math.sqrt(bound * (1 - bound) / n))
     low, high = wilson_interval(k, n)
     assert low <= k / n <= high
+    (below,), (above,) = Proportion(k, n).whiskers
+    assert (k / n - below, k / n + above) == pytest.approx((low, high))
+    assert min(below, above) >= 0, "which matplotlib refuses"
 
 
 def test_no_episode_is_no_number() -> None:

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from experiments.choose_policy import chosen_policy, main
+from lerobot_wmrl.evaluation.comparison import most_successful
 
 
 def results(better: dict[str, str | None], finished: bool = True) -> dict[str, Any]:
@@ -42,6 +43,15 @@ def test_an_interrupted_comparison_chooses_nothing(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr("sys.argv", ["choose_policy", str(tmp_path)])
     with pytest.raises(SystemExit, match="the comparison is not finished: run its command again"):
         main()
+
+
+def test_the_most_successful_is_the_first_of_equally_good_ones() -> None:
+    found = results({})
+    assert most_successful(found) == "third"
+    found["policies"]["second"]["share"] = 0.9
+    assert most_successful(found) == "second"
+    with pytest.raises(ValueError, match="the comparison is not finished"):
+        most_successful({**found, "finished": False})
 
 
 def test_the_policy_is_printed(

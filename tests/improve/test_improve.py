@@ -18,6 +18,7 @@ from lerobot.utils.constants import OBS_IMAGE
 
 from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_wmrl.common.command_line import run_command
+from lerobot_wmrl.common.errors import STOPPED
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.presets import preset_settings
 from lerobot_wmrl.common.stages import claimed
@@ -274,12 +275,40 @@ def test_without_starts_to_select_on_the_last_checkpoint_and_policy_are_taken(tm
     assert improvement.chosen() == DISTILLED
 
 
-def test_rl_may_stop_early_if_it_leaves_a_checkpoint(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("real", "link"), [(None, "last"), (PushtEnv(), "best")])
+def test_rl_may_stop_by_its_own_rules_if_it_leaves_a_checkpoint(
+    real: PushtEnv | None, link: str, tmp_path: Path
+) -> None:
+    """After any other error it is tried again."""
     improvement = improvement_of(tmp_path)
+    improvement.config.real_env = real
     (rl,) = (stage for stage in improvement.stages() if stage.name == "rl")
-    assert not rl.optional()
-    Path(improvement.policies[PPO]).mkdir(parents=True)
-    assert rl.optional()
+    for other in {"last", "best"} - {link}:
+        (tmp_path / "rl" / "checkpoints" / other / "pretrained_model").mkdir(parents=True)
+    assert not rl.optional(STOPPED)
+    (tmp_path / "rl" / "checkpoints" / link / "pretrained_model").mkdir(parents=True)
+    assert rl.optional(STOPPED)
+    assert not rl.optional(1)
+
+
+@pytest.mark.parametrize(("kind", "iterations", "freq"), [
+    (CnnConfig, 1, 1), (CnnConfig, 3, 1), (CnnConfig, 5, 2), (CnnConfig, 60, 15), (CnnConfig, None, 10),
+    (VQBeTConfig, None, 2),
+])  # fmt: skip
+def test_rl_is_measured_four_times_at_most(
+    kind: type[PreTrainedConfig], iterations: int | None, freq: int, tmp_path: Path
+) -> None:
+    improvement = improvement_of(tmp_path, policy=kind(device="cpu", pretrained_path=tmp_path))
+    config = improvement.config
+    config.real_env, config.iterations, config.selection_episodes = PushtEnv(), iterations, 1
+    commands = {
+        stage.name: stage.command() for stage in improvement.stages() if stage.name in ("rl", "choice")
+    }
+    assert {f"--selection.freq={freq}", "--selection.n_episodes=1"} <= {*commands["rl"]}
+    assert {"--n_episodes=1", "--seed=2000001"} <= {*commands["choice"]}
+    assert all(
+        "checkpoints/best/" in improvement.policies[name] for name in {PPO, FITTED} & {*improvement.policies}
+    )
 
 
 @pytest.mark.parametrize(("kind", "names"), [
@@ -292,7 +321,7 @@ def test_only_policies_for_which_it_was_measured_are_fitted_to_a_planner_after_p
 ) -> None:
     improvement = improvement_of(tmp_path, policy=kind(device="cpu", pretrained_path=tmp_path))
     assert [*improvement.policies] == names
-    optional = [stage.name for stage in improvement.stages() if stage.optional()]
+    optional = [stage.name for stage in improvement.stages() if stage.optional(1)]
     assert optional == (["distilled"] if DISTILLED in names else [])
     assert improvement.chosen() == names[-1]
 
@@ -312,6 +341,15 @@ def test_cloning_suits_the_policy_and_its_frames(
     given = [flag for flag in command if flag.startswith(("--batch_size=", "--peft"))]
     assert given == flags
     assert "--dataset.episodes=[0,1,3,4]" in command
+
+
+def test_a_run_that_selects_nothing_goes_on_where_there_was_no_selection(tmp_path: Path) -> None:
+    improvement = improvement_of(tmp_path, failures=2)
+    given = settings(improvement.config, improvement.stages())
+    older = {name: value for name, value in given.items() if name != "selection_episodes"}
+    write_json(tmp_path / "settings.json", older)
+    with claimed(tmp_path, given):
+        pass
 
 
 def test_a_folder_that_was_begun_with_other_stages_is_refused(tmp_path: Path) -> None:

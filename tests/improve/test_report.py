@@ -95,10 +95,8 @@ def test_the_page_is_self_contained_and_says_the_numbers(finished: Improvement) 
     assert (
         f"RL began with: {CLONED}. Success in imagination, from frames of the dataset: {CLONED} 70 %" in page
     )
-    assert (
-        "RL&#39;s checkpoint is that of iteration 10, the most successful in pusht. Success by iteration, on "
-        "starts set aside for this: 0: 50 % (5 of 10; 24–76 %), 10: 80 % (8 of 10; " in page
-    )
+    assert "RL&#39;s checkpoint is that of iteration 10: none succeeded more often in the real" in page
+    assert "on starts set aside for this: 0: 50 % (5 of 10; 24–76 %), 10: 80 % (8 of 10; " in page
     for stage in finished.stages():
         assert f"<pre>run-{stage.name}</pre>" in page
     assert page.count("data:image/png;base64,") == 8, "bars, the replayed episode, and six curves"
@@ -141,10 +139,12 @@ def test_a_planner_that_could_not_be_distilled_is_left_out(finished: Improvement
 
 @pytest.mark.usefixtures("without_drawing")
 def test_rl_that_stopped_early_is_named(finished: Improvement) -> None:
-    warned = f"RL stopped before its end ({finished.out}/logs/rl.log)"
+    warned = (
+        f"RL stopped ({finished.out}/logs/rl.log). A checkpoint from before that is compared. error: too far"
+    )
     assert warned not in text_of(finished)
     record = json.loads((finished.out / "stages" / "rl.json").read_text())
-    write_json(finished.out / "stages" / "rl.json", {**record, "failed": True})
+    write_json(finished.out / "stages" / "rl.json", {**record, "failed": "error: too far"})
     assert warned in text_of(finished)
     assert warned in verdict(finished, [compared(finished)])
 
@@ -157,10 +157,9 @@ def test_a_success_in_imagination_is_said_to_be_a_belief(finished: Improvement) 
     page = text_of(finished)
     assert warned in page
     assert "<h3>Changes in imagination, from frames of the dataset, on the same starts</h3>" in page
-    assert (
-        f"Policy to use: {DISTILLED}, {finished.policies[DISTILLED]}, the last one. Nothing has chosen it"
-        in page
-    )
+    assert f"The last policy: {DISTILLED}, {finished.policies[DISTILLED]}. RL can make a policy worse" in page
+    assert 'class="chosen"' not in page
+    assert json.loads((finished.out / "summary.json").read_text())["chosen"] is None
     assert warned in verdict(finished, [compared(finished)])
 
 
@@ -181,11 +180,14 @@ def test_what_the_gate_found_is_shown_and_its_last_warning_in_red(finished: Impr
     fresh = {"false_positive_rate": {"k": 1, "n": 10}, "recall": {"k": 3, "n": 4}}
     gate, shown = finished.out / "rl" / "gate", '<p class="warning">'
     assert shown not in text_of(finished)
-    write_json(gate / "000000" / "record.json", {"warning": "many false positives", "fresh": fresh})
+    record = {"warning": "many false positives", "failed": True, "fresh": fresh}
+    write_json(gate / "000000" / "record.json", record)
     page = text_of(finished)
-    assert f"{shown}many false positives." in page
+    assert f"{shown}many false positives. Success in imagination may rise with nothing behind it" in page
     assert "On 14 fresh rollouts of the policy that RL began with: false positives 10 % (1 of 10;" in page
-    write_json(gate / "000010" / "record.json", {"warning": None, "fresh": fresh})
+    write_json(gate / "000005" / "record.json", {**record, "failed": False, "warning": "no rollout failed"})
+    assert f"{shown}no rollout failed.</p>" in text_of(finished)
+    write_json(gate / "000010" / "record.json", {"warning": None, "failed": False, "fresh": fresh})
     assert shown not in text_of(finished)
 
 
@@ -209,6 +211,7 @@ def test_the_summary_holds_every_headline_number(finished: Improvement) -> None:
     assert summary["seconds"] == 3.0 * len(finished.stages())
 
 
+@pytest.mark.usefixtures("without_drawing")
 @pytest.mark.parametrize(("successes", "chosen"), [
     ([10, 12, 13, 18], DISTILLED),
     ([10, 12, 6, 12], CLONED),
@@ -217,13 +220,23 @@ def test_the_summary_holds_every_headline_number(finished: Improvement) -> None:
 def test_the_policy_to_use_is_the_best_one_on_other_starts(
     successes: list[int], chosen: str, finished: Improvement
 ) -> None:
-    """Of equally good ones the one with the least training, whatever the reported starts say."""
+    """Of equally good ones the earliest, whatever the reported starts say."""
     write_json(finished.out / "choice" / "comparison.json", comparison(successes, 20))
     said, path = verdict(finished, [compared(finished)]), finished.policies[chosen]
-    assert f"Policy to use: {chosen}, {path}, the most successful in pusht on starts set aside" in said
+    assert f"Policy to use: {chosen}, {path}. None succeeded more often in pusht, on starts set aside" in said
     assert said.count(": better") + said.count(": worse") + said.count(": not decided") == 3
     assert said.count(f"{chosen}, against ") + said.count(f", against {chosen}:") == 3
     assert f"--policy.path={path}" in finished.drive()
+    assert f'<tr class="chosen"><td>{chosen}</td>' in text_of(finished)
+    assert json.loads((finished.out / "summary.json").read_text())["chosen"] == chosen
+
+
+@pytest.mark.usefixtures("without_drawing")
+def test_an_rl_that_never_helped_is_said_to_be_where_it_began(finished: Improvement) -> None:
+    for iteration in (10, 20):
+        record = {"real": {"k": 5, "n": 10}, "imagined": {"k": 9, "n": 10}}
+        write_json(finished.out / "rl" / "selection" / f"{iteration:06d}" / "record.json", record)
+    assert "RL&#39;s checkpoint is iteration 0, the policy that RL began with: none" in text_of(finished)
 
 
 def test_the_command_says_what_the_chosen_policy_gained_over_each_other_one(finished: Improvement) -> None:

@@ -11,12 +11,21 @@ import jinja2
 from lerobot_wmrl.common.files import write_json, write_text
 from lerobot_wmrl.common.stages import Stage, read_record
 from lerobot_wmrl.improve.report import figures
-from lerobot_wmrl.improve.report.results import Curve, Place, read_check, read_gate, training_curves
+from lerobot_wmrl.improve.report.results import (
+    Curve,
+    Place,
+    read_check,
+    read_choice,
+    read_gate,
+    read_selection,
+    training_curves,
+)
 from lerobot_wmrl.improve.report.words import (
     choice_line,
     compared,
     decided_at,
     gate_line,
+    gate_warnings,
     lacks,
     pair_lines,
     reservations,
@@ -99,13 +108,16 @@ class Page:
     def summary(self) -> dict[str, Any]:
         """Return every headline number as JSON."""
         check, gate = read_check(self.improvement), read_gate(self.improvement)
+        choice = read_choice(self.improvement)
         return {
             "size": self.improvement.config.preset,
             "seed": self.seed,
             "places": {place.name: place.comparison.as_json() for place in self.places},
             "check": {name: check[name] for name in CHECKED},
             "gate": gate and gate["fresh"],
-            "chosen": self.improvement.chosen(),
+            "chosen": self.improvement.chosen() if choice else None,
+            "choice": choice and choice.comparison.as_json(),
+            "rl_checkpoints": read_selection(self.improvement),
             "seconds": sum(record["seconds"] for record in self.records),
             "peak_memory_bytes": max(record["peak_memory_bytes"] for record in self.records),
         }
@@ -127,7 +139,7 @@ class Page:
             autoescape=True,
             undefined=jinja2.StrictUndefined,
         )
-        improvement, gate = self.improvement, read_gate(self.improvement)
+        improvement = self.improvement
         curves = {**self.curves, **training_curves(improvement)}
         return environment.get_template("template.html").render(
             title=self.title,
@@ -147,7 +159,7 @@ class Page:
             data=[*improvement.found.lines, *rollouts_line(improvement)],
             missing=lacks(improvement),
             trust=[trust(improvement), *gate_line(improvement)],
-            warning=gate and gate["warning"],
+            warnings=gate_warnings(improvement),
             pictures=picture_sections(self.replays),
             curves=[figures.line(curve, title) for title, curve in curves.items()],
             drive=shlex.join(improvement.drive()),

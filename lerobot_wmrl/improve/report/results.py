@@ -11,7 +11,9 @@ from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.evaluation.comparison import RESULTS, Comparison, read_episodes
 from lerobot_wmrl.improve.stages import Improvement
-from lerobot_wmrl.rl.callbacks import Record
+from lerobot_wmrl.rl.callbacks import RECORD_FILE, Record
+from lerobot_wmrl.rl.gate import SuccessGate
+from lerobot_wmrl.rl.selection import Selection
 
 MODELS = {"tokenizer": "Frame tokenizer", "world_model": "World model"}
 """Models that are trained, by their folders."""
@@ -80,14 +82,23 @@ def read_check(improvement: Improvement) -> dict[str, Any]:
 
 def read_gate(improvement: Improvement) -> dict[str, Any] | None:
     """Read what the gate found before RL; None if there was none."""
-    records = sorted((improvement.out / "rl" / "gate").glob("*/record.json"))
+    records = sorted((improvement.out / "rl" / SuccessGate.name).glob(f"*/{RECORD_FILE}"))
     return read_json(records[-1]) if records else None
 
 
 def read_selection(improvement: Improvement) -> dict[int, Record]:
-    """Read how successful RL's checkpoints were, by iteration."""
-    folders = (improvement.out / "rl" / "selection").glob("*/record.json")
+    """Read how successful RL's checkpoints were in the real environment, by iteration; nothing without
+    selection."""
+    folders = (improvement.out / "rl" / Selection.name).glob(f"*/{RECORD_FILE}")
     return {int(path.parent.name): read_json(path) for path in folders}
+
+
+def read_choice(improvement: Improvement) -> Place | None:
+    """Read the comparison that chooses the policy to use; None without selection."""
+    real = improvement.config.real_env
+    if real is None or not improvement.config.selects:
+        return None
+    return read_place(f"in {real.type}", improvement.out / "choice", [*improvement.policies])
 
 
 def training_curves(improvement: Improvement) -> dict[str, Curve]:

@@ -10,7 +10,14 @@ from lerobot_wmrl.evaluation.comparison import Pair
 from lerobot_wmrl.evaluation.gate import DOUBTFUL_AUC
 from lerobot_wmrl.evaluation.report import seen_line
 from lerobot_wmrl.improve.findings import few_failures
-from lerobot_wmrl.improve.report.results import Place, read_check, read_gate, read_place, read_selection
+from lerobot_wmrl.improve.report.results import (
+    Place,
+    read_check,
+    read_choice,
+    read_gate,
+    read_place,
+    read_selection,
+)
 from lerobot_wmrl.improve.stages import CLONED, DONE_THRESHOLD, SFT, Improvement
 from lerobot_wmrl.rl.selection import REAL, best_iteration, success
 
@@ -45,7 +52,7 @@ def lacks(improvement: Improvement) -> list[str]:
 
 
 def verdict(improvement: Improvement, places: Sequence[Place]) -> str:
-    """Say in a few lines which policy to use, and what it gained over each other one, and where."""
+    """Say in a few lines which policy to use, and how it compares with each other one, and where."""
     paths, chosen = improvement.policies, improvement.chosen()
     said = []
     for place in places:
@@ -59,26 +66,30 @@ def verdict(improvement: Improvement, places: Sequence[Place]) -> str:
 
 def choice_line(improvement: Improvement) -> str:
     """Say which policy to use, and why."""
-    chosen, config = improvement.chosen(), improvement.config
-    said = f"Policy to use: {chosen}, {improvement.policies[chosen]}"
-    if config.real_env is None or not config.selects:
-        return f"{said}, the last one. Nothing has chosen it, and RL can make a policy worse."
-    where = f"in {config.real_env.type}"
-    rates = read_place(where, improvement.out / "choice", [*improvement.policies]).rates
-    shown = ", ".join(f"{title} {rate}" for title, rate in rates.items())
-    return f"{said}, the most successful {where} on starts set aside for this choice: {shown}."
+    chosen, found = improvement.chosen(), read_choice(improvement)
+    path = improvement.policies[chosen]
+    if found is None:
+        return (
+            f"The last policy: {chosen}, {path}. RL can make a policy worse: the comparison says "
+            "whether to use it."
+        )
+    shown = ", ".join(f"{title} {rate}" for title, rate in found.rates.items())
+    return (
+        f"Policy to use: {chosen}, {path}. None succeeded more often {found.name}, on starts set aside for "
+        f"this choice: {shown}. Of equally good ones it is the earliest."
+    )
 
 
 def rl_line(improvement: Improvement) -> list[str]:
     """Say which checkpoint of RL is compared, and how others did; nothing if none was chosen."""
-    real = improvement.config.real_env
-    if real is None or not improvement.config.selects:
-        return []
     records = read_selection(improvement)
+    if not records:
+        return []
     best = best_iteration(records, REAL)
     shown = ", ".join(f"{iteration}: {success(records[iteration], REAL)}" for iteration in sorted(records))
+    which = f"that of iteration {best}" if best else "iteration 0, the policy that RL began with"
     return [
-        f"RL's checkpoint is that of iteration {best}, the most successful in {real.type}. Success by "
+        f"RL's checkpoint is {which}: none succeeded more often in the real environment. Success by "
         f"iteration, on starts set aside for this: {shown}."
     ]
 
@@ -118,11 +129,10 @@ def reservations(improvement: Improvement) -> list[str]:
             "This is what the world model predicts, and shows nothing about the real world. Run the policies "
             "there, label what they did, and run the command again on all episodes."
         )
-    if read_record(improvement.out, "rl").get(FAILED):
-        log = improvement.out / "logs" / "rl.log"
+    if reason := read_record(improvement.out, "rl").get(FAILED):
         found.append(
-            f"RL stopped before its end ({log}), so a checkpoint from before that is compared. To try again, "
-            "choose another output_dir."
+            f"RL stopped ({improvement.out / 'logs' / 'rl.log'}). A checkpoint from before that is compared. "
+            f"{reason}"
         )
     if improvement.config.distils and not improvement.has_distilled:
         log = improvement.out / "logs" / "distilled.log"
@@ -179,6 +189,19 @@ def gate_line(improvement: Improvement) -> list[str]:
     return [
         f"On {false.n + recall.n} fresh rollouts of the policy that RL began with: false positives {false}, "
         f"recall {recall}."
+    ]
+
+
+def gate_warnings(improvement: Improvement) -> list[str]:
+    """Say what the gate warned of."""
+    record = read_gate(improvement)
+    if record is None or not record["warning"]:
+        return []
+    if not record["failed"]:
+        return [f"{record['warning']}."]
+    return [
+        f"{record['warning']}. Success in imagination may rise with nothing behind it: trust only success in "
+        "the real environment."
     ]
 
 
