@@ -24,6 +24,7 @@ from lerobot_wmrl.common.lerobot_commands import edit_command, merge_command, tr
 from lerobot_wmrl.common.presets import Flags, format_flags
 from lerobot_wmrl.common.stages import FAILED, Stage, never, read_record
 from lerobot_wmrl.data.episodes import SUCCESS, ChosenEpisodes, DatasetSource, EpisodeTable, read_episodes
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.evaluation.comparison import RESULTS, chosen_policy, most_successful
 from lerobot_wmrl.improve.configuration_improve import ROLLOUT_SEED_OFFSET, ImproveConfig
 from lerobot_wmrl.improve.findings import LONGEST_IMAGINATION, Findings, look
@@ -53,6 +54,13 @@ would fill the data."""
 
 ROLLOUT_COLUMNS: Final = (*DEFAULT_FEATURES, ACTION, REWARD, SUCCESS, DONE, START_SEED, START_KIND)
 """Columns of recorded rollouts, beside those that the policy sees and the environment declares."""
+
+LATEST_WORTH: Final = 0.3
+"""What PPO's discount leaves of a success in the last frame that an episode may take. A smaller discount
+factor hurries the policy, at costs that the world model may not see."""
+
+LARGEST_DISCOUNT: Final = 0.999
+"""Largest discount factor of PPO."""
 
 SELECTIONS: Final = 4
 """Measurements of success in the real environment during RL at most, beside one before it."""
@@ -205,7 +213,20 @@ class Improvement:
     @property
     def _in_maniskill(self) -> bool:
         """Whether rollouts are recorded in ManiSkill, where they get the recorder's columns."""
-        return self.config.real_env is not None and self.config.real_env.type == "wmrl_maniskill"
+        return isinstance(self.config.real_env, WmrlManiSkillEnv)
+
+    @property
+    def frame_limit(self) -> int:
+        """Frames that an episode may take, beyond which it fails."""
+        real = self.config.real_env
+        if isinstance(real, WmrlManiSkillEnv):
+            return real.horizon
+        return self.found.longest * (SLOWEST if self.config.rollouts else 1)
+
+    @property
+    def discount(self) -> float:
+        """PPO's discount factor."""
+        return min(LARGEST_DISCOUNT, round(LATEST_WORTH ** (1 / self.frame_limit), 3))
 
     @property
     def branches(self) -> int:
@@ -295,7 +316,7 @@ class Improvement:
         return self.out / "columns" if self.extra_columns else self.found.root
 
     def _rollouts(self) -> list[str]:
-        like: Flags = {"like.root": str(self._dataset), "max_frames": SLOWEST * self.found.longest}
+        like: Flags = {"like.root": str(self._dataset), "max_frames": self.frame_limit}
         flags: Flags = {
             "policy.path": self.policy, **self._real_env("env"), **({} if self._in_maniskill else like),
             "video": "video" in self.found.columns.values(), "num_episodes": self.config.rollouts,
@@ -384,6 +405,8 @@ class Improvement:
         real: Flags = {} if self.config.real_env is None else self._real_env("real_env")
         given = self.config.iterations
         algorithm: Flags = {**self.config.algorithm, **({} if given is None else {"iterations": given})}
+        if algorithm["algorithm.type"] == "ppo":
+            algorithm = {**algorithm, "algorithm.gamma": self.discount}
         selection: Flags = {
             "selection.freq": ceil(self.sizes.iterations(algorithm) / SELECTIONS),
             "selection.n_episodes": self._rl_selection_episodes,

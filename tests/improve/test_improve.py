@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from lerobot.configs import PreTrainedConfig
-from lerobot.envs.configs import PushtEnv
+from lerobot.envs.configs import EnvConfig, PushtEnv
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
 from lerobot.utils.constants import OBS_IMAGE
@@ -23,6 +23,7 @@ from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.presets import preset_settings
 from lerobot_wmrl.common.stages import claimed
 from lerobot_wmrl.data.episodes import ChosenEpisodes, read_episodes
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.improve import stages
 from lerobot_wmrl.improve.configuration_improve import ImproveConfig
 from lerobot_wmrl.improve.findings import few_decisions
@@ -261,6 +262,24 @@ def test_rollouts_are_merged_and_successes_cloned_before_rl(
     assert measured <= {*commands["rl"]}
     assert "checkpoints/best/" in ppo
     assert "checkpoints/last/" in distilled
+
+
+@pytest.mark.parametrize(("real", "rollouts", "longest", "discount"), [
+    (None, 0, 40, 0.97),
+    (WmrlManiSkillEnv(task="push"), 300, 37, 0.97),
+    (PushtEnv(), 150, 150, 0.996),
+    (PushtEnv(), 0, 150, 0.992),
+    (None, 0, 5000, 0.999),
+])  # fmt: skip
+def test_the_discount_leaves_a_late_success_its_worth(
+    real: EnvConfig | None, rollouts: int, longest: int, discount: float, tmp_path: Path
+) -> None:
+    improvement = improvement_of(tmp_path, longest=longest)
+    improvement.config.real_env, improvement.config.rollouts = real, rollouts
+    assert improvement.discount == discount
+    if not rollouts:
+        (rl,) = (stage.command() for stage in improvement.stages() if stage.name == "rl")
+        assert f"--algorithm.gamma={discount}" in rl
 
 
 def test_without_starts_to_select_on_the_last_checkpoint_and_policy_are_taken(tmp_path: Path) -> None:
