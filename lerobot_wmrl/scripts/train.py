@@ -31,9 +31,9 @@ from lerobot.configs import PreTrainedConfig, parser
 from lerobot.configs.default import PeftConfig, WandBConfig
 from lerobot.envs.configs import EnvConfig
 from lerobot.rl.algorithms.configs import RLAlgorithmConfig
-from lerobot.utils.constants import ACTION, CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
+from lerobot.utils.constants import ACTION, PRETRAINED_MODEL_DIR
 
-from lerobot_wmrl.common.checkpoints import BEST_CHECKPOINT_LINK
+from lerobot_wmrl.common.checkpoints import best_checkpoint, last_checkpoint
 from lerobot_wmrl.common.command_line import RunConfig, claim_output_dir, run_command
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.distributed import LONGEST_WAIT, rank_and_size, wait_for_all
@@ -329,8 +329,8 @@ def train_in(
 
 def chosen_checkpoint(cfg: TrainConfig) -> Path:
     """Return the best checkpoint, or the last one of a training without selection."""
-    checkpoints = cfg.output_dir / CHECKPOINTS_DIR
-    return checkpoints / (BEST_CHECKPOINT_LINK if cfg.selection.freq else LAST_CHECKPOINT_LINK)
+    model = best_checkpoint if cfg.selection.freq else last_checkpoint
+    return model(cfg.output_dir).parent
 
 
 def summary(cfg: TrainConfig) -> list[str]:
