@@ -119,15 +119,20 @@ def look(
         frame_side=min(map(min, sizes.values())), pixels=sum(h * w for h, w in sizes.values()),
         episodes=len(success),
         held_out=held_out, fewest=int(tasks.min()), longest=int(table.length.max()),
-        usual=max(
-            int(np.quantile(table.length[table.column(START_TASK) == task], 0.9, method="inverted_cdf"))
-            for task in np.unique(table.column(START_TASK))
-        ),
+        usual=usual_length(table),
         success_frames=int(table.length[success].sum()), failures=int((~success).sum()),
         root=Path(root), total=total,
         columns={name: feature["dtype"] for name, feature in features.items()},
         held=int(np.median(np.array(done)[success])),
     )  # fmt: skip
+
+
+def usual_length(table: EpisodeTable) -> int:
+    """Return the frames that nine of ten episodes do not exceed, of the task with the longest."""
+    tasks = table.column(START_TASK)
+    return max(
+        int(np.quantile(table.length[tasks == task], 0.9, method="inverted_cdf")) for task in np.unique(tasks)
+    )
 
 
 def missing_labels(table: EpisodeTable) -> list[str]:

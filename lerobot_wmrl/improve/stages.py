@@ -27,7 +27,7 @@ from lerobot_wmrl.data.episodes import SUCCESS, ChosenEpisodes, DatasetSource, E
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.evaluation.comparison import RESULTS, chosen_policy, most_successful
 from lerobot_wmrl.improve.configuration_improve import ROLLOUT_SEED_OFFSET, ImproveConfig
-from lerobot_wmrl.improve.findings import LONGEST_IMAGINATION, Findings, look
+from lerobot_wmrl.improve.findings import LONGEST_IMAGINATION, Findings, look, usual_length
 from lerobot_wmrl.improve.sizes import Sizes
 from lerobot_wmrl.rl.recorders import env_flags
 
@@ -230,8 +230,13 @@ class Improvement:
 
     @property
     def branches(self) -> int:
-        """Frames beyond the first from which imagination of a recorded episode begins."""
-        return (self.found.usual - 1) // self.length
+        """Frames beyond the first from which imagination of a recorded episode begins: as far apart as an
+        imagined episode is long."""
+        usual = self.found.usual
+        if self.config.rollouts:
+            table = self.table()
+            usual = usual_length(table.subset(table.among(self.data.episodes)))
+        return max(0, round(usual / self.length) - 1)
 
     def checked(self) -> tuple[Flags, str]:
         """Return the flags of the dataset that the world model is checked on, and its split.

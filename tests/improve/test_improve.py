@@ -122,7 +122,7 @@ def test_bad_settings_are_named_and_nothing_is_made(
     assert not (tmp_path / "improve").exists()
 
 
-@pytest.mark.parametrize(("longest", "clip", "length", "branches"), [(40, 42, 40, 0), (300, 100, 98, 3)])
+@pytest.mark.parametrize(("longest", "clip", "length", "branches"), [(40, 42, 40, 0), (300, 100, 98, 2)])
 def test_long_episodes_are_imagined_in_parts(
     longest: int, clip: int, length: int, branches: int, tmp_path: Path
 ) -> None:
@@ -135,7 +135,19 @@ def test_long_episodes_are_imagined_in_parts(
 
 
 def test_one_long_recording_does_not_divide_all_the_others(tmp_path: Path) -> None:
-    assert "--env.dataset.branches=3" in made_commands(tmp_path, longest=9000, usual=300)["rl"]
+    assert "--env.dataset.branches=2" in made_commands(tmp_path, longest=9000, usual=300)["rl"]
+
+
+@pytest.mark.parametrize(("longest", "branches"), [(5, 3), (19, 0)])
+def test_imagination_begins_all_over_the_rollouts_too(
+    longest: int, branches: int, make_synthetic_dataset: Any, tmp_path: Path
+) -> None:
+    """Here they have 20 frames. A frame more than the dataset has is no reason to begin in the middle."""
+    improvement = improvement_of(tmp_path, longest=longest, usual=longest, total=3)
+    assert improvement.branches == 0
+    make_synthetic_dataset(tmp_path / "merged", episodes=6)
+    improvement.config.rollouts = 3
+    assert improvement.branches == branches
 
 
 @pytest.mark.parametrize("size", ["tiny", "demo", "cpu"])
