@@ -62,7 +62,7 @@ class PPOConfig(PolicyGradientConfig):
     """Proximal policy optimisation (Schulman et al. 2017) with a KL penalty towards the SFT policy.
 
     Args:
-        gamma: discount factor. For episodes that may take L steps set it to about 0.3 ** (1 / L): 0.97 for 40.
+        gamma: discount factor. For episodes of up to L steps set it to about 0.3 ** (1 / L), as 0.97 for 40.
         gae_lambda: λ of generalised advantage estimation.
         clip: half-width of the interval around 1 in which the ratio may move.
         value_lr: learning rate of the value function (AdamW).
