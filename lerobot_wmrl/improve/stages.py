@@ -130,6 +130,20 @@ class Improvement:
             "policy.path": self.policies[self.chosen()], **real, **self._success_criterion(),
         })]  # fmt: skip
 
+    def another_round(self) -> list[str] | None:
+        """Return the command that records rollouts of the policy to use and improves it on all episodes;
+        None if nothing was recorded."""
+        config = self.config
+        if not config.rollouts:
+            return None
+        given: Flags = {} if config.iterations is None else {"iterations": config.iterations}
+        return ["lerobot-wmrl-improve", *format_flags({
+            "policy.path": self.policies[self.chosen()], **self.data.flags(), **self._real_env("real_env"),
+            "rollouts": config.rollouts, "exploration": config.exploration, "size": config.preset, **given,
+            "selection_episodes": config.selection_episodes, "eval_episodes": config.eval_episodes,
+            "seed": config.seed + config.rollouts, "output_dir": f"{self.out}_again",
+        })]  # fmt: skip
+
     @property
     def duration(self) -> str:
         """The expected duration, as text."""

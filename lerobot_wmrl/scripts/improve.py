@@ -14,6 +14,7 @@ Every stage is one console command, which it prints. Running the same command ag
 stopped. It ends with a summary and `report.html`.
 """
 
+import shlex
 from typing import TYPE_CHECKING
 
 import draccus
@@ -40,6 +41,8 @@ def improve(cfg: ImproveConfig) -> None:
         page = Page.of(improvement)
         path = page.write(cfg.output_dir)
     print(f"\n{verdict(improvement, page.places)}\n\nThe report: {path}")
+    if again := improvement.another_round():
+        print(f"Another round, with as many rollouts of this policy:\n{shlex.join(again)}")
 
 
 def settings(cfg: ImproveConfig, stages: "list[Stage]") -> dict[str, object]:

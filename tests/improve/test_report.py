@@ -176,6 +176,28 @@ def test_the_command_that_drives_the_world_model_takes_its_flags(finished: Impro
 
 
 @pytest.mark.usefixtures("without_drawing")
+def test_another_round_begins_from_the_policy_to_use_on_all_episodes(
+    finished: Improvement, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From starts of its own."""
+    assert finished.another_round() is None
+    assert "Another round" not in text_of(finished)
+    finished.config.rollouts, finished.config.seed = 20, 7
+    command = shlex.join(finished.another_round() or [])
+    check(command)
+    merged = f"--dataset.root={finished.out}/merged --real_env.type=pusht --rollouts=20"
+    assert f"--policy.path={finished.out}/distilled/checkpoints/last/pretrained_model {merged}" in command
+    assert f"--seed=27 --output_dir={finished.out}_again" in command
+    write_records(finished)
+    table = SimpleNamespace(success=np.arange(60) < 40, among=lambda episodes: None)
+    monkeypatch.setattr(table, "subset", lambda among: table, raising=False)
+    monkeypatch.setattr(Improvement, "table", lambda improvement: table)
+    page = text_of(finished)
+    assert "<p>This records as many rollouts of the policy to use" in page
+    assert html.escape(command).replace("&#x27;", "&#39;") in page
+
+
+@pytest.mark.usefixtures("without_drawing")
 def test_what_the_gate_found_is_shown_and_its_last_warning_in_red(finished: Improvement) -> None:
     fresh = {"false_positive_rate": {"k": 1, "n": 10}, "recall": {"k": 3, "n": 4}}
     gate, shown = finished.out / "rl" / "gate", '<p class="warning">'

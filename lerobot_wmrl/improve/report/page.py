@@ -163,6 +163,7 @@ class Page:
             pictures=picture_sections(self.replays),
             curves=[figures.line(curve, title) for title, curve in curves.items()],
             drive=shlex.join(improvement.drive()),
+            another_round=shlex.join(improvement.another_round() or []),
             stages=self._all_records(),
         )
 
