@@ -15,6 +15,7 @@ from lerobot.envs.configs import EnvConfig
 from safetensors.torch import load_file
 
 from lerobot_wmrl.common.constants import GATE_SEED
+from lerobot_wmrl.common.errors import STOPPED
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 from lerobot_wmrl.scripts.train import main
@@ -139,7 +140,7 @@ def test_the_gate_is_asked_before_the_first_update(improve: Any, capsys: pytest.
     flags = [*PUSH, *SHORT, "--output_dir={out}", "--gate.dataset.root={data}"]
     with pytest.raises(SystemExit) as stopped:
         improve(*flags, "--env.done_threshold=0.0001")
-    assert stopped.value.code == 1
+    assert stopped.value.code == STOPPED
     assert "the world model calls failures successes" in capsys.readouterr().err
     out = improve(*flags, "--env.done_threshold=0.0001", "--gate.action=warn")
     assert (out / "checkpoints" / "last").resolve().name == "000002"
