@@ -81,7 +81,9 @@ def test_with_a_real_environment_its_rollouts_are_learnt_from_and_success_is_mea
     assert "failures: " not in first.stdout.partition("[1/11]")[0], "there are rollouts to come"
     assert "Leave out columns" not in report
     merged = f"dataset.root={folder / 'merged'}"
-    assert report.count(merged) == 7, "cloning, tokenizer, world model, imagined starts thrice, driving"
+    assert report.count(merged) == 8, (
+        "cloning, tokenizer, world model, imagined starts thrice, driving, another round"
+    )
     last = Path("checkpoints/last/pretrained_model")
     trained = json.loads((folder / "tokenizer" / last / "config.json").read_text())
     assert trained["tokenizer"]["frame_sizes"] == [[96, 96]]
