@@ -246,10 +246,7 @@ class Improvement:
     def branches(self) -> int:
         """Frames beyond the first from which imagination of a recorded episode begins: as far apart as an
         imagined episode is long."""
-        usual = self.found.usual
-        if self.config.rollouts:
-            table = self.table()
-            usual = usual_length(table.subset(table.among(self.data.episodes)))
+        usual = usual_length(self.learnt()) if self.config.rollouts else self.found.usual
         return max(0, round(usual / self.length) - 1)
 
     def checked(self) -> tuple[Flags, str]:
@@ -319,8 +316,7 @@ class Improvement:
         """Return the number of episodes that are learnt from, of the task that has the fewest."""
         if not self.config.rollouts:
             return self.found.fewest
-        table = self.table()
-        tasks = table.column(START_TASK)[table.among(self.data.episodes)]
+        tasks = self.learnt().column(START_TASK)
         return int(np.unique(tasks, return_counts=True)[1].min())
 
     def _columns(self) -> list[str]:
@@ -349,8 +345,13 @@ class Improvement:
         return merge_command(self.out / "merged", parts)
 
     def table(self) -> EpisodeTable:
-        """Read the episodes that are learnt from."""
+        """Read all episodes of the data that is learnt from, chosen or not."""
         return read_episodes(self.data.open())
+
+    def learnt(self) -> EpisodeTable:
+        """Read the episodes that are learnt from."""
+        table = self.table()
+        return table.subset(table.among(self.data.episodes))
 
     def _cloned(self) -> list[str]:
         table = self.table()
@@ -452,8 +453,8 @@ class Improvement:
         """Return the frames of all successful episodes that are learnt from."""
         if not self.config.rollouts:
             return self.found.success_frames
-        table = self.table()
-        return int(table.length[table.success & table.among(self.data.episodes)].sum())
+        learnt = self.learnt()
+        return int(learnt.length[learnt.success].sum())
 
     def _comparison(self) -> list[str]:
         imagined = self.config.real_env is None

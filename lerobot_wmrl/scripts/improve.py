@@ -8,10 +8,10 @@
 It looks at the data and says what it has and lacks; trains the policy further on the episodes that succeed,
 which needs no world model: imagination has to beat it; trains a frame tokenizer and a world model; checks the
 world model on held-out episodes; trains that policy in imagination; fits it to a planner there, if it is a
-`cnn` (distillation); and compares the policies, in `--real_env` if there is one, where other starts choose
-the policy to use. With `--rollouts` it first records rollouts of the policy there, and learns from them too.
-Every stage is one console command, which it prints. Running the same command again continues where it
-stopped. It ends with a summary and `report.html`.
+`cnn` (distillation); and compares the policies, in `--real_env` if there is one. There it also chooses the
+policy to use, on other starts. With `--rollouts` it first records rollouts of the policy there, and learns
+from them too. Every stage is one console command, which it prints. Running the same command again continues
+where it stopped. It ends with a summary and `report.html`.
 """
 
 import shlex

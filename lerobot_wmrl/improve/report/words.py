@@ -46,9 +46,7 @@ def lacks(improvement: Improvement) -> list[str]:
     found = improvement.found.missing
     if not improvement.config.rollouts:
         return found
-    table = improvement.table()
-    chosen = table.subset(table.among(improvement.data.episodes))
-    return [*found, *few_failures(chosen, "Record more rollouts, with more exploration")]
+    return [*found, *few_failures(improvement.learnt(), "Record more rollouts, with more exploration")]
 
 
 def verdict(improvement: Improvement, places: Sequence[Place]) -> str:
