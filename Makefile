@@ -2,8 +2,9 @@
 
 # What `lerobot-wmrl-demo` gets besides its preset: make demo DEMO_FLAGS="--seed=1 --output_dir=outputs/demo-1"
 DEMO_FLAGS ?=
-# Two processes suit two cores: a test starts commands of its own, and each process loads a simulator.
-PYTEST_FLAGS ?= --numprocesses=2 --dist=loadfile
+# Two processes suit two cores: a test starts commands of its own, and each process loads a simulator. xdist would
+# put files with few tests last, which are the longest here.
+PYTEST_FLAGS ?= --numprocesses=2 --dist=loadfile --no-loadscope-reorder
 
 setup:  ## an interpreter, .venv, the locked packages, this project, a renderer: does only what is missing
 	@tools/setup.sh

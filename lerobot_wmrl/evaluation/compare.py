@@ -137,13 +137,18 @@ def require_new_starts(envs: Envs, config: EnvConfig, n_episodes: int) -> None:
     """Raise FieldError if a world model has too few start frames: episodes would repeat and count twice."""
     if not isinstance(config, WorldModelEnv):
         return
-    fewest = min(len(env.env.starts) for env in _flat(envs))
+    fewest = fewest_starts(envs)
     if n_episodes > fewest:
         raise FieldError(
             "n_episodes", n_episodes,
             f"the world model has {fewest} start frames for a task, and an episode that is repeated says "
             f"nothing new", f"set it to at most {fewest}, or give more with `env.dataset.max_starts`",
         )  # fmt: skip
+
+
+def fewest_starts(envs: Envs) -> int:
+    """Return how many start frames a world model has at least, over its tasks."""
+    return min(len(env.env.starts) for env in _flat(envs))
 
 
 def run_comparison(
