@@ -169,7 +169,7 @@ def test_a_policy_is_not_also_a_reference(config, seeing, tmp_path):
         judge(config)
     config.policies = config.policies[1:]
     found = results_of(config)
-    assert [each["real"] and each["real"]["k"] for each in found["policies"].values()] == [None, 1]
+    assert [each["real"] and each["real"]["k"] for each in found["policies"].values()] == [1, None]
     config = replace(config, output_dir=tmp_path / "other")
     write(config.references, {"policies": {str(tmp_path / "nothing"): {"k": 1, "n": 2}}})
     with pytest.raises(ValueError, match=r"references=.*no checkpoint there"):
