@@ -83,3 +83,22 @@ def draw_learning_curve(variants: Mapping[str, Mapping[str, Any]], path: Path) -
     grid[0, 0].set_ylabel("delta-PSNR after 0.6 s (dB)")
     grid[1, 0].set_ylabel("AUC of the gate")
     tidy(figure).savefig(path, dpi=130)
+
+
+def draw_judged(found: Mapping[str, Any], path: Path) -> None:
+    """A panel a domain: every policy's estimated and real success, those trained in the world model apart."""
+    figure = Figure(figsize=(4.4 * len(found), 4), layout="constrained")
+    panels = figure.subplots(1, len(found), sharey=True, squeeze=False)[0]
+    for axes, (domain, numbers) in zip(panels, found.items(), strict=True):
+        axes.plot((0, 1), (0, 1), color="#999", linewidth=1, linestyle="--")
+        for row in numbers["policies"].values():
+            value, low, high = (row["estimate"][name] for name in ("value", "low", "high"))
+            real = Proportion(row["real"]["k"], row["real"]["n"])
+            axes.errorbar(
+                value, real.share, real.whiskers, [[value - low], [high - value]], linewidth=0.7,
+                color=COLOURS[1 if row["inside"] else 0], marker="x" if row["inside"] else "o", markersize=4,
+            )  # fmt: skip
+        axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), title=DOMAINS[domain])
+        axes.set_xlabel("success estimated by the world model")
+    panels[0].set_ylabel("success in ManiSkill")
+    tidy(figure).savefig(path, dpi=110)

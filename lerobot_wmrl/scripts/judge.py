@@ -27,7 +27,6 @@ from tqdm import tqdm
 
 from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.command_line import RunConfig, claim_output_dir, require_free, run_command
-from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least
 from lerobot_wmrl.common.files import write_json, writing
 from lerobot_wmrl.data.episodes import ChosenEpisodes
@@ -186,14 +185,12 @@ def imagine(
     if not missing:
         return
     with opened(env, cfg.batch_size, False, 1) as (envs,):
-        episodes = fewest_starts(envs)
+        starts = fewest_starts(envs)
         for name, config in tqdm(missing.items(), desc="Imagining", unit="policy"):
             policies = load_policies({name: config})
-            blocks = [
-                run_block(
-                    [envs], env, policies, min(cfg.batch_size, episodes - begin), EVALUATION_SEED + begin
-                )
-                for begin in range(0, episodes, cfg.batch_size)
+            blocks = [  # the seed of an episode is the number of its start
+                run_block([envs], env, policies, min(cfg.batch_size, starts - begin), begin)
+                for begin in range(0, starts, cfg.batch_size)
             ]
             judgement.outcomes[name] = [episode.successes[0] for block in blocks for episode in block]
             write_json(cfg.output_dir / RESULTS, judgement.as_json())

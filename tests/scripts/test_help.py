@@ -16,6 +16,7 @@ from lerobot_wmrl.scripts import (
     demo,
     eval_world_model,
     improve,
+    judge,
     label,
     play,
     resample,
@@ -36,13 +37,14 @@ COMMANDS = {
     "lerobot-wmrl-improve": (improve.improve, improve.ImproveConfig),
     "lerobot-wmrl-play": (play.play, play.PlayConfig),
     "lerobot-wmrl-compare": (compare.compare, compare.CompareConfig),
+    "lerobot-wmrl-judge": (judge.judge, judge.JudgeConfig),
     "lerobot-wmrl-label": (label.label, label.LabelConfig),
     "lerobot-wmrl-resample": (resample.resample, resample.ResampleConfig),
     "lerobot-wmrl-convert-openvla": (convert_openvla.convert, convert_openvla.ConvertOpenVLAConfig),
 }  # fmt: skip
 
 
-WITHOUT_PRESET = ("compare", "improve", "label", "openvla", "play", "resample")
+WITHOUT_PRESET = ("compare", "improve", "judge", "label", "openvla", "play", "resample")
 
 
 @pytest.mark.parametrize("command", COMMANDS)
