@@ -42,6 +42,7 @@ class Judgement:
         references: real success of the policies for which it is known, by name.
         refused: why a policy cannot be judged, by name.
         coverage: share of the intervals that shall contain the real rate.
+        warning: what is wrong with the rollouts, if anything is.
         outcomes: success of each policy's imagined episodes, those of the references included.
     """
 
@@ -49,6 +50,7 @@ class Judgement:
     references: Mapping[str, Proportion]
     refused: Mapping[str, str]
     coverage: float
+    warning: str | None = None
     outcomes: dict[str, list[bool]] = field(default_factory=dict)
 
     @property
@@ -94,6 +96,7 @@ class Judgement:
                 "recall": self.recognition.recall.as_json(),
                 "false_positive_rate": self.recognition.false_positives.as_json(),
             },
+            "warning": self.warning,
             "margin": None if margin is None or math.isinf(margin) else margin,
             "policies": {name: self._policy_json(name) for name in {**self.outcomes, **self.refused}},
             "outcomes": self.outcomes,
@@ -122,16 +125,15 @@ class Judgement:
             )
         width = max(map(len, self.outcomes))
         rows = [f"{name:<{width}}  {self._row(name)}" for name in self.outcomes]
-        return "\n".join([rollouts, self._basis(), "", *rows, *self._refusals()])
+        refusals = [f"{name}: not judged, {why}" for name, why in self.refused.items()]
+        warnings = [self.warning] if self.warning else []
+        return "\n".join([rollouts, self._basis(), *warnings, "", *rows, *refusals])
 
     def _row(self, name: str) -> str:
         said = f"{self.imagined(name)} in imagination"
         if name in self.references:
             return f"{said}; in reality {self.references[name]}"
         return f"{said}; estimated {self.estimate(name)}"
-
-    def _refusals(self) -> list[str]:
-        return [f"{name}: not judged, {why}" for name, why in self.refused.items()]
 
     def _basis(self) -> str:
         """Say what the intervals rest on."""
@@ -203,18 +205,36 @@ def read_references(path: Path | None) -> dict[str, Proportion]:
 
 def trained_inside(policy: str, world_model: str) -> str | None:
     """Return why a policy is not judged in a world model, if it was trained there."""
-    settings = resolve_checkpoint(policy) / CONFIG_FILE
-    if not settings.is_file():
-        return None
-    path = (json.loads(settings.read_text()).get("env") or {}).get("world_model_path")
-    if not path or not same_model(path, world_model):
+    path = training_settings(policy, "env").get("world_model_path")
+    if not path or not _same(path, world_model, resolve_checkpoint(path), resolve_checkpoint(world_model)):
         return None
     return "it was trained in this world model, and may have learnt what only looks like success there"
 
 
-def same_model(one: str, other: str) -> bool:
-    """Return whether two paths name the same model."""
-    first, second = resolve_checkpoint(one), resolve_checkpoint(other)
+def learnt_from(world_model: str, rollouts: ChosenEpisodes, split: str) -> str | None:
+    """Return a warning if the world model has learnt from the rollouts that say how often it errs."""
+    name = training_settings(world_model, "dataset")
+    own = name.get("root") or name.get("repo_id") or ""
+    if (
+        not own
+        or not _same(own, rollouts.name, Path(own), Path(rollouts.name))
+        or "validation" in split.split(",")
+    ):
+        return None
+    return (
+        f"The world model has learnt from {rollouts.name}, whose episodes it recognises better than others: "
+        "the intervals are too narrow. Choose the episodes that were held out (--split=validation), or record "
+        "others."
+    )
+
+
+def training_settings(checkpoint: str, group: str) -> Mapping[str, Any]:
+    """Return settings of the training that made a checkpoint, none if they are not stored."""
+    path = resolve_checkpoint(checkpoint) / CONFIG_FILE
+    return (json.loads(path.read_text()).get(group) if path.is_file() else None) or {}
+
+
+def _same(one: str, other: str, first: Path, second: Path) -> bool:
     return one == other or (first.exists() and second.exists() and first.samefile(second))
 
 

@@ -128,6 +128,7 @@ def judge(cfg: JudgeConfig) -> None:
     from lerobot_wmrl.evaluation.judgement import (
         RESULTS,
         Judgement,
+        learnt_from,
         recognise,
         save_picture,
         trained_inside,
@@ -142,7 +143,8 @@ def judge(cfg: JudgeConfig) -> None:
     reasons = {name: trained_inside(name, cfg.world_model.path) for name in configs}
     refused = {name: why for name, why in reasons.items() if why}
     recognition = recognise(env, cfg.dataset, cfg.split)
-    judgement = Judgement(recognition, references, refused, cfg.coverage, outcomes)
+    warning = learnt_from(cfg.world_model.path, cfg.dataset, cfg.split)
+    judgement = Judgement(recognition, references, refused, cfg.coverage, warning, outcomes)
     with writing("output_dir", cfg.output_dir):
         claim_output_dir(cfg.output_dir, draccus.encode(cfg))
         if not judgement.blind:
@@ -184,7 +186,7 @@ def imagine(
     missing = {name: config for name, config in configs.items() if name not in judgement.outcomes}
     if not missing:
         return
-    with opened(env, cfg.batch_size, False, 1) as (envs,):
+    with opened(env, min(cfg.batch_size, env.dataset.max_starts), False, 1) as (envs,):
         starts = fewest_starts(envs)
         for name, config in tqdm(missing.items(), desc="Imagining", unit="policy"):
             policies = load_policies({name: config})

@@ -35,7 +35,7 @@ def with_references(*rates: tuple[int, int], judged: int = 50, **settings) -> Ju
     """Return a judgement of `judged` by references that succeed so often in imagination and in reality."""
     known = {str(index): Proportion(real, 100) for index, (_, real) in enumerate(rates)}
     imagined = {str(index): outcomes(seen) for index, (seen, _) in enumerate(rates)}
-    judgement = Judgement(GOOD, known, {}, 0.9, {"judged": outcomes(judged), **imagined})
+    judgement = Judgement(GOOD, known, {}, 0.9, None, {"judged": outcomes(judged), **imagined})
     return replace(judgement, **settings)
 
 
@@ -190,6 +190,14 @@ def test_a_policy_that_was_trained_in_the_world_model_is_refused(config, seeing,
     assert trained_inside(name, model) is None
     write(settings, {"env": None})
     assert trained_inside(name, model) is None
+
+
+def test_rollouts_that_the_world_model_has_learnt_from_are_warned_about(config, seeing, capsys, tmp_path):
+    assert "has learnt from" in results_of(config)["warning"]
+    assert "the intervals are too narrow" in capsys.readouterr().out
+    assert (
+        results_of(replace(config, split="validation", output_dir=tmp_path / "held_out"))["warning"] is None
+    )
 
 
 def test_rollouts_count_within_the_length_of_an_episode_and_must_both_succeed_and_fail(
