@@ -213,18 +213,14 @@ def trained_inside(policy: str, world_model: str) -> str | None:
 
 def learnt_from(world_model: str, rollouts: ChosenEpisodes, split: str) -> str | None:
     """Return a warning if the world model has learnt from the rollouts that say how often it errs."""
-    name = training_settings(world_model, "dataset")
-    own = name.get("root") or name.get("repo_id") or ""
-    if (
-        not own
-        or not _same(own, rollouts.name, Path(own), Path(rollouts.name))
-        or "validation" in split.split(",")
-    ):
+    source = training_settings(world_model, "dataset")
+    own = source.get("root") or source.get("repo_id")
+    held_out = "validation" in split.split(",")
+    if not own or held_out or not _same(own, rollouts.name, Path(own), Path(rollouts.name)):
         return None
     return (
-        f"The world model has learnt from {rollouts.name}, whose episodes it recognises better than others: "
-        "the intervals are too narrow. Choose the episodes that were held out (--split=validation), or record "
-        "others."
+        f"The world model has learnt from {rollouts.name} and recognises its episodes better than others: the "
+        "intervals are too narrow. Choose the episodes that were held out (--split=validation), or others."
     )
 
 
