@@ -219,8 +219,8 @@ def learnt_from(world_model: str, rollouts: ChosenEpisodes, split: str) -> str |
     if not own or held_out or not _same(own, rollouts.name, Path(own), Path(rollouts.name)):
         return None
     return (
-        f"The world model has learnt from {rollouts.name} and recognises its episodes better than others: "
-        "the intervals are too narrow. Choose the episodes that were held out (--split=validation), or others."
+        f"The world model has learnt from {rollouts.name} and recognises these better than other episodes: "
+        "the intervals are too narrow. Take the episodes that were held out (--split=validation), or others."
     )
 
 
