@@ -1,7 +1,7 @@
-"""Collect what a world model says about policies, beside what they do in ManiSkill."""
+"""What a world model says about policies, beside what they do in ManiSkill."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -9,7 +9,8 @@ import numpy as np
 from scipy.stats import kendalltau, pearsonr
 
 from experiments import figures
-from experiments.study import Study
+from experiments.cells import DOMAINS, Load, counted, table
+from experiments.study import ROOT, Study, read_cells
 from experiments.success import Results
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.evaluation import comparison, judgement
@@ -27,7 +28,7 @@ def push(study: Study) -> Results:
     """Return what is estimated for every policy, in known and in unseen scenes, and how it compares."""
     found = {domain: judged(study.folder, domain) for domain in SCENES}
     settings = {name: study.variables[name] for name in ("demonstrations", "rollouts", "seed")}
-    figures.draw_judged(found, study.folder / "judge.png")
+    figures.draw_judged(found, study.folder / f"{study.variables['cell']}.png")
     return {study.variables["cell"]: {**settings, "domains": found}}
 
 
@@ -128,3 +129,55 @@ def by_scene(
         }
         for each in scenes
     }  # fmt: skip
+
+
+def section(load: Load) -> str:
+    """Return the section of docs/results.md."""
+    (study,) = read_cells(ROOT / "experiments" / "judge.yaml")
+    cell = study.variables["cell"]
+    found = load(f"judge/{cell}")["domains"]
+    known = found["ind"]
+    outside, (recall, false_positives) = known["outside"], known["rollouts"].values()
+    starts = next(iter(known["policies"].values()))["real"]["n"]
+    rows = [
+        [
+            DOMAINS[domain], title, row["n"], *(f"{100 * row[name]:.0f}" for name in ERRORS),
+            *(f"{row[name]:.2f}" for name in RANKS),
+            *(f"{row[name]['k']} of {row[name]['n']}" for name in INTERVALS),
+        ]
+        for domain, each in found.items()
+        for title, row in (("no", each["outside"]), ("yes", each["inside"]))
+    ]  # fmt: skip
+    known_scenes, unseen_scenes = (each["scenes"].values() for each in found.values())
+    return f"""In the scenes that it has learnt from, its estimates for {outside["n"]} checkpoints that
+were not trained in it are {100 * outside["mean_absolute_error"]:.0f} points off on average; each is measured
+on {starts} starts.
+
+{table(HEAD, rows)}
+
+On the labelled rollouts of one policy the world model recognises {counted(recall)} of the successes and takes
+{counted(false_positives)} of the failures for successes, by which success in imagination is corrected.
+Intervals shall contain 90 % of the rates. They are made by these two numbers, or by the errors about all other policies
+that were not trained in the world model. For all of those together, imagined and real success differ by more
+than {100 * TOLERATED:.0f} points in {differing(known_scenes)} known scenes and in {differing(unseen_scenes)}
+unseen ones.
+
+![Estimated and real success of every policy](results/judge/{cell}.png)"""
+
+
+def differing(scenes: Collection[Mapping[str, Any]]) -> str:
+    """`2 of 16`: scenes in which imagined and real success differ too much."""
+    wrong = [abs(each["imagined"]["share"] - each["real"]["share"]) > TOLERATED for each in scenes]
+    return f"{sum(wrong)} of {len(wrong)}"
+
+
+ERRORS: Final = ("uncorrected", "mean_absolute_error")
+RANKS: Final = ("pearson", "kendall")
+INTERVALS: Final = ("corrected", "conformal")
+HEAD: Final = (
+    "scenes", "trained in the world model", "policies", "imagined: points off", "corrected: points off",
+    "Pearson's r", "Kendall's τ", "intervals by rollouts contain", "intervals by references contain",
+)  # fmt: skip
+
+TOLERATED: Final = 0.15
+"""Difference of imagined and real success beyond which a world model is wrong about a scene."""

@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from experiments import foreign
+from experiments import foreign, judged
 from experiments import policy_sections as policies
 from experiments import value_sections as value
 from experiments import world_model_sections as world_models
@@ -53,6 +53,7 @@ SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     "gate_autoregressive": ("Trust", world_models.gate_autoregressive),
     "gate_sensitivity": ("Trust", world_models.gate_sensitivity),
     "policies": ("Trust", world_models.policies),
+    "judge": ("Trust", judged.section),
     "reward_curves": ("Trust", world_models.reward_curves),
     "four_tasks": ("World models", world_models.four_tasks),
     "learning_curve": ("World models", world_models.learning_curve),
