@@ -157,10 +157,10 @@ on {starts} starts.
 
 On the labelled rollouts of one policy the world model recognises {counted(recall)} of the successes and takes
 {counted(false_positives)} of the failures for successes, by which success in imagination is corrected.
-Intervals shall contain 90 % of the rates. They are made by these two numbers, or by the errors about all other policies
-that were not trained in the world model. For all of those together, imagined and real success differ by more
-than {100 * TOLERATED:.0f} points in {differing(known_scenes)} known scenes and in {differing(unseen_scenes)}
-unseen ones.
+Intervals shall contain 90 % of the rates. They are made by these two numbers, or by the errors about all
+other policies that were not trained in the world model. For all of those together, imagined and real success
+differ by more than {100 * TOLERATED:.0f} points in {differing(known_scenes)} known scenes and in
+{differing(unseen_scenes)} unseen ones.
 
 ![Estimated and real success of every policy](results/judge/{cell}.png)"""
 
