@@ -1,12 +1,13 @@
 """What a world model says about policies, beside what they do in ManiSkill."""
 
 import json
+import math
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from scipy.stats import kendalltau, pearsonr
+from scipy.stats import binomtest, kendalltau, pearsonr
 
 from experiments import figures
 from experiments.cells import DOMAINS, Load, counted, table
@@ -14,7 +15,7 @@ from experiments.study import ROOT, Study, read_cells
 from experiments.success import Results
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.evaluation import comparison, judgement
-from lerobot_wmrl.evaluation.calibration import Recognition, conformal_margin, corrected_rate
+from lerobot_wmrl.evaluation.calibration import Confusion, conformal_margin, corrected_rate
 from lerobot_wmrl.maniskill.scenes import SCENES as ALL_SCENES
 from lerobot_wmrl.maniskill.scenes import scene_for_seed, scenes_of
 
@@ -22,6 +23,12 @@ SCENES: Final = {"ind": [ALL_SCENES[index] for index in (0, 1, 2)], "ood": scene
 """Scenes of known and of unseen starts: the seed chooses among them."""
 
 COVERAGE: Final = 0.9
+
+TOLERATED: Final = 0.15
+"""Difference of imagined and real success beyond which a world model is wrong about a scene."""
+
+Row = Mapping[str, Any]
+"""What is known of a policy: imagined and real success, the estimate, its training."""
 
 
 def push(study: Study) -> Results:
@@ -33,33 +40,35 @@ def push(study: Study) -> Results:
 
 
 def judged(folder: Path, domain: str) -> dict[str, Any]:
-    """Return every policy's estimate beside its real success, and how often intervals contain that."""
+    """Return every policy's estimate beside its real success, and how the two agree."""
     said = json.loads((folder / f"judged_{domain}" / judgement.RESULTS).read_text())
     real = json.loads((folder / f"real_{domain}" / comparison.RESULTS).read_text())
+    confusion = Confusion(as_rate(said["recall"]), as_rate(said["false_positive_rate"]))
+    rows = {
+        name: {
+            "imagined": policy["imagined"],
+            "estimate": corrected_rate(as_rate(policy["imagined"]), confusion, COVERAGE).clipped()._asdict(),
+            "real": real["policies"][name],
+            "refused": policy["refused"],
+            "training": str(Path(name).parents[1]),
+        }
+        for name, policy in said["policies"].items()
+    }
+    others = [name for name, row in rows.items() if not row["refused"]]
     outcomes = {
         name: [episode["successes"][index] for episode in real["episodes"]]
         for index, name in enumerate(real["policies"])
     }
-    seeds = [episode["seed"] for episode in real["episodes"]]
-    recognition = Recognition(
-        *(as_rate(said["rollouts"][name]) for name in ("recall", "false_positive_rate"))
-    )
-    rows = {
-        name: {
-            "imagined": policy["imagined"],
-            "estimate": corrected_rate(as_rate(policy["imagined"]), recognition, COVERAGE)._asdict(),
-            "real": real["policies"][name],
-            "inside": policy["refused"] is not None,
-        }
-        for name, policy in said["policies"].items()
-    }
-    others = [name for name, row in rows.items() if not row["inside"]]
+    references = [rows[name] for name in others]
     return {
-        "rollouts": said["rollouts"],
+        "recall": said["recall"],
+        "false_positive_rate": said["false_positive_rate"],
         "policies": {short_name(name): row for name, row in rows.items()},
-        "outside": agreement([rows[name] for name in others], [rows[name] for name in others]),
-        "inside": agreement([row for row in rows.values() if row["inside"]], [rows[name] for name in others]),
-        "scenes": by_scene(domain, said["outcomes"], outcomes, seeds, others),
+        "judged": agreement(references, references),
+        "refused": agreement([row for row in rows.values() if row["refused"]], references),
+        "scenes": by_scene(
+            domain, said["outcomes"], outcomes, [episode["seed"] for episode in real["episodes"]], others
+        ),
     }
 
 
@@ -73,34 +82,51 @@ def short_name(checkpoint: str) -> str:
     return f"{path.parents[1].name} {int(path.name)}"
 
 
-def error(row: Mapping[str, Any]) -> float:
-    return float(row["estimate"]["value"] - row["real"]["share"])
-
-
-def agreement(rows: Sequence[Mapping[str, Any]], references: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def agreement(rows: Sequence[Row], references: Sequence[Row]) -> dict[str, Any]:
     """Return how far estimates are from real success, how well they rank, and what intervals contain.
 
-    `corrected` are the intervals that rest on labelled rollouts alone. `conformal` are those by references:
-    every policy's by all others.
+    `by_rollouts` counts estimates whose difference to the measured rate may be 0 by the intervals of both.
+    `by_references` counts measured rates within the margin that the references of other trainings give.
     """
     estimates = [row["estimate"]["value"] for row in rows]
     real = [row["real"]["share"] for row in rows]
-    inside = [row["estimate"]["low"] <= row["real"]["share"] <= row["estimate"]["high"] for row in rows]
     margins = [
-        conformal_margin([error(other) for other in references if other is not row], COVERAGE) for row in rows
+        conformal_margin(
+            [error(each) for each in references if each["training"] != row["training"]], COVERAGE
+        )
+        for row in rows
     ]
     covered = [abs(error(row)) <= margin for row, margin in zip(rows, margins, strict=True)]
     return {
         "n": len(rows),
-        "mean_error": float(np.mean([error(row) for row in rows])),
-        "mean_absolute_error": float(np.mean([abs(error(row)) for row in rows])),
-        "uncorrected": float(np.mean([abs(row["imagined"]["share"] - row["real"]["share"]) for row in rows])),
+        "trainings": len({row["training"] for row in rows}),
+        "imagined_error": float(
+            np.mean([abs(row["imagined"]["share"] - row["real"]["share"]) for row in rows])
+        ),
+        "error": float(np.mean([abs(error(row)) for row in rows])),
+        "bias": float(np.mean([error(row) for row in rows])),
         "pearson": float(pearsonr(estimates, real).statistic),
         "kendall": float(kendalltau(estimates, real).statistic),
-        "corrected": Proportion(sum(inside), len(rows)).as_json(),
-        "conformal": Proportion(sum(covered), len(rows)).as_json(),
+        "by_rollouts": Proportion(sum(map(compatible, rows)), len(rows)).as_json(),
+        "by_references": Proportion(sum(covered), len(rows)).as_json(),
         "margin": float(np.median(margins)),
     }
+
+
+def error(row: Row) -> float:
+    return float(row["estimate"]["value"] - row["real"]["share"])
+
+
+def compatible(row: Row) -> bool:
+    """Return whether estimate and measured rate may be equal, by the interval of their difference.
+
+    It is made of the intervals of both (Zou and Donner 2008); the measured rate's is Wilson's.
+    """
+    estimate, real = row["estimate"], row["real"]
+    interval = binomtest(real["k"], real["n"]).proportion_ci(COVERAGE, "wilson")
+    above = math.hypot(estimate["value"] - estimate["low"], interval.high - real["share"])
+    below = math.hypot(estimate["high"] - estimate["value"], real["share"] - interval.low)
+    return -below <= error(row) <= above
 
 
 def by_scene(
@@ -111,14 +137,10 @@ def by_scene(
     scenes = SCENES[domain]
 
     def rates(outcomes: Mapping[str, Sequence[bool]], seeds: Sequence[int]) -> dict[int, Proportion]:
-        table = np.array([outcomes[name] for name in policies])
+        successes = np.array([outcomes[name] for name in policies])
         scene = np.array([scene_for_seed(scenes, seed).index for seed in seeds])
-        return {
-            each.index: Proportion(
-                int(table[:, scene == each.index].sum()), table[:, scene == each.index].size
-            )
-            for each in scenes
-        }
+        parts = {each.index: successes[:, scene == each.index] for each in scenes}
+        return {index: Proportion(int(part.sum()), part.size) for index, part in parts.items()}
 
     starts = len(next(iter(imagined.values())))
     seen, happened = rates(imagined, range(starts)), rates(real, seeds)
@@ -137,47 +159,44 @@ def section(load: Load) -> str:
     cell = study.variables["cell"]
     found = load(f"judge/{cell}")["domains"]
     known = found["ind"]
-    outside, (recall, false_positives) = known["outside"], known["rollouts"].values()
-    starts = next(iter(known["policies"].values()))["real"]["n"]
+    starts = [next(iter(each["policies"].values()))["real"]["n"] for each in found.values()]
     rows = [
         [
-            DOMAINS[domain], title, row["n"], *(f"{100 * row[name]:.0f}" for name in ERRORS),
-            *(f"{row[name]:.2f}" for name in RANKS),
-            *(f"{row[name]['k']} of {row[name]['n']}" for name in INTERVALS),
+            DOMAINS[domain], title, f"{row['n']} ({row['trainings']})",
+            *(f"{100 * row[name]:.0f}" for name in ("imagined_error", "error")),
+            *(f"{row[name]:.2f}" for name in ("pearson", "kendall")),
+            *(f"{row[name]['k']} of {row[name]['n']}" for name in ("by_rollouts", "by_references")),
+            f"{100 * row['margin']:.0f}",
         ]
         for domain, each in found.items()
-        for title, row in (("no", each["outside"]), ("yes", each["inside"]))
+        for title, row in (("no", each["judged"]), ("yes", each["refused"]))
     ]  # fmt: skip
     known_scenes, unseen_scenes = (each["scenes"].values() for each in found.values())
-    return f"""In the scenes that it has learnt from, its estimates for {outside["n"]} checkpoints that
-were not trained in it are {100 * outside["mean_absolute_error"]:.0f} points off on average; each is measured
-on {starts} starts.
+    return f"""In the scenes that it has learnt from, estimates for {known["judged"]["n"]} checkpoints that
+were not trained in it are {100 * known["judged"]["error"]:.0f} points off on average. Their real success is
+measured on {starts[0]} known and {starts[1]} unseen starts.
 
 {table(HEAD, rows)}
 
-On the labelled rollouts of one policy the world model recognises {counted(recall)} of the successes and takes
-{counted(false_positives)} of the failures for successes, by which success in imagination is corrected.
-Intervals shall contain 90 % of the rates. They are made by these two numbers, or by the errors about all
-other policies that were not trained in the world model. For all of those together, imagined and real success
-differ by more than {100 * TOLERATED:.0f} points in {differing(known_scenes)} known scenes and in
+Of the successes among 200 rollouts of one policy in known scenes it predicts {counted(known["recall"])} as
+successes, of the failures {counted(known["false_positive_rate"])}; by that success in imagination is
+corrected. Intervals of 90 % rest on these two rates, or on the errors about the policies of all other
+trainings, which give the margin. An interval by rollouts counts if the estimate and the measured rate may be
+equal. For all policies that were not trained in the world model together, imagined and real success differ
+by more than {100 * TOLERATED:.0f} points in {differing(known_scenes)} known scenes and in
 {differing(unseen_scenes)} unseen ones.
 
 ![Estimated and real success of every policy](results/judge/{cell}.png)"""
+
+
+HEAD: Final = (
+    "scenes", "trained in the world model", "checkpoints (trainings)", "imagined: points off",
+    "corrected: points off", "Pearson's r", "Kendall's τ", "intervals by rollouts hold",
+    "intervals by references hold", "their margin (points)",
+)  # fmt: skip
 
 
 def differing(scenes: Collection[Mapping[str, Any]]) -> str:
     """`2 of 16`: scenes in which imagined and real success differ too much."""
     wrong = [abs(each["imagined"]["share"] - each["real"]["share"]) > TOLERATED for each in scenes]
     return f"{sum(wrong)} of {len(wrong)}"
-
-
-ERRORS: Final = ("uncorrected", "mean_absolute_error")
-RANKS: Final = ("pearson", "kendall")
-INTERVALS: Final = ("corrected", "conformal")
-HEAD: Final = (
-    "scenes", "trained in the world model", "policies", "imagined: points off", "corrected: points off",
-    "Pearson's r", "Kendall's τ", "intervals by rollouts contain", "intervals by references contain",
-)  # fmt: skip
-
-TOLERATED: Final = 0.15
-"""Difference of imagined and real success beyond which a world model is wrong about a scene."""

@@ -90,6 +90,22 @@ def renamed(field: str, name: str) -> Iterator[None]:
         raise FieldError(name, error.value, error.problem, error.remedy) from error
 
 
+@contextmanager
+def regrouped(group: str, name: str) -> Iterator[None]:
+    """Let a FieldError about a field of `group` that leaves the block be about the same field of `name`."""
+
+    def moved(text: str) -> str:
+        return text.replace(f"{group}.", f"{name}.")
+
+    try:
+        yield
+    except FieldError as error:
+        if not error.field.startswith(f"{group}."):
+            raise
+        field, remedy = moved(error.field), moved(error.remedy)
+        raise FieldError(field, error.value, moved(error.problem), remedy) from error
+
+
 def suggestion(name: str, known: Sequence[str], prefix: str = "") -> str:
     """Return the known name nearest to a wrong one, with `prefix` before it; all of them if none is near."""
     near = get_close_matches(name, known, 1)

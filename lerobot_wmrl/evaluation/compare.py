@@ -63,7 +63,7 @@ def read_policies(paths: Sequence[str], env: EnvConfig) -> dict[str, PreTrainedC
         name = checkpoint_name(path)
         if name in configs:
             raise FieldError("policies", path, "is given twice", "give every checkpoint once")
-        with _about_policy(path):
+        with about_policy(path):
             configs[name] = read_policy_config(name, [])
             check_weights(configs[name])
             _check_environment(configs[name], env)
@@ -71,7 +71,7 @@ def read_policies(paths: Sequence[str], env: EnvConfig) -> dict[str, PreTrainedC
 
 
 @contextmanager
-def _about_policy(path: str) -> Iterator[None]:
+def about_policy(path: str) -> Iterator[None]:
     """Let a FieldError that leaves the block be about the policy at `path`."""
     try:
         yield
@@ -97,7 +97,7 @@ def load_policies(configs: Mapping[str, PreTrainedConfig]) -> list[LoadedPolicy]
     """Load the policies with their processors. FieldError if one cannot be loaded."""
     loaded = []
     for name, config in configs.items():
-        with _about_policy(name):
+        with about_policy(name):
             loaded.append(LoadedPolicy(config, load_policy(config), load_processors(config)))
     return loaded
 
@@ -137,18 +137,13 @@ def require_new_starts(envs: Envs, config: EnvConfig, n_episodes: int) -> None:
     """Raise FieldError if a world model has too few start frames: episodes would repeat and count twice."""
     if not isinstance(config, WorldModelEnv):
         return
-    fewest = fewest_starts(envs)
+    fewest = min(len(env.env.starts) for env in _flat(envs))
     if n_episodes > fewest:
         raise FieldError(
             "n_episodes", n_episodes,
             f"the world model has {fewest} start frames for a task, and an episode that is repeated says "
             f"nothing new", f"set it to at most {fewest}, or give more with `env.dataset.max_starts`",
         )  # fmt: skip
-
-
-def fewest_starts(envs: Envs) -> int:
-    """Return how many start frames a world model has at least, over its tasks."""
-    return min(len(env.env.starts) for env in _flat(envs))
 
 
 def run_comparison(

@@ -4,30 +4,36 @@
         --world_model.path=outputs/action_world_model --output_dir=outputs/judgement
 
 It needs no simulator and no robot, but labelled rollouts (`--dataset`) that the world model has not learnt
-from. Replayed in it, they say how many successes it misses and how many failures it takes for successes. The
-success rate in imagination is corrected for both, and gets an interval.
+from. Replayed in it, they give its recall and its false positives, by which the success rate in imagination
+is corrected. The interval of the estimate holds if the world model errs about a policy as it does about the
+rollouts.
 
-That supposes that the world model errs about these policies as it does about the rollouts. If the real
-success of some policies is known, nine or more (`--references`), the errors about them give the interval
-instead, by split conformal prediction. It then supposes only that a policy to judge might be one of them.
+If the real success of nine policies or more is known (`--references`), the errors about them make the
+interval instead, by split conformal prediction. It holds for policies that could have been among these:
+references should differ as much as the policies do that are judged.
 
-A policy that was trained in this world model is not judged, since it may have learnt what only looks like
-success there. Nothing is judged if the world model hardly tells the rollouts' successes from their failures.
-Running the same command again continues after the last finished policy.
+A policy that was trained in this world model is not judged: it may have learnt what only looks like success
+there. Neither is one whose success in imagination no real rate explains. If the world model hardly tells the
+rollouts' successes from their failures, the command ends with exit status 3 before it imagines anything.
+
+The same command again continues after the last finished policy. More policies, references or another coverage
+may be given then: what has been imagined is kept.
 """
 
 import json
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
+from math import ceil
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import draccus
 from tqdm import tqdm
 
 from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.command_line import RunConfig, claim_output_dir, require_free, run_command
-from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least
+from lerobot_wmrl.common.errors import FieldError, Stopped, regrouped, renamed, require_at_least
 from lerobot_wmrl.common.files import write_json, writing
 from lerobot_wmrl.data.episodes import ChosenEpisodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
@@ -37,6 +43,8 @@ if TYPE_CHECKING:
     from lerobot.configs import PreTrainedConfig
 
     from lerobot_wmrl.common.statistics import Proportion
+    from lerobot_wmrl.evaluation.calibration import Confusion
+    from lerobot_wmrl.evaluation.compare import Envs
     from lerobot_wmrl.evaluation.judgement import Judgement
 
 
@@ -85,9 +93,7 @@ class JudgeConfig(RunConfig):
     def check(self) -> None:
         """Raise FieldError for a setting that cannot be."""
         if not self.policies:
-            raise FieldError(
-                "policies", [], "there is nothing to judge", "give checkpoints of policies: [a,b]"
-            )
+            raise FieldError("policies", [], "there is nothing to judge", "give checkpoints: [a,b]")
         if not self.world_model.path:
             raise FieldError(
                 "world_model.path",
@@ -101,57 +107,84 @@ class JudgeConfig(RunConfig):
                 "give some that it has not learnt from, or its own data with `split=validation`",
             )  # fmt: skip
         require_at_least(self, 1, "batch_size")
-        if self.starts.branches:
+        if not 0 < self.coverage < 1:
+            raise FieldError("coverage", self.coverage, "must be a share between 0 and 1")
+        self._check_starts()
+
+    @property
+    def starts_given(self) -> bool:
+        """Whether imagined episodes start elsewhere than in the rollouts."""
+        return bool(self.starts.given or self.starts.frames or self.starts.resets)
+
+    def _check_starts(self) -> None:
+        starts = self.starts
+        require_at_least(starts, 1, "max_starts")
+        if starts.branches:
             raise FieldError(
-                "starts.branches", self.starts.branches,
+                "starts.branches", starts.branches,
                 "from the middle of episodes a policy does not succeed as often as from their starts",
                 "leave it out",
             )  # fmt: skip
-        if not 0 < self.coverage < 1:
-            raise FieldError("coverage", self.coverage, "must be a share between 0 and 1")
+        if self.starts_given:
+            with regrouped("dataset", "starts"):
+                starts.check()
+        elif starts != StartFrames(max_starts=starts.max_starts):
+            raise FieldError(
+                "starts.root", "", "is missing, so that imagined episodes start in the rollouts",
+                "choose among them by `dataset.episodes` and `split`, or give `starts.root`",
+            )  # fmt: skip
 
     def imagination(self) -> WorldModelEnv:
         """Return the world model as the environment of the policies. FieldError if it cannot be one."""
-        starts = self.starts
-        if not (starts.given or starts.frames or starts.resets):
-            starts = replace(starts, **vars(self.dataset), split=self.split)
+        own = replace(self.starts, **vars(self.dataset), split=self.split)
         with renamed("world_model_path", "world_model.path"):
             return WorldModelEnv(
-                world_model_path=self.world_model.path, dataset=starts, reward=GeneralConfig(alpha=1.0),
-                episode_length=self.episode_length, done_threshold=self.done_threshold,
-                done_frames=self.done_frames, device=self.device,
+                world_model_path=self.world_model.path, dataset=self.starts if self.starts_given else own,
+                reward=GeneralConfig(alpha=1.0), episode_length=self.episode_length,
+                done_threshold=self.done_threshold, done_frames=self.done_frames, device=self.device,
             )  # fmt: skip
+
+
+MAY_DIFFER = ("policies", "references", "coverage", "batch_size", "device")
+"""Settings that change no imagined episode of a policy."""
 
 
 def judge(cfg: JudgeConfig) -> None:
     """Replay the rollouts and imagine what is missing of the episodes; write the results."""
-    from lerobot_wmrl.evaluation.judgement import (
-        RESULTS,
-        Judgement,
+    from lerobot_wmrl.evaluation.compare import checkpoint_name
+    from lerobot_wmrl.evaluation.evidence import (
+        confusion_of,
         learnt_from,
-        recognise,
-        save_picture,
+        replayed_rollouts,
         trained_inside,
     )
+    from lerobot_wmrl.evaluation.judgement import LEAST_YOUDEN, Judgement, save_picture, told
 
     cfg.check()
+    cfg.world_model.path = checkpoint_name(cfg.world_model.path)
     env = cfg.imagination()
     configs, references = read_both(cfg, env)
-    require_free(cfg.output_dir, draccus.encode(cfg))
-    results = cfg.output_dir / RESULTS
-    outcomes = json.loads(results.read_text())["outcomes"] if results.is_file() else {}
+    require_free(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER)
+    confusion, warnings = confusion_of(replayed_rollouts(env, cfg.dataset, cfg.split), env)
+    if not confusion.youden >= LEAST_YOUDEN:
+        raise Stopped(
+            f"{told(confusion)} That is too little to judge by. Choose another --done_threshold or "
+            "--done_frames (lerobot-wmrl-eval-world-model shows what they do), or train the world model on "
+            "more failures"
+        )
     reasons = {name: trained_inside(name, cfg.world_model.path) for name in configs}
-    refused = {name: why for name, why in reasons.items() if why}
-    recognition = recognise(env, cfg.dataset, cfg.split)
-    warning = learnt_from(cfg.world_model.path, cfg.dataset, cfg.split)
-    judgement = Judgement(recognition, references, refused, cfg.coverage, warning, outcomes)
+    judgement = Judgement(
+        confusion, references, {name: why for name, why in reasons.items() if why}, cfg.coverage,
+        [*learnt_from(cfg.world_model.path, cfg.dataset, cfg.split), *warnings],
+        imagined_before(cfg, configs, confusion),
+    )  # fmt: skip
     with writing("output_dir", cfg.output_dir):
-        claim_output_dir(cfg.output_dir, draccus.encode(cfg))
-        if not judgement.blind:
-            imagine(cfg, env, judgement, configs)
-        write_json(results, judgement.as_json())
+        imagine(cfg, env, judgement, configs)
         save_picture(judgement, cfg.output_dir / "judgement.png")
-    print(f"{judgement}\n{RESULTS} and judgement.png are in {cfg.output_dir}")
+    print(
+        f"{judgement}\n\njudgement.json and judgement.png are in {cfg.output_dir}. Next: try the best in "
+        "reality, and give the success that you count as --references"
+    )
 
 
 def read_both(
@@ -163,7 +196,7 @@ def read_both(
         FieldError: one of them cannot be read, or a policy to judge is a reference.
     """
     from lerobot_wmrl.evaluation.compare import read_policies
-    from lerobot_wmrl.evaluation.judgement import read_references
+    from lerobot_wmrl.evaluation.evidence import read_references
 
     judged, known = read_policies(cfg.policies, env), read_references(cfg.references)
     with renamed("policies", "references"):
@@ -176,26 +209,75 @@ def read_both(
     return others | judged, dict(zip(others, known.values(), strict=True))
 
 
+def imagined_before(
+    cfg: JudgeConfig, configs: "Mapping[str, PreTrainedConfig]", confusion: "Confusion"
+) -> dict[str, list[bool]]:
+    """Return what an earlier call has imagined of these policies.
+
+    Raises:
+        ValueError: the rollouts or the world model are not what they were then.
+    """
+    from lerobot_wmrl.evaluation.judgement import RESULTS, confusion_json
+
+    results = cfg.output_dir / RESULTS
+    if not results.is_file():
+        return {}
+    found = json.loads(results.read_text())
+    for name, rate in confusion_json(confusion).items():
+        if found[name] != rate:
+            raise ValueError(
+                f"--output_dir={cfg.output_dir}: {cfg.dataset.name} or the world model has changed since its "
+                "episodes were imagined; choose another folder"
+            )
+    return {name: outcomes for name, outcomes in found["outcomes"].items() if name in configs}
+
+
 def imagine(
     cfg: JudgeConfig, env: WorldModelEnv, judgement: "Judgement", configs: "Mapping[str, PreTrainedConfig]"
 ) -> None:
     """Imagine the episodes of the policies that have none yet; write the results after every policy."""
-    from lerobot_wmrl.evaluation.compare import fewest_starts, load_policies, opened, run_block
+    from lerobot_wmrl.evaluation.compare import about_policy, load_policies, opened, run_block
     from lerobot_wmrl.evaluation.judgement import RESULTS
+
+    def write() -> None:
+        finished = configs.keys() == judgement.outcomes.keys()
+        write_json(cfg.output_dir / RESULTS, judgement.as_json(finished))
 
     missing = {name: config for name, config in configs.items() if name not in judgement.outcomes}
     if not missing:
+        write()
         return
-    with opened(env, min(cfg.batch_size, env.dataset.max_starts), False, 1) as (envs,):
-        starts = fewest_starts(envs)
+    size = even_batch(env.dataset.max_starts, cfg.batch_size)
+    group = regrouped("dataset", "starts") if cfg.starts_given else nullcontext()
+    with group, opened(env, size, False, 1) as (envs,):
+        starts = starts_of_one_task(envs)
+        claim_output_dir(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER)
         for name, config in tqdm(missing.items(), desc="Imagining", unit="policy"):
-            policies = load_policies({name: config})
-            blocks = [  # the seed of an episode is the number of its start
-                run_block([envs], env, policies, min(cfg.batch_size, starts - begin), begin)
-                for begin in range(0, starts, cfg.batch_size)
-            ]
+            with about_policy(name):
+                policies = load_policies({name: config})
+                blocks = [  # the seed of an episode is the number of its start
+                    run_block([envs], env, policies, min(size, starts - begin), begin)
+                    for begin in range(0, starts, size)
+                ]
             judgement.outcomes[name] = [episode.successes[0] for block in blocks for episode in block]
-            write_json(cfg.output_dir / RESULTS, judgement.as_json())
+            write()
+
+
+def even_batch(episodes: int, most: int) -> int:
+    """Return the size of batches of at most `most` that are about equal: a smaller last one takes as long."""
+    return ceil(episodes / ceil(episodes / most))
+
+
+def starts_of_one_task(envs: "Envs") -> int:
+    """Return the number of starts. FieldError if they are of several tasks: one rate says little of these."""
+    made = [env for tasks in envs.values() for env in tasks.values()]
+    if len(made) > 1:
+        raise FieldError(
+            "dataset.tasks", None, f"the starts are of {len(made)} tasks, and success is judged task by task",
+            "choose one of them, for the rollouts too (`dataset.episodes`)",
+        )  # fmt: skip
+    env: Any = made[0]
+    return len(env.env.starts)
 
 
 def main() -> None:

@@ -2,90 +2,96 @@
 
 import json
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from lerobot_wmrl.common.checkpoints import Checkpoint, resolve_checkpoint
+from lerobot_wmrl.common.errors import Stopped
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.data.episodes import ChosenEpisodes
-from lerobot_wmrl.envs.configuration_world_model import StartFrames
-from lerobot_wmrl.evaluation import judgement as judging
-from lerobot_wmrl.evaluation.calibration import Recognition
-from lerobot_wmrl.evaluation.judgement import (
-    Judgement,
+from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
+from lerobot_wmrl.evaluation import evidence
+from lerobot_wmrl.evaluation.calibration import Confusion
+from lerobot_wmrl.evaluation.evidence import (
+    confusion_of,
     learnt_from,
     read_references,
-    recognise,
-    save_picture,
+    replayed_rollouts,
     trained_inside,
 )
-from lerobot_wmrl.scripts.judge import JudgeConfig, judge
+from lerobot_wmrl.evaluation.gate import Outcomes
+from lerobot_wmrl.evaluation.judgement import Judgement
+from lerobot_wmrl.scripts.judge import JudgeConfig, even_batch, judge, main
 from tests.relabelled import relabelled
 from tests.rl.checkpoints import save_untrained_policy
 
-GOOD = Recognition(Proportion(80, 100), Proportion(20, 100))
+GOOD = Confusion(Proportion(80, 100), Proportion(20, 100))
+NINE = [(38, 30 + error) for error in range(1, 10)]
+"""38 of 100 seen are 30 real ones by that; these references are one to nine points off."""
 
 
 def outcomes(successes: int, n: int = 100) -> list[bool]:
     return [True] * successes + [False] * (n - successes)
 
 
-def with_references(*rates: tuple[int, int], judged: int = 50, **settings) -> Judgement:
+def with_references(*rates: tuple[int, int], judged: int = 50, **settings: Any) -> Judgement:
     """Return a judgement of `judged` by references that succeed so often in imagination and in reality."""
     known = {str(index): Proportion(real, 100) for index, (_, real) in enumerate(rates)}
     imagined = {str(index): outcomes(seen) for index, (seen, _) in enumerate(rates)}
-    judgement = Judgement(GOOD, known, {}, 0.9, None, {"judged": outcomes(judged), **imagined})
+    judgement = Judgement(GOOD, known, {}, 0.9, (), {"judged": outcomes(judged), **imagined})
     return replace(judgement, **settings)
 
 
 def test_without_references_the_interval_is_that_of_the_rollouts():
     judgement = with_references()
-    assert judgement.margin is None
-    assert judgement.estimate("judged") == judgement.corrected("judged")
+    assert judgement.margin == math.inf
+    assert judgement.estimate("judged") == judgement.corrected("judged").clipped()
     assert judgement.estimate("judged").value == pytest.approx(0.5)
-    assert "if it errs alike about these policies" in str(judgement)
+    assert "hold if the world model errs about these policies as it does about the rollouts" in str(judgement)
+    assert "too few" not in str(judgement)
 
 
-def test_nine_references_give_the_margin_and_eight_none():
-    """38 of 100 seen are 30 real ones; the references are up to nine points off."""
-    rates = [(38, 30 + error) for error in range(1, 10)]
-    judgement = with_references(*rates)
+def test_nine_references_give_the_margin_and_eight_are_too_few():
+    judgement = with_references(*NINE)
     assert judgement.margin == pytest.approx(0.09)
     assert judgement.estimate("judged") == pytest.approx((0.5, 0.41, 0.59))
-    assert "By 9 references, 90 % of the estimates are at most 9 points" in str(judgement)
-    few = with_references(*rates[:8])
-    assert few.margin == math.inf
-    assert few.estimate("judged")[1:] == (0, 1)
-    assert "8 references are too few" in str(few)
-    assert few.as_json()["margin"] is None
+    assert "9 points to both sides, by the errors about 9 references" in str(judgement)
+    few = with_references(*NINE[:8])
+    assert few.estimate("judged") == with_references().estimate("judged")
+    assert "8 references are too few to show that" in str(few)
+    assert few.as_json(True)["margin"] is None
 
 
 def test_a_reference_that_is_refused_says_nothing_about_errors():
-    rates = [(38, 30 + error) for error in range(1, 10)]
-    judgement = with_references(*rates, (90, 10), refused={"9": "trained there"})
+    judgement = with_references(*NINE, (75, 10), refused={"9": "it was trained there"})
     assert judgement.margin == pytest.approx(0.09)
+    assert "about 9 references" in str(judgement)
+    assert "75 % (75 of 100) in imagination, 10 % in reality; not judged: it was trained there" in str(
+        judgement
+    )
 
 
-def test_a_refused_policy_has_no_estimate_but_its_reason():
+def test_a_refused_policy_has_its_reason_in_place_of_an_estimate():
     judgement = with_references(refused={"judged": "it was trained there"})
     assert judgement.estimate("judged") is None
-    assert judgement.as_json()["policies"]["judged"] == {
+    assert judgement.as_json(True)["policies"]["judged"] == {
         "imagined": Proportion(50, 100).as_json(), "estimate": None, "real": None,
         "refused": "it was trained there",
     }  # fmt: skip
-    assert "judged: not judged, it was trained there" in str(judgement)
+    assert "judged  50 % (50 of 100) in imagination; not judged: it was trained there" in str(judgement)
 
 
-@pytest.mark.parametrize("recall", [60, 0])
-def test_a_world_model_that_hardly_sees_success_judges_nothing(recall, tmp_path):
-    judgement = with_references(recognition=Recognition(Proportion(recall, 100), Proportion(20, 100)))
-    assert judgement.blind
-    assert judgement.estimate("judged") is None
-    assert "Nothing is judged" in str(judgement)
-    save_picture(judgement, tmp_path / "judgement.png")
-    assert (tmp_path / "judgement.png").stat().st_size > 1000
+@pytest.mark.parametrize(
+    ("seen", "said"), [(5, "less often than the rollouts' failures"), (98, "more often")]
+)
+def test_a_policy_whose_imagined_success_no_real_rate_explains_is_refused(seen, said):
+    assert said in with_references(judged=seen).refusal("judged")
+    assert with_references(judged=15).refusal("judged") is None
 
 
 def write(path: Path, content: object) -> Path:
@@ -102,12 +108,15 @@ def test_references_are_read_from_a_comparison_or_a_file_by_hand(tmp_path):
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        ({"policies": {"a": {"k": 5, "n": 4}}}, "a succeeds in 5 of 4 episodes"),
-        ({"policies": {"a": {"k": 0, "n": 0}}}, "a succeeds in 0 of 0 episodes"),
+        ({"policies": {"a": {"k": 5, "n": 4}}}, "5 of 4 is no number"),
+        ({"policies": {"a": {"k": 0, "n": 0}}}, "0 of 0 is no number"),
+        ({"policies": {"a": {"k": 0.6, "n": 1}}}, "0.6 of 1 is no number"),
         ({"policies": {"a": 0.5}}, "no success of policies can be read"),
         ({"a": 1}, "no success of policies can be read"),
         ([], "no success of policies can be read"),
+        ({"env": "pusht", "policies": {}}, "no success of policies can be read"),
         ({"env": {"type": "world_model"}, "policies": {}}, "its episodes are imagined ones"),
+        ({"env": None, "finished": False, "policies": {}}, "the comparison was interrupted"),
     ],
 )
 def test_other_references_are_refused(content, said, tmp_path):
@@ -115,6 +124,26 @@ def test_other_references_are_refused(content, said, tmp_path):
         read_references(write(tmp_path / "known.json", content))
     with pytest.raises(ValueError, match=r"^references=.*no success of policies can be read"):
         read_references(tmp_path / "absent.json")
+
+
+def test_rollouts_that_bias_the_confusion_are_warned_about():
+    """Three frames of each episode; the first failure has but two, and the success holds for one frame."""
+    probability = np.array([[0.1, 0.1, np.nan], [0.1, 0.9, 0.9], [0.9, 0.9, 0.9]])
+    done = np.array([[False] * 3, [False] * 3, [False, False, True]])
+    env = WorldModelEnv(episode_length=3, done_frames=2)
+    found, warnings = confusion_of(Outcomes(np.arange(3), probability, done, held=9), env)
+    assert (found.false_positives, found.recall) == (Proportion(1, 2), Proportion(1, 1))
+    assert [warning.partition(" were ")[0].partition(" end ")[0] for warning in warnings] == [
+        "1 of 2 failures", "1 of 1 successes"
+    ]  # fmt: skip
+    assert confusion_of(Outcomes(np.arange(2), probability[1:], done[1:], held=1), env)[1] == []
+
+
+@pytest.mark.parametrize(
+    ("episodes", "most", "size"), [(102, 50, 34), (160, 50, 40), (3, 50, 3), (100, 50, 50)]
+)
+def test_batches_are_even(episodes, most, size):
+    assert even_batch(episodes, most) == size
 
 
 @pytest.fixture
@@ -130,37 +159,53 @@ def config(small_dataset, trained_models, tmp_path) -> JudgeConfig:
 @pytest.fixture
 def seeing(monkeypatch) -> None:
     """Let the untrained world model tell successes from failures."""
-    monkeypatch.setattr(judging, "recognise", lambda *_: GOOD)
+    monkeypatch.setattr(evidence, "confusion_of", lambda *_: (GOOD, []))
 
 
-def results_of(config: JudgeConfig) -> dict:
+def results_of(config: JudgeConfig) -> dict[str, Any]:
     judge(config)
     return json.loads((config.output_dir / "judgement.json").read_text())
 
 
-def test_an_untrained_world_model_judges_nothing_and_imagines_nothing(config, capsys):
-    found = results_of(config)
-    assert "Nothing is judged" in capsys.readouterr().out
-    assert found["outcomes"] == {}
+def test_an_untrained_world_model_judges_nothing_and_leaves_the_folder_free(config):
+    with pytest.raises(Stopped, match="too little to judge by"):
+        judge(config)
+    assert not config.output_dir.exists()
 
 
 def test_every_policy_has_one_episode_from_each_start(config, seeing, capsys):
+    """All are imagined successes at this threshold, none at a threshold that is out of reach."""
     found = results_of(config)
     assert found["outcomes"] == {name: [True] * 3 for name in config.policies}
-    assert all(each["estimate"]["value"] == 1 for each in found["policies"].values())
-    assert "estimated 100 %" in capsys.readouterr().out
+    assert found["finished"]
+    assert "100 % (3 of 3) in imagination; estimate: 100 %" in capsys.readouterr().out
     assert (config.output_dir / "judgement.png").is_file()
+    never = replace(config, done_threshold=0.9999, output_dir=config.output_dir.with_name("never"))
+    assert results_of(never)["outcomes"] == {name: [False] * 3 for name in config.policies}
 
 
-def test_the_same_command_again_imagines_only_what_is_missing(config, seeing):
-    first = results_of(config)
+def test_policies_references_and_coverage_may_be_added_and_what_was_imagined_is_kept(
+    config, seeing, tmp_path
+):
+    first, second = config.policies
+    config.policies = [first]
+    results_of(config)
     path = config.output_dir / "judgement.json"
-    name = config.policies[0]
-    path.write_text(json.dumps({**first, "outcomes": {name: [False] * 3}}))
-    again = results_of(config)
-    assert again["outcomes"] == {name: [False] * 3, config.policies[1]: [True] * 3}
-    config.done_threshold = 0.9999
+    stored = json.loads(path.read_text())
+    write(path, {**stored, "outcomes": {first: [True, False, False], "another": [True] * 3}})
+    known = write(tmp_path / "known.json", {"policies": {second: {"k": 1, "n": 2}}})
+    found = results_of(replace(config, references=known, coverage=0.5))
+    assert found["outcomes"] == {first: [True, False, False], second: [True] * 3}
+    assert found["policies"][second]["real"]["k"] == 1
     with pytest.raises(ValueError, match="holds a run with other settings"):
+        judge(replace(config, done_threshold=0.9999))
+
+
+def test_episodes_of_other_rollouts_or_another_world_model_are_not_mixed(config, seeing, monkeypatch):
+    judge(config)
+    changed = Confusion(Proportion(81, 100), Proportion(20, 100))
+    monkeypatch.setattr(evidence, "confusion_of", lambda *_: (changed, []))
+    with pytest.raises(ValueError, match="has changed since its episodes were imagined"):
         judge(config)
 
 
@@ -168,50 +213,82 @@ def test_a_policy_is_not_also_a_reference(config, seeing, tmp_path):
     config.references = write(tmp_path / "known.json", {"policies": {config.policies[0]: {"k": 1, "n": 2}}})
     with pytest.raises(ValueError, match=r"policies=.*its real success is known"):
         judge(config)
-    config.policies = config.policies[1:]
-    found = results_of(config)
-    assert [each["real"] and each["real"]["k"] for each in found["policies"].values()] == [1, None]
-    config = replace(config, output_dir=tmp_path / "other")
     write(config.references, {"policies": {str(tmp_path / "nothing"): {"k": 1, "n": 2}}})
     with pytest.raises(ValueError, match=r"references=.*no checkpoint there"):
         judge(config)
 
 
+def settings_of(checkpoint: str) -> Path:
+    return resolve_checkpoint(checkpoint) / "train_config.json"
+
+
 def test_a_policy_that_was_trained_in_the_world_model_is_refused(config, seeing, trained_models):
     name, model = config.policies[0], str(trained_models["action_world_model"])
-    settings = resolve_checkpoint(name) / "train_config.json"
-    write(settings, {"env": {"type": "world_model", "world_model_path": model}})
+    write(settings_of(name), {"env": {"type": "world_model", "world_model_path": model}})
     found = results_of(config)["policies"]
     assert "it was trained in this world model" in found[name]["refused"]
     assert found[name]["estimate"] is None
     assert found[config.policies[1]]["refused"] is None
-    write(
-        settings, {"env": {"type": "world_model", "world_model_path": str(trained_models["frame_tokenizer"])}}
-    )
-    assert trained_inside(name, model) is None
-    write(settings, {"env": None})
-    assert trained_inside(name, model) is None
 
 
-def test_rollouts_that_the_world_model_has_learnt_from_are_warned_about(config, seeing, capsys, tmp_path):
-    assert "has learnt from" in results_of(config)["warning"]
-    assert "the intervals are too narrow" in capsys.readouterr().out
-    assert learnt_from(config.world_model.path, config.dataset, "validation,ind") is None
-    assert learnt_from(config.world_model.path, ChosenEpisodes(str(tmp_path)), "all") is None
+def test_any_checkpoint_of_the_world_model_and_any_training_before_counts(config, trained_models):
+    """The second policy began with the first, which was trained in an earlier checkpoint of the world
+    model.
+    """
+    (first, second), model = config.policies, str(trained_models["action_world_model"])
+    earlier = min((trained_models["action_world_model"] / "checkpoints").glob("0*"))
+    write(settings_of(first), {"env": {"type": "world_model", "world_model_path": str(earlier)}})
+    write(settings_of(second), {"env": None, "policy": {"pretrained_path": first}})
+    assert trained_inside(second, model) is not None
+    write(settings_of(second), {"env": None, "policy": {"pretrained_path": second}})
+    assert trained_inside(second, model) is None
+    other = str(trained_models["frame_tokenizer"])
+    write(settings_of(first), {"env": {"type": "world_model", "world_model_path": other}})
+    assert trained_inside(first, model) is None
+
+
+def test_a_planner_in_the_world_model_is_refused(tmp_path, trained_models):
+    model = str(trained_models["action_world_model"])
+    planner = write(tmp_path / "config.json", {"type": "wm_mpc", "world_model_path": model})
+    assert "it plans in this world model" in trained_inside(str(planner.parent), model)
+
+
+def test_rollouts_that_the_world_model_has_learnt_from_are_warned_about(
+    config, seeing, capsys, tmp_path, trained_models
+):
+    (warning,) = results_of(config)["warnings"]
+    assert "has learnt from" in warning
+    assert warning in capsys.readouterr().out
+    assert learnt_from(config.world_model.path, config.dataset, "validation,ind") == []
+    assert learnt_from(config.world_model.path, ChosenEpisodes(str(tmp_path)), "all") == []
+    copy = tmp_path / "model"
+    shutil.copytree(resolve_checkpoint(config.world_model.path), copy)
+    write(copy / "train_config.json", {"dataset": {"root": "demonstrations", "more": [str(tmp_path)]}})
+    assert learnt_from(str(copy), ChosenEpisodes(str(tmp_path)), "all") != []
 
 
 def test_rollouts_count_within_the_length_of_an_episode_and_must_both_succeed_and_fail(
     config, small_dataset, tmp_path
 ):
     env = config.imagination()
-    every = recognise(env, config.dataset, "all")
-    assert every.recall.n + every.false_positives.n == small_dataset.num_episodes
+    every = replayed_rollouts(env, config.dataset, "all")
+    assert len(every.episodes) == small_dataset.num_episodes
+    assert every.probability.shape[1] <= env.horizon
+    chosen = ChosenEpisodes(config.dataset.root, episodes=[0, 1, 2, 3])
+    assert len(replayed_rollouts(env, chosen, "train").episodes) == 4
+    config.episode_length = int(every.done[every.success].argmax(1).min())
+    with pytest.raises(
+        ValueError, match=rf"none of the \d+ rollouts succeeds within {config.episode_length} frames"
+    ):
+        replayed_rollouts(config.imagination(), config.dataset, "all")
     labels = [False] * small_dataset.num_frames
-    failing = relabelled(Path(small_dataset.root), tmp_path / "failing", {"next.success": labels})
+    failing = ChosenEpisodes(
+        str(relabelled(Path(small_dataset.root), tmp_path / "f", {"next.success": labels}))
+    )
     with pytest.raises(
         ValueError, match=r"dataset\.root=.*none of the \d+ rollouts succeeds within 20 frames"
     ):
-        recognise(env, ChosenEpisodes(str(failing)), "all")
+        replayed_rollouts(env, failing, "all")
 
 
 @pytest.mark.parametrize(
@@ -223,6 +300,8 @@ def test_rollouts_count_within_the_length_of_an_episode_and_must_both_succeed_an
         ({"coverage": 1.0}, "coverage=1.0: must be a share"),
         ({"batch_size": 0}, "batch_size=0: must be at least 1"),
         ({"starts": StartFrames(branches=2)}, r"starts\.branches=2: from the middle"),
+        ({"starts": StartFrames(split="train")}, r"starts\.root=.*is missing"),
+        ({"starts": StartFrames(root="a", resets=5)}, r"starts\.root=.*starts are given by"),
         ({"done_threshold": 1.5}, "done_threshold=1.5: must be a probability"),
         ({"world_model": Checkpoint("/nowhere")}, r"world_model\.path=/nowhere: no action_world_model there"),
     ],
@@ -230,4 +309,19 @@ def test_rollouts_count_within_the_length_of_an_episode_and_must_both_succeed_an
 def test_bad_settings_are_named_before_anything_is_made(config, changes, said):
     with pytest.raises(ValueError, match=f"^{said}"):
         judge(replace(config, **changes))
+    assert not config.output_dir.exists()
+
+
+def test_starts_that_cannot_be_read_are_named_by_their_own_flag(config, seeing, monkeypatch, capsys):
+    flags = {
+        "policies": f"[{','.join(config.policies)}]", "world_model.path": config.world_model.path,
+        "dataset.root": config.dataset.root, "starts.root": "/nowhere", "output_dir": config.output_dir,
+        "episode_length": 20, "device": "cpu",
+    }  # fmt: skip
+    monkeypatch.setattr(
+        "sys.argv", ["lerobot-wmrl-judge", *(f"--{name}={value}" for name, value in flags.items())]
+    )
+    with pytest.raises(SystemExit):
+        main()
+    assert "error: --starts.root=/nowhere: " in capsys.readouterr().err
     assert not config.output_dir.exists()

@@ -6,32 +6,40 @@ from typing import Any
 
 import pytest
 
-from experiments.judged import SCENES, agreement, by_scene, judged
+from experiments.judged import SCENES, agreement, by_scene, compatible, judged
 from lerobot_wmrl.common.statistics import Proportion
 
-PERFECT = {"recall": {"k": 1000, "n": 1000}, "false_positive_rate": {"k": 0, "n": 1000}}
+PERFECT = {
+    "recall": Proportion(1000, 1000).as_json(),
+    "false_positive_rate": Proportion(0, 1000).as_json(),
+}
 
 
-def row(estimate: float, real: float, half: float = 0.05) -> dict[str, Any]:
+def row(estimate: float, k: int, n: int = 100, training: str = "a", half: float = 0.05) -> dict[str, Any]:
     interval = {"value": estimate, "low": estimate - half, "high": estimate + half}
-    return {"imagined": {"share": estimate}, "estimate": interval, "real": {"share": real}}
+    return {
+        "imagined": {"share": estimate}, "estimate": interval, "real": Proportion(k, n).as_json(),
+        "training": training,
+    }  # fmt: skip
 
 
-def test_intervals_are_counted_and_every_policy_is_covered_by_the_errors_about_all_others():
-    """Errors of 1 to 11 points in the same order as the rates: the largest is above all others'."""
-    rows = [row(0.05 * place + 0.01 * place, 0.05 * place) for place in range(1, 12)]
-    found = agreement(rows, rows)
-    assert found["kendall"] == pytest.approx(1)
-    assert found["mean_error"] == found["mean_absolute_error"] == pytest.approx(0.06)
-    assert found["corrected"]["k"] == 5  # errors up to 5 points
-    assert found["conformal"]["k"] == 10
-    assert found["margin"] == pytest.approx(0.11)
+def test_a_policy_is_held_against_the_errors_about_other_trainings():
+    """The second training's policies are 20 points off, the ten others' at most 10."""
+    references = [row(0.05 * place + 0.01 * place, 5 * place, training=str(place)) for place in range(1, 11)]
+    wrong = [row(0.7, 50, training="wrong"), row(0.6, 40, training="wrong")]
+    found = agreement(wrong, [*references, *wrong])
+    assert found["by_references"]["k"] == 0
+    assert found["margin"] == pytest.approx(0.1)
+    assert (found["n"], found["trainings"]) == (2, 1)
+    assert found["error"] == found["bias"] == pytest.approx(0.2)
+    assert agreement([row(0.45, 50), row(0.6, 55)], references)["by_references"]["k"] == 2
 
 
-def test_policies_of_another_kind_are_covered_by_the_errors_about_the_references():
-    references = [row(0.05 * place + 0.01 * place, 0.05 * place) for place in range(1, 12)]
-    found = agreement([row(0.9, 0.5), row(0.5, 0.45)], references)
-    assert (found["conformal"]["k"], found["n"]) == (1, 2)
+def test_a_measured_rate_of_few_starts_is_compatible_with_more_estimates():
+    assert compatible(row(0.5, 9, 20))
+    assert compatible(row(0.5, 7, 20))
+    assert not compatible(row(0.5, 350, 1000))
+    assert not compatible(row(0.2, 350, 1000))
 
 
 def test_success_is_counted_by_the_scenes_of_the_seeds():
@@ -46,30 +54,27 @@ def test_success_is_counted_by_the_scenes_of_the_seeds():
     assert {name for name, each in found.items() if each["real"]["k"]} == {scenes[5]}
 
 
-def test_policies_that_were_trained_in_the_world_model_are_kept_apart(tmp_path: Path):
-    folders = [
-        f"out/{name}/checkpoints/000100" for name in ("cloned", "act", "diffusion", "ppo", "distilled")
-    ]
-    shares = [0.2, 0.5, 0.8, 0.9, 0.7]
-    outcomes = {
-        name: [start < 30 * share for start in range(30)] for name, share in zip(folders, shares, strict=True)
-    }
+def test_refused_policies_are_kept_apart(tmp_path: Path):
+    names = [f"out/{name}/checkpoints/000100" for name in ("cloned", "act", "diffusion", "ppo", "distilled")]
+    shares = dict(zip(names, (0.2, 0.5, 0.8, 0.9, 0.7), strict=True))
+    outcomes = {name: [start < 30 * share for start in range(30)] for name, share in shares.items()}
+    rates = {name: Proportion(sum(own), 30).as_json() for name, own in outcomes.items()}
     policies = {
-        name: {"imagined": Proportion(sum(own), 30).as_json(), "refused": "it was" if index > 2 else None}
-        for index, (name, own) in enumerate(outcomes.items())
+        name: {"imagined": rate, "refused": "it was trained there" if shares[name] in (0.9, 0.7) else None}
+        for name, rate in rates.items()
     }
-    said = {"rollouts": PERFECT, "policies": policies, "outcomes": outcomes}
     episodes = [{"seed": seed, "successes": [own[seed] for own in outcomes.values()]} for seed in range(30)]
-    real = {
-        "policies": {name: Proportion(sum(own), 30).as_json() for name, own in outcomes.items()},
-        "episodes": episodes,
+    contents = {
+        "judged_ind/judgement.json": {**PERFECT, "policies": policies, "outcomes": outcomes},
+        "real_ind/comparison.json": {"policies": rates, "episodes": episodes},
     }
-    for name, content in {"judged_ind/judgement.json": said, "real_ind/comparison.json": real}.items():
+    for name, content in contents.items():
         (tmp_path / name).parent.mkdir()
         (tmp_path / name).write_text(json.dumps(content))
     found = judged(tmp_path, "ind")
-    assert found["outside"]["n"] == 3
-    assert found["inside"]["n"] == 2
-    assert found["outside"]["mean_absolute_error"] == pytest.approx(0, abs=1e-9)
+    assert found["judged"]["n"] == 3
+    assert found["refused"]["n"] == 2
+    assert found["judged"]["error"] == pytest.approx(0, abs=1e-9)
+    assert found["judged"]["kendall"] == pytest.approx(1)
     assert found["policies"]["act 100"]["estimate"]["value"] == pytest.approx(0.5)
     assert sum(each["real"]["n"] for each in found["scenes"].values()) == 3 * 30

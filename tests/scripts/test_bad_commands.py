@@ -13,6 +13,7 @@ from lerobot_wmrl.scripts.compare import main as compare
 from lerobot_wmrl.scripts.convert_openvla import main as convert_openvla
 from lerobot_wmrl.scripts.demo import main as demo
 from lerobot_wmrl.scripts.eval_world_model import main as eval_world_model
+from lerobot_wmrl.scripts.judge import main as judge
 from lerobot_wmrl.scripts.train import main as train
 from lerobot_wmrl.scripts.train_world_model import main as train_world_model
 from tests.rl.checkpoints import save_untrained_policy
@@ -23,6 +24,7 @@ SIMULATOR = ["--env.type=wmrl_maniskill"]
 TRAIN = ["--dataset.root={data}", "--model.type=frame_tokenizer", "--model.tokenizer.image_size=32"]
 TWO = "--policies=[{policy},{other}]"
 FITTING = ["--policies=[{cnn},{copy}]", *SIMULATOR]
+JUDGED = ["--world_model.path={action_world_model}", "--dataset.root={data}"]
 NEW = "--target={foreign}/new"
 IMPORT = ["--direction=import", "--source={policy}"]
 ROLL_OUT = ["--policy.path={policy}", *SIMULATOR, "--num_episodes=1"]
@@ -57,6 +59,12 @@ ROLL_OUT = ["--policy.path={policy}", *SIMULATOR, "--num_episodes=1"]
     (compare, [TWO, *SIMULATOR], "third_view of shape (3, 32, 32), the environment has"),
     (compare, [TWO, *SIMULATOR, "--env.image_size=32"], "has 3 action components, the environment 7"),
     (compare, [TWO, *SIMULATOR, "--against=none"], "--against=none: choose one of first, all"),
+    (judge, JUDGED, "--policies=[]: there is nothing to judge"),
+    (judge, ["--policies=[{cnn}]"], "--world_model.path: is missing; give the output folder"),
+    (judge, ["--policies=[{cnn}]", *JUDGED[:1]], "--dataset.root: is missing: labelled rollouts say"),
+    (judge, ["--policies=[{cnn}]", *JUDGED, "--starts.split=train"], "--starts.root: is missing, so that"),
+    (judge, ["--policies=[{foreign}]", *JUDGED], "foreign: no checkpoint there"),
+    (judge, ["--policies=[{cnn}]", *JUDGED, "--references={foreign}/thesis.txt"], "no success of policies"),
     (compare, [TWO, *SIMULATOR, "--n_episodes=0"], "--n_episodes=0: must be at least 1"),
     (compare, [TWO, *SIMULATOR, "--n_episodes=3"], "--batch_size=4: there are 3 episodes; lower it"),
     (compare, [TWO, *SIMULATOR, "--alpha=1"], "--alpha=1.0: must be a probability"),

@@ -1,0 +1,160 @@
+"""What a judgement rests on: labelled rollouts, policies of known success, and where models come from."""
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from lerobot.utils.constants import CHECKPOINTS_DIR, PRETRAINED_MODEL_DIR
+
+from lerobot_wmrl.common.checkpoints import resolve_checkpoint
+from lerobot_wmrl.common.command_line import CONFIG_FILE
+from lerobot_wmrl.common.constants import START_SCENE
+from lerobot_wmrl.common.errors import FieldError, first_line
+from lerobot_wmrl.common.statistics import Proportion
+from lerobot_wmrl.data.episodes import ChosenEpisodes, choose_episodes
+from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
+from lerobot_wmrl.evaluation.calibration import Confusion
+from lerobot_wmrl.evaluation.gate import Outcomes, gate_at, labelled_recording, predict_outcomes
+from lerobot_wmrl.evaluation.replay import Recording
+from lerobot_wmrl.maniskill.recordings import scene_splits
+from lerobot_wmrl.world_models.checkpoint import load_model
+
+
+def replayed_rollouts(env: WorldModelEnv, rollouts: ChosenEpisodes, split: str) -> Outcomes:
+    """Replay labelled rollouts in a world model, as long as an imagined episode lasts.
+
+    Raises:
+        FieldError: they do not fit the world model, have no labels, or do not both succeed and fail.
+    """
+    model = load_model(env.world_model_path, "action_world_model", env.device)
+    recording = labelled_recording(model, rollouts.open())
+    table = recording.table
+    scenes = scene_splits(table.column(START_SCENE), split)
+    chosen = choose_episodes(table, split, len(table.length), scenes, table.among(rollouts.episodes))
+    recording = Recording(table.subset(chosen), recording.frames)
+    outcomes = predict_outcomes(model, recording).within(env.horizon)
+    for found, kind in ((outcomes.success, "succeeds"), (~outcomes.success, "fails")):
+        if not found.any():
+            raise FieldError(
+                "dataset.root", rollouts.name,
+                f"none of the {len(found)} rollouts {kind} within {env.horizon} frames, so nobody knows how "
+                "often the world model errs", "give rollouts that both succeed and fail",
+            )  # fmt: skip
+    return outcomes
+
+
+def confusion_of(outcomes: Outcomes, env: WorldModelEnv) -> tuple[Confusion, list[str]]:
+    """Return the world model's confusion where the environment ends an episode, and what biases it."""
+    gate = gate_at(outcomes, env.done_threshold, env.done_frames)
+    warnings = []
+    short = int((outcomes.length[~outcomes.success] < env.horizon).sum())
+    if short:
+        warnings.append(
+            f"{short} of {gate.false_positives.n} failures were recorded for fewer than the {env.horizon} "
+            "frames of an imagined episode. A later false positive is not counted, so estimates may be too "
+            "high: lower --episode_length."
+        )
+    if gate.cut_short and not gate.repeats_last:
+        warnings.append(
+            f"{gate.cut_short} of {gate.recall.n} successes end before success has held for "
+            f"{env.done_frames} frames. They cannot be predicted, so estimates may be too high: lower "
+            "--done_frames."
+        )
+    return Confusion(gate.recall, gate.false_positives), warnings
+
+
+def read_references(path: Path | None) -> dict[str, Proportion]:
+    """Read real success of policies from a comparison, or from a file that is written like it.
+
+    Raises:
+        FieldError: there is none, it is something else, it is not finished, or its episodes are imagined.
+    """
+    if path is None:
+        return {}
+    try:
+        found = json.loads(path.read_text())
+        rates = {name: _rate(policy["k"], policy["n"]) for name, policy in found["policies"].items()}
+        kind = (found.get("env") or {}).get("type")
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        raise FieldError(
+            "references", path, f"no success of policies can be read from it ({first_line(error)})",
+            "give comparison.json of lerobot-wmrl-compare, or a file like it: "
+            '{"policies": {"outputs/a": {"k": 12, "n": 20}}}',
+        ) from error  # fmt: skip
+    if kind == WorldModelEnv.get_choice_name(WorldModelEnv):
+        raise FieldError(
+            "references", path, "its episodes are imagined ones", "compare the policies in a real environment"
+        )
+    if not found.get("finished", True):
+        raise FieldError("references", path, "the comparison was interrupted", "run its command again")
+    return rates
+
+
+def _rate(k: Any, n: Any) -> Proportion:
+    if not (isinstance(k, int) and isinstance(n, int) and 0 <= k <= n and n):
+        raise ValueError(f"{k} of {n} is no number of successes and of episodes")
+    return Proportion(k, n)
+
+
+def trained_inside(policy: str, world_model: str) -> str | None:
+    """Return why a policy is not judged in a world model: it was trained there, or plans there.
+
+    Trainings are followed back as far as their settings lie on this machine. Any checkpoint of the training
+    that made the world model counts.
+    """
+    for settings in _trainings(policy):
+        used = (settings.get("env") or {}).get("world_model_path")
+        if used and same_training(used, world_model):
+            return (
+                "it was trained in this world model, and may have learnt what only looks like success there"
+            )
+    planner = read_json(resolve_checkpoint(policy) / "config.json").get("world_model_path")
+    if planner and same_training(planner, world_model):
+        return "it plans in this world model, and finds what only looks like success there"
+    return None
+
+
+def learnt_from(world_model: str, rollouts: ChosenEpisodes, split: str) -> list[str]:
+    """Return a warning if the world model has learnt from the rollouts that it is checked on."""
+    source = read_json(resolve_checkpoint(world_model) / CONFIG_FILE).get("dataset") or {}
+    roots = [source.get("root") or source.get("repo_id"), *source.get("more", ())]
+    known = any(root and (root == rollouts.name or _same(Path(root), Path(rollouts.name))) for root in roots)
+    if not known or "validation" in split.split(","):
+        return []
+    return [
+        f"The world model has learnt from {rollouts.name} and predicts these episodes better than others, so "
+        "estimates and intervals are wrong. Take those that were held out (--split=validation), or others."
+    ]
+
+
+def _trainings(policy: str) -> Iterator[Mapping[str, Any]]:
+    """Yield the settings of the training that made a checkpoint, and of those that it goes back to."""
+    seen = set()
+    while policy and policy not in seen:
+        seen.add(policy)
+        settings = read_json(resolve_checkpoint(policy) / CONFIG_FILE)
+        yield settings
+        policy = str((settings.get("policy") or {}).get("pretrained_path") or "")
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Return the content of a file of settings, nothing if there is none."""
+    content = json.loads(path.read_text()) if path.is_file() else {}
+    return content if isinstance(content, dict) else {}
+
+
+def same_training(one: str, other: str) -> bool:
+    """Return whether two checkpoints are the same or of the same training."""
+    return one == other or _same(training_folder(one), training_folder(other))
+
+
+def training_folder(checkpoint: str) -> Path:
+    """Return the output folder of the training that made a checkpoint, or the checkpoint itself."""
+    folder = resolve_checkpoint(checkpoint).resolve()
+    folder = folder.parent if folder.name == PRETRAINED_MODEL_DIR else folder
+    return folder.parents[1] if folder.parent.name == CHECKPOINTS_DIR else folder
+
+
+def _same(one: Path, other: Path) -> bool:
+    return one.exists() and other.exists() and one.samefile(other)
