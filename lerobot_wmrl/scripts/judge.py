@@ -198,7 +198,7 @@ def read_both(
     from lerobot_wmrl.evaluation.compare import read_policies
     from lerobot_wmrl.evaluation.evidence import read_references
 
-    judged, known = read_policies(cfg.policies, env), read_references(cfg.references)
+    known, judged = read_references(cfg.references), read_policies(cfg.policies, env)
     with renamed("policies", "references"):
         others = read_policies(list(known), env)
     if both := sorted(judged.keys() & others.keys()):
