@@ -54,7 +54,7 @@ def draw_improvement(found: Mapping[str, Any], path: Path) -> None:
         policies = numbers["policies"]
         for offset, (kind, title) in enumerate({"cloned": "SFT", "trained": "PPO in imagination"}.items()):
             for place, row in enumerate(policies.values()):
-                rate = Proportion(row[kind]["k"], row[kind]["n"])
+                rate = Proportion.from_json(row[kind])
                 axes.bar(
                     place + 0.25 * offset, rate.share, 0.22, yerr=rate.whiskers, capsize=3,
                     color=COLOURS[offset], label=title if place == 0 and domain == list(found)[-1] else None,
@@ -93,7 +93,7 @@ def draw_judged(found: Mapping[str, Any], path: Path) -> None:
         axes.plot((0, 1), (0, 1), color="#999", linewidth=1, linestyle="--")
         for row in numbers["policies"].values():
             value, low, high = (row["estimate"][name] for name in ("value", "low", "high"))
-            real = Proportion(row["real"]["k"], row["real"]["n"])
+            real = Proportion.from_json(row["real"])
             axes.errorbar(
                 value, real.share, real.whiskers, [[value - low], [high - value]], linewidth=0.7,
                 color=COLOURS[1 if row["refused"] else 0], marker="x" if row["refused"] else "o",

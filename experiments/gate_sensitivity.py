@@ -80,7 +80,7 @@ def results_table(rows: Sequence[dict[str, Any]]) -> str:
     lines = []
     for row in rows:
         rates = (row[name] for name in ("false_positive_rate", "recall"))
-        lines.append([row["error_mm"], *(str(Proportion(rate["k"], rate["n"])) for rate in rates)])
+        lines.append([row["error_mm"], *(str(Proportion.from_json(rate)) for rate in rates)])
     return markdown_table(["error (mm)", "false positives", "recall"], lines)
 
 

@@ -43,11 +43,15 @@ def judged(folder: Path, domain: str) -> dict[str, Any]:
     """Return every policy's estimate beside its real success, and how the two agree."""
     said = json.loads((folder / f"judged_{domain}" / judgement.RESULTS).read_text())
     real = json.loads((folder / f"real_{domain}" / comparison.RESULTS).read_text())
-    confusion = Confusion(as_rate(said["recall"]), as_rate(said["false_positive_rate"]))
+    confusion = Confusion(
+        Proportion.from_json(said["recall"]), Proportion.from_json(said["false_positive_rate"])
+    )
     rows = {
         name: {
             "imagined": policy["imagined"],
-            "estimate": corrected_rate(as_rate(policy["imagined"]), confusion, COVERAGE).clipped()._asdict(),
+            "estimate": corrected_rate(Proportion.from_json(policy["imagined"]), confusion, COVERAGE)
+            .clipped()
+            ._asdict(),
             "real": real["policies"][name],
             "refused": policy["refused"],
             "training": str(Path(name).parents[1]),
@@ -70,10 +74,6 @@ def judged(folder: Path, domain: str) -> dict[str, Any]:
             domain, said["outcomes"], outcomes, [episode["seed"] for episode in real["episodes"]], others
         ),
     }
-
-
-def as_rate(found: Mapping[str, Any]) -> Proportion:
-    return Proportion(found["k"], found["n"])
 
 
 def short_name(checkpoint: str) -> str:

@@ -2,8 +2,9 @@
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.stats import binomtest, bootstrap
@@ -29,6 +30,11 @@ class Proportion:
 
     k: int
     n: int
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> "Proportion":
+        """Return the proportion that `as_json` has written."""
+        return cls(content["k"], content["n"])
 
     @property
     def share(self) -> float:

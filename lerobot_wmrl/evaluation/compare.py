@@ -17,7 +17,7 @@ from lerobot.utils.constants import ACTION, PRETRAINED_MODEL_DIR
 from lerobot.utils.random_utils import set_seed
 
 from lerobot_wmrl.common.checkpoints import resolve_checkpoint
-from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.errors import FieldError, first_line
 from lerobot_wmrl.common.policies import (
     check_weights,
     fit_to_environment,
@@ -72,12 +72,14 @@ def read_policies(paths: Sequence[str], env: EnvConfig) -> dict[str, PreTrainedC
 
 @contextmanager
 def about_policy(path: str) -> Iterator[None]:
-    """Let a FieldError that leaves the block be about the policy at `path`."""
+    """Let an error that leaves the block be a FieldError about the policy at `path`."""
     try:
         yield
     except FieldError as error:
         field = "" if error.field == "policy.path" else f"{error.field}={error.value}: "
         raise FieldError("policies", path, f"{field}{error.problem}", error.remedy) from error
+    except ValueError as error:
+        raise FieldError("policies", path, first_line(error)) from error
 
 
 def _check_environment(config: PreTrainedConfig, env: EnvConfig) -> None:

@@ -77,7 +77,7 @@ class Selection:
 
 def success(record: Record, place: str) -> Proportion:
     """Return the proportion of successes in a record."""
-    return Proportion(record[place]["k"], record[place]["n"])
+    return Proportion.from_json(record[place])
 
 
 def best_iteration(records: Mapping[int, Record], place: str) -> int:

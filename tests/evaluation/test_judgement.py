@@ -201,6 +201,16 @@ def test_policies_references_and_coverage_may_be_added_and_what_was_imagined_is_
         judge(replace(config, done_threshold=0.9999))
 
 
+def test_a_policy_whose_actions_are_not_finite_is_named_and_the_others_are_kept(config, seeing, tmp_path):
+    broken = str(save_untrained_policy(tmp_path / "broken", actions=7, constant=math.nan))
+    config = replace(config, policies=[*config.policies, broken])
+    with pytest.raises(ValueError, match=r"^policies=.*broken.*NaN in environments"):
+        judge(config)
+    stored = json.loads((config.output_dir / "judgement.json").read_text())
+    assert list(stored["outcomes"]) == config.policies[:2]
+    assert not stored["finished"]
+
+
 def test_episodes_of_other_rollouts_or_another_world_model_are_not_mixed(config, seeing, monkeypatch):
     judge(config)
     changed = Confusion(Proportion(81, 100), Proportion(20, 100))

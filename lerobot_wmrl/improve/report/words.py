@@ -205,7 +205,7 @@ def gate_warnings(improvement: Improvement) -> list[str]:
 
 def gate_rates(gate: Mapping[str, Any]) -> list[Proportion]:
     """Return false positive rate and recall of a gate, as JSON has it."""
-    return [Proportion(gate[name]["k"], gate[name]["n"]) for name in ("false_positive_rate", "recall")]
+    return [Proportion.from_json(gate[name]) for name in ("false_positive_rate", "recall")]
 
 
 def taken_instead(improvement: Improvement) -> str:
