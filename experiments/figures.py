@@ -96,7 +96,7 @@ def draw_judged(found: Mapping[str, Any], path: Path) -> None:
             real = Proportion.from_json(row["real"])
             axes.errorbar(
                 value, real.share, real.whiskers, [[value - low], [high - value]], linewidth=0.7,
-                color=COLOURS[1 if row["refused"] else 0], marker="x" if row["refused"] else "o",
+                color=COLOURS[1 if row["inside"] else 0], marker="x" if row["inside"] else "o",
             markersize=4, )  # fmt: skip
         axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), title=DOMAINS[domain])
         axes.set_xlabel("success estimated by the world model")

@@ -2,7 +2,8 @@
 
 import json
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,6 +17,7 @@ from experiments.success import Results
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.evaluation import comparison, judgement
 from lerobot_wmrl.evaluation.calibration import Confusion, conformal_margin, corrected_rate
+from lerobot_wmrl.evaluation.evidence import trained_inside
 from lerobot_wmrl.maniskill.scenes import SCENES as ALL_SCENES
 from lerobot_wmrl.maniskill.scenes import scene_for_seed, scenes_of
 
@@ -33,14 +35,18 @@ Row = Mapping[str, Any]
 
 def push(study: Study) -> Results:
     """Return what is estimated for every policy, in known and in unseen scenes, and how it compares."""
-    found = {domain: judged(study.folder, domain) for domain in SCENES}
+    inside = partial(trained_inside, world_model=study.variables["world_model"])
+    found = {domain: judged(study.folder, domain, inside) for domain in SCENES}
     settings = {name: study.variables[name] for name in ("demonstrations", "rollouts", "seed")}
     figures.draw_judged(found, study.folder / f"{study.variables['cell']}.png")
     return {study.variables["cell"]: {**settings, "domains": found}}
 
 
-def judged(folder: Path, domain: str) -> dict[str, Any]:
-    """Return every policy's estimate beside its real success, and how the two agree."""
+def judged(folder: Path, domain: str, inside: Callable[[str], str | None]) -> dict[str, Any]:
+    """Return every policy's estimate beside its real success, and how the two agree.
+
+    inside: why a policy counts as trained in the world model, if it does.
+    """
     said = json.loads((folder / f"judged_{domain}" / judgement.RESULTS).read_text())
     real = json.loads((folder / f"real_{domain}" / comparison.RESULTS).read_text())
     confusion = Confusion(
@@ -54,11 +60,12 @@ def judged(folder: Path, domain: str) -> dict[str, Any]:
             ._asdict(),
             "real": real["policies"][name],
             "refused": policy["refused"],
+            "inside": inside(name) is not None,
             "training": str(Path(name).parents[1]),
         }
         for name, policy in said["policies"].items()
     }
-    others = [name for name, row in rows.items() if not row["refused"]]
+    others = [name for name, row in rows.items() if not row["inside"]]
     outcomes = {
         name: [episode["successes"][index] for episode in real["episodes"]]
         for index, name in enumerate(real["policies"])
@@ -68,8 +75,9 @@ def judged(folder: Path, domain: str) -> dict[str, Any]:
         "recall": said["recall"],
         "false_positive_rate": said["false_positive_rate"],
         "policies": {short_name(name): row for name, row in rows.items()},
-        "judged": agreement(references, references),
-        "refused": agreement([row for row in rows.values() if row["refused"]], references),
+        "outside": agreement(references, references),
+        "inside": agreement([row for row in rows.values() if row["inside"]], references),
+        "unexplained": sum(bool(row["refused"]) for row in references),
         "scenes": by_scene(
             domain, said["outcomes"], outcomes, [episode["seed"] for episode in real["episodes"]], others
         ),
@@ -169,11 +177,12 @@ def section(load: Load) -> str:
             f"{100 * row['margin']:.0f}",
         ]
         for domain, each in found.items()
-        for title, row in (("no", each["judged"]), ("yes", each["refused"]))
+        for title, row in (("no", each["outside"]), ("yes", each["inside"]))
     ]  # fmt: skip
+    unexplained = [each["unexplained"] for each in found.values()]
     known_scenes, unseen_scenes = (each["scenes"].values() for each in found.values())
-    return f"""In the scenes that it has learnt from, estimates for {known["judged"]["n"]} checkpoints that
-were not trained in it are {100 * known["judged"]["error"]:.0f} points off on average. Their real success is
+    return f"""In the scenes that it has learnt from, estimates for {known["outside"]["n"]} checkpoints that
+were not trained in it are {100 * known["outside"]["error"]:.0f} points off on average. Their real success is
 measured on {starts[0]} known and {starts[1]} unseen starts.
 
 {table(HEAD, rows)}
@@ -182,9 +191,11 @@ Of the successes among 200 rollouts of one policy in known scenes it predicts {c
 successes, of the failures {counted(known["false_positive_rate"])}; by that success in imagination is
 corrected. Intervals of 90 % rest on these two rates, or on the errors about the policies of all other
 trainings, which give the margin. An interval by rollouts counts if the estimate and the measured rate may be
-equal. For all policies that were not trained in the world model together, imagined and real success differ
-by more than {100 * TOLERATED:.0f} points in {differing(known_scenes)} known scenes and in
-{differing(unseen_scenes)} unseen ones.
+equal. Without references the command refuses {unexplained[0]} of these policies in known and
+{unexplained[1]} in unseen scenes, which succeed in imagination more often than the rollouts' successes, or
+less often than their failures. For all policies that were not trained in the world model together, imagined
+and real success differ by more than {100 * TOLERATED:.0f} points in {differing(known_scenes)} known scenes
+and in {differing(unseen_scenes)} unseen ones.
 
 ![Estimated and real success of every policy](results/judge/{cell}.png)"""
 

@@ -55,9 +55,12 @@ class Judgement:
         return corrected_rate(self.imagined(name), self.confusion, self.coverage)
 
     def refusal(self, name: str) -> str | None:
-        """Return why a policy is not judged, None if it is."""
-        if name in self.refused:
-            return self.refused[name]
+        """Return why a policy is not judged, None if it is.
+
+        With references it is judged by the errors about them, also where no real rate explains its success.
+        """
+        if name in self.refused or not math.isinf(self.margin):
+            return self.refused.get(name)
         corrected = self.corrected(name)
         if corrected.high < 0:
             return f"it succeeds in imagination less often than the rollouts' failures do, {OTHERWISE}"
@@ -68,7 +71,7 @@ class Judgement:
     @property
     def usable_references(self) -> list[str]:
         """The references that have been imagined and are not refused."""
-        return [name for name in self.references if name in self.outcomes and not self.refusal(name)]
+        return [name for name in self.references if name in self.outcomes and name not in self.refused]
 
     @property
     def margin(self) -> float:

@@ -13,8 +13,9 @@ interval instead, by split conformal prediction. It holds for policies that coul
 references should differ as much as the policies do that are judged.
 
 A policy that was trained in this world model is not judged: it may have learnt what only looks like success
-there. Neither is one whose success in imagination no real rate explains. If the world model hardly tells the
-rollouts' successes from their failures, the command ends with exit status 3 before it imagines anything.
+there. Without references, neither is one whose success in imagination no real rate explains. If the world
+model hardly tells the rollouts' successes from their failures, the command ends with exit status 3 before it
+imagines anything.
 
 The same command again continues after the last finished policy. More policies, references or another coverage
 may be given then: what has been imagined is kept.

@@ -92,6 +92,9 @@ def test_a_refused_policy_has_its_reason_in_place_of_an_estimate():
 def test_a_policy_whose_imagined_success_no_real_rate_explains_is_refused(seen, said):
     assert said in with_references(judged=seen).refusal("judged")
     assert with_references(judged=15).refusal("judged") is None
+    assert with_references(*NINE, judged=seen).estimate("judged").value in (0, 1), (
+        "references say how far off"
+    )
 
 
 def write(path: Path, content: object) -> Path:

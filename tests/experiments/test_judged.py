@@ -54,13 +54,13 @@ def test_success_is_counted_by_the_scenes_of_the_seeds():
     assert {name for name, each in found.items() if each["real"]["k"]} == {scenes[5]}
 
 
-def test_refused_policies_are_kept_apart(tmp_path: Path):
+def test_policies_that_were_trained_in_the_world_model_are_kept_apart(tmp_path: Path):
     names = [f"out/{name}/checkpoints/000100" for name in ("cloned", "act", "diffusion", "ppo", "distilled")]
     shares = dict(zip(names, (0.2, 0.5, 0.8, 0.9, 0.7), strict=True))
     outcomes = {name: [start < 30 * share for start in range(30)] for name, share in shares.items()}
     rates = {name: Proportion(sum(own), 30).as_json() for name, own in outcomes.items()}
     policies = {
-        name: {"imagined": rate, "refused": "it was trained there" if shares[name] in (0.9, 0.7) else None}
+        name: {"imagined": rate, "refused": "no rate explains it" if shares[name] == 0.2 else None}
         for name, rate in rates.items()
     }
     episodes = [{"seed": seed, "successes": [own[seed] for own in outcomes.values()]} for seed in range(30)]
@@ -71,10 +71,11 @@ def test_refused_policies_are_kept_apart(tmp_path: Path):
     for name, content in contents.items():
         (tmp_path / name).parent.mkdir()
         (tmp_path / name).write_text(json.dumps(content))
-    found = judged(tmp_path, "ind")
-    assert found["judged"]["n"] == 3
-    assert found["refused"]["n"] == 2
-    assert found["judged"]["error"] == pytest.approx(0, abs=1e-9)
-    assert found["judged"]["kendall"] == pytest.approx(1)
+    found = judged(tmp_path, "ind", {names[3]: "it was trained there", names[4]: "it was"}.get)
+    assert found["outside"]["n"] == 3
+    assert found["inside"]["n"] == 2
+    assert found["unexplained"] == 1
+    assert found["outside"]["error"] == pytest.approx(0, abs=1e-9)
+    assert found["outside"]["kendall"] == pytest.approx(1)
     assert found["policies"]["act 100"]["estimate"]["value"] == pytest.approx(0.5)
     assert sum(each["real"]["n"] for each in found["scenes"].values()) == 3 * 30
