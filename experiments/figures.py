@@ -86,19 +86,18 @@ def draw_learning_curve(variants: Mapping[str, Mapping[str, Any]], path: Path) -
 
 
 def draw_judged(found: Mapping[str, Any], path: Path) -> None:
-    """A panel a domain: every policy's estimated and real success, those trained in the world model apart."""
+    """A panel a domain: every policy's imagined and real success, those trained in the world model apart."""
     figure = Figure(figsize=(4.4 * len(found), 4), layout="constrained")
     panels = figure.subplots(1, len(found), sharey=True, squeeze=False)[0]
     for axes, (domain, numbers) in zip(panels, found.items(), strict=True):
         axes.plot((0, 1), (0, 1), color="#999", linewidth=1, linestyle="--")
         for row in numbers["policies"].values():
-            value, low, high = (row["estimate"][name] for name in ("value", "low", "high"))
-            real = Proportion.from_json(row["real"])
+            imagined, real = (Proportion.from_json(row[kind]) for kind in ("imagined", "real"))
             axes.errorbar(
-                value, real.share, real.whiskers, [[value - low], [high - value]], linewidth=0.7,
-                color=COLOURS[1 if row["inside"] else 0], marker="x" if row["inside"] else "o",
-            markersize=4, )  # fmt: skip
+                imagined.share, real.share, real.whiskers, imagined.whiskers, linewidth=0.7,
+                color=COLOURS[1 if row["inside"] else 0], marker="x" if row["inside"] else "o", markersize=4,
+            )  # fmt: skip
         axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), title=DOMAINS[domain])
-        axes.set_xlabel("success estimated by the world model")
+        axes.set_xlabel("success in the world model (crosses: trained in it)")
     panels[0].set_ylabel("success in ManiSkill")
     tidy(figure).savefig(path, dpi=110)

@@ -16,7 +16,12 @@ from experiments.study import ROOT, Study, read_cells
 from experiments.success import Results
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.evaluation import comparison, judgement
-from lerobot_wmrl.evaluation.calibration import Confusion, conformal_margin, corrected_rate
+from lerobot_wmrl.evaluation.calibration import (
+    Confusion,
+    RateEstimate,
+    calibrated_rate,
+    corrected_rate,
+)
 from lerobot_wmrl.evaluation.evidence import trained_inside
 from lerobot_wmrl.maniskill.scenes import SCENES as ALL_SCENES
 from lerobot_wmrl.maniskill.scenes import scene_for_seed, scenes_of
@@ -94,35 +99,43 @@ def agreement(rows: Sequence[Row], references: Sequence[Row]) -> dict[str, Any]:
     """Return how far estimates are from real success, how well they rank, and what intervals contain.
 
     `by_rollouts` counts estimates whose difference to the measured rate may be 0 by the intervals of both.
-    `by_references` counts measured rates within the margin that the references of other trainings give.
+    `by_references` counts measured rates within the interval that references of other trainings give.
     """
-    estimates = [row["estimate"]["value"] for row in rows]
+    imagined = [row["imagined"]["share"] for row in rows]
     real = [row["real"]["share"] for row in rows]
-    margins = [
-        conformal_margin(
-            [error(each) for each in references if each["training"] != row["training"]], COVERAGE
-        )
-        for row in rows
-    ]
-    covered = [abs(error(row)) <= margin for row, margin in zip(rows, margins, strict=True)]
+    corrected = [row["estimate"]["value"] for row in rows]
+    calibrated = [by_other_trainings(row, references) for row in rows]
+    within = [each.low <= share <= each.high for each, share in zip(calibrated, real, strict=True)]
     return {
         "n": len(rows),
         "trainings": len({row["training"] for row in rows}),
-        "imagined_error": float(
-            np.mean([abs(row["imagined"]["share"] - row["real"]["share"]) for row in rows])
-        ),
-        "error": float(np.mean([abs(error(row)) for row in rows])),
-        "bias": float(np.mean([error(row) for row in rows])),
-        "pearson": float(pearsonr(estimates, real).statistic),
-        "kendall": float(kendalltau(estimates, real).statistic),
+        "imagined": errors(imagined, real),
+        "corrected": errors(corrected, real),
+        "calibrated": errors([each.value for each in calibrated], real),
+        "pearson": float(pearsonr(imagined, real).statistic),
+        "kendall": float(kendalltau(imagined, real).statistic),
         "by_rollouts": Proportion(sum(map(compatible, rows)), len(rows)).as_json(),
-        "by_references": Proportion(sum(covered), len(rows)).as_json(),
-        "margin": float(np.median(margins)),
+        "by_references": Proportion(sum(within), len(rows)).as_json(),
+        "width": float(np.median([each.high - each.low for each in calibrated])),
     }
 
 
-def error(row: Row) -> float:
-    return float(row["estimate"]["value"] - row["real"]["share"])
+def by_other_trainings(row: Row, references: Sequence[Row]) -> RateEstimate:
+    """Return a policy's success by the references of other trainings than its own."""
+    known = [
+        (each["imagined"]["share"], each["real"]["share"])
+        for each in references
+        if each["training"] != row["training"]
+    ]
+    found = calibrated_rate(row["imagined"]["share"], known, COVERAGE)
+    assert found is not None, "there are enough references"
+    return found.clipped()
+
+
+def errors(estimates: Sequence[float], real: Sequence[float]) -> dict[str, float]:
+    """Return the mean absolute and the mean error."""
+    differences = np.subtract(estimates, real)
+    return {"absolute": float(np.abs(differences).mean()), "mean": float(differences.mean())}
 
 
 def compatible(row: Row) -> bool:
@@ -134,7 +147,7 @@ def compatible(row: Row) -> bool:
     interval = binomtest(real["k"], real["n"]).proportion_ci(COVERAGE, "wilson")
     above = math.hypot(estimate["value"] - estimate["low"], interval.high - real["share"])
     below = math.hypot(estimate["high"] - estimate["value"], real["share"] - interval.low)
-    return -below <= error(row) <= above
+    return -below <= estimate["value"] - real["share"] <= above
 
 
 def by_scene(
@@ -171,40 +184,47 @@ def section(load: Load) -> str:
     rows = [
         [
             DOMAINS[domain], title, f"{row['n']} ({row['trainings']})",
-            *(f"{100 * row[name]:.0f}" for name in ("imagined_error", "error")),
+            *(f"{100 * row[kind]['absolute']:.0f} ({100 * row[kind]['mean']:+.0f})" for kind in ESTIMATES),
             *(f"{row[name]:.2f}" for name in ("pearson", "kendall")),
             *(f"{row[name]['k']} of {row[name]['n']}" for name in ("by_rollouts", "by_references")),
-            f"{100 * row['margin']:.0f}",
+            f"{100 * row['width']:.0f}",
         ]
         for domain, each in found.items()
         for title, row in (("no", each["outside"]), ("yes", each["inside"]))
     ]  # fmt: skip
     unexplained = [each["unexplained"] for each in found.values()]
     known_scenes, unseen_scenes = (each["scenes"].values() for each in found.values())
-    return f"""In the scenes that it has learnt from, estimates for {known["outside"]["n"]} checkpoints that
-were not trained in it are {100 * known["outside"]["error"]:.0f} points off on average. Their real success is
-measured on {starts[0]} known and {starts[1]} unseen starts.
+    outside, counts = known["outside"], [known["recall"], known["false_positive_rate"]]
+    return f"""It ranks them well, and thinks too well of most. In the scenes that it has learnt from,
+imagined success of {outside["n"]} checkpoints that were not trained in it is {
+        100
+        * outside["imagined"][
+            "absolute"
+        ]:.0f} points off on average; by a line through policies of other trainings
+{100 * outside["calibrated"]["absolute"]:.0f}. Their real success is measured on {starts[0]} known and
+{starts[1]} unseen starts.
 
 {table(HEAD, rows)}
 
-Of the successes among 200 rollouts of one policy in known scenes it predicts {counted(known["recall"])} as
-successes, of the failures {counted(known["false_positive_rate"])}; by that success in imagination is
-corrected. Intervals of 90 % rest on these two rates, or on the errors about the policies of all other
-trainings, which give the margin. An interval by rollouts counts if the estimate and the measured rate may be
-equal. Without references the command refuses {unexplained[0]} of these policies in known and
-{unexplained[1]} in unseen scenes, which succeed in imagination more often than the rollouts' successes, or
-less often than their failures. For all policies that were not trained in the world model together, imagined
-and real success differ by more than {100 * TOLERATED:.0f} points in {differing(known_scenes)} known scenes
-and in {differing(unseen_scenes)} unseen ones.
+Differences are absolute, in parentheses with their sign. *Corrected* is by 200 rollouts of one policy in
+known scenes, replayed with their actions: of the successes the world model predicts {counted(counts[0])} as
+successes, of the failures {counted(counts[1])}. That does not show what it does with a policy that acts on
+imagined frames. *Calibrated* is by the line through the policies of all other trainings that were not trained
+in the world model, whose intervals of 90 % are {100 * outside["width"]:.0f} points wide in known scenes. An
+interval by rollouts counts if the estimate and the measured rate may be equal. Without references the command
+refuses {unexplained[0]} of these policies in known and {unexplained[1]} in unseen scenes, which succeed in
+imagination more often than the rollouts' successes, or less often than their failures. For all of them
+together, imagined and real success differ by more than {100 * TOLERATED:.0f} points in
+{differing(known_scenes)} known scenes and in {differing(unseen_scenes)} unseen ones.
 
-![Estimated and real success of every policy](results/judge/{cell}.png)"""
+![Imagined and real success of every policy](results/judge/{cell}.png)"""
 
 
+ESTIMATES: Final = ("imagined", "corrected", "calibrated")
 HEAD: Final = (
-    "scenes", "trained in the world model", "checkpoints (trainings)", "imagined: points off",
-    "corrected: points off", "Pearson's r", "Kendall's τ", "intervals by rollouts hold",
-    "intervals by references hold", "their margin (points)",
-)  # fmt: skip
+    "scenes", "trained in the world model", "checkpoints (trainings)", *(f"{kind}: points off" for kind in
+    ESTIMATES), "Pearson's r", "Kendall's τ", "intervals by rollouts hold", "intervals by references hold",
+"their width (points)", )  # fmt: skip
 
 
 def differing(scenes: Collection[Mapping[str, Any]]) -> str:

@@ -1,6 +1,5 @@
 """The success of policies as a world model sees it, and what that says about reality."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +11,7 @@ from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.evaluation.calibration import (
     Confusion,
     RateEstimate,
-    conformal_margin,
+    calibrated_rate,
     corrected_rate,
 )
 
@@ -54,12 +53,17 @@ class Judgement:
         """Return that rate, corrected for false positives and recall; it may lie beyond 0 and 1."""
         return corrected_rate(self.imagined(name), self.confusion, self.coverage)
 
+    def calibrated(self, name: str) -> RateEstimate | None:
+        """Return the rate that the references give, None if they are too few; it may lie beyond 0 and 1."""
+        known = [(self.imagined(each).share, self.references[each].share) for each in self.usable_references]
+        return calibrated_rate(self.imagined(name).share, known, self.coverage)
+
     def refusal(self, name: str) -> str | None:
         """Return why a policy is not judged, None if it is.
 
-        With references it is judged by the errors about them, also where no real rate explains its success.
+        With enough references it is judged by them, also where the rollouts do not explain its success.
         """
-        if name in self.refused or not math.isinf(self.margin):
+        if name in self.refused or self.calibrated(name):
             return self.refused.get(name)
         corrected = self.corrected(name)
         if corrected.high < 0:
@@ -73,21 +77,11 @@ class Judgement:
         """The references that have been imagined and are not refused."""
         return [name for name in self.references if name in self.outcomes and name not in self.refused]
 
-    @property
-    def margin(self) -> float:
-        """Margin that the errors about the references give, infinite if they are too few."""
-        return conformal_margin([self.error(name) for name in self.usable_references], self.coverage)
-
-    def error(self, name: str) -> float:
-        """Return how much the estimate of a reference is above its real success."""
-        return self.corrected(name).clipped().value - self.references[name].share
-
     def estimate(self, name: str) -> RateEstimate | None:
         """Return a policy's real success rate, None if it is not judged."""
         if self.refusal(name):
             return None
-        corrected, margin = self.corrected(name), self.margin
-        return corrected.clipped() if math.isinf(margin) else corrected.with_margin(margin)
+        return (self.calibrated(name) or self.corrected(name)).clipped()
 
     def as_json(self, finished: bool) -> dict[str, Any]:
         """Return the judgement as JSON. finished: whether all policies have been imagined."""
@@ -96,7 +90,7 @@ class Judgement:
             "coverage": self.coverage,
             **confusion_json(self.confusion),
             "warnings": list(self.warnings),
-            "margin": None if math.isinf(self.margin) else self.margin,
+            "references": len(self.usable_references),
             "policies": {name: self._policy_json(name) for name in self.outcomes},
             "outcomes": self.outcomes,
         }
@@ -127,12 +121,12 @@ class Judgement:
     def _basis(self) -> str:
         """Say what the intervals rest on."""
         share, usable = f"{100 * self.coverage:.3g} %", len(self.usable_references)
-        if not math.isinf(self.margin):
+        if any(self.calibrated(name) for name in self.outcomes):
             return (
-                f"The intervals of {share} are {100 * self.margin:.0f} points to both sides, by the errors "
-                f"about {usable} references; they hold for policies that could have been among these."
+                f"Estimates and their intervals of {share} are by a line through {usable} references; they "
+                "hold for policies that could have been among these."
             )
-        few = f" {usable} references are too few to show that." if self.references else ""
+        few = f" {usable} references are too few to do without that." if self.references else ""
         return (
             f"The intervals of {share} hold if the world model errs about these policies as it does about "
             f"the rollouts.{few}"

@@ -8,9 +8,9 @@ from. Replayed in it, they give its recall and its false positives, by which the
 is corrected. The interval of the estimate holds if the world model errs about a policy as it does about the
 rollouts.
 
-If the real success of nine policies or more is known (`--references`), the errors about them make the
-interval instead, by split conformal prediction. It holds for policies that could have been among these:
-references should differ as much as the policies do that are judged.
+Better: give policies whose real success is known, nine or more of different trainings (`--references`). A
+line through their rates then predicts the real success of the others, whatever the world model gets wrong.
+It holds for policies that could have been among the references.
 
 A policy that was trained in this world model is not judged: it may have learnt what only looks like success
 there. Without references, neither is one whose success in imagination no real rate explains. If the world

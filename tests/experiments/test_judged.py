@@ -23,16 +23,16 @@ def row(estimate: float, k: int, n: int = 100, training: str = "a", half: float 
     }  # fmt: skip
 
 
-def test_a_policy_is_held_against_the_errors_about_other_trainings():
-    """The second training's policies are 20 points off, the ten others' at most 10."""
-    references = [row(0.05 * place + 0.01 * place, 5 * place, training=str(place)) for place in range(1, 11)]
-    wrong = [row(0.7, 50, training="wrong"), row(0.6, 40, training="wrong")]
+def test_a_policy_is_calibrated_by_other_trainings_than_its_own():
+    """Of ten trainings the world model thinks 10 points too well; of the eleventh, 30 points."""
+    references = [row(0.05 * place + 0.1, 5 * place, training=str(place)) for place in range(1, 11)]
+    wrong = [row(0.8, 50, training="wrong"), row(0.7, 40, training="wrong")]
     found = agreement(wrong, [*references, *wrong])
-    assert found["by_references"]["k"] == 0
-    assert found["margin"] == pytest.approx(0.1)
     assert (found["n"], found["trainings"]) == (2, 1)
-    assert found["error"] == found["bias"] == pytest.approx(0.2)
-    assert agreement([row(0.45, 50), row(0.6, 55)], references)["by_references"]["k"] == 2
+    assert found["imagined"] == pytest.approx({"absolute": 0.3, "mean": 0.3})
+    assert found["calibrated"] == pytest.approx({"absolute": 0.2, "mean": 0.2})
+    assert found["by_references"]["k"] == 0
+    assert agreement([row(0.6, 50), row(0.65, 55)], references)["by_references"]["k"] == 2
 
 
 def test_a_measured_rate_of_few_starts_is_compatible_with_more_estimates():
@@ -55,12 +55,12 @@ def test_success_is_counted_by_the_scenes_of_the_seeds():
 
 
 def test_policies_that_were_trained_in_the_world_model_are_kept_apart(tmp_path: Path):
-    names = [f"out/{name}/checkpoints/000100" for name in ("cloned", "act", "diffusion", "ppo", "distilled")]
-    shares = dict(zip(names, (0.2, 0.5, 0.8, 0.9, 0.7), strict=True))
-    outcomes = {name: [start < 30 * share for start in range(30)] for name, share in shares.items()}
+    """Imagination is right about twelve trainings; the last two were trained in it."""
+    names = [f"out/act{number}/checkpoints/000100" for number in range(14)]
+    outcomes = {name: [start <= 2 * number for start in range(30)] for number, name in enumerate(names)}
     rates = {name: Proportion(sum(own), 30).as_json() for name, own in outcomes.items()}
     policies = {
-        name: {"imagined": rate, "refused": "no rate explains it" if shares[name] == 0.2 else None}
+        name: {"imagined": rate, "refused": "no rate explains it" if name == names[0] else None}
         for name, rate in rates.items()
     }
     episodes = [{"seed": seed, "successes": [own[seed] for own in outcomes.values()]} for seed in range(30)]
@@ -71,11 +71,12 @@ def test_policies_that_were_trained_in_the_world_model_are_kept_apart(tmp_path: 
     for name, content in contents.items():
         (tmp_path / name).parent.mkdir()
         (tmp_path / name).write_text(json.dumps(content))
-    found = judged(tmp_path, "ind", {names[3]: "it was trained there", names[4]: "it was"}.get)
-    assert found["outside"]["n"] == 3
+    found = judged(tmp_path, "ind", {names[12]: "it was trained there", names[13]: "it was"}.get)
+    assert found["outside"]["n"] == 12
     assert found["inside"]["n"] == 2
     assert found["unexplained"] == 1
-    assert found["outside"]["error"] == pytest.approx(0, abs=1e-9)
+    assert found["outside"]["imagined"]["absolute"] == 0
+    assert found["outside"]["calibrated"]["absolute"] == pytest.approx(0, abs=1e-9)
     assert found["outside"]["kendall"] == pytest.approx(1)
-    assert found["policies"]["act 100"]["estimate"]["value"] == pytest.approx(0.5)
-    assert sum(each["real"]["n"] for each in found["scenes"].values()) == 3 * 30
+    assert found["policies"]["act7 100"]["estimate"]["value"] == pytest.approx(0.5)
+    assert sum(each["real"]["n"] for each in found["scenes"].values()) == 12 * 30
