@@ -15,6 +15,9 @@ from scipy.stats import norm
 
 from lerobot_wmrl.common.statistics import Proportion
 
+LEAST_REFERENCES = 3
+"""Fewer leave no line without one of them."""
+
 
 class Confusion(NamedTuple):
     """What a world model says of labelled episodes: the share of the successes that it predicts as successes
@@ -94,7 +97,7 @@ def calibrated_rate(
         Nothing if there are too few references: 0.9 needs 9, 0.95 needs 19.
     """
     rank = math.ceil((len(references) + 1) * coverage)
-    if rank > len(references):
+    if len(references) < max(rank, LEAST_REFERENCES):
         return None
     seen, real = np.array(references).T
     kept = ~np.eye(len(seen), dtype=bool)

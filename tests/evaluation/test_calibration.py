@@ -105,6 +105,7 @@ def test_references_on_a_line_give_its_value_without_doubt():
 def test_an_interval_of_90_percent_needs_nine_references():
     assert calibrated_rate(0.5, LINE[:8], 0.9) is None
     assert calibrated_rate(0.5, LINE[:4], 0.8) is not None
+    assert calibrated_rate(0.5, LINE[:2], 0.5) is None
     assert calibrated_rate(0.5, [], 0.5) is None
 
 
