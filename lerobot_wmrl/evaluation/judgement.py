@@ -78,8 +78,8 @@ class Judgement:
         return [name for name in self.references if name in self.outcomes and name not in self.refused]
 
     def estimate(self, name: str) -> RateEstimate | None:
-        """Return a policy's real success rate, None if it is not judged."""
-        if self.refusal(name):
+        """Return a policy's real success rate, None if it is known or the policy is not judged."""
+        if name in self.references or self.refusal(name):
             return None
         return (self.calibrated(name) or self.corrected(name)).clipped()
 
@@ -116,7 +116,8 @@ class Judgement:
             said = f"{said}, {100 * self.references[name].share:.0f} % in reality"
         if reason := self.refusal(name):
             return f"{said}; not judged: {reason}"
-        return said if name in self.references else f"{said}; estimate: {self.estimate(name)}"
+        estimate = self.estimate(name)
+        return f"{said}; estimate: {estimate}" if estimate else said
 
     def _basis(self) -> str:
         """Say what the intervals rest on."""

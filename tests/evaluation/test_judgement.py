@@ -61,6 +61,8 @@ def test_nine_references_give_the_estimate_and_eight_are_too_few():
     assert estimate.value == pytest.approx(0.35)
     assert 0.25 < estimate.low < 0.31 < 0.39 < estimate.high < 0.45
     assert "by a line through 9 references" in str(judgement)
+    assert judgement.estimate("0") is None, "it is known"
+    assert "0       38 % (38 of 100) in imagination, 31 % in reality" in str(judgement).splitlines()
     few = with_references(*NINE[:8])
     assert few.estimate("judged") == with_references().estimate("judged")
     assert "8 references are too few to do without that" in str(few)
