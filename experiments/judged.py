@@ -14,6 +14,7 @@ from experiments import figures
 from experiments.cells import DOMAINS, Load, counted, table
 from experiments.study import ROOT, Study, read_cells
 from experiments.success import Results
+from experiments.value import policy_name
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.evaluation import comparison, judgement
 from lerobot_wmrl.evaluation.calibration import (
@@ -62,19 +63,17 @@ def judged(folder: Path, domain: str, inside: Callable[[str], str | None]) -> di
     confusion = Confusion(
         Proportion.from_json(said["recall"]), Proportion.from_json(said["false_positive_rate"])
     )
-    rows = {
-        name: {
+    rows = {}
+    for name, policy in said["policies"].items():
+        corrected = corrected_rate(Proportion.from_json(policy["imagined"]), confusion, COVERAGE)
+        rows[name] = {
             "imagined": policy["imagined"],
-            "estimate": corrected_rate(Proportion.from_json(policy["imagined"]), confusion, COVERAGE)
-            .clipped()
-            ._asdict(),
+            "estimate": corrected.clipped()._asdict(),
             "real": real["policies"][name],
             "refused": policy["refused"],
             "inside": inside(name) is not None,
             "training": str(Path(name).parents[1]),
         }
-        for name, policy in said["policies"].items()
-    }
     others = [name for name, row in rows.items() if not row["inside"]]
     outcomes = {
         name: [episode["successes"][index] for episode in real["episodes"]]
@@ -96,8 +95,7 @@ def judged(folder: Path, domain: str, inside: Callable[[str], str | None]) -> di
 
 def short_name(checkpoint: str) -> str:
     """`…/act/checkpoints/000400` → `act 400`"""
-    path = Path(checkpoint)
-    return f"{path.parents[1].name} {int(path.name)}"
+    return f"{policy_name(checkpoint)} {int(Path(checkpoint).name)}"
 
 
 def agreement(rows: Sequence[Row], references: Sequence[Row]) -> dict[str, Any]:
@@ -237,9 +235,10 @@ together, imagined and real success differ by more than {100 * TOLERATED:.0f} po
 
 ESTIMATES: Final = ("imagined", "corrected", "calibrated")
 HEAD: Final = (
-    "scenes", "trained in the world model", "checkpoints (trainings)", *(f"{kind}: points off" for kind in
-    ESTIMATES), "Pearson's r", "Kendall's τ", "intervals by rollouts hold", "intervals by references hold",
-"their width (points)", )  # fmt: skip
+    "scenes", "trained in the world model", "checkpoints (trainings)",
+    *(f"{kind}: points off" for kind in ESTIMATES), "Pearson's r", "Kendall's τ",
+    "intervals by rollouts hold", "intervals by references hold", "their width (points)",
+)  # fmt: skip
 
 
 def differing(scenes: Collection[Mapping[str, Any]]) -> str:

@@ -97,10 +97,7 @@ class JudgeConfig(RunConfig):
             raise FieldError("policies", [], "there is nothing to judge", "give checkpoints: [a,b]")
         if not self.world_model.path:
             raise FieldError(
-                "world_model.path",
-                "",
-                "is missing",
-                "give the output folder of an action world model's training",
+                "world_model.path", "", "is missing", "give the output folder of its training, or a hub id"
             )
         if not self.dataset.given:
             raise FieldError(

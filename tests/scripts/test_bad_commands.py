@@ -60,7 +60,7 @@ ROLL_OUT = ["--policy.path={policy}", *SIMULATOR, "--num_episodes=1"]
     (compare, [TWO, *SIMULATOR, "--env.image_size=32"], "has 3 action components, the environment 7"),
     (compare, [TWO, *SIMULATOR, "--against=none"], "--against=none: choose one of first, all"),
     (judge, JUDGED, "--policies=[]: there is nothing to judge"),
-    (judge, ["--policies=[{cnn}]"], "--world_model.path: is missing; give the output folder"),
+    (judge, ["--policies=[{cnn}]"], "--world_model.path: is missing; give the output folder of its training"),
     (judge, ["--policies=[{cnn}]", *JUDGED[:1]], "--dataset.root: is missing: labelled rollouts say"),
     (judge, ["--policies=[{cnn}]", *JUDGED, "--starts.split=train"], "--starts.root: is missing, so that"),
     (judge, ["--policies=[{foreign}]", *JUDGED], "foreign: no checkpoint there"),
