@@ -176,7 +176,7 @@ def decode_episode(dataset: LeRobotDataset, episode: int, key: str) -> Tensor:
     rows = dataset.meta.episodes[episode]
     indices = range(rows["dataset_from_index"], rows["dataset_to_index"])
     if key not in dataset.meta.video_keys:
-        images = dataset.hf_dataset.with_format(None)[indices][key]
+        images = dataset.hf_dataset.with_format(None, columns=[key])[indices][key]
         frames = np.stack([np.asarray(image.convert("RGB")) for image in images])
         return torch.from_numpy(frames).permute(0, 3, 1, 2)
     return decode_video(dataset, episode, key)
