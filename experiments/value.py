@@ -39,6 +39,32 @@ def cell(study: Study) -> Results:
     return {study.variables["cell"]: results}
 
 
+def four_tasks(study: Study) -> Results:
+    """Return the success of one policy in each of its tasks, after every method, on the same starts.
+
+    `minutes` are those of the steps on the machines that the provenance names.
+    """
+    methods: dict[str, Sequence[str]] = study.variables["methods"]
+    found = {
+        task: {
+            domain: {name: rate(outcomes(study.folder / f"eval_{name}_{task}_{domain}")) for name in methods}
+            for domain in ("ind", "ood")
+        }
+        for task in study.variables["tasks"]
+    }
+    results = {
+        **{name: study.variables[name] for name in ("demonstrations", "rollouts", "seed", "starts")},
+        "real_episodes": Ledger(study.budget).read().spent().total(),
+        "real_successes": int(recorded_episodes(study.folder / "dataset")["success"].sum()),
+        "minutes": {
+            name: round(sum(seconds(study, step) for step in steps) / 60, 1)
+            for name, steps in methods.items()
+        },
+        "tasks": found,
+    }
+    return {study.variables["cell"]: results}
+
+
 def begun(run: Path) -> dict[str, Any]:
     """Return which policy imagination has chosen to begin from, and how often each succeeded in it."""
     results = run / "comparison" / RESULTS

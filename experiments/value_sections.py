@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
+from itertools import product
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,9 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from experiments.cells import DOMAINS, Load, paired, points, table
+from experiments.cells import DOMAINS, Load, paired, points, share, table
 from experiments.study import ROOT, read_cells
-from lerobot_wmrl.common.statistics import PairedChange, RunsMean
+from lerobot_wmrl.common.statistics import PairedChange, Proportion, RunsMean
 from lerobot_wmrl.improve.report.figures import COLOURS, tidy
 
 TITLES: Final = {
@@ -87,6 +88,9 @@ SECOND_PARTS: Final = (
     "value_pick_place_iterated",
 )
 """The same of the second task."""
+
+FOUR_STUDY: Final = "value_four_tasks"
+"""One policy for four tasks."""
 
 Cell = dict[str, Any]
 Groups = dict[tuple[int, int], list[Cell]]
@@ -188,6 +192,37 @@ In unseen scenes all methods mostly fail: 50 demonstrations in three scenes teac
 compared: PPO in ManiSkill where the table has no row of it, and planning at test time, which failed in a
 [pilot](pilots.md#pick-and-place), on whose episodes the done threshold was
 chosen too."""
+
+
+def value_four_tasks(load: Load) -> str:
+    """Return the section: each task's success after every method, and what PPO changes on the same starts."""
+    cells = [
+        cell
+        for each in read_cells(ROOT / "experiments" / f"{FOUR_STUDY}.yaml")
+        if (cell := published(load, FOUR_STUDY, each.variables["cell"]))
+    ]
+    tasks = {name: [name] for name in cells[0]["tasks"]}
+    methods = [method for method in TITLES if method in cells[0]["minutes"]]
+    rows = []
+    for cell, (title, pooled), domain in product(
+        cells, {**tasks, "all four": list(tasks)}.items(), ("ind", "ood")
+    ):
+        own = {
+            method: [
+                success for task in pooled for success in cell["tasks"][task][domain][method]["outcomes"]
+            ]
+            for method in methods
+        }
+        change = PairedChange.between(own["filtered"], own["imagined_ppo"])
+        rates = [share(Proportion(sum(each), len(each)).as_json()) for each in own.values()]
+        rows.append([cell["seed"], title, DOMAINS[domain], *rates, change])
+    first = cells[0]
+    return f"""{first["demonstrations"]} demonstrations and {first["rollouts"]} rollouts, a quarter of them of
+each task, in all 64 known scenes. The policy is told the task in words.
+
+{table(["seed", "task", "scenes", *map(TITLES.get, methods), "PPO against filtered BC"], rows)}
+
+{first["starts"]} starts of each task, the same for all methods. Intervals count starts."""
 
 
 def comparison(found: Groups) -> str:
