@@ -4,6 +4,7 @@ import zlib
 from collections.abc import Sequence
 from functools import lru_cache
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -63,16 +64,18 @@ class ImageEncoder(nn.Module):
 
 
 @lru_cache(maxsize=4096)
-def ngram_counts(text: str) -> tuple[float, ...]:
-    """Return normalised counts of hashed words and character trigrams. No vocabulary is needed."""
-    counts = [0.0] * LANGUAGE_BUCKETS
+def ngram_counts(text: str) -> np.ndarray:
+    """Return normalised counts of hashed words and character trigrams. No vocabulary is needed.
+
+    → float32 (LANGUAGE_BUCKETS,)
+    """
+    counts = np.zeros(LANGUAGE_BUCKETS)
     words = text.lower().split()
     for word in words:
         padded = f"<{word}>"
         for gram in (padded, *(padded[i : i + 3] for i in range(len(padded) - 2))):
             counts[zlib.crc32(gram.encode()) % LANGUAGE_BUCKETS] += 1.0
-    norm = max(1.0, sum(count * count for count in counts) ** 0.5)
-    return tuple(count / norm for count in counts)
+    return (counts / max(1.0, np.sqrt(counts @ counts))).astype(np.float32)
 
 
 class InstructionEncoder(nn.Module):
@@ -86,7 +89,7 @@ class InstructionEncoder(nn.Module):
         """Embed B strings, each distinct one once. → (B, LANGUAGE_SIZE)"""
         distinct = list(dict.fromkeys(instructions))
         device = self.project.weight.device
-        counts = torch.tensor([ngram_counts(text) for text in distinct], device=device)
+        counts = torch.from_numpy(np.stack([ngram_counts(text) for text in distinct])).to(device)
         row = {text: index for index, text in enumerate(distinct)}
         rows = torch.tensor([row[text] for text in instructions], device=device)
         return self.project(counts).tanh()[rows]
