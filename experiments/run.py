@@ -163,9 +163,9 @@ def machine() -> str:
 
 
 def is_published(study: Study, docs: Path) -> bool:
-    """Return whether the results of a study's cell are in docs/; a study without cells is always run."""
+    """Return whether the results of a study's cell are in docs/; one without cells or results is always run."""
     cell = study.variables.get("cell")
-    published = bool(cell) and all((docs / result).exists() for result in study.results)
+    published = bool(cell and study.results) and all((docs / result).exists() for result in study.results)
     if published:
         print(f"{study.name}, {cell}: its results are in {docs}")
     return published

@@ -128,6 +128,7 @@ class Comparison:
             "policies": {name: rate.as_json() for name, rate in self.rates().items()},
             "alpha": self.alpha,
             "finished": self.finished,
+            "complete": self.complete,
             "pairs": [pair.as_json() for pair in self.pairs()],
             "episodes": [episode._asdict() for episode in self.episodes],
         }

@@ -68,7 +68,8 @@ def read_references(path: Path | None) -> dict[str, Proportion]:
     """Read real success of policies from a comparison, or from a file that is written like it.
 
     Raises:
-        FieldError: there is none, it is something else, it is not finished, or its episodes are imagined.
+        FieldError: there is none, it is something else, it is not finished or has stopped early, or its
+            episodes are imagined.
     """
     if path is None:
         return {}
@@ -88,6 +89,11 @@ def read_references(path: Path | None) -> dict[str, Proportion]:
         )
     if not found.get("finished", True):
         raise FieldError("references", path, "the comparison was interrupted", "run its command again")
+    if not found.get("complete", True):
+        raise FieldError(
+            "references", path, "the comparison stopped early, and then the rates lean to the winner",
+            "compare the policies anew with --stop_early=false",
+        )  # fmt: skip
     return rates
 
 

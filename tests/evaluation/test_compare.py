@@ -120,6 +120,7 @@ def test_a_clear_difference_stops_early_and_every_outcome_is_of_its_task_and_see
     found = results_of(config)
     episodes = [Episode(**episode) for episode in found["episodes"]]
     assert found["finished"]
+    assert not found["complete"]
     assert 0 < len(episodes) < 60 * 3
     assert len(episodes) % (config.batch_size * 3) == 0
     for suite, task, seed, successes in episodes:

@@ -119,6 +119,7 @@ def test_references_are_read_from_a_comparison_or_a_file_by_hand(tmp_path):
         ({"env": "pusht", "policies": {}}, "no success of policies can be read"),
         ({"env": {"type": "world_model"}, "policies": {}}, "its episodes are imagined ones"),
         ({"env": None, "finished": False, "policies": {}}, "the comparison was interrupted"),
+        ({"finished": True, "complete": False, "policies": {}}, "the comparison stopped early"),
     ],
 )
 def test_other_references_are_refused(content, said, tmp_path):

@@ -216,6 +216,16 @@ def test_a_cell_whose_results_are_published_is_left_out(
         assert capfd.readouterr().out.count("$ mkdir") == ran
 
 
+def test_a_cell_that_publishes_nothing_is_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "sizes.yaml"
+    path.write_text(CELLS[: CELLS.index("results:")])
+    monkeypatch.setattr(sys, "argv", ["run", str(path), "size=1", f"output_dir={tmp_path / 'out'}"])
+    main()
+    assert capfd.readouterr().out.count("$ mkdir") == 2
+
+
 def test_one_cell_must_be_chosen_where_one_is_wanted(tmp_path: Path) -> None:
     path = tmp_path / "sizes.yaml"
     path.write_text(CELLS)
