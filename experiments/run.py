@@ -163,7 +163,7 @@ def machine() -> str:
 
 
 def is_published(study: Study, docs: Path) -> bool:
-    """Return whether the results of a study's cell are in docs/; one without cells or results is always run."""
+    """Return whether the results of a cell are in docs/; without cells or results a study is always run."""
     cell = study.variables.get("cell")
     published = bool(cell and study.results) and all((docs / result).exists() for result in study.results)
     if published:
