@@ -49,8 +49,8 @@ ENOUGH_HELD_OUT: Final = 10
 about a threshold."""
 
 SLOWEST: Final = 2
-"""A rollout may take this many times as long as the longest recorded episode: what a stuck one does beyond
-would fill the data."""
+"""A rollout may take this many times as long as the longest recorded episode, unless the recording itself has
+ended failures there: what a stuck one does beyond would fill the data."""
 
 ROLLOUT_COLUMNS: Final = (*DEFAULT_FEATURES, ACTION, REWARD, SUCCESS, DONE, START_SEED, START_KIND)
 """Columns of recorded rollouts, beside those that the policy sees and the environment declares."""
@@ -235,7 +235,9 @@ class Improvement:
         real = self.config.real_env
         if isinstance(real, WmrlManiSkillEnv):
             return real.horizon
-        return self.found.longest * (SLOWEST if self.config.rollouts else 1)
+        if not self.config.rollouts:
+            return self.found.longest
+        return self.found.limit or self.found.longest * SLOWEST
 
     @property
     def discount(self) -> float:

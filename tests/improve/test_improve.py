@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from lerobot.configs import PreTrainedConfig
+from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig, PushtEnv
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
@@ -26,7 +27,7 @@ from lerobot_wmrl.data.episodes import ChosenEpisodes, read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.improve import stages
 from lerobot_wmrl.improve.configuration_improve import ImproveConfig
-from lerobot_wmrl.improve.findings import few_decisions
+from lerobot_wmrl.improve.findings import few_decisions, look
 from lerobot_wmrl.improve.stages import CLONED, DISTILLED, FITTED, PPO, SFT
 from lerobot_wmrl.scripts.improve import improve, settings
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
@@ -150,6 +151,24 @@ def test_imagination_begins_all_over_the_rollouts_too(
     make_synthetic_dataset(tmp_path / "merged", episodes=6)
     improvement.config.rollouts = 3
     assert improvement.branches == branches
+
+
+@pytest.mark.parametrize(("episodes", "limit", "frames"), [(3, 0, 40), (6, 20, 20)])
+def test_failures_that_were_ended_at_one_length_are_the_limit_of_rollouts(
+    episodes: int, limit: int, frames: int, make_synthetic_dataset: Any, tmp_path: Path
+) -> None:
+    """One episode of three fails, two of six, all after 20 frames: in another round the limit stays."""
+    camera = PolicyFeature(FeatureType.VISUAL, (3, 32, 32))
+    policy = CnnConfig(
+        device="cpu", input_features={"observation.images.third_view": camera},
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (7,))},
+    )  # fmt: skip
+    found = look(read_episodes(make_synthetic_dataset(tmp_path / "data", episodes=episodes)), policy, None)
+    assert (found.longest, found.limit) == (20, limit)
+    improvement = improvement_of(tmp_path, longest=found.longest, limit=found.limit)
+    assert improvement.frame_limit == 20, "without rollouts"
+    improvement.config.rollouts = 3
+    assert improvement.frame_limit == frames
 
 
 @pytest.mark.parametrize("size", ["tiny", "demo", "cpu"])
