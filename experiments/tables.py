@@ -79,9 +79,10 @@ Each section is a question, its answer, one table and its limits. The page is ge
   world model were trained in; *unseen* ones are in no training data. Starts are held out in both.
 - Intervals in parentheses are 95 %: Wilson's for a share, bootstrap over episodes for a mean, bootstrap over
   starts for a change. None of them covers other seeds of training.
-- All numbers but those of [speed_gpu](#speed_gpu) come from CPUs, and all from earlier commits than the
-  present one. The commit is under each table; *before* means that only the commit that added the numbers is
-  known. Today's studies repeat the set-up, but not all have been run again.
+- All numbers come from CPUs but those of [speed_gpu](#speed_gpu) and where a GPU is named under the table,
+  and all from earlier commits than the present one. The commit is under each table; *before* means that only
+  the commit that added the numbers is known. Today's studies repeat the set-up, but not all have been run
+  again.
 - Null results stay here.
 """
 

@@ -56,6 +56,7 @@ def four_tasks(study: Study) -> Results:
         **{name: study.variables[name] for name in ("demonstrations", "rollouts", "seed", "starts")},
         "real_episodes": Ledger(study.budget).read().spent().total(),
         "real_successes": int(recorded_episodes(study.folder / "dataset")["success"].sum()),
+        **begun(study.folder),
         "minutes": {
             name: round(sum(seconds(study, step) for step in steps) / 60, 1)
             for name, steps in methods.items()

@@ -248,7 +248,7 @@ def imagine(
     size = even_batch(env.dataset.max_starts, cfg.batch_size)
     group = regrouped("dataset", "starts") if cfg.starts_given else nullcontext()
     with group, opened(env, size, False, 1) as (envs,):
-        starts = starts_of_one_task(envs)
+        starts = starts_of_one_task(envs, "dataset.tasks" if cfg.starts_given else "dataset.episodes")
         claim_output_dir(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER)
         for name, config in tqdm(missing.items(), desc="Imagining", unit="policy"):
             with about_policy(name):
@@ -266,13 +266,21 @@ def even_batch(episodes: int, most: int) -> int:
     return ceil(episodes / ceil(episodes / most))
 
 
-def starts_of_one_task(envs: "Envs") -> int:
-    """Return the number of starts. FieldError if they are of several tasks: one rate says little of these."""
+def starts_of_one_task(envs: "Envs", chosen_by: str) -> int:
+    """Return the number of starts.
+
+    Args:
+        envs: the environments, one a task.
+        chosen_by: the setting that chooses the starts.
+
+    Raises:
+        FieldError: they are of several tasks, of which one rate says little.
+    """
     made = [env for tasks in envs.values() for env in tasks.values()]
     if len(made) > 1:
         raise FieldError(
-            "dataset.tasks", None, f"the starts are of {len(made)} tasks, and success is judged task by task",
-            "choose one of them, for the rollouts too (`dataset.episodes`)",
+            chosen_by, None, f"the starts are of {len(made)} tasks, and success is judged task by task",
+            "choose one task, for the rollouts too (`dataset.episodes`)",
         )  # fmt: skip
     env: Any = made[0]
     return len(env.env.starts)

@@ -26,7 +26,7 @@ from lerobot_wmrl.evaluation.evidence import (
 )
 from lerobot_wmrl.evaluation.gate import Outcomes
 from lerobot_wmrl.evaluation.judgement import Judgement
-from lerobot_wmrl.scripts.judge import JudgeConfig, even_batch, judge, main
+from lerobot_wmrl.scripts.judge import JudgeConfig, even_batch, judge, main, starts_of_one_task
 from tests.relabelled import relabelled
 from tests.rl.checkpoints import save_untrained_policy
 
@@ -127,6 +127,11 @@ def test_other_references_are_refused(content, said, tmp_path):
         read_references(write(tmp_path / "known.json", content))
     with pytest.raises(ValueError, match=r"^references=.*no success of policies can be read"):
         read_references(tmp_path / "absent.json")
+
+
+def test_starts_of_several_tasks_are_refused_by_the_setting_that_chooses_them():
+    with pytest.raises(ValueError, match=r"^dataset\.episodes=None: the starts are of 2 tasks"):
+        starts_of_one_task({"imagination": {0: None, 1: None}}, "dataset.episodes")
 
 
 def test_rollouts_that_bias_the_confusion_are_warned_about():
