@@ -12,6 +12,7 @@ from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.improve.report.figures import COLOURS, tidy
 
 PLACES: Final = {"imagined": "PPO in imagination", "simulated": "PPO in ManiSkill"}
+IMPROVEMENT: Final = {"cloned": "SFT", "trained": "PPO in imagination"}
 DOMAINS: Final = {"ind": "known scenes", "ood": "unseen scenes", "drawn": "known scenes, tokens drawn"}
 CURVES: Final = (("data", "episodes"), ("time", "minutes"), ("size", "parameters"))
 """How the names of a learning curve's trainings begin, and what they are drawn over."""
@@ -46,20 +47,23 @@ def _draw_curves(axes: Axes, results: Mapping[str, Any], abscissa: str, unit: fl
         axes.plot(*curves.mean(0).T, color=colour, marker="o", label=title)
 
 
-def draw_improvement(found: Mapping[str, Any], path: Path) -> None:
-    """A panel a domain: every policy's success before and after PPO in imagination."""
+def draw_improvement(found: Mapping[str, Any], path: Path, kinds: Mapping[str, str] = IMPROVEMENT) -> None:
+    """A panel a domain, a group of bars a policy (or task): success after each of the `kinds` of training."""
     figure = Figure(figsize=(4 * len(found), 3.2), layout="constrained")
     panels = figure.subplots(1, len(found), sharey=True, squeeze=False)[0]
+    width = 0.5 if len(kinds) < 3 else 0.8
     for axes, (domain, numbers) in zip(panels, found.items(), strict=True):
-        policies = numbers["policies"]
-        for offset, (kind, title) in enumerate({"cloned": "SFT", "trained": "PPO in imagination"}.items()):
-            for place, row in enumerate(policies.values()):
+        groups = numbers["policies"]
+        for number, (kind, title) in enumerate(kinds.items()):
+            for place, row in enumerate(groups.values()):
                 rate = Proportion.from_json(row[kind])
                 axes.bar(
-                    place + 0.25 * offset, rate.share, 0.22, yerr=rate.whiskers, capsize=3,
-                    color=COLOURS[offset], label=title if place == 0 and domain == list(found)[-1] else None,
+                    place + width / len(kinds) * number, rate.share, 0.88 * width / len(kinds),
+                    yerr=rate.whiskers, capsize=3, color=COLOURS[number],
+                    label=title if place == 0 and domain == list(found)[-1] else None,
                 )  # fmt: skip
-        axes.set_xticks([place + 0.125 for place in range(len(policies))], list(policies))
+        middle = width / 2 * (1 - 1 / len(kinds))
+        axes.set_xticks([place + middle for place in range(len(groups))], list(groups))
         axes.set_title(DOMAINS[domain])
         axes.set_ylim(0, 1.2)
     panels[0].set_ylabel("success in ManiSkill")

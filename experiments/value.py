@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from experiments import figures
 from experiments.choose_policy import chosen_policy
 from experiments.run import read_record
 from experiments.study import Study
@@ -16,6 +17,14 @@ from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
 CELL: Final = ("task", "kind", "demonstrations", "rollouts", "seed", "starts")
 """Variables of the study that say which cell it is."""
+
+SHORT: Final = {
+    "cloning": "BC",
+    "filtered": "filtered BC",
+    "imagined_ppo": "PPO in imagination",
+    "ppo_distilled": "and the planner distilled",
+}
+"""Methods of the four tasks, as their picture names them."""
 
 
 def cell(study: Study) -> Results:
@@ -63,6 +72,11 @@ def four_tasks(study: Study) -> Results:
         },
         "tasks": found,
     }
+    by_domain = {
+        domain: {"policies": {task: rates[domain] for task, rates in found.items()}}
+        for domain in ("ind", "ood")
+    }
+    figures.draw_improvement(by_domain, study.folder / f"{study.variables['cell']}.png", SHORT)
     return {study.variables["cell"]: results}
 
 

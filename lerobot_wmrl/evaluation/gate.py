@@ -289,13 +289,10 @@ def gate_at(outcomes: Outcomes, threshold: float, frames: int) -> Gate:
     )
 
 
-def gates_by_task(outcomes: Outcomes, table: EpisodeTable, threshold: float, frames: int) -> dict[str, Gate]:
-    """Return the gate of each task in the dataset; none if the dataset does not name tasks."""
+def by_task(outcomes: Outcomes, table: EpisodeTable) -> dict[str, Outcomes]:
+    """Return the outcomes of each task in the dataset; none if the dataset does not name tasks."""
     tasks = table.column(START_TASK)[outcomes.episodes]
-    return {
-        TASKS[task]: gate_at(outcomes.where(tasks == task), threshold, frames)
-        for task in np.unique(tasks[tasks >= 0])
-    }
+    return {TASKS[task]: outcomes.where(tasks == task) for task in np.unique(tasks[tasks >= 0])}
 
 
 def sweep(outcomes: Outcomes) -> list[Gate]:

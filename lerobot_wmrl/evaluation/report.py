@@ -29,10 +29,10 @@ from lerobot_wmrl.evaluation.gate import (
     Gate,
     Outcomes,
     best_operating_point,
+    by_task,
     done_accuracy,
     gate_at,
     gate_details,
-    gates_by_task,
     seen_outcomes,
     sweep,
 )
@@ -161,7 +161,9 @@ def report_action_model(
         e for e in evaluation.accuracy if recording.table.column(START_KIND)[e.episode] == KINDS.index(PLAY)
     ]
     steps, play_steps = by_step(evaluation.accuracy, horizon), by_step(play, COMPARED_FRAMES)
-    gates, by_task = sweep(outcomes), gates_by_task(outcomes, recording.table, threshold, frames)
+    gates, tasks = sweep(outcomes), by_task(outcomes, recording.table)
+    at_task = {task: gate_at(own, threshold, frames) for task, own in tasks.items()}
+    best_at_task = {task: best_operating_point(sweep(own)) for task, own in tasks.items()}
     best = best_operating_point(gates)
     extremes = robustness(model, recording, evaluation.attempts, threshold, frames)
     seen = seen_outcomes(model, recording, outcomes.episodes)
@@ -175,7 +177,10 @@ def report_action_model(
         "play": {"episodes": len(play), **play_steps},
         "operating_point": best.as_json() if best else None,
         "seen_auc": None if math.isnan(seen_auc) else seen_auc,
-        "gate_by_task": {task: gate.as_json() for task, gate in by_task.items()},
+        "gate_by_task": {task: gate.as_json() for task, gate in at_task.items()},
+        "operating_point_by_task": {
+            task: point.as_json() if point else None for task, point in best_at_task.items()
+        },
         "gate_sweep": [gate.as_json() for gate in gates],
         "extreme_actions": extremes,
     }
@@ -191,7 +196,7 @@ def report_action_model(
         headline_table(estimates),
         gate_lines(gate_at(outcomes, threshold, frames), best),
         *([] if math.isnan(seen_auc) else [seen_line(seen_auc, LARGER)]),
-        *([task_table(by_task)] if by_task else []),
+        *([task_table(at_task, best_at_task)] if tasks else []),
         "False positives / recall, in percent:",
         sweep_table(gates),
         robustness_table(extremes),
@@ -267,13 +272,25 @@ def seen_line(auc: float, remedy: str) -> str:
     return f"{said}: it hardly sees success in them, and the world model has success from it.{remedy}"
 
 
-def task_table(gates: Mapping[str, Gate]) -> str:
-    """List the gate of each task, at one operating point."""
+def task_table(gates: Mapping[str, Gate], best: Mapping[str, Gate | None]) -> str:
+    """List the gate of each task at one operating point, the task's own best one, and tasks without any
+    recognised success."""
     rows = [
-        (task, gate.false_positives, gate.recall, f"{gate.auc:.2f}", "yes" if gate.passed else "no")
+        (
+            task, gate.false_positives, gate.recall, f"{gate.auc:.2f}", "yes" if gate.passed else "no",
+            f"{point.threshold}, {point.frames}: {point.recall}" if (point := best[task]) else "none",
+        )
         for task, gate in gates.items()
-    ]
-    return markdown_table(("task", "false positives", "recall", "AUC", "passed"), rows)
+    ]  # fmt: skip
+    own = "threshold, frames: recall with at most 5 % false positives"
+    table = markdown_table(("task", "false positives", "recall", "AUC", "passed", own), rows)
+    blind = [task for task, gate in gates.items() if gate.recall.n and not gate.recall.k]
+    if not blind:
+        return table
+    return (
+        f"{table}\n\nNo recorded success of {', '.join(blind)} is recognised, so RL would not be rewarded "
+        "there: lower done_threshold or done_frames."
+    )
 
 
 def sweep_table(gates: Sequence[Gate]) -> str:

@@ -11,16 +11,16 @@ import pytest
 from lerobot_wmrl.evaluation.gate import (
     Outcomes,
     best_operating_point,
+    by_task,
     done_accuracy,
     done_delay,
     done_log_loss,
     first_run,
     gate_at,
     gate_details,
-    gates_by_task,
     sweep,
 )
-from lerobot_wmrl.evaluation.report import gate_lines
+from lerobot_wmrl.evaluation.report import gate_lines, task_table
 
 
 @pytest.fixture
@@ -167,7 +167,8 @@ def test_without_any_success_rates_are_no_numbers():
 def test_every_task_has_a_gate_of_its_own(outcomes):
     columns = {"start.task": np.array([0, 0, 1, 1, -1])}
     table: Any = SimpleNamespace(column=columns.__getitem__)
-    gates = gates_by_task(outcomes, table, 0.5, 3)
+    tasks = by_task(outcomes, table)
+    gates = {task: gate_at(own, 0.5, 3) for task, own in tasks.items()}
     assert list(gates) == ["push", "pull"]
     assert (gates["push"].recall.k, gates["push"].recall.n, gates["push"].false_positives.n) == (
         2,
@@ -175,3 +176,8 @@ def test_every_task_has_a_gate_of_its_own(outcomes):
         0,
     )
     assert (gates["pull"].recall.k, gates["pull"].false_positives.k) == (0, 1)
+    lines = task_table(gates, {"push": gates["push"], "pull": None}).splitlines()
+    assert lines[2].endswith("| 0.5, 3: 100 % (2 of 2; 34–100 %) |")
+    assert lines[3].endswith("| none |")
+    assert lines[5].startswith("No recorded success of pull is recognised")
+    assert len(task_table({"push": gates["push"]}, {"push": None}).splitlines()) == 3
