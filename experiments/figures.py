@@ -48,7 +48,13 @@ def _draw_curves(axes: Axes, results: Mapping[str, Any], abscissa: str, unit: fl
 
 
 def draw_improvement(found: Mapping[str, Any], path: Path, kinds: Mapping[str, str] = IMPROVEMENT) -> None:
-    """A panel a domain, a group of bars a policy (or task): success after each of the `kinds` of training."""
+    """Draw success after several kinds of training: a panel a domain, a group of bars a policy or task.
+
+    Args:
+        found: domain → `policies` → policy or task → kind → its rate.
+        path: of the picture.
+        kinds: their titles.
+    """
     figure = Figure(figsize=(4 * len(found), 3.2), layout="constrained")
     panels = figure.subplots(1, len(found), sharey=True, squeeze=False)[0]
     width = 0.5 if len(kinds) < 3 else 0.8

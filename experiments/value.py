@@ -22,9 +22,8 @@ SHORT: Final = {
     "cloning": "BC",
     "filtered": "filtered BC",
     "imagined_ppo": "PPO in imagination",
-    "ppo_distilled": "and the planner distilled",
 }
-"""Methods of the four tasks, as their picture names them."""
+"""Methods of value_four_tasks, as its picture names them."""
 
 
 def cell(study: Study) -> Results:
@@ -70,6 +69,7 @@ def four_tasks(study: Study) -> Results:
             name: round(sum(seconds(study, step) for step in steps) / 60, 1)
             for name, steps in methods.items()
         },
+        "gate": json.loads((study.folder / "check" / "metrics.json").read_text())["gate_by_task"],
         "tasks": found,
     }
     by_domain = {

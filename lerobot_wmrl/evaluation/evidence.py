@@ -89,10 +89,12 @@ def read_references(path: Path | None) -> dict[str, Proportion]:
         )
     if not found.get("finished", True):
         raise FieldError("references", path, "the comparison was interrupted", "run its command again")
-    if not found.get("complete", True):
+    sequential = any(pair.get("test") == "sequential" for pair in found.get("pairs", []))
+    if not found.get("complete", not sequential):
+        early = "stopped early" if "complete" in found else "may have stopped early"
         raise FieldError(
-            "references", path, "the comparison stopped early, and then the rates lean to the winner",
-            "compare the policies anew with --stop_early=false",
+            "references", path, f"the comparison {early}, and then the rates lean to the winner",
+            "repeat it with --stop_early=false in another folder",
         )  # fmt: skip
     return rates
 

@@ -290,7 +290,7 @@ def gate_at(outcomes: Outcomes, threshold: float, frames: int) -> Gate:
 
 
 def by_task(outcomes: Outcomes, table: EpisodeTable) -> dict[str, Outcomes]:
-    """Return the outcomes of each task in the dataset; none if the dataset does not name tasks."""
+    """Return the outcomes of each task in the dataset; none if it has no column `start.task`."""
     tasks = table.column(START_TASK)[outcomes.episodes]
     return {TASKS[task]: outcomes.where(tasks == task) for task in np.unique(tasks[tasks >= 0])}
 

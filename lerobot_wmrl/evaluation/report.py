@@ -273,12 +273,15 @@ def seen_line(auc: float, remedy: str) -> str:
 
 
 def task_table(gates: Mapping[str, Gate], best: Mapping[str, Gate | None]) -> str:
-    """List the gate of each task at one operating point, the task's own best one, and tasks without any
-    recognised success."""
+    """List the gate of each task at one operating point, beside the operating point that is best for it.
+
+    Below the table, tasks of which no success is recognised are named.
+    """
     rows = [
         (
             task, gate.false_positives, gate.recall, f"{gate.auc:.2f}", "yes" if gate.passed else "no",
-            f"{point.threshold}, {point.frames}: {point.recall}" if (point := best[task]) else "none",
+            "–" if not gate.recall.n or not gate.false_positives.n
+            else f"{point.threshold}, {point.frames}: {point.recall}" if (point := best[task]) else "none",
         )
         for task, gate in gates.items()
     ]  # fmt: skip
@@ -288,8 +291,9 @@ def task_table(gates: Mapping[str, Gate], best: Mapping[str, Gate | None]) -> st
     if not blind:
         return table
     return (
-        f"{table}\n\nNo recorded success of {', '.join(blind)} is recognised, so RL would not be rewarded "
-        "there: lower done_threshold or done_frames."
+        f"{table}\n\nNo recorded success of {', '.join(blind)} is recognised, so RL would be rewarded there "
+        "seldom or never. One threshold holds for all tasks: choose one at which each is recognised, or "
+        "train a world model for these alone."
     )
 
 

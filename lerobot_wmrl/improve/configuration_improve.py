@@ -19,6 +19,7 @@ from lerobot_wmrl.common.policies import (
 )
 from lerobot_wmrl.common.presets import Flags
 from lerobot_wmrl.data.episodes import ChosenEpisodes
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 
 SIZES: Final = ("auto", "tiny", "demo", "cpu")
 """Presets of the stages; `auto` is `cpu` with CUDA and `demo` without."""
@@ -61,6 +62,8 @@ class ImproveConfig(RunConfig):
         rollouts: rollouts of the policy that are recorded in `real_env` first, and learnt from. Columns of
             the dataset that these lack are left out of what is learnt from.
         exploration: noise on the actions of these rollouts, as a share of half their range.
+        max_frames: frames after which a rollout has failed; by default twice as many as the dataset's longest
+            episode has. In ManiSkill set `real_env.episode_length`.
         size: how large models are and how long they train: `demo` (an hour on two cores), `cpu` (several),
             `tiny` (a minute, to try the command), or `auto`.
         iterations: of PPO, or of distillation if the policy is not trained by PPO; by default those of the
@@ -81,6 +84,7 @@ class ImproveConfig(RunConfig):
     real_env: EnvConfig | None = None
     rollouts: int = 0
     exploration: float = 0.2
+    max_frames: int | None = None
     size: str = "auto"
     iterations: int | None = None
     selection_episodes: int = 50
@@ -115,10 +119,20 @@ class ImproveConfig(RunConfig):
             raise FieldError(
                 "rollouts", self.rollouts, "are recorded in a real environment", "give `real_env.type`"
             )
+        if self.max_frames is not None:
+            self._check_max_frames()
         last = EVALUATION_SEED - (self.rollouts + ROLLOUT_SEED_OFFSET if self.rollouts else 1)
         if not 0 <= self.seed <= last:
             raise FieldError(
                 "seed", self.seed, f"must be from 0 to {last}, so that no evaluation seed is trained on"
+            )
+
+    def _check_max_frames(self) -> None:
+        require_at_least(self, 1, "max_frames")
+        if not self.rollouts or isinstance(self.real_env, WmrlManiSkillEnv):
+            remedy = "set `real_env.episode_length`" if self.rollouts else "leave it out"
+            raise FieldError(
+                "max_frames", self.max_frames, "limits rollouts in environments other than ManiSkill", remedy
             )
 
     @property

@@ -39,8 +39,6 @@ class Findings:
         held_out: how many of them are held out from training.
         fewest: how many there are of the task that has the fewest.
         longest: frames of the longest episode.
-        limit: frames after which its recording has ended failures, where two of them or more have the length
-            of the longest episode; else 0.
         usual: length that nine of ten episodes do not exceed, of the task with the longest.
         success_frames: frames of all successful episodes.
         failures: how many episodes fail.
@@ -59,7 +57,6 @@ class Findings:
     held_out: int
     fewest: int
     longest: int
-    limit: int
     usual: int
     success_frames: int
     failures: int
@@ -112,8 +109,6 @@ def look(
         f"{success.sum()} episodes succeed, {(~success).sum()} fail",
     ]
     tasks = np.unique(table.column(START_TASK), return_counts=True)[1]
-    longest = int(table.length.max())
-    ended = (table.length[~success] == longest).sum() >= 2
     done = [table.taught[rows].sum() for rows in table.rows(range(len(success)))]
     return Findings(
         lines=lines,
@@ -123,7 +118,7 @@ def look(
         cameras=camera_names(keys),
         frame_side=min(map(min, sizes.values())), pixels=sum(h * w for h, w in sizes.values()),
         episodes=len(success),
-        held_out=held_out, fewest=int(tasks.min()), longest=longest, limit=longest if ended else 0,
+        held_out=held_out, fewest=int(tasks.min()), longest=int(table.length.max()),
         usual=usual_length(table),
         success_frames=int(table.length[success].sum()), failures=int((~success).sum()),
         root=Path(root), total=total,

@@ -49,8 +49,8 @@ ENOUGH_HELD_OUT: Final = 10
 about a threshold."""
 
 SLOWEST: Final = 2
-"""A rollout may take this many times as long as the longest recorded episode, unless the recording itself has
-ended failures there: what a stuck one does beyond would fill the data."""
+"""A rollout may take this many times as long as the longest recorded episode: what a stuck one does beyond
+would fill the data."""
 
 ROLLOUT_COLUMNS: Final = (*DEFAULT_FEATURES, ACTION, REWARD, SUCCESS, DONE, START_SEED, START_KIND)
 """Columns of recorded rollouts, beside those that the policy sees and the environment declares."""
@@ -137,6 +137,8 @@ class Improvement:
         if not config.rollouts:
             return None
         given: Flags = {} if config.iterations is None else {"iterations": config.iterations}
+        if not self._in_maniskill:
+            given["max_frames"] = self.frame_limit
         return ["lerobot-wmrl-improve", *format_flags({
             "policy.path": self.policies[self.chosen()], **self.data.flags(), **self._real_env("real_env"),
             "rollouts": config.rollouts, "exploration": config.exploration, "size": config.preset, **given,
@@ -237,7 +239,7 @@ class Improvement:
             return real.horizon
         if not self.config.rollouts:
             return self.found.longest
-        return self.found.limit or self.found.longest * SLOWEST
+        return self.config.max_frames or self.found.longest * SLOWEST
 
     @property
     def discount(self) -> float:

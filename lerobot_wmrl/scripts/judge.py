@@ -65,8 +65,8 @@ class JudgeConfig(RunConfig):
         starts: where imagined episodes start, by default in the first frames of these rollouts. Each policy
             has one episode from each start.
         references: policies whose real success is known: comparison.json of lerobot-wmrl-compare in a real
-            environment, or a file like it, `{"policies": {"outputs/a": {"k": 12, "n": 20}}}`, k successes in
-            n episodes. These must have started as the imagined ones do.
+            environment (`--stop_early=false`), or a file like it, `{"policies": {"outputs/a": {"k": 12, "n":
+            20}}}`, k successes in n episodes. These must have started as the imagined ones do.
         batch_size: imagined episodes that run at once.
         episode_length: frames within which an episode must succeed, in imagination and in the rollouts; by
             default as many as the clips that the world model has learnt from have.
@@ -248,7 +248,7 @@ def imagine(
     size = even_batch(env.dataset.max_starts, cfg.batch_size)
     group = regrouped("dataset", "starts") if cfg.starts_given else nullcontext()
     with group, opened(env, size, False, 1) as (envs,):
-        starts = starts_of_one_task(envs, "dataset.tasks" if cfg.starts_given else "dataset.episodes")
+        starts = starts_of_one_task(envs, cfg)
         claim_output_dir(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER)
         for name, config in tqdm(missing.items(), desc="Imagining", unit="policy"):
             with about_policy(name):
@@ -266,22 +266,16 @@ def even_batch(episodes: int, most: int) -> int:
     return ceil(episodes / ceil(episodes / most))
 
 
-def starts_of_one_task(envs: "Envs", chosen_by: str) -> int:
-    """Return the number of starts.
-
-    Args:
-        envs: the environments, one a task.
-        chosen_by: the setting that chooses the starts.
-
-    Raises:
-        FieldError: they are of several tasks, of which one rate says little.
-    """
+def starts_of_one_task(envs: "Envs", cfg: JudgeConfig) -> int:
+    """Return the number of starts. FieldError if they are of several tasks: one rate says little of these."""
     made = [env for tasks in envs.values() for env in tasks.values()]
     if len(made) > 1:
-        raise FieldError(
-            chosen_by, None, f"the starts are of {len(made)} tasks, and success is judged task by task",
-            "choose one task, for the rollouts too (`dataset.episodes`)",
-        )  # fmt: skip
+        said = f"the starts are of {len(made)} tasks, and success is judged task by task"
+        if cfg.starts_given:
+            raise FieldError(
+                "dataset.tasks", cfg.starts.tasks, said, "choose one of them, and rollouts of the same task"
+            )
+        raise FieldError("dataset.episodes", cfg.dataset.episodes, said, "choose the rollouts of one of them")
     env: Any = made[0]
     return len(env.env.starts)
 

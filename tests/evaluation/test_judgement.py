@@ -120,6 +120,7 @@ def test_references_are_read_from_a_comparison_or_a_file_by_hand(tmp_path):
         ({"env": {"type": "world_model"}, "policies": {}}, "its episodes are imagined ones"),
         ({"env": None, "finished": False, "policies": {}}, "the comparison was interrupted"),
         ({"finished": True, "complete": False, "policies": {}}, "the comparison stopped early"),
+        ({"pairs": [{"test": "sequential"}], "policies": {}}, "the comparison may have stopped early"),
     ],
 )
 def test_other_references_are_refused(content, said, tmp_path):
@@ -129,9 +130,16 @@ def test_other_references_are_refused(content, said, tmp_path):
         read_references(tmp_path / "absent.json")
 
 
-def test_starts_of_several_tasks_are_refused_by_the_setting_that_chooses_them():
-    with pytest.raises(ValueError, match=r"^dataset\.episodes=None: the starts are of 2 tasks"):
-        starts_of_one_task({"imagination": {0: None, 1: None}}, "dataset.episodes")
+@pytest.mark.parametrize(("starts", "field", "remedy"), [
+    (StartFrames(), "dataset.episodes=[0, 1]", "choose the rollouts of one of them"),
+    (StartFrames(root="s"), "dataset.tasks=None", "choose one of them, and rollouts of the same task"),
+])  # fmt: skip
+def test_starts_of_several_tasks_are_refused(starts, field, remedy):
+    config = JudgeConfig(dataset=ChosenEpisodes("d", episodes=[0, 1]), starts=starts)
+    with pytest.raises(ValueError, match="the starts are of 2 tasks") as refused:
+        starts_of_one_task({"imagination": {0: None, 1: None}}, config)
+    assert str(refused.value).startswith(f"{field}:")
+    assert str(refused.value).endswith(f"; {remedy}")
 
 
 def test_rollouts_that_bias_the_confusion_are_warned_about():

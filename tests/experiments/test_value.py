@@ -9,7 +9,7 @@ import pytest
 
 from experiments import value
 from experiments.run import record_path
-from experiments.study import ROOT, read_cells
+from experiments.study import ROOT, Study, read_cells
 from experiments.tables import loader
 from experiments.value_sections import (
     CONTROLLED,
@@ -21,11 +21,12 @@ from experiments.value_sections import (
     gain,
     groups,
     value_controls,
+    value_four_tasks,
     value_others,
     value_push,
 )
 from lerobot_wmrl.common.files import write_json
-from lerobot_wmrl.common.statistics import RunsMean
+from lerobot_wmrl.common.statistics import Proportion, RunsMean
 
 STUDY = ROOT / "experiments" / "value_push.yaml"
 SUCCESSES = {"cloning": 5, "filtered": 7, "weighted": 6, "imagined_ppo": 8, "planned": 9}
@@ -143,12 +144,8 @@ def test_nothing_is_drawn_without_a_cell(tmp_path: Path) -> None:
     assert not (tmp_path / "value.png").exists()
 
 
-def test_a_cell_keeps_outcomes_and_minutes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    study = read_cells(STUDY, ["demonstrations=8", "rollouts=300", "seed=0", f"output_dir={tmp_path}"])[0]
-    for name, k in SUCCESSES.items():
-        for domain in ("ind", "ood"):
-            task = {"metrics": {"successes": [True] * k + [False] * (10 - k)}}
-            write_json(study.folder / f"eval_{name}_{domain}" / "eval_info.json", {"per_task": [task]})
+def finish_cell(study: Study, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write what the study's steps leave, but for evaluations and the steps' records."""
     episodes = {str(episode): {"spent": "rollouts"} for episode in range(208)}
     write_json(study.budget, {"limits": {}, "episodes": episodes, "trainings": {"dyna": 100}})
     (study.folder / "dataset").mkdir()
@@ -161,10 +158,28 @@ def test_a_cell_keeps_outcomes_and_minutes(tmp_path: Path, monkeypatch: pytest.M
     write_json(study.folder / "comparison" / "comparison.json", comparison)
     table = {"success": np.arange(308) < 140}
     monkeypatch.setattr(value, "recorded_episodes", lambda root: table)
-    with pytest.raises(ValueError, match="step cloning is not finished"):
-        value.cell(study)
+
+
+def write_outcomes(folder: Path, k: int) -> None:
+    """As lerobot-eval does: k successes, then failures, ten in all."""
+    task = {"metrics": {"successes": [True] * k + [False] * (10 - k)}}
+    write_json(folder / "eval_info.json", {"per_task": [task]})
+
+
+def write_records(study: Study) -> None:
     for step in study.steps:
         write_json(record_path(study.folder, step.name), {"seconds": 60.0})
+
+
+def test_a_cell_keeps_outcomes_and_minutes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    study = read_cells(STUDY, ["demonstrations=8", "rollouts=300", "seed=0", f"output_dir={tmp_path}"])[0]
+    for name, k in SUCCESSES.items():
+        for domain in ("ind", "ood"):
+            write_outcomes(study.folder / f"eval_{name}_{domain}", k)
+    finish_cell(study, monkeypatch)
+    with pytest.raises(ValueError, match="step cloning is not finished"):
+        value.cell(study)
+    write_records(study)
     (content,) = value.cell(study).values()
     assert (content["real_episodes"], content["real_successes"]) == (308, 140)
     assert content["start"] == "cloning"
@@ -174,6 +189,31 @@ def test_a_cell_keeps_outcomes_and_minutes(tmp_path: Path, monkeypatch: pytest.M
     assert content["methods"]["filtered"]["ind"]["outcomes"] == [1] * 7 + [0] * 3
     assert content["methods"].keys() == SUCCESSES.keys()
     json.dumps(content)
+
+
+def test_four_tasks_are_collected_and_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = ROOT / "experiments" / "value_four_tasks.yaml"
+    study = read_cells(path, ["seed=0", f"output_dir={tmp_path / 'runs'}"])[0]
+    for method, k in {"cloning": 5, "filtered": 3, "imagined_ppo": 8}.items():
+        for task in study.variables["tasks"]:
+            better = task == "pull" and method == "filtered"
+            for domain in ("ind", "ood"):
+                write_outcomes(study.folder / f"eval_{method}_{task}_{domain}", 6 if better else k)
+    finish_cell(study, monkeypatch)
+    rate = Proportion(4, 10).as_json()
+    gates = {"push": {"false_positive_rate": rate, "recall": Proportion(9, 10).as_json()}}
+    write_json(study.folder / "check" / "metrics.json", {"gate_by_task": gates})
+    write_records(study)
+    ((name, content),) = value.four_tasks(study).items()
+    assert (study.folder / f"{name}.png").exists()
+    assert content["minutes"] == {"cloning": 1, "filtered": 2, "imagined_ppo": 6}
+    write_json(tmp_path / "results" / "value_four_tasks" / f"{name}.json", content)
+    text = value_four_tasks(loader(tmp_path))
+    assert "| push | known | 50 % (20–80) | 30 % (10–60) | 80 % (50–100) | +30.0 points" in text
+    assert "| pull | unseen | 50 % (20–80) | 60 % (30–90) | 80 % (50–100) | +20.0 points" in text
+    assert "| all four | known | 50 % (35–65) | 38 % (" in text
+    assert "from the demonstrations alone in 1 of 1 cells" in text
+    assert "| 0 | push | 4 of 10, 40 % (17–69) | 9 of 10, 90 % (60–98) |" in text
 
 
 def test_an_interval_over_runs_and_starts_covers_the_mean_of_both() -> None:

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 from lerobot.configs import PreTrainedConfig
-from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig, PushtEnv
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
@@ -27,7 +26,7 @@ from lerobot_wmrl.data.episodes import ChosenEpisodes, read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.improve import stages
 from lerobot_wmrl.improve.configuration_improve import ImproveConfig
-from lerobot_wmrl.improve.findings import few_decisions, look
+from lerobot_wmrl.improve.findings import few_decisions
 from lerobot_wmrl.improve.stages import CLONED, DISTILLED, FITTED, PPO, SFT
 from lerobot_wmrl.scripts.improve import improve, settings
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
@@ -108,6 +107,11 @@ def test_without_one_the_report_says_that_it_is_a_belief(demonstrations: Path, t
 @pytest.mark.parametrize(("flags", "message"), [
     (["--rollouts=2"], "--rollouts=2: are recorded in a real environment; give --real_env.type"),
     (["--real_env.type=pusht", "--rollouts=2", "--seed=949999"], "--seed=949999: must be from 0 to 949998"),
+    (["--max_frames=9"],
+     "--max_frames=9: limits rollouts in environments other than ManiSkill; leave it out"),
+    (["--max_frames=9", "--rollouts=2", "--real_env.type=wmrl_maniskill"],
+     "--max_frames=9: limits rollouts in environments other than ManiSkill; set --real_env.episode_length"),
+    (["--max_frames=0"], "--max_frames=0: must be at least 1"),
     (["--seed=1000000"], "--seed=1000000: must be from 0 to 999999"),
     (["--size=huge"], "--size=huge: choose one of auto, tiny, demo, cpu"),
     (["--policy.n_action_steps=8"], "--policy.n_action_steps=8: would hold for some of the commands only"),
@@ -153,22 +157,13 @@ def test_imagination_begins_all_over_the_rollouts_too(
     assert improvement.branches == branches
 
 
-@pytest.mark.parametrize(("episodes", "limit", "frames"), [(3, 0, 40), (6, 20, 20)])
-def test_failures_that_were_ended_at_one_length_are_the_limit_of_rollouts(
-    episodes: int, limit: int, frames: int, make_synthetic_dataset: Any, tmp_path: Path
-) -> None:
-    """One episode of three fails, two of six, all after 20 frames: in another round the limit stays."""
-    camera = PolicyFeature(FeatureType.VISUAL, (3, 32, 32))
-    policy = CnnConfig(
-        device="cpu", input_features={"observation.images.third_view": camera},
-        output_features={"action": PolicyFeature(FeatureType.ACTION, (7,))},
-    )  # fmt: skip
-    found = look(read_episodes(make_synthetic_dataset(tmp_path / "data", episodes=episodes)), policy, None)
-    assert (found.longest, found.limit) == (20, limit)
-    improvement = improvement_of(tmp_path, longest=found.longest, limit=found.limit)
-    assert improvement.frame_limit == 20, "without rollouts"
-    improvement.config.rollouts = 3
-    assert improvement.frame_limit == frames
+def test_another_round_does_not_double_the_frames_of_a_rollout(tmp_path: Path) -> None:
+    improvement = improvement_of(tmp_path, longest=80)
+    improvement.config.rollouts, improvement.config.real_env = 3, PushtEnv()
+    assert improvement.frame_limit == 160
+    improvement.config.max_frames = 80
+    assert improvement.frame_limit == 80
+    assert "--max_frames=80" in (improvement.another_round() or [])
 
 
 @pytest.mark.parametrize("size", ["tiny", "demo", "cpu"])

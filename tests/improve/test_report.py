@@ -188,6 +188,7 @@ def test_another_round_begins_from_the_policy_to_use_on_all_episodes(
     merged = f"--dataset.root={finished.out}/merged --real_env.type=pusht --rollouts=20"
     assert f"--policy.path={finished.out}/distilled/checkpoints/last/pretrained_model {merged}" in command
     assert f"--seed=27 --output_dir={finished.out}_again" in command
+    assert f"--max_frames={2 * finished.found.longest} " in command, "as many as in this round"
     write_records(finished)
     table = SimpleNamespace(success=np.arange(60) < 40, among=lambda episodes: None)
     monkeypatch.setattr(table, "subset", lambda among: table, raising=False)
