@@ -233,7 +233,7 @@ def value_four_tasks(load: Load) -> str:
 each task, in all 64 known scenes; {first["starts"]} starts of each task, the same for all methods. The policy
 is told the task in words.
 
-{table(["task", "scenes", *map(TITLES.get, methods), "PPO against the better BC"], rows)}
+{table(["task", "scenes", *(TITLES[method] for method in methods), "PPO against the better BC"], rows)}
 
 {pictures}
 

@@ -137,12 +137,11 @@ class Improvement:
         if not config.rollouts:
             return None
         given: Flags = {} if config.iterations is None else {"iterations": config.iterations}
-        if not self._in_maniskill:
-            given["max_frames"] = self.frame_limit
+        limit: Flags = {} if self._in_maniskill else {"max_frames": self.frame_limit}
         return ["lerobot-wmrl-improve", *format_flags({
             "policy.path": self.policies[self.chosen()], **self.data.flags(), **self._real_env("real_env"),
             "rollouts": config.rollouts, "exploration": config.exploration, "size": config.preset, **given,
-            "selection_episodes": config.selection_episodes, "eval_episodes": config.eval_episodes,
+            **limit, "selection_episodes": config.selection_episodes, "eval_episodes": config.eval_episodes,
             "seed": config.seed + config.rollouts, "output_dir": f"{self.out}_again",
         })]  # fmt: skip
 

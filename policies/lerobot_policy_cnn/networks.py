@@ -75,7 +75,7 @@ def ngram_counts(text: str) -> np.ndarray:
         padded = f"<{word}>"
         for gram in (padded, *(padded[i : i + 3] for i in range(len(padded) - 2))):
             counts[zlib.crc32(gram.encode()) % LANGUAGE_BUCKETS] += 1.0
-    return (counts / max(1.0, np.sqrt(counts @ counts))).astype(np.float32)
+    return (counts / max(1.0, float(np.sqrt(counts @ counts)))).astype(np.float32)
 
 
 class InstructionEncoder(nn.Module):
