@@ -92,12 +92,13 @@ FOUR_STUDY: Final = "value_four_tasks"
 """Stem of the study of one policy for four tasks."""
 
 FOUR_LIMITS: Final = """\
-The world model is not told the task: it sees it in the first frame, or not. The done threshold was
+The world model is not told the task: it knows it if the first frame shows it. The done threshold was
 chosen on these held-out rollouts of seed 0: a first run of PPO with 0.9, at which no success of
 pick_place and move_to_aim is recognised, was ended unmeasured. The world model and filtered BC learnt
 on a GPU, where the frames came compressed as video (H.264, 4:4:4): what that changes of the filtered
-policy's actions is 7 % of their error. Not compared: weighted BC, RECAP, iterated BC, planning, and PPO
-in ManiSkill, the best baseline in [push](#value_push) from 25 demonstrations on."""
+policy's actions is 7 % of their error. Not compared: BC for more than its 5,000 steps, weighted BC,
+RECAP, iterated BC, planning, and PPO in ManiSkill, the best baseline in [push](#value_push) from 25
+demonstrations on."""
 """What its section says of its limits."""
 
 Cell = dict[str, Any]
