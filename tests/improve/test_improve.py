@@ -160,6 +160,7 @@ def test_imagination_begins_all_over_the_rollouts_too(
 def test_another_round_does_not_double_the_frames_of_a_rollout(tmp_path: Path) -> None:
     improvement = improvement_of(tmp_path, longest=80)
     improvement.config.rollouts, improvement.config.real_env = 3, PushtEnv()
+    improvement.config.selection_episodes = 0
     assert improvement.frame_limit == 160
     improvement.config.max_frames = 80
     assert improvement.frame_limit == 80
