@@ -213,6 +213,7 @@ def test_four_tasks_are_collected_and_shown(tmp_path: Path, monkeypatch: pytest.
     assert "| pull | unseen | 50 % (20–80) | 60 % (30–90) | 80 % (50–100) | +20.0 points" in text
     assert "| all four | known | 50 % (35–65) | 38 % (" in text
     assert "from the demonstrations alone in 1 of 1 cells" in text
+    assert "BC succeeds from\n70 % of recorded starts, filtered BC from 50 %." in text
     assert "| 0 | push | 4 of 10, 40 % (17–69) | 9 of 10, 90 % (60–98) |" in text
 
 
