@@ -27,21 +27,11 @@ SHORT: Final = {
 
 
 def cell(study: Study) -> Results:
-    """Return the success of every method in one cell, with the minutes that the steps it needs took.
-
-    `real_episodes` is what the ledger says was spent, `real_successes` counts those that were merged before
-    training: rollouts of Dyna rounds are not among them, and PPO in ManiSkill has none. `start` is the
-    policy that PPO in imagination begins from, `imagined` the share of starts from which the policies it is
-    chosen from succeed in imagination.
-    """
+    """Return the success of every method in one cell, with the minutes that the steps it needs took."""
     methods: dict[str, Sequence[str]] = study.variables["methods"]
-    run = Path(study.variables["run"])
-    dataset = run / "dataset"
     results = {
         **{name: study.variables[name] for name in CELL},
-        "real_episodes": Ledger(study.budget).read().spent().total(),
-        "real_successes": int(recorded_episodes(dataset)["success"].sum()) if dataset.exists() else None,
-        **begun(run),
+        **spent(study),
         "methods": {name: method(study, name, steps) for name, steps in methods.items()},
     }
     return {study.variables["cell"]: results}
@@ -62,13 +52,8 @@ def four_tasks(study: Study) -> Results:
     }
     results = {
         **{name: study.variables[name] for name in ("demonstrations", "rollouts", "seed", "starts")},
-        "real_episodes": Ledger(study.budget).read().spent().total(),
-        "real_successes": int(recorded_episodes(study.folder / "dataset")["success"].sum()),
-        **begun(study.folder),
-        "minutes": {
-            name: round(sum(seconds(study, step) for step in steps) / 60, 1)
-            for name, steps in methods.items()
-        },
+        **spent(study),
+        "minutes": {name: minutes(study, steps) for name, steps in methods.items()},
         "gate": json.loads((study.folder / "check" / "metrics.json").read_text())["gate_by_task"],
         "tasks": found,
     }
@@ -78,6 +63,23 @@ def four_tasks(study: Study) -> Results:
     }
     figures.draw_improvement(by_domain, study.folder / f"{study.variables['cell']}.png", SHORT)
     return {study.variables["cell"]: results}
+
+
+def spent(study: Study) -> dict[str, Any]:
+    """Return the real episodes of a cell, and where PPO in imagination began.
+
+    `real_episodes` is what the ledger says was spent, `real_successes` counts those that were merged before
+    training: rollouts of Dyna rounds are not among them, and PPO in ManiSkill has none. `start` is the
+    policy that PPO in imagination begins from, `imagined` the share of starts from which the policies it is
+    chosen from succeed in imagination.
+    """
+    run = Path(study.variables["run"])
+    dataset = run / "dataset"
+    return {
+        "real_episodes": Ledger(study.budget).read().spent().total(),
+        "real_successes": int(recorded_episodes(dataset)["success"].sum()) if dataset.exists() else None,
+        **begun(run),
+    }
 
 
 def begun(run: Path) -> dict[str, Any]:
@@ -119,15 +121,20 @@ def driven(study: Study) -> Results:
 
 def method(study: Study, name: str, steps: Sequence[str]) -> dict[str, Any]:
     """Return a method's success, the minutes of its steps, and the seconds that it takes for an episode."""
-    minutes = sum(seconds(study, step) for step in steps) / 60
+    training = minutes(study, steps)
     found = success(study, name)
     evaluated = sum(seconds(study, f"eval_{name}_{domain}") for domain in found)
     episodes = sum(each["n"] for each in found.values())
     return {
         **found,
-        "minutes": round(minutes, 1),
+        "minutes": training,
         "seconds_an_episode": round(evaluated / episodes, 2),
     }
+
+
+def minutes(study: Study, steps: Sequence[str]) -> float:
+    """Return the minutes that these steps took."""
+    return round(sum(seconds(study, step) for step in steps) / 60, 1)
 
 
 def success(study: Study, name: str) -> dict[str, Any]:
