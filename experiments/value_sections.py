@@ -12,6 +12,7 @@ from matplotlib.lines import Line2D
 
 from experiments.cells import DOMAINS, Load, counted, paired, points, table
 from experiments.study import ROOT, cell_name, read_cells
+from experiments.value import SHORT
 from lerobot_wmrl.common.statistics import PairedChange, RunsMean
 from lerobot_wmrl.improve.report.figures import COLOURS, tidy
 
@@ -89,7 +90,8 @@ SECOND_PARTS: Final = (
 """The same of the second task."""
 
 FOUR_STUDY: Final = "value_four_tasks"
-"""Stem of the study of one policy for four tasks."""
+FOUR_PART: Final = "value_four_tasks_simulator"
+"""Stems of the study of one policy for four tasks, and of the one that adds a method to its table."""
 
 FOUR_LIMITS: Final = """\
 The world model is not told the task: it knows it if the first frame shows it. The done threshold was
@@ -205,13 +207,15 @@ chosen too."""
 
 def value_four_tasks(load: Load) -> str:
     """Return the section: each task's success after every method, the gate, and where PPO began."""
-    cells = [
-        cell
-        for each in read_cells(ROOT / "experiments" / f"{FOUR_STUDY}.yaml")
-        if (cell := published(load, FOUR_STUDY, each.variables["cell"]))
-    ]
+    cells = []
+    for study in read_cells(ROOT / "experiments" / f"{FOUR_STUDY}.yaml"):
+        found, part = (published(load, stem, study.variables["cell"]) for stem in (FOUR_STUDY, FOUR_PART))
+        if found:
+            cells.append(joined(found, part))
     first = cells[0]
-    methods, tasks = [method for method in TITLES if method in first["minutes"]], list(first["tasks"])
+    methods = [method for method in SHORT if all(method in cell["minutes"] for cell in cells)]
+    titles = [SHORT[method] for method in methods]
+    tasks = list(first["tasks"])
     baselines = [method for method in methods if method not in IMAGINED]
     rows = []
     for title, pooled in {**{task: [task] for task in tasks}, "all four": tasks}.items():
@@ -238,7 +242,7 @@ def value_four_tasks(load: Load) -> str:
 each task, in all 64 known scenes; {first["starts"]} starts of each task, the same for all methods. The policy
 is told the task in words.
 
-{table(["task", "scenes", *(TITLES[method] for method in methods), "PPO against the better BC"], rows)}
+{table(["task", "scenes", *titles, f"{titles[-1]} against the best other"], rows)}
 
 {pictures}
 
@@ -251,6 +255,17 @@ The world model on held-out rollouts, at the done threshold of PPO:
 {table(["seed", "task", "false positives", "recall"], gates)}
 
 {FOUR_LIMITS}"""
+
+
+def joined(cell: Cell, part: Cell | None) -> Cell:
+    """Return a cell of four tasks with the methods of the same cell of another study, if it is there."""
+    if part is None:
+        return cell
+    tasks = {
+        task: {domain: {**rates, **part["tasks"][task][domain]} for domain, rates in domains.items()}
+        for task, domains in cell["tasks"].items()
+    }
+    return {**cell, "minutes": {**cell["minutes"], **part["minutes"]}, "tasks": tasks}
 
 
 def of_tasks(cell: Cell, tasks: Sequence[str]) -> Cell:

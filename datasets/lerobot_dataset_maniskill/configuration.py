@@ -258,7 +258,7 @@ class RecordConfig(RunConfig):
     @property
     def recorded_tasks(self) -> list[str]:
         """Names of the tasks, in turn."""
-        return self.tasks or [str(self.maniskill.task)]
+        return self.tasks or self.maniskill.task_names
 
     @property
     def dataset_id(self) -> str:

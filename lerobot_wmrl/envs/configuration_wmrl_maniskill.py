@@ -3,7 +3,7 @@
 Importing it imports no simulator: that happens when an environment is built.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +17,7 @@ from lerobot_wmrl.maniskill.cameras import CAMERAS, IMAGE_SIZE, ROBOT_MESH_DETAI
 from lerobot_wmrl.maniskill.embodiment import ACTION_NAMES, FPS, STATE_NAMES
 from lerobot_wmrl.maniskill.objects import describe_assets, read_assets, use_assets
 from lerobot_wmrl.maniskill.scenes import Scene, scenes_of
-from lerobot_wmrl.maniskill.tasks import Task, task_of
+from lerobot_wmrl.maniskill.tasks import tasks_of
 from lerobot_wmrl.rewards.general import RuleBasedReward
 
 if TYPE_CHECKING:
@@ -33,12 +33,12 @@ class WmrlManiSkillEnv(EnvConfig):
     """ManiSkill with this project's tasks and scenes.
 
     Args:
-        task: push, pull, pick_place or move_to_aim.
+        task: push, pull, pick_place or move_to_aim; or several of them (`push,pull`), shared out evenly.
         split: `ind` (scenes that training may see) or `ood` (scenes held out).
         scenes: indices of scenes within the split (`lerobot-wmrl-record --list_scenes=true`); all by default.
         cameras: cameras that the policy sees.
         image_size: side of the square images in pixels.
-        episode_length: steps after which an episode is truncated; the task's own horizon by default.
+        episode_length: steps after which an episode is truncated; each task's own horizon by default.
         reward: what a step pays for success and for progress.
         assets: YAML file with meshes to use in place of objects (`lemon: {mesh: lemon.obj, scale: 0.001}`).
         robot_mesh_detail: share of the robot's triangles that are drawn; 1 draws all, three times slower.
@@ -93,16 +93,22 @@ class WmrlManiSkillEnv(EnvConfig):
 
     def selected_scenes(self) -> tuple[Scene, ...]:
         """Return the scenes of the episodes. FieldError if task, split or scenes are unknown."""
-        self._task()
+        tasks_of(self.task)
         return scenes_of(self.split, self.scenes)
 
-    def _task(self) -> Task:
-        return task_of(self.task)
+    @property
+    def task_names(self) -> list[str]:
+        """Names of the tasks. FieldError if one is unknown or named twice."""
+        return [task.name for task in tasks_of(self.task)]
+
+    def each_task(self) -> list["WmrlManiSkillEnv"]:
+        """Return this configuration for each task alone."""
+        return [replace(self, task=name) for name in self.task_names]
 
     @property
     def horizon(self) -> int:
-        """Steps after which an episode is truncated."""
-        return self.episode_length or self._task().horizon
+        """Steps after which an episode is truncated, of the longest task."""
+        return self.episode_length or max(task.horizon for task in tasks_of(self.task))
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
@@ -115,15 +121,19 @@ class WmrlManiSkillEnv(EnvConfig):
         return {**images, OBS_STATE: (len(STATE_NAMES),)}
 
     def create_simulation(self, depth: bool = False) -> "Simulation":
-        """Return a simulator of these scenes and cameras, in this process."""
+        """Return a simulator of the first task, these scenes and cameras, in this process."""
         require_simulator()
         from lerobot_wmrl.maniskill.simulation import Simulation
 
         self._use_assets()
-        return Simulation(self._task(), self.selected_scenes(), self._rendering(depth))
+        return Simulation(tasks_of(self.task)[0], self.selected_scenes(), self._rendering(depth))
 
     def create_batched_simulation(self, n_envs: int, device: str) -> "BatchedSimulation":
-        """Return a simulator of `n_envs` episodes at once. FieldError if light or cameras are to vary."""
+        """Return a simulator of `n_envs` episodes of one task at once.
+
+        Raises:
+            FieldError: light or cameras are to vary, or there are several tasks.
+        """
         require_simulator()
         from lerobot_wmrl.maniskill.batched import BatchedSimulation
 
@@ -133,9 +143,17 @@ class WmrlManiSkillEnv(EnvConfig):
                     name, getattr(self, name), "a batched simulation varies neither light nor camera",
                     "set it to 0, or `batched` to false",
                 )  # fmt: skip
+        task, *more = tasks_of(self.task)
+        if more:
+            raise FieldError(
+                "task",
+                self.task,
+                "a batched simulation has one task",
+                "choose one, or set `batched` to false",
+            )
         self._use_assets()
         scenes = self.selected_scenes()
-        return BatchedSimulation(self._task(), scenes, self._rendering(depth=False), n_envs, device)
+        return BatchedSimulation(task, scenes, self._rendering(depth=False), n_envs, device)
 
     def describe_assets(self) -> dict[str, Any] | None:
         """Describe the user's own meshes by their content; None if there are none."""
@@ -154,16 +172,20 @@ class WmrlManiSkillEnv(EnvConfig):
     def create_envs(
         self, n_envs: int, use_async_envs: bool = False
     ) -> dict[str, dict[int, "gym.vector.VectorEnv"]]:
-        """Return {suite: {task id: environment}}, as lerobot-eval wants it."""
+        """Return {suite: {index of the task: environments}}, as lerobot-eval wants it."""
         require_simulator()
         if self.runs_batched("cuda"):
             from lerobot_wmrl.envs.batched_maniskill_env import BatchedManiSkillEnv
             from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
 
-            return {self.type: {0: EvaluationAdapter(BatchedManiSkillEnv(self, n_envs, "cuda", False))}}
-        from lerobot_wmrl.envs.maniskill_env import make_vector_env
+            made: list[Any] = [EvaluationAdapter(BatchedManiSkillEnv(self, n_envs, "cuda", False))]
+        else:
+            from lerobot_wmrl.envs.maniskill_env import make_vector_env
 
-        return {self.type: {0: make_vector_env(self, n_envs, use_async_envs, freeze=True)}}
+            made = [
+                make_vector_env([each] * n_envs, use_async_envs, freeze=True) for each in self.each_task()
+            ]
+        return {self.type: dict(zip((task.index for task in tasks_of(self.task)), made, strict=True))}
 
     def create_tensor_env(self, n_envs: int, device: str) -> "gym.vector.VectorEnv":
         """Return `n_envs` simulators with tensors on `device`, for reinforcement learning."""

@@ -1,6 +1,6 @@
 """ManiSkill as an environment: one episode in numpy, several for lerobot-eval, and as tensors for PPO."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, ClassVar
 
@@ -26,7 +26,7 @@ class ManiSkillEnv(gym.Env):
 
     Observation: `pixels` {camera: (H, W, 3) uint8}, `agent_pos` (8,) float32. Action (7,): metres, radians,
     gripper. An episode is terminated as soon as success holds, and truncated at the horizon. The seed of a
-    reset decides scene and start; a reset without one draws a training seed.
+    reset decides scene and start; a reset without one draws a training seed. The configuration has one task.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": FPS}
@@ -106,16 +106,17 @@ def make_env(config: WmrlManiSkillEnv, freeze: bool) -> gym.Env:
 
 
 def make_vector_env(
-    config: WmrlManiSkillEnv, n_envs: int, use_async_envs: bool, freeze: bool
+    configs: Sequence[WmrlManiSkillEnv], use_async_envs: bool, freeze: bool
 ) -> gym.vector.VectorEnv:
-    """Return `n_envs` environments with SAME_STEP autoreset.
+    """Return an environment of each configuration, with SAME_STEP autoreset.
 
     Args:
+        configs: of one task each; images are of the same cameras and size.
         use_async_envs: whether each has a process of its own.
         freeze: whether episodes stop as lerobot-eval wants it. Success by scene is then logged on closing.
     """
-    factories = [partial(make_env, config, freeze)] * n_envs
-    if use_async_envs and n_envs > 1:
+    factories = [partial(make_env, config, freeze) for config in configs]
+    if use_async_envs and len(configs) > 1:
         context = simulating_context().get_start_method()
         kind = CountingAsyncVectorEnv if freeze else AsyncVectorEnv
         return kind(factories, context=context, autoreset_mode=AutoresetMode.SAME_STEP)
@@ -127,6 +128,8 @@ def make_vector_env(
 class ManiSkillTensorEnv(gym.vector.VectorEnv):
     """B simulators, each in a process of its own, with tensors on `device` and SAME_STEP autoreset.
 
+    If there are several tasks, they are shared out among the B: row b has task b mod their number.
+
     The world model has the same interface. Observation: `observation.images.<camera>` (B, 3, H, W) float32 in
     [0, 1], `observation.state` (B, 8), `task` (B instructions). When an episode ends in a step,
     `info["final_obs"]` holds the observations before the reset (rows of the others equal the observation),
@@ -136,7 +139,10 @@ class ManiSkillTensorEnv(gym.vector.VectorEnv):
     metadata = {"render_fps": FPS, "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012 (gymnasium's own)
 
     def __init__(self, config: WmrlManiSkillEnv, n_envs: int, device: str) -> None:
-        self.envs = make_vector_env(config, n_envs, use_async_envs=n_envs > 1, freeze=False)
+        tasks = config.each_task()
+        self.tasks = len(tasks)
+        rows = [tasks[row % self.tasks] for row in range(n_envs)]
+        self.envs = make_vector_env(rows, use_async_envs=n_envs > 1, freeze=False)
         self.config, self.num_envs, self.device = config, n_envs, torch.device(device)
         self.single_action_space, self.action_space = self.envs.single_action_space, self.envs.action_space
         self.single_observation_space = observation_space(config)

@@ -334,6 +334,14 @@ TASKS: Final[dict[str, Task]] = {task.name: task for task in (Push(), Pull(), Pi
 """Name → task."""
 
 
+def tasks_of(names: str | None) -> tuple[Task, ...]:
+    """Return the tasks of "push" or "push,pull". FieldError if one is unknown or named twice."""
+    tasks = tuple(task_of(name.strip()) for name in str(names).split(","))
+    if len({*tasks}) < len(tasks):
+        raise FieldError("task", names, "names a task twice", "name each task once")
+    return tasks
+
+
 def task_of(name: str | None) -> Task:
     """Return the task called `name`. Raises FieldError if there is none."""
     if name not in TASKS:

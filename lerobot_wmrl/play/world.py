@@ -137,6 +137,12 @@ class World:
         if self.real_env is None:
             return None
         env = make_tensor_env(self.real_env, 1, "cpu")
+        if (tasks := getattr(env, "tasks", 1)) > 1:
+            env.close()
+            raise FieldError(
+                "real_env.task", getattr(self.real_env, "task", None),
+                f"has {tasks} tasks, and one episode has one", "choose one of them",
+            )  # fmt: skip
         count, wanted = env.single_action_space.shape[0], len(self.model.embodiment.action_names)
         if count != wanted:
             env.close()

@@ -229,7 +229,7 @@ def load_text_model(
 
 
 def policies_imagination(cfg: EvalWorldModelConfig, table: "EpisodeTable") -> "WorldModelEnv":
-    """Return the world model as `policies` are evaluated in it, from starts of the environment's task.
+    """Return the world model as `policies` are evaluated in it, from starts of the environment's tasks.
 
     Raises:
         FieldError: nothing can be evaluated in it, or the dataset has too few starts.
@@ -238,10 +238,8 @@ def policies_imagination(cfg: EvalWorldModelConfig, table: "EpisodeTable") -> "W
     from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
     from lerobot_wmrl.envs.start_frames import chosen_episodes
 
-    task = cfg.real_env.task if isinstance(cfg.real_env, WmrlManiSkillEnv) else None
-    starts = StartFrames(
-        **vars(cfg.dataset), split=cfg.split, tasks=[task] if task else None, max_starts=cfg.policy_episodes
-    )
+    tasks = cfg.real_env.task_names if isinstance(cfg.real_env, WmrlManiSkillEnv) else None
+    starts = StartFrames(**vars(cfg.dataset), split=cfg.split, tasks=tasks, max_starts=cfg.policy_episodes)
     longest = getattr(cfg.real_env, "horizon", None) or getattr(cfg.real_env, "episode_length", None)
     try:
         imagination = WorldModelEnv(

@@ -184,9 +184,14 @@ def check_distillation(algorithm: DistillationConfig, env: EnvConfig) -> None:
         )  # fmt: skip
 
 
-def require_one_task(cfg: TrainConfig, env: Any) -> None:
-    """Raise FieldError for GRPO where neighbouring environments have different tasks."""
+def check_tasks(cfg: TrainConfig, env: Any) -> None:
+    """Raise FieldError if a task has no environment, or for GRPO with several tasks."""
     tasks = getattr(env, "tasks", 1)
+    if tasks > env.num_envs:
+        raise FieldError(
+            "num_envs", env.num_envs, f"the environment has {tasks} tasks, and each needs one of its own",
+            f"set it to a multiple of {tasks}, or choose fewer tasks",
+        )  # fmt: skip
     if isinstance(cfg.algorithm, GRPOConfig) and tasks > 1:
         raise FieldError(
             "algorithm.type", cfg.algorithm.type,
@@ -293,7 +298,7 @@ def train_in(
     from lerobot_wmrl.rl.rollout import RolloutBuffer
     from lerobot_wmrl.rl.trainer import Schedule, make_algorithm, train
 
-    require_one_task(cfg, env)
+    check_tasks(cfg, env)
     config, settings = policy.config, draccus.encode(cfg)
     observation = env.reset(seed=cfg.seed)[0]
     shown = {name: tuple(value.shape[1:]) for name, value in observation.items() if hasattr(value, "shape")}

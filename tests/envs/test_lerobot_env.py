@@ -13,7 +13,7 @@ from lerobot.utils.constants import OBS_IMAGE, OBS_STATE
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.envs.lerobot_env import LeRobotTensorEnv, make_tensor_env
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
-from lerobot_wmrl.scripts.train import TrainConfig, main, require_one_task
+from lerobot_wmrl.scripts.train import TrainConfig, check_tasks, main
 from tests.rl.checkpoints import save_untrained_policy
 
 B, STEPS = 2, 3
@@ -75,10 +75,14 @@ def test_several_tasks_are_shared_out_and_the_longest_episode_counts() -> None:
     env = LeRobotTensorEnv(TwoTasks(episode_length=STEPS), 3, "cpu")
     assert [int(each.call("_max_episode_steps")[0]) for each in env.envs] == [STEPS, 2 * STEPS, STEPS]
     assert env.max_episode_steps == 2 * STEPS
-    require_one_task(TrainConfig(), env)
+    check_tasks(TrainConfig(), env)
     with pytest.raises(ValueError, match=r"^algorithm\.type=grpo: .*the environment has 2 tasks; choose one"):
-        require_one_task(TrainConfig(algorithm=GRPOConfig()), env)
+        check_tasks(TrainConfig(algorithm=GRPOConfig()), env)
     env.close()
+    single = LeRobotTensorEnv(TwoTasks(episode_length=STEPS), 1, "cpu")
+    with pytest.raises(ValueError, match=r"^num_envs=1: .* 2 tasks.* set it to a multiple of 2"):
+        check_tasks(TrainConfig(), single)
+    single.close()
 
 
 def test_ppo_trains_in_it_and_the_best_policy_is_selected_there(

@@ -11,6 +11,7 @@ from lerobot.envs.utils import NEW_ROLLOUT_OPTION, preprocess_observation
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.maniskill_env import ManiSkillEnv, ManiSkillTensorEnv
+from lerobot_wmrl.maniskill.tasks import TASKS
 from lerobot_wmrl.rewards.general import RuleBasedReward
 
 HORIZON = 3
@@ -70,7 +71,7 @@ def test_a_reset_without_a_seed_draws_a_training_seed(env: ManiSkillEnv) -> None
 
 def test_lerobot_gets_what_a_policy_is_trained_on() -> None:
     config = WmrlManiSkillEnv(episode_length=HORIZON, image_size=64)
-    envs = config.create_envs(1)["wmrl_maniskill"][0]
+    (envs,) = config.create_envs(1)["wmrl_maniskill"].values()
     try:
         observation, _ = envs.reset(seed=[7], options={NEW_ROLLOUT_OPTION: True})
         batch = preprocess_observation(observation)
@@ -124,6 +125,47 @@ def test_the_tensor_environment_keeps_the_last_observation_of_an_episode(
     final = info["final_obs"]["observation.state"]
     assert not torch.allclose(final, observation["observation.state"], atol=1e-3)
     assert len(info["final_obs"]["task"]) == 1
+
+
+def test_lerobot_gets_an_environment_of_each_task() -> None:
+    envs = WmrlManiSkillEnv(task="pull, push").create_envs(1)["wmrl_maniskill"]
+    assert {index: env.call("task") for index, env in envs.items()} == {
+        TASKS["pull"].index: ("pull",), TASKS["push"].index: ("push",),
+    }  # fmt: skip
+    lengths = [env.call("_max_episode_steps")[0] for env in envs.values()]
+    assert lengths == [TASKS["pull"].horizon, TASKS["push"].horizon]
+
+
+def test_tasks_are_shared_out_among_the_environments_of_the_trainer() -> None:
+    config = WmrlManiSkillEnv(task="push,pick_place", episode_length=1, image_size=32)
+    env = ManiSkillTensorEnv(config, 3, "cpu")
+    try:
+        shown = env.reset(seed=0)[0]["task"]
+        ended = env.step(torch.zeros(3, 7))[4]["final_obs"]["task"]
+        after = env.step(torch.zeros(3, 7))[0]["task"]
+    finally:
+        env.close()
+    assert env.tasks == 2
+    for texts in (shown, ended, after):
+        assert ["push" in text for text in texts] == [True, False, True], texts
+
+
+def test_the_longest_task_decides_the_horizon() -> None:
+    assert WmrlManiSkillEnv(task="push,pick_place").horizon == TASKS["pick_place"].horizon
+    assert WmrlManiSkillEnv(task="push,pick_place", episode_length=7).horizon == 7
+
+
+@pytest.mark.parametrize(
+    ("task", "message"),
+    [
+        ("push,stack", "^task=stack: unknown; choose one of push, "),
+        ("push,pull,push", "^task=push,pull,push: names a task twice"),
+        (None, "^task=None: unknown"),
+    ],
+)
+def test_unknown_tasks_are_named(task: str | None, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        WmrlManiSkillEnv(task=task).selected_scenes()
 
 
 @pytest.mark.parametrize(

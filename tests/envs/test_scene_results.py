@@ -35,7 +35,7 @@ def test_a_seed_counts_once_and_groups_add_up() -> None:
 
 def test_environments_log_what_they_counted(caplog: pytest.LogCaptureFixture) -> None:
     config = WmrlManiSkillEnv(episode_length=1, split="ood", scenes=[3, 4], image_size=32)
-    envs = make_vector_env(config, 2, use_async_envs=False, freeze=True)
+    envs = make_vector_env([config] * 2, use_async_envs=False, freeze=True)
     envs.reset(seed=[EVALUATION_SEED, EVALUATION_SEED + 1])
     envs.step(np.zeros((2, 7), np.float32))
     with caplog.at_level(logging.INFO):

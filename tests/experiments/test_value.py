@@ -194,7 +194,7 @@ def test_a_cell_keeps_outcomes_and_minutes(tmp_path: Path, monkeypatch: pytest.M
 def test_four_tasks_are_collected_and_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = ROOT / "experiments" / "value_four_tasks.yaml"
     study = read_cells(path, ["seed=0", f"output_dir={tmp_path / 'runs'}"])[0]
-    for method, k in {"cloning": 5, "filtered": 3, "imagined_ppo": 8}.items():
+    for method, k in {"cloning": 5, "longer": 4, "filtered": 3, "imagined_ppo": 8}.items():
         for task in study.variables["tasks"]:
             better = task == "pull" and method == "filtered"
             for domain in ("ind", "ood"):
@@ -206,15 +206,27 @@ def test_four_tasks_are_collected_and_shown(tmp_path: Path, monkeypatch: pytest.
     write_records(study)
     ((name, content),) = value.four_tasks(study).items()
     assert (study.folder / f"{name}.png").exists()
-    assert content["minutes"] == {"cloning": 1, "filtered": 2, "imagined_ppo": 6}
+    assert content["minutes"] == {"cloning": 1, "longer": 2, "filtered": 2, "imagined_ppo": 6}
     write_json(tmp_path / "results" / "value_four_tasks" / f"{name}.json", content)
     text = value_four_tasks(loader(tmp_path))
-    assert "| push | known | 50 % (20–80) | 30 % (10–60) | 80 % (50–100) | +30.0 points" in text
-    assert "| pull | unseen | 50 % (20–80) | 60 % (30–90) | 80 % (50–100) | +20.0 points" in text
-    assert "| all four | known | 50 % (35–65) | 38 % (" in text
+    known = "| push | known | 50 % (20–80) | 40 % (10–70) | 30 % (10–60)"
+    unseen = "| pull | unseen | 50 % (20–80) | 40 % (10–70) | 60 % (30–90)"
+    assert f"{known} | 80 % (50–100) | +30.0 points" in text
+    assert f"{unseen} | 80 % (50–100) | +20.0 points" in text
+    assert "| all four | known | 50 % (35–65) | 40 % (" in text
     assert "from the demonstrations alone in 1 of 1 cells" in text
     assert "BC succeeds from\n70 % of recorded starts, filtered BC from 50 %." in text
     assert "| 0 | push | 4 of 10, 40 % (17–69) | 9 of 10, 90 % (60–98) |" in text
+    part = {**content, "minutes": {"simulated_ppo": 3}, "tasks": {}}
+    for task in content["tasks"]:
+        rates = {"ind": Proportion(9, 10), "ood": Proportion(2, 10)}
+        part["tasks"][task] = {
+            domain: {"simulated_ppo": {**rate.as_json(), "outcomes": [1] * rate.k + [0] * (10 - rate.k)}}
+            for domain, rate in rates.items()
+        }
+    write_json(tmp_path / "results" / "value_four_tasks_simulator" / f"{name}.json", part)
+    text = value_four_tasks(loader(tmp_path))
+    assert f"{known} | 90 % (70–100) | 80 % (50–100) | -10.0 points" in text
 
 
 def test_an_interval_over_runs_and_starts_covers_the_mean_of_both() -> None:
