@@ -6,11 +6,15 @@ import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode
+from lerobot.configs.policies import PreTrainedConfig
 from lerobot.envs import make_env, make_env_pre_post_processors
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION, preprocess_observation
 from lerobot.utils.constants import ACTION
 from torch import Tensor
+
+from lerobot_wmrl.common.policies import check_fit
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 
 Observation = dict[str, Any]
 
@@ -36,6 +40,26 @@ def runs_in_processes(config: EnvConfig) -> bool:
     rollout asks for it, and an asynchronous environment without it does not survive the question.
     """
     return is_own(config) or type(config).create_envs is not EnvConfig.create_envs
+
+
+def shapes_of(observation: Observation) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of a batch's tensors, without the batch's dimension, as `check_fit` takes them."""
+    return {name: tuple(value.shape[1:]) for name, value in observation.items() if isinstance(value, Tensor)}
+
+
+def check_acts_in(policy: PreTrainedConfig, config: EnvConfig) -> None:
+    """Raise FieldError unless a policy can act in an environment, of which one is made to look at it.
+
+    ManiSkill says what it shows without its simulator.
+    """
+    if isinstance(config, WmrlManiSkillEnv):
+        check_fit(policy, config.observation_shapes(), config.features[ACTION].shape[0])
+        return
+    env = make_tensor_env(config, 1, "cpu")
+    try:
+        check_fit(policy, shapes_of(env.reset()[0]), env.single_action_space.shape[0])
+    finally:
+        env.close()
 
 
 class LeRobotTensorEnv(gym.vector.VectorEnv):

@@ -1,7 +1,7 @@
 """Success rates of policies on the same starts, their pairs, and which pairs are decided."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -100,6 +100,17 @@ class Comparison:
         """Return each policy's success rate."""
         return {name: Proportion(sum(own), len(own)) for name, own in self._outcomes().items()}
 
+    def rates_by_task(self) -> dict[str, dict[str, Proportion]]:
+        """Return the rates of each task, named by its suite and its number there."""
+        tasks = {
+            (episode.suite, episode.task_id): f"{episode.suite} {episode.task_id}"
+            for episode in self.episodes
+        }
+        return {
+            name: replace(self, episodes=[each for each in self.episodes if each[:2] == task]).rates()
+            for task, name in tasks.items()
+        }
+
     def pairs(self) -> list[Pair]:
         """Return the pairs, each decided at alpha over their number (Bonferroni)."""
         outcomes, names = self._outcomes(), self._pair_names()
@@ -125,7 +136,8 @@ class Comparison:
     def as_json(self) -> dict[str, Any]:
         """Return results and episodes as JSON, from which `read_episodes` continues."""
         return {
-            "policies": {name: rate.as_json() for name, rate in self.rates().items()},
+            "policies": as_json(self.rates()),
+            "by_task": {task: as_json(rates) for task, rates in self.rates_by_task().items()},
             "alpha": self.alpha,
             "finished": self.finished,
             "complete": self.complete,
@@ -134,9 +146,12 @@ class Comparison:
         }
 
     def __str__(self) -> str:
-        width = max(map(len, self.policies))
-        rates = [f"{name:<{width}}  {rate}" for name, rate in self.rates().items()]
-        return "\n".join([*rates, "", *map(self._verdict, self.pairs()), self._explanation()])
+        found = self.rates_by_task()
+        parts = {f", {task}": rates for task, rates in found.items()} if len(found) > 1 else {}
+        rates = {name + part: own[name] for part, own in {"": self.rates(), **parts}.items() for name in own}
+        width = max(map(len, rates))
+        lines = [f"{name:<{width}}  {rate}" for name, rate in rates.items()]
+        return "\n".join([*lines, "", *map(self._verdict, self.pairs()), self._explanation()])
 
     def _verdict(self, pair: Pair) -> str:
         found = f"{pair.change.gained} gained, {pair.change.lost} lost, p = {pair.p_value:.2g}"
@@ -150,6 +165,11 @@ class Comparison:
     def _explanation(self) -> str:
         valid = "p is valid at any time of stopping" if self.stop_early else "p is McNemar's exact one"
         return f"{valid}; p up to {self.alpha / len(self._pair_names()):.2g} decides."
+
+
+def as_json(rates: Mapping[str, Proportion]) -> dict[str, Any]:
+    """Return rates by name as JSON."""
+    return {name: rate.as_json() for name, rate in rates.items()}
 
 
 def read_episodes(results: Mapping[str, Any]) -> list[Episode]:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import torch
 from lerobot.envs.utils import env_to_policy_features
 from lerobot.utils.constants import ACTION, DEFAULT_FEATURES, DONE, REWARD
 
@@ -21,10 +22,13 @@ from lerobot_wmrl.common.constants import (
 )
 from lerobot_wmrl.common.errors import STOPPED
 from lerobot_wmrl.common.lerobot_commands import edit_command, merge_command, train_command
+from lerobot_wmrl.common.policies import check_units, load_processors
 from lerobot_wmrl.common.presets import Flags, format_flags
 from lerobot_wmrl.common.stages import FAILED, Stage, never, read_record
+from lerobot_wmrl.data.embodiment import Embodiment, read_embodiment
 from lerobot_wmrl.data.episodes import SUCCESS, ChosenEpisodes, DatasetSource, EpisodeTable, read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.envs.lerobot_env import check_acts_in
 from lerobot_wmrl.evaluation.comparison import RESULTS, chosen_policy, most_successful
 from lerobot_wmrl.improve.configuration_improve import ROLLOUT_SEED_OFFSET, ImproveConfig
 from lerobot_wmrl.improve.findings import LONGEST_IMAGINATION, Findings, look, usual_length
@@ -87,10 +91,22 @@ class Improvement:
 
     @classmethod
     def of(cls, config: ImproveConfig) -> "Improvement":
-        """Look at the dataset. FieldError if the policy cannot be improved with it."""
+        """Look at the dataset, and at the real environment if there is one.
+
+        Raises:
+            FieldError: the policy cannot be improved with the dataset, or cannot act in the environment.
+        """
         assert config.policy is not None
         table = read_episodes(config.dataset.open())
-        return cls(config, look(table, config.policy, config.dataset.episodes, config.rollouts))
+        found = look(table, config.policy, config.dataset.episodes, config.rollouts)
+        robot = read_embodiment(table.dataset.meta, Embodiment())
+        check_units(
+            config.policy, load_processors(config.policy)[1], robot.action_names,
+            torch.tensor(robot.action_low), torch.tensor(robot.action_high),
+        )  # fmt: skip
+        if config.real_env is not None:
+            check_acts_in(config.policy, config.real_env)
+        return cls(config, found)
 
     def stages(self) -> list[Stage]:
         """List every stage in order."""

@@ -31,7 +31,7 @@ from lerobot.configs import PreTrainedConfig, parser
 from lerobot.configs.default import PeftConfig, WandBConfig
 from lerobot.envs.configs import EnvConfig
 from lerobot.rl.algorithms.configs import RLAlgorithmConfig
-from lerobot.utils.constants import ACTION, PRETRAINED_MODEL_DIR
+from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 
 from lerobot_wmrl.common.checkpoints import best_checkpoint, last_checkpoint
 from lerobot_wmrl.common.command_line import RunConfig, claim_output_dir, run_command
@@ -41,7 +41,6 @@ from lerobot_wmrl.common.errors import FieldError, require_at_least
 from lerobot_wmrl.common.precision import keep_freed_memory
 from lerobot_wmrl.common.presets import expand_preset, format_flags
 from lerobot_wmrl.common.tracking import make_wandb
-from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.rl.configuration_algorithms import PolicyGradientConfig, PPOConfig
 from lerobot_wmrl.rl.configuration_callbacks import CallbackSettings
@@ -292,6 +291,7 @@ def train_in(
 ) -> None:
     """Check that policy and environment fit, then train."""
     from lerobot_wmrl.common.policies import adopt_features, check_fit, check_units, with_new_adapters
+    from lerobot_wmrl.envs.lerobot_env import check_acts_in, shapes_of
     from lerobot_wmrl.rl.budget import charge_steps
     from lerobot_wmrl.rl.make_callbacks import Trained, make_callbacks
     from lerobot_wmrl.rl.policy_adapters import make_pipeline
@@ -301,14 +301,14 @@ def train_in(
     check_tasks(cfg, env)
     config, settings = policy.config, draccus.encode(cfg)
     observation = env.reset(seed=cfg.seed)[0]
-    shown = {name: tuple(value.shape[1:]) for name, value in observation.items() if hasattr(value, "shape")}
+    shown = shapes_of(observation)
     adopt_features(config, shown)
     check_fit(config, shown, env.single_action_space.shape[-1])
     if isinstance(cfg.env, WorldModelEnv):
         names = env.model.config.embodiment.action_names
         check_units(config, processors[1], names, env.action_low, env.action_high)
-    if isinstance(cfg.real_env, WmrlManiSkillEnv):
-        check_fit(config, cfg.real_env.observation_shapes(), cfg.real_env.features[ACTION].shape[0])
+    if cfg.real_env is not None:
+        check_acts_in(config, cfg.real_env)
     if cfg.peft is not None:
         policy = with_new_adapters(policy, cfg.peft)
     algorithm = make_algorithm(policy, cfg.algorithm, cfg.output_dir)

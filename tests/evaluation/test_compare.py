@@ -23,6 +23,7 @@ from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
 from lerobot_policy_wm_mpc.modeling_wm_mpc import WmMpcPolicy
 from lerobot_wmrl.common.checkpoints import link_checkpoint
 from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.lerobot_env import runs_in_processes
@@ -221,6 +222,21 @@ def test_mcnemars_test_decides_when_all_starts_are_there() -> None:
     (decided,) = Comparison("ab", 10, stop_early=False, episodes=episodes).pairs()
     assert (waiting.better, decided.better) == (None, "b")
     assert decided.p_value == pytest.approx(2 / 2**10)
+
+
+def test_each_task_has_rates_of_its_own() -> None:
+    episodes = [Episode("lift", task, seed, [task == 0, seed > 0]) for task in (0, 3) for seed in range(4)]
+    compared = Comparison("ab", 4, episodes=episodes)
+    found = {
+        task: {name: rate.k for name, rate in own.items()} for task, own in compared.rates_by_task().items()
+    }
+    assert found == {"lift 0": {"a": 4, "b": 3}, "lift 3": {"a": 0, "b": 3}}
+    assert compared.as_json()["by_task"]["lift 3"]["b"] == Proportion(3, 4).as_json()
+    lines = str(compared).splitlines()
+    assert [line.split("  ")[0] for line in lines[:6]] == [
+        "a", "b", "a, lift 0", "b, lift 0", "a, lift 3", "b, lift 3",
+    ]  # fmt: skip
+    assert "lift" not in str(Comparison("ab", 4, episodes=episodes[:4]))
 
 
 @pytest.mark.parametrize(("against", "pairs"), [("first", ["ab", "ac"]), ("all", ["ab", "ac", "bc"])])

@@ -116,6 +116,10 @@ def test_without_one_the_report_says_that_it_is_a_belief(demonstrations: Path, t
     (["--size=huge"], "--size=huge: choose one of auto, tiny, demo, cpu"),
     (["--policy.n_action_steps=8"], "--policy.n_action_steps=8: would hold for some of the commands only"),
     (["--dataset.root=nowhere"], "no LeRobotDataset there"),
+    (["--real_env.type=wmrl_maniskill"],
+     "the policy needs observation.image, which the environment does not"),
+    (["--real_env.type=pusht", "--real_env.obs_type=environment_state_agent_pos"],
+     "the policy needs observation.image, which the environment does not"),
 ])  # fmt: skip
 def test_bad_settings_are_named_and_nothing_is_made(
     flags: list[str], message: str, demonstrations: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
@@ -126,6 +130,17 @@ def test_bad_settings_are_named_and_nothing_is_made(
         run_command(improve, ImproveConfig, list)
     assert stopped.value.code == 1
     assert message in capsys.readouterr().err
+    assert not (tmp_path / "improve").exists()
+
+
+def test_other_units_than_those_of_the_data_are_named_before_anything_is_made(
+    demonstrations: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_untrained_policy(tmp_path / "policy", OBS_IMAGE, size=96, actions=2, constant=5000.0)
+    monkeypatch.setattr(sys, "argv", ["lerobot-wmrl-improve", *arguments(tmp_path, demonstrations)])
+    with pytest.raises(SystemExit):
+        run_command(improve, ImproveConfig, list)
+    assert "is 5000 on average, the environment's is between" in capsys.readouterr().err
     assert not (tmp_path / "improve").exists()
 
 
