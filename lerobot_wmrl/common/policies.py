@@ -218,10 +218,9 @@ def load_with_adapters(config: PreTrainedConfig, **options: Any) -> Any:
         ValueError: the policy that was adapted is not there.
     """
     from lerobot.policies.factory import get_policy_class
-    from peft import PeftConfig, PeftModel
+    from peft import PeftModel
 
-    path = str(config.pretrained_path)
-    adapter = PeftConfig.from_pretrained(path)
+    path, adapter = str(config.pretrained_path), adapter_config(config)
     base = adapter.base_model_name_or_path
     if not may_be_on_hub(base) and not Path(base).is_dir():
         raise ValueError(
@@ -233,6 +232,13 @@ def load_with_adapters(config: PreTrainedConfig, **options: Any) -> Any:
         base, config=config, revision=adapter.revision, strict=True, **options
     )
     return PeftModel.from_pretrained(policy, path, config=adapter, is_trainable=True)
+
+
+def adapter_config(config: PreTrainedConfig) -> Any:
+    """Return PEFT's configuration of the adapter in a checkpoint."""
+    from peft import PeftConfig
+
+    return PeftConfig.from_pretrained(str(config.pretrained_path))
 
 
 def may_be_on_hub(name: str) -> bool:

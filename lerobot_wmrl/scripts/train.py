@@ -230,7 +230,24 @@ def load_config(cfg: TrainConfig) -> PreTrainedConfig:
             setattr(cfg.policy, name, getattr(stored, name))
     if cfg.policy.push_to_hub and not cfg.policy.repo_id:
         raise FieldError("policy.push_to_hub", True, "give its name on the hub, --policy.repo_id=user/name")
+    if cfg.policy.push_to_hub:
+        require_published_base(cfg, cfg.policy)
     return cfg.policy
+
+
+def require_published_base(cfg: TrainConfig, policy: PreTrainedConfig) -> None:
+    """Raise FieldError if adapters are to be published and what they adapt is a folder of this machine."""
+    from lerobot_wmrl.common.policies import adapter_config
+
+    base = policy.pretrained_path if cfg.peft is not None else None
+    if policy.use_peft:
+        base = adapter_config(policy).base_model_name_or_path
+    if base is not None and Path(base).exists():
+        raise FieldError(
+            "policy.push_to_hub", True, f"the adapters belong to the policy in {base}, which nobody else has",
+            "publish that one, and give its name on the hub: with new adapters as `policy.path`, else in "
+            "adapter_config.json, base_model_name_or_path",
+        )  # fmt: skip
 
 
 def train_policy(cfg: TrainConfig) -> None:

@@ -215,6 +215,20 @@ def test_the_reference_shares_what_is_frozen(tuned: Path) -> None:
         assert torch.equal(copied, parameter)
 
 
+@pytest.mark.parametrize("new", [False, True])
+def test_adapters_of_a_policy_that_others_lack_are_not_published(
+    new: bool, base: Path, tuned: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    """They would name a folder of this machine; said before anything is trained."""
+    flags = ["--policy.push_to_hub=true", "--policy.repo_id=me/adapters", *(["--peft.r=2"] if new else [])]
+    with pytest.raises(SystemExit):
+        improve(monkeypatch, base if new else tuned, tmp_path / "new", *flags)
+    said = capsys.readouterr().err
+    assert f"--policy.push_to_hub=true: the adapters belong to the policy in {base}" in said
+    assert not (tmp_path / "new").exists()
+
+
 def test_new_adapters_on_adapters_are_refused(
     tuned: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
