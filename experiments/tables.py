@@ -6,6 +6,7 @@ python -m experiments.tables --check
 
 import argparse
 import json
+import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -78,7 +79,8 @@ Each section is a question, its answer, one table and its limits. The page is ge
 - Success is success in ManiSkill unless a column says otherwise. *Known* scenes are those that policies and
   world model were trained in; *unseen* ones are in no training data. Starts are held out in both.
 - Intervals in parentheses are 95 %: Wilson's for a share, bootstrap over episodes for a mean, bootstrap over
-  starts for a change. None of them covers other seeds of training.
+  starts for a change. They cover other seeds of training where a table shows several seeds and their mean
+  (bootstrap over starts and seeds), and nowhere else.
 - All numbers come from CPUs but those of [speed_gpu](#speed_gpu) and where a GPU is named under the table,
   and all from earlier commits than the present one. The commit is under each table; *before* means that only
   the commit that added the numbers is known. Today's studies repeat the set-up, but not all have been run
@@ -107,10 +109,14 @@ def results_page(docs: Path = DOCS) -> str:
         results = [each for cell in cells for each in cell.results if each.endswith(".json")]
         published = [result for result in results if (docs / result).exists()]
         if results and not published:
-            missing.append(
-                f"- [{name}.yaml](../experiments/{name}.yaml): {' '.join(cells[0].question.split())}"
-            )
+            missing.append(f"- {link(name)}: {' '.join(cells[0].question.split())}")
             continue
+        if absent := [each for each in results if each not in published]:
+            stems = dict.fromkeys(re.sub(r"_seed\d+", "", Path(each).stem) for each in absent)
+            missing.append(
+                f"- {len(absent)} of {len(results)} cells of {link(name)}, with one seed or more of: "
+                f"{', '.join(stems)}"
+            )
         if title != chapter:
             chapter = title
             parts.append(f"## {chapter}\n")
@@ -119,6 +125,11 @@ def results_page(docs: Path = DOCS) -> str:
     if missing:
         parts.append("## Not run yet\n\n" + "\n".join(missing) + "\n")
     return "\n".join(parts)
+
+
+def link(study: str) -> str:
+    """Return a link to a study's file."""
+    return f"[{study}.yaml](../experiments/{study}.yaml)"
 
 
 def joined(text: str) -> str:

@@ -129,8 +129,8 @@ def make_sampler(
         episodes = episodes & golden_episodes(table)
         if not episodes.any():
             raise FieldError(
-                "dataset.root", table.dataset.root, "has no successful optimal episode",
-                "the text world model learns from nothing else: record some",
+                "dataset.root", table.dataset.root, "has no successful demonstration",
+                "the text world model learns from nothing else: record some, or label them with lerobot-wmrl-label",
             )  # fmt: skip
     elif not table.done_known:
         logging.warning(

@@ -16,10 +16,12 @@ from experiments.value_sections import (
     CONTROLS,
     TITLES,
     UNCHANGED,
+    aims,
     best,
     draw_value,
     gain,
     groups,
+    recorded_anew,
     value_controls,
     value_four_tasks,
     value_others,
@@ -42,7 +44,7 @@ def made_up_cell(demonstrations: int, seed: int) -> dict[str, Any]:
         rate = {"share": k / 10, "outcomes": [1] * k + [0] * (10 - k)}
         methods[name] = {"ind": rate, "ood": rate, "minutes": 2.0, "seconds_an_episode": 0.5}
     budget = {"demonstrations": demonstrations, "rollouts": 300, "seed": seed}
-    return {**budget, "start": "filtered", "methods": methods}
+    return {**budget, "start": "filtered", "real_successes": 100, "methods": methods}
 
 
 @pytest.fixture
@@ -68,6 +70,25 @@ def test_the_section_compares_the_best_with_and_without_a_world_model(docs: Path
     )
     assert "from the demonstrations alone in 0 of 2 cells" in text
     assert "| 8 | 300 | BC of the demonstrations | 50, 60 → 55 %" in text
+
+
+@pytest.mark.parametrize(("k", "reached"), [(10, "8 demonstrations and 300 rollouts"), (7, "no budget")])
+def test_aims_and_other_episodes_are_said(docs: Path, k: int, reached: str) -> None:
+    rate = {"share": k / 10, "outcomes": [1] * k + [0] * (10 - k)}
+    for cell in read_cells(STUDY, ["demonstrations=8", "rollouts=300", "seed=[0,100000]"]):
+        own = made_up_cell(8, cell.variables["seed"]) | {"real_successes": 100 + bool(cell.variables["seed"])}
+        own["methods"] = {"ppo_distilled": {"ind": rate, "ood": rate, "minutes": 40.0}}
+        write_json(docs / "results" / "value_ppo_distilled" / f"{cell.variables['cell']}.json", own)
+        whole = docs / "results" / "value_push" / f"{cell.variables['cell']}.json"
+        content = json.loads(whole.read_text())
+        content["methods"] = {"cloning": content["methods"]["cloning"]}
+        write_json(whole, content)
+    load = loader(docs)
+    text = " ".join(f"{aims(groups(load))} {recorded_anew(load)}".split())
+    assert f"It is so with {reached} alone" in text
+    planner = f"{reached}, in 40 minutes" if k == 10 else reached
+    assert f"it has that with {planner}." in text
+    assert "300 rollouts, seed 100000 (101 successes, the others 100)." in text
 
 
 def test_rounds_stand_in_the_same_table_for_the_seeds_that_have_them(docs: Path) -> None:
@@ -206,7 +227,7 @@ def test_four_tasks_are_collected_and_shown(tmp_path: Path, monkeypatch: pytest.
     write_records(study)
     ((name, content),) = value.four_tasks(study).items()
     assert (study.folder / f"{name}.png").exists()
-    assert content["minutes"] == {"cloning": 1, "longer": 2, "filtered": 2, "imagined_ppo": 6}
+    assert content["minutes"] == {"cloning": 1, "longer": 2, "filtered": 2, "imagined_ppo": 7}
     write_json(tmp_path / "results" / "value_four_tasks" / f"{name}.json", content)
     text = value_four_tasks(loader(tmp_path))
     known = "| push | known | 50 % (20–80) | 40 % (10–70) | 30 % (10–60)"
