@@ -130,7 +130,7 @@ def make_sampler(
         if not episodes.any():
             raise FieldError(
                 "dataset.root", table.dataset.root, "has no successful demonstration",
-                "the text world model learns from nothing else: record some, or add lerobot-wmrl-label's labels",
+                "the text world model needs some: record them, or add labels (lerobot-wmrl-label)",
             )  # fmt: skip
     elif not table.done_known:
         logging.warning(
