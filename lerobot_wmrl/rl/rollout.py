@@ -20,13 +20,22 @@ class RolloutBuffer:
     All fields are (T, B); `raw_action` and `log_prob` are (T, B, K), or (T, B, n, K) for action chunks. A
     chunk is stored in the row of its first step. Only such rows, where the policy decided, are trained on.
     `age` counts the steps since the policy decided on the action; it is 0 where it decides.
+
+    Args:
+        steps: T.
+        num_envs: B.
+        device: of the tensors.
+        longest: steps of the longest possible episode; T by default.
     """
 
-    def __init__(self, steps: int, num_envs: int, device: torch.device | str) -> None:
+    def __init__(
+        self, steps: int, num_envs: int, device: torch.device | str, longest: int | None = None
+    ) -> None:
         def empty(dtype: torch.dtype = torch.float32) -> Tensor:
             return torch.zeros((steps, num_envs), dtype=dtype, device=device)
 
         self.steps, self.num_envs, self.device = steps, num_envs, device
+        self.longest = longest or steps
         self.observations = ObservationBuffer(steps, num_envs)
         self.reward, self.value, self.next_value = empty(), empty(), empty()
         self.final_value = torch.full((steps, num_envs), torch.nan, device=device)
@@ -103,14 +112,17 @@ class RolloutBuffer:
         return torch.arange(self.raw_action.shape[2], device=self.device)[:, None] < length[..., None, None]
 
     def statistics(self) -> dict[str, float]:
-        """Return the mean reward of all steps, and success rate and length of first episodes. Later episodes
-        would bias success rate and length: only short ones end within the rollout."""
-        first = self.finished & self.first_episode
-        steps = torch.arange(1, self.steps + 1, device=self.device)[:, None]
-        episodes = first.sum().clamp_min(1)
+        """Return the mean reward of all steps, and success rate and length of the episodes that had the time
+        to end within the rollout, however long. Of later ones only short ones would count."""
+        step = torch.arange(self.steps, device=self.device)[:, None]
+        last_begin = torch.where(self.finished, step + 1, 0).roll(1, 0)
+        last_begin[0] = 0
+        begin = last_begin.cummax(0).values  # (T, B), of the episode that a step belongs to
+        counted = self.finished & (begin + self.longest <= self.steps)
+        episodes = counted.sum().clamp_min(1)
         return {
-            "success_rate": ((self.success & first).sum() / episodes).item(),
-            "episode_length": ((steps * first).sum() / episodes).item(),
+            "success_rate": ((self.success & counted).sum() / episodes).item(),
+            "episode_length": (((step + 1 - begin) * counted).sum() / episodes).item(),
             "reward": self.reward.mean().item(),
         }
 

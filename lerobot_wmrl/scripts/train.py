@@ -329,7 +329,8 @@ def train_in(
     if cfg.peft is not None:
         policy = with_new_adapters(policy, cfg.peft)
     algorithm = make_algorithm(policy, cfg.algorithm, cfg.output_dir)
-    buffer = RolloutBuffer(rollout_length(cfg, env.max_episode_steps), cfg.num_envs, config.device)
+    longest = env.max_episode_steps
+    buffer = RolloutBuffer(rollout_length(cfg, longest), cfg.num_envs, config.device, longest)
     trained = Trained(policy, processors, env, cfg.env)
     callbacks = make_callbacks(cfg, trained, cfg.output_dir, cfg.iterations)
     if rank_and_size()[0] == 0:

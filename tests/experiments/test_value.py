@@ -221,6 +221,10 @@ def test_four_tasks_are_collected_and_shown(tmp_path: Path, monkeypatch: pytest.
             for domain in ("ind", "ood"):
                 write_outcomes(study.folder / f"eval_{method}_{task}_{domain}", 6 if better else k)
     finish_cell(study, monkeypatch)
+    compared = study.folder / "comparison" / "comparison.json"
+    content = json.loads(compared.read_text())
+    content["policies"]["runs/longer/checkpoints/015000"] = {"share": 0.6}
+    write_json(compared, content)
     rate = Proportion(4, 10).as_json()
     gates = {"push": {"false_positive_rate": rate, "recall": Proportion(9, 10).as_json()}}
     write_json(study.folder / "check" / "metrics.json", {"gate_by_task": gates})
@@ -235,8 +239,8 @@ def test_four_tasks_are_collected_and_shown(tmp_path: Path, monkeypatch: pytest.
     assert f"{known} | 80 % (50–100) | +30.0 points" in text
     assert f"{unseen} | 80 % (50–100) | +20.0 points" in text
     assert "| all four | known | 50 % (35–65) | 40 % (" in text
-    assert "from the demonstrations alone in 1 of 1 cells" in text
-    assert "BC succeeds from\n70 % of recorded starts, filtered BC from 50 %." in text
+    assert "that succeeds most often there: BC. In the world model BC\nsucceeds from 70 % " in text
+    assert "longer BC from 60 %, filtered BC\nfrom 50 %." in text
     assert "| 0 | push | 4 of 10, 40 % (17–69) | 9 of 10, 90 % (60–98) |" in text
     part = {**content, "minutes": {"simulated_ppo": 3}, "tasks": {}}
     for task in content["tasks"]:

@@ -14,6 +14,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig, PushtEnv
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
+from lerobot.scripts import lerobot_eval
 from lerobot.utils.constants import OBS_IMAGE
 
 from lerobot_policy_cnn.configuration_cnn import CnnConfig
@@ -22,12 +23,14 @@ from lerobot_wmrl.common.errors import STOPPED
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.presets import preset_settings
 from lerobot_wmrl.common.stages import claimed
-from lerobot_wmrl.data.episodes import ChosenEpisodes, read_episodes
+from lerobot_wmrl.common.tracking import read_metrics
+from lerobot_wmrl.data.episodes import ChosenEpisodes, open_dataset, read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.improve import stages
 from lerobot_wmrl.improve.configuration_improve import ImproveConfig
 from lerobot_wmrl.improve.findings import few_decisions
 from lerobot_wmrl.improve.stages import CLONED, DISTILLED, FITTED, PPO, SFT
+from lerobot_wmrl.scripts import train
 from lerobot_wmrl.scripts.improve import improve, settings
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 from lerobot_wmrl.world_models.configuration_world_model import AnchoredConfig
@@ -63,11 +66,23 @@ def run(folder: Path, demonstrations: Path, *flags: str) -> subprocess.Completed
     )
 
 
+PUSHT = ("--real_env.type=pusht", "--real_env.episode_length=20")
+
+
+@pytest.fixture(scope="module")
+def improved(
+    demonstrations: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, subprocess.CompletedProcess[str]]:
+    """An improvement with PushT as the real environment: where it ran, and what it said."""
+    folder = tmp_path_factory.mktemp("improved")
+    return folder, run(folder, demonstrations, *PUSHT, "--rollouts=2")
+
+
 def test_with_a_real_environment_its_rollouts_are_learnt_from_and_success_is_measured_there(
-    demonstrations: Path, tmp_path: Path
+    demonstrations: Path, improved: tuple[Path, subprocess.CompletedProcess[str]]
 ) -> None:
-    real = ["--real_env.type=pusht", "--real_env.episode_length=20", "--rollouts=2"]
-    first, folder = run(tmp_path, demonstrations, *real), tmp_path / "improve"
+    where, first = improved
+    folder = where / "improve"
     assert first.returncode == 0, first.stdout[-3000:] + first.stderr[-3000:]
     assert "observation.image 96x96" in first.stdout
     assert "size tiny: about a minute on two cores, plus the time in pusht" in first.stdout
@@ -88,8 +103,41 @@ def test_with_a_real_environment_its_rollouts_are_learnt_from_and_success_is_mea
     trained = json.loads((folder / "tokenizer" / last / "config.json").read_text())
     assert trained["tokenizer"]["frame_sizes"] == [[96, 96]]
     assert (folder / "distilled" / last).exists()
-    again = run(tmp_path, demonstrations, *real)
+    again = run(where, demonstrations, *PUSHT, "--rollouts=2")
     assert "[11/11] Compare the policies: done in" in again.stdout
+
+
+def test_its_world_model_plans_in_pusht(
+    improved: tuple[Path, subprocess.CompletedProcess[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world_model = improved[0] / "improve" / "world_model"
+    monkeypatch.setattr(sys, "argv", [
+        "lerobot-eval", "--policy.type=wm_mpc", f"--policy.world_model_path={world_model}",
+        "--policy.horizon=4", "--policy.knots=2", "--policy.execute=2", "--policy.samples=4",
+        "--policy.elites=2", "--policy.iterations=1", "--policy.done_frames=1", "--env.type=pusht",
+        "--env.episode_length=4", "--eval.n_episodes=1", "--eval.batch_size=1", f"--output_dir={tmp_path}",
+    ])  # fmt: skip
+    lerobot_eval.main()
+    (found,) = json.loads((tmp_path / "eval_info.json").read_text())["per_task"]
+    assert found["metrics"]["successes"] == [False]
+
+
+def test_a_dyna_round_records_in_pusht(
+    improved: tuple[Path, subprocess.CompletedProcess[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, out = improved[0] / "improve", tmp_path / "rl"
+    monkeypatch.setattr(sys, "argv", [
+        "lerobot-wmrl-train", f"--policy.path={improved[0] / 'policy'}", "--env.type=world_model",
+        f"--env.world_model_path={made / 'world_model'}", f"--env.dataset.root={made / 'merged'}",
+        "--env.reward.type=general", "--env.reward.alpha=1", "--env.episode_length=3", "--iterations=2",
+        "--num_envs=2", "--gate.action=off", *PUSHT, "--dyna.rounds=1", "--dyna.n_episodes=2",
+        "--dyna.steps=1", "--dyna.batch_size=2", f"--output_dir={out}",
+    ])  # fmt: skip
+    train.main()
+    recorded = [read_episodes(open_dataset(out / "dyna" / "000001" / name)) for name in ("calm", "noisy")]
+    assert [len(table.length) for table in recorded] == [1, 1]
+    assert all(table.dataset.features[OBS_IMAGE]["shape"] == (96, 96, 3) for table in recorded)
+    assert read_metrics(out)[-1]["real_steps/dyna"] == sum(int(table.length.sum()) for table in recorded)
 
 
 def test_without_one_the_report_says_that_it_is_a_belief(demonstrations: Path, tmp_path: Path) -> None:

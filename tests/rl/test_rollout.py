@@ -80,6 +80,17 @@ def test_success_counts_the_first_episode_of_each_environment() -> None:
     assert statistics["episode_length"] == 4.0
 
 
+def test_success_counts_later_episodes_that_had_the_time_to_end() -> None:
+    """Others would count only if they are short, as successes are."""
+    buffer = RolloutBuffer(6, 2, "cpu", longest=3)
+    buffer.truncated[2] = True
+    buffer.terminated[[3, 5], [0, 1]] = buffer.success[[3, 5], [0, 1]] = True
+    buffer.terminated[5, 0] = buffer.success[5, 0] = True  # began in step 4: a failure would not have ended
+    statistics = buffer.statistics()
+    assert statistics["success_rate"] == 0.5
+    assert statistics["episode_length"] == pytest.approx((3 + 1 + 3 + 3) / 4)
+
+
 def test_images_and_instructions_survive_as_bytes_and_indices() -> None:
     buffer, images = ObservationBuffer(2, 3), torch.randint(0, 256, (2, 3, 3, 8, 8)) / 255.0
     texts = [["push", "pull", "push"], ["lift", "push", "push"]]
