@@ -17,6 +17,7 @@ from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data.clips import ClipSampler, InTurn
 from lerobot_wmrl.data.episodes import (
     ChosenEpisodes,
+    EpisodeTable,
     TrainingData,
     open_dataset,
     read_episodes,
@@ -93,6 +94,17 @@ def test_only_chosen_episodes_are_learnt_from(small_dataset, trained_models):
     model = load_model(trained_models["action_world_model"], "action_world_model")
     assert make_sampler(model, table, [1, 3], batch_size=2, seed=0).episodes.tolist() == [1, 3]
     assert make_sampler(model, table, None, batch_size=2, seed=0).episodes.tolist() == list(range(6))
+
+
+@pytest.mark.parametrize("kind", ["frame_tokenizer", "action_world_model", "text_world_model"])
+def test_held_out_episodes_are_not_learnt_from(kind, small_dataset, trained_models, monkeypatch):
+    held_out = np.arange(6) % 2 == 0
+    monkeypatch.setattr(EpisodeTable, "validation", property(lambda table: held_out))
+    table, model = read_episodes(small_dataset), load_model(trained_models[kind], kind)
+    for chosen in (None, [1, 2, 3]):
+        learnt = make_sampler(model, table, chosen, batch_size=2, seed=0).episodes
+        assert len(learnt)
+        assert not held_out[learnt].any()
 
 
 def test_every_second_batch_is_of_a_further_dataset(small_dataset, trained_models):
