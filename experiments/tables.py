@@ -33,6 +33,7 @@ SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     "value_pick_place_dyna": ("Policies", partial(SECOND_ROWS, ["dyna"])),
     "value_pick_place_iterated": ("Policies", partial(SECOND_ROWS, ["iterated", "iterated_ppo"])),
     "value_four_tasks": ("Policies", value.value_four_tasks),
+    "value_four_tasks_simulator": ("Policies", value.value_four_tasks_simulator),
     "value_others": ("Policies", value.value_others),
     "value_iterated": ("Policies", partial(value.rows_above, ["iterated", "iterated_ppo"])),
     "value_simulator": ("Policies", partial(value.rows_above, ["simulated_ppo"])),

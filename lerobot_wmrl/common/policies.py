@@ -134,13 +134,17 @@ def fit_to_environment(
     check_fit(config, shown, action_size)
 
 
-def check_fit(config: PreTrainedConfig, shown: Mapping[str, tuple[int, ...]], action_size: int) -> None:
+def check_fit(
+    config: PreTrainedConfig, shown: Mapping[str, tuple[int, ...]], action_size: int,
+    where: str = "the environment",
+) -> None:  # fmt: skip
     """Raise FieldError unless an environment shows what the policy looks at, in the same sizes.
 
     Args:
         config: the policy's.
         shown: the environment's observations by LeRobot's names with their shapes, images (3, H, W).
         action_size: components of the environment's actions.
+        where: what the error calls the environment.
     """
     cameras = ", ".join(name for name in shown if name.startswith(OBS_IMAGE)) or "none"
     path = config.pretrained_path
@@ -148,14 +152,13 @@ def check_fit(config: PreTrainedConfig, shown: Mapping[str, tuple[int, ...]], ac
         if name not in shown:
             raise FieldError(
                 "policy.path", path,
-                f"the policy needs {name}, which the environment does not have (its cameras: {cameras})",
-                "use an environment made from the policy's cameras and state, or train the policy on what "
-                "this one shows",
+                f"the policy needs {name}, which {where} does not have (its cameras: {cameras})",
+                "use one with the policy's cameras and state, or train the policy on what this one shows",
             )  # fmt: skip
         if shown[name] != tuple(feature.shape):
             needed = f"the policy needs {name} of shape {tuple(feature.shape)}"
             raise FieldError(
-                "policy.path", path, f"{needed}, the environment has {shown[name]}",
+                "policy.path", path, f"{needed}, {where} has {shown[name]}",
                 "use the image size that the policy was trained on",
             )  # fmt: skip
     if config.action_feature is None:
@@ -166,14 +169,15 @@ def check_fit(config: PreTrainedConfig, shown: Mapping[str, tuple[int, ...]], ac
     wanted = config.action_feature.shape[0]
     if wanted != action_size:
         raise FieldError(
-            "policy.path", path, f"the policy has {wanted} action components, the environment {action_size}",
-            "train it on a dataset with the environment's actions",
+            "policy.path", path, f"the policy has {wanted} action components, {where} {action_size}",
+            "train it on a dataset with these actions",
         )  # fmt: skip
 
 
 def check_units(
-    config: PreTrainedConfig, postprocessor: Any, names: Sequence[str], low: Tensor, high: Tensor
-) -> None:
+    config: PreTrainedConfig, postprocessor: Any, names: Sequence[str], low: Tensor, high: Tensor,
+    where: str = "the environment",
+) -> None:  # fmt: skip
     """Raise FieldError if a policy's actions are in other units than an environment's.
 
     This is seen from the mean of the actions that the policy was trained on: it must not lie farther outside
@@ -184,6 +188,7 @@ def check_units(
         postprocessor: the policy's, which knows that mean, if actions are normalised.
         names: one for each component of an action.
         low, high: the range of the environment's actions. (A,), (A,)
+        where: what the error calls the environment.
     """
     for step in postprocessor.steps:
         known = (getattr(step, "stats", None) or {}).get(ACTION, {}).get("mean")
@@ -194,8 +199,8 @@ def check_units(
         for component in strange.nonzero().flatten().tolist()[:1]:
             raise FieldError(
                 "policy.path", config.pretrained_path,
-                f"was trained on actions whose {names[component]} is {mean[component]:.4g} on average, the "
-                f"environment's is between {least[component]:.4g} and {most[component]:.4g}",
+                f"was trained on actions whose {names[component]} is {mean[component]:.4g} on average, in "
+                f"{where} it is between {least[component]:.4g} and {most[component]:.4g}",
                 "use a policy with the same actions in the same units",
             )  # fmt: skip
 

@@ -32,7 +32,7 @@ class BatchedManiSkillEnv(gym.vector.VectorEnv):
 
     def __init__(self, config: WmrlManiSkillEnv, n_envs: int, device: str, restart: bool) -> None:
         self.config, self.num_envs, self.restart = config, n_envs, restart
-        self.scenes, self.results = config.selected_scenes(), SceneResults()
+        self.scenes, self.results = config.selected_scenes(), SceneResults(str(config.task))
         self.simulation = config.create_batched_simulation(n_envs, device)
         self.device, self.max_episode_steps = self.simulation.device, config.horizon
         self._elapsed = torch.zeros(n_envs, dtype=torch.long, device=self.device)

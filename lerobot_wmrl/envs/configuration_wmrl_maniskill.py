@@ -33,7 +33,7 @@ class WmrlManiSkillEnv(EnvConfig):
     """ManiSkill with this project's tasks and scenes.
 
     Args:
-        task: push, pull, pick_place or move_to_aim; or several of them (`push,pull`), shared out evenly.
+        task: push, pull, pick_place or move_to_aim; or several of them (`push,pull`), in turn.
         split: `ind` (scenes that training may see) or `ood` (scenes held out).
         scenes: indices of scenes within the split (`lerobot-wmrl-record --list_scenes=true`); all by default.
         cameras: cameras that the policy sees.
@@ -172,7 +172,7 @@ class WmrlManiSkillEnv(EnvConfig):
     def create_envs(
         self, n_envs: int, use_async_envs: bool = False
     ) -> dict[str, dict[int, "gym.vector.VectorEnv"]]:
-        """Return {suite: {index of the task: environments}}, as lerobot-eval wants it."""
+        """Return {task: {0: environments}}, as lerobot-eval wants it: a suite for each task."""
         require_simulator()
         if self.runs_batched("cuda"):
             from lerobot_wmrl.envs.batched_maniskill_env import BatchedManiSkillEnv
@@ -185,7 +185,7 @@ class WmrlManiSkillEnv(EnvConfig):
             made = [
                 make_vector_env([each] * n_envs, use_async_envs, freeze=True) for each in self.each_task()
             ]
-        return {self.type: dict(zip((task.index for task in tasks_of(self.task)), made, strict=True))}
+        return {name: {0: each} for name, each in zip(self.task_names, made, strict=True)}
 
     def create_tensor_env(self, n_envs: int, device: str) -> "gym.vector.VectorEnv":
         """Return `n_envs` simulators with tensors on `device`, for reinforcement learning."""

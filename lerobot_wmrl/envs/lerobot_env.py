@@ -13,6 +13,7 @@ from lerobot.envs.utils import NEW_ROLLOUT_OPTION, preprocess_observation
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
+from lerobot_wmrl.common.errors import within
 from lerobot_wmrl.common.policies import check_fit
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 
@@ -47,19 +48,26 @@ def shapes_of(observation: Observation) -> dict[str, tuple[int, ...]]:
     return {name: tuple(value.shape[1:]) for name, value in observation.items() if isinstance(value, Tensor)}
 
 
-def check_acts_in(policy: PreTrainedConfig, config: EnvConfig) -> None:
-    """Raise FieldError unless a policy can act in an environment, of which one is made to look at it.
+def check_real_env(policy: PreTrainedConfig, config: EnvConfig) -> None:
+    """Raise FieldError unless a policy can act in `real_env`, of which one is made to look at it.
 
-    ManiSkill says what it shows without its simulator.
+    ManiSkill says what it shows without its simulator. The pictures of other environments may have any size:
+    LeRobot leaves it to policies to make them fit.
     """
     if isinstance(config, WmrlManiSkillEnv):
-        check_fit(policy, config.observation_shapes(), config.features[ACTION].shape[0])
+        with within("real_env"):
+            config.selected_scenes()
+            config.runs_batched("cuda")
+        check_fit(policy, config.observation_shapes(), config.features[ACTION].shape[0], "real_env")
         return
     env = make_tensor_env(config, 1, "cpu")
     try:
-        check_fit(policy, shapes_of(env.reset()[0]), env.single_action_space.shape[0])
+        shown = shapes_of(env.reset()[0])
     finally:
         env.close()
+    wanted = {name: tuple(feature.shape) for name, feature in policy.image_features.items()}
+    sized = {name: wanted.get(name, shape) for name, shape in shown.items()}
+    check_fit(policy, sized, env.single_action_space.shape[0], "real_env")
 
 
 class LeRobotTensorEnv(gym.vector.VectorEnv):

@@ -15,9 +15,10 @@ from lerobot_wmrl.maniskill.scenes import SCENES, UNSEEN_OBJECTS, Scene
 
 
 class SceneResults:
-    """Outcomes of episodes by scene. An episode is identified by its seed and counts when it first ends."""
+    """Outcomes of a task's episodes by scene. One is identified by its seed and counts when it first ends."""
 
-    def __init__(self) -> None:
+    def __init__(self, task: str) -> None:
+        self.task = task
         self.episodes: dict[int, tuple[Scene, bool]] = {}
 
     def add(self, info: Mapping[str, np.ndarray], ended: np.ndarray) -> None:
@@ -34,7 +35,9 @@ class SceneResults:
     def log(self) -> None:
         """Log the table, if there was an episode."""
         if self.episodes:
-            logging.info("Success by scene, of all %d episodes:\n%s", len(self.episodes), self.table())
+            logging.info(
+                "Success in %s by scene, of all %d episodes:\n%s", self.task, len(self.episodes), self.table()
+            )
 
     def table(self) -> str:
         """Return the rates of scenes, of the groups of held-out scenes and of all, with 95 % intervals."""
@@ -71,7 +74,7 @@ class _Counting:
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self.results = SceneResults()
+        self.results = SceneResults(self.call("task")[0])  # type: ignore[attr-defined]
 
     def step(self, actions: Any) -> tuple[Any, ...]:
         result: tuple[Any, ...] = super().step(actions)  # type: ignore[misc]

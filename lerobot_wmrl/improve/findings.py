@@ -91,7 +91,8 @@ def look(
             "policy.path", policy.pretrained_path, "looks at no camera, and a world model imagines frames",
             "train a policy that looks at one",
         )  # fmt: skip
-    check_fit(policy, {key: (3, *size) for key, size in sizes.items()} | state, table.action.shape[1])
+    shown = {key: (3, *size) for key, size in sizes.items()} | state
+    check_fit(policy, shown, table.action.shape[1], "the dataset")
     if not success.any():
         has = "has no successful episode" if table.done_known else "says nowhere whether an episode succeeds"
         raise FieldError(

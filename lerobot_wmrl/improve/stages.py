@@ -28,7 +28,7 @@ from lerobot_wmrl.common.stages import FAILED, Stage, never, read_record
 from lerobot_wmrl.data.embodiment import Embodiment, read_embodiment
 from lerobot_wmrl.data.episodes import SUCCESS, ChosenEpisodes, DatasetSource, EpisodeTable, read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
-from lerobot_wmrl.envs.lerobot_env import check_acts_in
+from lerobot_wmrl.envs.lerobot_env import check_real_env
 from lerobot_wmrl.evaluation.comparison import RESULTS, chosen_policy, most_successful
 from lerobot_wmrl.improve.configuration_improve import ROLLOUT_SEED_OFFSET, ImproveConfig
 from lerobot_wmrl.improve.findings import LONGEST_IMAGINATION, Findings, look, usual_length
@@ -102,10 +102,10 @@ class Improvement:
         robot = read_embodiment(table.dataset.meta, Embodiment())
         check_units(
             config.policy, load_processors(config.policy)[1], robot.action_names,
-            torch.tensor(robot.action_low), torch.tensor(robot.action_high),
+            torch.tensor(robot.action_low), torch.tensor(robot.action_high), "the dataset",
         )  # fmt: skip
         if config.real_env is not None:
-            check_acts_in(config.policy, config.real_env)
+            check_real_env(config.policy, config.real_env)
         return cls(config, found)
 
     def stages(self) -> list[Stage]:

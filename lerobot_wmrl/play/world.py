@@ -137,12 +137,6 @@ class World:
         if self.real_env is None:
             return None
         env = make_tensor_env(self.real_env, 1, "cpu")
-        if (tasks := getattr(env, "tasks", 1)) > 1:
-            env.close()
-            raise FieldError(
-                "real_env.task", getattr(self.real_env, "task", None),
-                f"has {tasks} tasks, and one episode has one", "choose one of them",
-            )  # fmt: skip
         count, wanted = env.single_action_space.shape[0], len(self.model.embodiment.action_names)
         if count != wanted:
             env.close()
@@ -257,6 +251,8 @@ def load_world(
     driven = config if end_at_success else replace(config, done_frames=config.horizon)
     world = World(models, driven, config.done_frames)
     if isinstance(real_env, WmrlManiSkillEnv):
+        if len(real_env.task_names) > 1:
+            raise FieldError("real_env.task", real_env.task, "a drive needs a single task", "choose one")
         side = resets_side(world.sizes)
         real_env = replace(real_env, cameras=list(world.sizes.cameras), image_size=side)
     world.real_env = real_env

@@ -22,9 +22,9 @@ class SelectionConfig:
 
     Args:
         freq: iterations between two measurements of success. Each one also saves a checkpoint. 0: off.
-        n_episodes: episodes in each measurement, always from the same starts. They run in `real_env` if it is
-            set, from starts that are used neither for training nor for evaluation; otherwise in the world
-            model, from those of `dataset`.
+        n_episodes: episodes of each task in a measurement, always from the same starts. They run in
+            `real_env` if it is set, from starts that are used neither for training nor for evaluation;
+            otherwise in the world model, from those of `dataset`.
         dataset: dataset whose first frames start the imagined episodes; by default `env.dataset`.
     """
 

@@ -113,16 +113,22 @@ class RolloutBuffer:
 
     def statistics(self) -> dict[str, float]:
         """Return the mean reward of all steps, and success rate and length of the episodes that had the time
-        to end within the rollout, however long. Of later ones only short ones would count."""
+        to end within the rollout, however long. Of later ones only short ones would count. Every environment
+        has the same weight, however many of its episodes there are."""
         step = torch.arange(self.steps, device=self.device)[:, None]
         last_begin = torch.where(self.finished, step + 1, 0).roll(1, 0)
         last_begin[0] = 0
         begin = last_begin.cummax(0).values  # (T, B), of the episode that a step belongs to
         counted = self.finished & (begin + self.longest <= self.steps)
-        episodes = counted.sum().clamp_min(1)
+        episodes = counted.sum(0)  # (B,)
+
+        def mean(values: Tensor) -> float:
+            each = (values * counted).sum(0) / episodes.clamp_min(1)
+            return (each.sum() / (episodes > 0).sum().clamp_min(1)).item()
+
         return {
-            "success_rate": ((self.success & counted).sum() / episodes).item(),
-            "episode_length": (((step + 1 - begin) * counted).sum() / episodes).item(),
+            "success_rate": mean(self.success),
+            "episode_length": mean(step + 1 - begin),
             "reward": self.reward.mean().item(),
         }
 

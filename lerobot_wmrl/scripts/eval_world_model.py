@@ -229,7 +229,7 @@ def load_text_model(
 
 
 def policies_imagination(cfg: EvalWorldModelConfig, table: "EpisodeTable") -> "WorldModelEnv":
-    """Return the world model as `policies` are evaluated in it, from starts of the environment's tasks.
+    """Return the world model as `policies` are evaluated in it, from starts of the environment's task.
 
     Raises:
         FieldError: nothing can be evaluated in it, or the dataset has too few starts.
@@ -239,6 +239,11 @@ def policies_imagination(cfg: EvalWorldModelConfig, table: "EpisodeTable") -> "W
     from lerobot_wmrl.envs.start_frames import chosen_episodes
 
     tasks = cfg.real_env.task_names if isinstance(cfg.real_env, WmrlManiSkillEnv) else None
+    if tasks is not None and len(tasks) > 1:
+        raise FieldError(
+            "real_env.task", ",".join(tasks), "the success of `policies` is compared in one task at a time",
+            "choose one",
+        )  # fmt: skip
     starts = StartFrames(**vars(cfg.dataset), split=cfg.split, tasks=tasks, max_starts=cfg.policy_episodes)
     longest = getattr(cfg.real_env, "horizon", None) or getattr(cfg.real_env, "episode_length", None)
     try:

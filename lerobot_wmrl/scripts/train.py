@@ -186,16 +186,16 @@ def check_distillation(algorithm: DistillationConfig, env: EnvConfig) -> None:
 def check_tasks(cfg: TrainConfig, env: Any) -> None:
     """Raise FieldError if a task has no environment, or for GRPO with several tasks."""
     tasks = getattr(env, "tasks", 1)
-    if tasks > env.num_envs:
-        raise FieldError(
-            "num_envs", env.num_envs, f"the environment has {tasks} tasks, and each needs one of its own",
-            f"set it to a multiple of {tasks}, or choose fewer tasks",
-        )  # fmt: skip
     if isinstance(cfg.algorithm, GRPOConfig) and tasks > 1:
         raise FieldError(
             "algorithm.type", cfg.algorithm.type,
             f"compares episodes from the same start, and the environment has {tasks} tasks",
             "choose one task, or ppo",
+        )  # fmt: skip
+    if tasks > env.num_envs:
+        raise FieldError(
+            "num_envs", env.num_envs, f"the environment has {tasks} tasks, and each needs one of its own",
+            f"set it to a multiple of {tasks}, or choose fewer tasks",
         )  # fmt: skip
 
 
@@ -308,7 +308,7 @@ def train_in(
 ) -> None:
     """Check that policy and environment fit, then train."""
     from lerobot_wmrl.common.policies import adopt_features, check_fit, check_units, with_new_adapters
-    from lerobot_wmrl.envs.lerobot_env import check_acts_in, shapes_of
+    from lerobot_wmrl.envs.lerobot_env import check_real_env, shapes_of
     from lerobot_wmrl.rl.budget import charge_steps
     from lerobot_wmrl.rl.make_callbacks import Trained, make_callbacks
     from lerobot_wmrl.rl.policy_adapters import make_pipeline
@@ -325,7 +325,7 @@ def train_in(
         names = env.model.config.embodiment.action_names
         check_units(config, processors[1], names, env.action_low, env.action_high)
     if cfg.real_env is not None:
-        check_acts_in(config, cfg.real_env)
+        check_real_env(config, cfg.real_env)
     if cfg.peft is not None:
         policy = with_new_adapters(policy, cfg.peft)
     algorithm = make_algorithm(policy, cfg.algorithm, cfg.output_dir)

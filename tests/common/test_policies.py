@@ -78,5 +78,5 @@ def test_a_policy_whose_actions_are_in_other_units_is_refused(
     if not refused:
         check_units(config, pipeline, names, low, high)
         return
-    with pytest.raises(ValueError, match="elbow is 45 on average, the environment's is between 0 and 1"):
+    with pytest.raises(ValueError, match="elbow is 45 on average, in the environment it is between 0 and 1"):
         check_units(config, pipeline, names, low, high)

@@ -141,6 +141,11 @@ def test_batched_without_cuda_is_refused() -> None:
         WmrlManiSkillEnv(batched=True).create_tensor_env(1, "cpu")
 
 
+def test_a_batch_has_one_task() -> None:
+    with pytest.raises(ValueError, match=r"^task=push,pull: a batched simulation has one task; choose one"):
+        WmrlManiSkillEnv(task="push,pull").create_batched_simulation(1, "cpu")
+
+
 @pytest.mark.parametrize("env", [True], indirect=True)
 def test_an_action_that_is_no_number_is_refused(env: BatchedManiSkillEnv) -> None:
     env.reset(seed=[EVALUATION_SEED])

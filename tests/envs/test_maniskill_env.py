@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
+from lerobot.envs import close_envs
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION, preprocess_observation
 
 from lerobot_wmrl.common.constants import EVALUATION_SEED
@@ -71,7 +72,7 @@ def test_a_reset_without_a_seed_draws_a_training_seed(env: ManiSkillEnv) -> None
 
 def test_lerobot_gets_what_a_policy_is_trained_on() -> None:
     config = WmrlManiSkillEnv(episode_length=HORIZON, image_size=64)
-    (envs,) = config.create_envs(1)["wmrl_maniskill"].values()
+    envs = config.create_envs(1)["push"][0]
     try:
         observation, _ = envs.reset(seed=[7], options={NEW_ROLLOUT_OPTION: True})
         batch = preprocess_observation(observation)
@@ -128,12 +129,15 @@ def test_the_tensor_environment_keeps_the_last_observation_of_an_episode(
 
 
 def test_lerobot_gets_an_environment_of_each_task() -> None:
-    envs = WmrlManiSkillEnv(task="pull, push").create_envs(1)["wmrl_maniskill"]
-    assert {index: env.call("task") for index, env in envs.items()} == {
-        TASKS["pull"].index: ("pull",), TASKS["push"].index: ("push",),
-    }  # fmt: skip
-    lengths = [env.call("_max_episode_steps")[0] for env in envs.values()]
-    assert lengths == [TASKS["pull"].horizon, TASKS["push"].horizon]
+    made = WmrlManiSkillEnv(task="pull, push").create_envs(1)
+    try:
+        assert {suite: envs[0].call("task") for suite, envs in made.items()} == {
+            "pull": ("pull",), "push": ("push",),
+        }  # fmt: skip
+        lengths = [envs[0].call("_max_episode_steps")[0] for envs in made.values()]
+        assert lengths == [TASKS["pull"].horizon, TASKS["push"].horizon]
+    finally:
+        close_envs(made)
 
 
 def test_tasks_are_shared_out_among_the_environments_of_the_trainer() -> None:

@@ -24,7 +24,7 @@ def test_a_seed_counts_once_and_groups_add_up() -> None:
     held_out = [scene for scene in SCENES if scene.split == "ood"]
     unseen = next(scene.index for scene in held_out if scene.object in UNSEEN_OBJECTS)
     combined = next(scene.index for scene in held_out if scene.object not in UNSEEN_OBJECTS)
-    results = SceneResults()
+    results = SceneResults("push")
     results.add(ended((1, unseen, True), (2, combined, False), (3, combined, True)), np.array([True] * 3))
     results.add(ended((3, combined, True), (4, unseen, True)), np.array([True, False]))
     lines = results.table().splitlines()

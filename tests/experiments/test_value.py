@@ -87,7 +87,7 @@ def test_aims_and_other_episodes_are_said(docs: Path, k: int, reached: str) -> N
     text = " ".join(f"{aims(groups(load))} {recorded_anew(load)}".split())
     assert f"It is so with {reached} alone" in text
     planner = f"{reached}, in 40 minutes" if k == 10 else reached
-    assert f"it has that with {planner}." in text
+    assert f"It reaches both rates with {planner}." in text
     assert "300 rollouts, seed 100000 (101 successes, the others 100)." in text
 
 

@@ -165,9 +165,10 @@ def test_without_one_the_report_says_that_it_is_a_belief(demonstrations: Path, t
     (["--policy.n_action_steps=8"], "--policy.n_action_steps=8: would hold for some of the commands only"),
     (["--dataset.root=nowhere"], "no LeRobotDataset there"),
     (["--real_env.type=wmrl_maniskill"],
-     "the policy needs observation.image, which the environment does not"),
+     "the policy needs observation.image, which real_env does not have"),
+    (["--real_env.type=wmrl_maniskill", "--real_env.task=push,lift"], "--real_env.task=lift: unknown"),
     (["--real_env.type=pusht", "--real_env.obs_type=environment_state_agent_pos"],
-     "the policy needs observation.image, which the environment does not"),
+     "the policy needs observation.image, which real_env does not have"),
 ])  # fmt: skip
 def test_bad_settings_are_named_and_nothing_is_made(
     flags: list[str], message: str, demonstrations: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
@@ -188,7 +189,7 @@ def test_other_units_than_those_of_the_data_are_named_before_anything_is_made(
     monkeypatch.setattr(sys, "argv", ["lerobot-wmrl-improve", *arguments(tmp_path, demonstrations)])
     with pytest.raises(SystemExit):
         run_command(improve, ImproveConfig, list)
-    assert "is 5000 on average, the environment's is between" in capsys.readouterr().err
+    assert "is 5000 on average, in the dataset it is between" in capsys.readouterr().err
     assert not (tmp_path / "improve").exists()
 
 

@@ -58,3 +58,11 @@ def test_an_unknown_size_and_a_missing_file_are_named(tmp_path: Path) -> None:
         packaged_recipe("huge")
     with pytest.raises(ValueError, match=r"nothing\.yaml: cannot be read"):
         recipe_flags(tmp_path / "nothing.yaml")
+
+
+def test_the_environments_tasks_are_recorded_in_turn(tmp_path: Path) -> None:
+    flags = ["--env.type=wmrl_maniskill", "--env.task=push,pull", "--num_episodes=4"]
+    config = draccus.parse(RecordConfig, args=[*flags, f"--output_dir={tmp_path / 'dataset'}"])
+    config.validate()
+    plans = [plan for part in planned_parts(config) for plan in part.episodes]
+    assert sorted(plan.task for plan in plans) == ["pull", "pull", "push", "push"]

@@ -10,10 +10,11 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.episodes import read_episodes
+from lerobot_wmrl.data.episodes import DatasetSource, read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.play.drive import Drive
 from lerobot_wmrl.play.visit import Visit
+from lerobot_wmrl.play.world import load_world
 
 IMAGE = "observation.images.third_view"
 
@@ -35,10 +36,12 @@ def test_a_drive_begins_in_the_frame_that_is_asked_for(drive, small_dataset):
     assert len(drive.recorded.actions) == table.length[1] - 4
 
 
-def test_a_real_environment_has_one_task(world, monkeypatch):
-    monkeypatch.setattr(world, "real_env", WmrlManiSkillEnv(task="push,pull"))
-    with pytest.raises(FieldError, match=r"^real_env\.task=push,pull: has 2 tasks.* choose one of them"):
-        world.make_real_env()
+def test_a_real_environment_has_one_task(world):
+    several = WmrlManiSkillEnv(task="push,pull")
+    with pytest.raises(
+        FieldError, match=r"^real_env\.task=push,pull: a drive needs a single task; choose one"
+    ):
+        load_world(world.config, DatasetSource(), None, several)
 
 
 def test_going_back_and_doing_the_same_again_gives_the_same_frames(drive):

@@ -88,7 +88,14 @@ def test_success_counts_later_episodes_that_had_the_time_to_end() -> None:
     buffer.terminated[5, 0] = buffer.success[5, 0] = True  # began in step 4: a failure would not have ended
     statistics = buffer.statistics()
     assert statistics["success_rate"] == 0.5
-    assert statistics["episode_length"] == pytest.approx((3 + 1 + 3 + 3) / 4)
+    assert statistics["episode_length"] == 2.5
+
+
+def test_environments_whose_episodes_are_short_do_not_weigh_more() -> None:
+    buffer = RolloutBuffer(6, 2, "cpu", longest=3)
+    buffer.terminated[:, 0] = buffer.success[:, 0] = True
+    buffer.truncated[[2, 5], 1] = True
+    assert buffer.statistics()["success_rate"] == 0.5
 
 
 def test_images_and_instructions_survive_as_bytes_and_indices() -> None:
