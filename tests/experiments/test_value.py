@@ -252,6 +252,7 @@ def test_four_tasks_are_collected_and_shown(tmp_path: Path, monkeypatch: pytest.
     write_json(tmp_path / "results" / "value_four_tasks_simulator" / f"{name}.json", part)
     text = value_four_tasks(loader(tmp_path))
     assert f"{known} | 90 % (70–100) | 80 % (50–100) | -10.0 points" in text
+    assert "Over the best BC, in all four tasks, PPO in ManiSkill gains +" in text
 
 
 def test_an_interval_over_runs_and_starts_covers_the_mean_of_both() -> None:
