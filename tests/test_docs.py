@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from experiments.tables import loader
@@ -107,6 +108,15 @@ def test_the_readme_says_what_was_measured() -> None:
     for policy, words in said.items():
         shares = (round(100 * rates[policy]["share"]) for rates in (known, unseen))
         assert f"{'/'.join(map(str, shares))}{words}" in text
+    for study, method, words in (
+        ("value_four_tasks", "longer", "BC"),
+        ("value_four_tasks", "imagined_ppo", "PPO in imagination"),
+        ("value_four_tasks_simulator", "simulated_ppo", "PPO in ManiSkill"),
+    ):
+        (found,) = (results / study).glob("*.json")
+        tasks = json.loads(found.read_text())["tasks"].values()
+        shares = ([task[domain][method]["share"] for task in tasks] for domain in ("ind", "ood"))
+        assert f"{'/'.join(f'{100 * np.mean(each):.0f}' for each in shares)} after {words}" in text
     best = json.loads((results / "cloning_control.json").read_text())["cloned_from"]["180"]
     known, unseen = (round(100 * best[domain]["share"]) for domain in ("ind", "ood"))
     assert f"{known} % in known and {unseen} % in unseen scenes" in text
