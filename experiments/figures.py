@@ -11,6 +11,21 @@ from matplotlib.figure import Figure
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.improve.report.figures import COLOURS, tidy
 
+PALETTE: Final = (
+    *COLOURS,
+    "#b83280",
+    "#333333",
+    "#d69e2e",
+    "#319795",
+    "#718096",
+    "#9c4221",
+    "#63b3ed",
+    "#553c9a",
+    "#b7791f",
+    "#22543d",
+)
+"""Colours of methods, in their order."""
+
 PLACES: Final = {"imagined": "PPO in imagination", "simulated": "PPO in ManiSkill"}
 IMPROVEMENT: Final = {"cloned": "SFT", "trained": "PPO in imagination"}
 DOMAINS: Final = {"ind": "known scenes", "ood": "unseen scenes", "drawn": "known scenes, tokens drawn"}
@@ -65,13 +80,13 @@ def draw_improvement(found: Mapping[str, Any], path: Path, kinds: Mapping[str, s
                 rate = Proportion.from_json(row[kind])
                 axes.bar(
                     place + width / len(kinds) * number, rate.share, 0.88 * width / len(kinds),
-                    yerr=rate.whiskers, capsize=3, color=COLOURS[number],
+                    yerr=rate.whiskers, capsize=3, color=PALETTE[number],
                     label=title if place == 0 and domain == list(found)[-1] else None,
                 )  # fmt: skip
         middle = width / 2 * (1 - 1 / len(kinds))
         axes.set_xticks([place + middle for place in range(len(groups))], list(groups))
         axes.set_title(DOMAINS[domain])
-        axes.set_ylim(0, 1.2)
+        axes.set_ylim(0, 1 + 0.07 * len(kinds))  # room for the legend
     panels[0].set_ylabel("success in ManiSkill")
     tidy(figure).savefig(path, dpi=130)
 

@@ -170,7 +170,9 @@ def main() -> None:
         if not target.exists() or target.read_text() != page:
             sys.exit("docs/results.md is not what the JSON says: run python -m experiments.tables")
         return
-    value.draw_value(loader(DOCS), DOCS / "images" / "value_push.png")
+    load, images = loader(DOCS), DOCS / "images"
+    value.draw_value(load, images / "value_push.png")
+    value.draw_four_tasks(load, images / "value_four_tasks.png")
     write_text(target, page)
     print(f"wrote {target.relative_to(ROOT)}")
 

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from experiments import figures
 from experiments.choose_policy import chosen_policy
 from experiments.run import read_record
 from experiments.study import Study
@@ -17,15 +16,6 @@ from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
 CELL: Final = ("task", "kind", "demonstrations", "rollouts", "seed", "starts")
 """Variables of the study that say which cell it is."""
-
-SHORT: Final = {
-    "cloning": "BC",
-    "longer": "longer BC",
-    "filtered": "filtered BC",
-    "simulated_ppo": "PPO in ManiSkill",
-    "imagined_ppo": "PPO in imagination",
-}
-"""Methods of value_four_tasks, as its picture and its table name them."""
 
 
 def cell(study: Study) -> Results:
@@ -60,12 +50,6 @@ def four_tasks(study: Study) -> Results:
     }
     if (gate := study.folder / "check" / "metrics.json").exists():
         results["gate"] = json.loads(gate.read_text())["gate_by_task"]
-    by_domain = {
-        domain: {"policies": {task: rates[domain] for task, rates in found.items()}}
-        for domain in ("ind", "ood")
-    }
-    shown = {name: title for name, title in SHORT.items() if name in methods}
-    figures.draw_improvement(by_domain, study.folder / f"{study.variables['cell']}.png", shown)
     return {study.variables["cell"]: results}
 
 

@@ -10,11 +10,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from experiments import figures
 from experiments.cells import DOMAINS, Load, counted, paired, points, table
-from experiments.study import ROOT, cell_name, read_cells
-from experiments.value import SHORT
+from experiments.study import ROOT, read_cells
 from lerobot_wmrl.common.statistics import PairedChange, RunsMean
-from lerobot_wmrl.improve.report.figures import COLOURS, tidy
+from lerobot_wmrl.improve.report.figures import tidy
 
 TITLES: Final = {
     "cloning": "BC of the demonstrations",
@@ -56,19 +56,6 @@ CONTROLS: Final = {
 """What a control's world model learnt from."""
 
 BUDGET: Final = ("demonstrations", "rollouts", "seed")
-MORE_COLOURS: Final = (
-    "#b83280",
-    "#333333",
-    "#d69e2e",
-    "#319795",
-    "#718096",
-    "#9c4221",
-    "#63b3ed",
-    "#553c9a",
-    "#b7791f",
-    "#22543d",
-)
-
 SCENES: Final = ("ind", "ood")
 """Where success is measured: in known and in unseen scenes."""
 
@@ -101,6 +88,15 @@ SECOND_PARTS: Final = (
 FOUR_STUDY: Final = "value_four_tasks"
 FOUR_PART: Final = "value_four_tasks_simulator"
 """Stems of the study of one policy for four tasks, and of the one that adds a method to its table."""
+
+SHORT: Final = {
+    "cloning": "BC",
+    "longer": "longer BC",
+    "filtered": "filtered BC",
+    "simulated_ppo": "PPO in ManiSkill",
+    "imagined_ppo": "PPO in imagination",
+}
+"""Methods of the four tasks, as picture and table name them, in their order."""
 
 FOUR_LIMITS: Final = """\
 The world model is not told the task: it knows it if the first frame shows it. The done threshold was
@@ -278,13 +274,8 @@ chosen too."""
 
 def value_four_tasks(load: Load) -> str:
     """Return the section: each task's success after every method, the gate, and where PPO began."""
-    cells = []
-    for study in read_cells(ROOT / "experiments" / f"{FOUR_STUDY}.yaml"):
-        found, part = (published(load, stem, study.variables["cell"]) for stem in (FOUR_STUDY, FOUR_PART))
-        if found:
-            cells.append(joined(found, part))
-    first = cells[0]
-    methods = [method for method in SHORT if all(method in cell["minutes"] for cell in cells)]
+    cells = four_cells(load)
+    first, methods = cells[0], four_methods(cells)
     titles = [SHORT[method] for method in methods]
     tasks = list(first["tasks"])
     baselines = [method for method in methods if method not in IMAGINED]
@@ -306,17 +297,13 @@ def value_four_tasks(load: Load) -> str:
     def believed(method: str) -> str:
         return ", ".join(f"{100 * cell['imagined'][method]:.0f}" for cell in cells)
 
-    pictures = "\n\n".join(
-        f"![Success in four tasks, seed {cell['seed']}](results/{FOUR_STUDY}/{name(cell)}.png)"
-        for cell in cells
-    )
     return f"""{first["demonstrations"]} demonstrations and {first["rollouts"]} rollouts, a quarter of them of
 each task, in all 64 known scenes; {first["starts"]} starts of each task, the same for all methods. The policy
 is told the task in words.
 
 {table(["task", "scenes", *titles, f"{titles[-1]} against the best other"], rows)}
 
-{pictures}
+![Success in four tasks, seed {first["seed"]}](images/value_four_tasks.png)
 
 {over_cloning([of_tasks(cell, tasks) for cell in cells], methods)}
 
@@ -329,6 +316,32 @@ The world model on held-out rollouts, at the done threshold of PPO:
 {table(["seed", "task", "false positives", "recall"], gates)}
 
 {FOUR_LIMITS}"""
+
+
+def four_cells(load: Load) -> list[Cell]:
+    """Return the published cells of the four tasks, each with the methods of the same cell of its part."""
+    cells = []
+    for study in read_cells(ROOT / "experiments" / f"{FOUR_STUDY}.yaml"):
+        found, part = (published(load, stem, study.variables["cell"]) for stem in (FOUR_STUDY, FOUR_PART))
+        if found:
+            cells.append(joined(found, part))
+    return cells
+
+
+def four_methods(cells: Sequence[Cell]) -> list[str]:
+    """Return the methods that have been run in all cells of the four tasks."""
+    return [method for method in SHORT if all(method in cell["minutes"] for cell in cells)]
+
+
+def draw_four_tasks(load: Load, path: Path) -> None:
+    """Draw the success of every method in each task, of the first published seed. Nothing without one."""
+    cells = four_cells(load)[:1]
+    for cell in cells:
+        by_domain = {
+            domain: {"policies": {task: rates[domain] for task, rates in cell["tasks"].items()}}
+            for domain in SCENES
+        }
+        figures.draw_improvement(by_domain, path, {name: SHORT[name] for name in four_methods(cells)})
 
 
 def over_cloning(cells: Sequence[Cell], methods: Sequence[str]) -> str:
@@ -375,11 +388,6 @@ def of_tasks(cell: Cell, tasks: Sequence[str]) -> Cell:
         for method in cell["minutes"]
     }
     return {"methods": methods}
-
-
-def name(cell: Cell) -> str:
-    """Return the stem of a cell's files."""
-    return cell_name({key: cell[key] for key in BUDGET})
 
 
 def comparison(found: Groups) -> str:
@@ -546,7 +554,7 @@ def draw_value(load: Load, path: Path) -> None:
     figure = Figure(figsize=(9, 4.8), layout="constrained")
     panels = figure.subplots(1, 2, sharey=True)
     methods = measured([cell for cells in found.values() for cell in cells], TITLES)
-    colours = dict(zip(TITLES, (*COLOURS, *MORE_COLOURS), strict=True))
+    colours = dict(zip(TITLES, figures.PALETTE, strict=True))
     for axes, domain in zip(panels, ("ind", "ood"), strict=True):
         lines = [_draw_line(axes, found, method, domain, colours[method]) for method in methods]
         axes.set_title(f"{DOMAINS[domain]} scenes")

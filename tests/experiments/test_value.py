@@ -18,6 +18,7 @@ from experiments.value_sections import (
     UNCHANGED,
     aims,
     best,
+    draw_four_tasks,
     draw_value,
     gain,
     groups,
@@ -161,8 +162,9 @@ def test_the_figure_has_a_line_for_every_method(docs: Path) -> None:
 
 
 def test_nothing_is_drawn_without_a_cell(tmp_path: Path) -> None:
-    draw_value(loader(tmp_path), tmp_path / "value.png")
-    assert not (tmp_path / "value.png").exists()
+    for draw in (draw_value, draw_four_tasks):
+        draw(loader(tmp_path), tmp_path / "value.png")
+        assert not (tmp_path / "value.png").exists()
 
 
 def finish_cell(study: Study, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -230,7 +232,6 @@ def test_four_tasks_are_collected_and_shown(tmp_path: Path, monkeypatch: pytest.
     write_json(study.folder / "check" / "metrics.json", {"gate_by_task": gates})
     write_records(study)
     ((name, content),) = value.four_tasks(study).items()
-    assert (study.folder / f"{name}.png").exists()
     assert content["minutes"] == {"cloning": 1, "longer": 2, "filtered": 2, "imagined_ppo": 7}
     write_json(tmp_path / "results" / "value_four_tasks" / f"{name}.json", content)
     text = value_four_tasks(loader(tmp_path))
@@ -252,6 +253,8 @@ def test_four_tasks_are_collected_and_shown(tmp_path: Path, monkeypatch: pytest.
     write_json(tmp_path / "results" / "value_four_tasks_simulator" / f"{name}.json", part)
     text = value_four_tasks(loader(tmp_path))
     assert f"{known} | 90 % (70–100) | 80 % (50–100) | -10.0 points" in text
+    draw_four_tasks(loader(tmp_path), tmp_path / "four.png")
+    assert (tmp_path / "four.png").stat().st_size > 10_000
     assert "Over the best BC, in all four tasks, PPO in ManiSkill gains +" in text
 
 

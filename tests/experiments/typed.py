@@ -80,14 +80,14 @@ def check(command: str) -> None:
 
 
 def without_paths(flags: list[str]) -> list[str]:
-    """Replace a policy's checkpoint by its type, and leave out a file of meshes: neither need be there."""
+    """Replace what need not be there: a policy's checkpoint by its type, the configuration of a resumed
+    training by what it must have. Leave out a file of meshes."""
     own = {"--policy.sampling": "openvla", "--policy.camera": "openvla", "--policy.n_action_steps": "act"}
     kinds = [own[name] for flag in flags if (name := flag.partition("=")[0]) in own]
     kind = f"--policy.type={kinds[0] if kinds else 'cnn'}"
+    replaced = {"--policy.path": kind, "--config_path": "--dataset.repo_id=local/any"}
     return [
-        kind if flag.startswith("--policy.path") else flag
-        for flag in flags
-        if not flag.startswith("--env.assets")
+        replaced.get(flag.partition("=")[0], flag) for flag in flags if not flag.startswith("--env.assets")
     ]
 
 
