@@ -335,13 +335,12 @@ def four_methods(cells: Sequence[Cell]) -> list[str]:
 
 def draw_four_tasks(load: Load, path: Path) -> None:
     """Draw the success of every method in each task, of the first published seed. Nothing without one."""
-    cells = four_cells(load)[:1]
-    for cell in cells:
-        by_domain = {
-            domain: {"policies": {task: rates[domain] for task, rates in cell["tasks"].items()}}
-            for domain in SCENES
-        }
-        figures.draw_improvement(by_domain, path, {name: SHORT[name] for name in four_methods(cells)})
+    first = four_cells(load)[:1]
+    if not first:
+        return
+    tasks = first[0]["tasks"].items()
+    by_domain = {domain: {"policies": {task: rates[domain] for task, rates in tasks}} for domain in SCENES}
+    figures.draw_improvement(by_domain, path, {name: SHORT[name] for name in four_methods(first)})
 
 
 def over_cloning(cells: Sequence[Cell], methods: Sequence[str]) -> str:
@@ -555,7 +554,7 @@ def draw_value(load: Load, path: Path) -> None:
     panels = figure.subplots(1, 2, sharey=True)
     methods = measured([cell for cells in found.values() for cell in cells], TITLES)
     colours = dict(zip(TITLES, figures.PALETTE, strict=True))
-    for axes, domain in zip(panels, ("ind", "ood"), strict=True):
+    for axes, domain in zip(panels, SCENES, strict=True):
         lines = [_draw_line(axes, found, method, domain, colours[method]) for method in methods]
         axes.set_title(f"{DOMAINS[domain]} scenes")
         axes.set_xlabel("real episodes: demonstrations + rollouts")
