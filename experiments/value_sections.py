@@ -172,8 +172,8 @@ def value_push(load: Load) -> str:
 PPO in imagination begins from the policy cloned from demonstrations and successful rollouts, or from that
 cloned from the demonstrations alone where this one succeeds more often in the world model (256 starts or all,
 McNemar's test): {begun(cells)}. PPO in ManiSkill begins from the latter; its policy learns from the second
-iteration on, with 50 demonstrations from the fourth of ten. With 25 both were run, and are equal (three
-seeds, 88 and 74 %); with 8 it had 70 and 60 % when it learnt from the fourth on.
+iteration on. When it learnt from the fourth of ten on, it had 70 and 60 % with 8 demonstrations and 300
+rollouts, 88 and 74 % with 25, and 96 and 79 % with 50 (three seeds each).
 
 Planning changes what PPO's policy would do, and plans anew after eight actions. An episode of it takes
 {planned:.1f} s on one core, simulator included, one of the policy {policy:.1f} s.
