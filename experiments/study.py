@@ -10,9 +10,10 @@ A file has these keys:
     budget     real episodes that all its methods may learn from: demonstrations, rollouts, play. `$budget` is
                the ledger, $output_dir/budget.json, which commands are given as --budget=$budget
     variables  names for commands; a later one may use an earlier one
-    cells      variables with a list of values each: the study is run once for every combination, in a folder
-               `$cell` of its own, and publishes each one's results as soon as it is finished. In place of a
-               list, a mapping from each value to more variables, which hold in its cells
+    cells      variables with a list of values each, which hold in place of those in `variables`: the study is
+               run once for every combination, in a folder `$cell` of its own, and publishes each one's results
+               as soon as it is finished. In place of a list, a mapping from each value to more variables,
+               which hold in its cells
     steps      name, command; `for`: repeat the step for every combination; `fresh: true`: delete first what
                an interrupted run of it has left, since the command refuses that
     collect    a function of this package, `module.function(study)`, that returns results by their stem
@@ -146,7 +147,9 @@ def _read_cell(
         folders[BUDGET] = "$output_dir/budget.json"
     own = {"cell": name, **cell} if cell else {}
     cells = {"output_dir": name, **{need: _cell_needed(path, need, cell) for need in needs}}
-    variables = resolve({**own, **folders, **content.get("variables", {}), **more}, given, cells)
+    # `own` comes first, for variables that use it, and again after those that it replaces
+    declared = {**own, **folders, **content.get("variables", {}), **own, **more}
+    variables = resolve(declared, given, cells)
     steps = tuple(step for entry in content["steps"] for step in repeated(entry, variables))
     names = [step.name for step in steps]
     if twice := {name for name in names if names.count(name) > 1}:

@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.datasets.utils import BackwardCompatibilityError
 from lerobot.utils.constants import ACTION, DONE, OBS_IMAGE, OBS_IMAGES, OBS_STATE
 from numpy.typing import ArrayLike
 
@@ -16,6 +17,11 @@ from lerobot_wmrl.common.errors import FieldError, first_line, renamed
 
 VIDEO_BACKEND: Final = "pyav"
 """pyav ships its own FFmpeg, torchcodec needs the system's. Speed matters little: frames are decoded once."""
+
+OLDER_FORMAT: Final = (BackwardCompatibilityError, NotImplementedError)
+"""What LeRobot raises for version 2.1, and for those before."""
+
+NOT_V3: Final = "is in a format before LeRobotDataset v3.0"
 
 VALIDATION_EVERY: Final = 20
 """Every twentieth episode is held out from the training of tokenizers and world models."""
@@ -199,6 +205,13 @@ def open_dataset(root: str | Path, repo_id: str | None = None) -> LeRobotDataset
         missing = missing_files(LeRobotDatasetMetadata(name, root=root))
         if not missing:
             return LeRobotDataset(name, root=root, video_backend=VIDEO_BACKEND)
+    except OLDER_FORMAT as error:
+        raise FieldError(
+            "dataset.root",
+            root,
+            NOT_V3,
+            f"convert it: `{conversion(name, root)}` keeps the old files beside it",
+        ) from error
     except Exception as error:  # parquet, JSON, datasets and the hub each raise their own
         reason = first_line(error.__cause__ or error)
         raise FieldError(
@@ -217,6 +230,12 @@ def download_dataset(repo_id: str, revision: str | None = None) -> LeRobotDatase
     """Download a dataset of the hub into LeRobot's cache and open it. FieldError if that fails."""
     try:
         return LeRobotDataset(repo_id, revision=revision, video_backend=VIDEO_BACKEND)
+    except OLDER_FORMAT as error:
+        copy = Path("data") / repo_id.rpartition("/")[2]
+        raise FieldError(
+            "dataset.repo_id", repo_id, NOT_V3,
+            f"convert a copy of it: `{conversion(repo_id, copy)}`, and give that, `dataset.root` {copy}",
+        ) from error  # fmt: skip
     except Exception as error:  # the hub's client, parquet and JSON each raise their own
         reason = first_line(error)
         raise FieldError(
@@ -224,6 +243,12 @@ def download_dataset(repo_id: str, revision: str | None = None) -> LeRobotDatase
             "correct the name, log in with `hf auth login` if it is private, or give a folder on disk, "
             "`dataset.root`",
         ) from error  # fmt: skip
+
+
+def conversion(repo_id: str, root: str | Path) -> str:
+    """Return LeRobot's command that converts a dataset in a folder, where it is or after downloading it."""
+    script = "lerobot.scripts.convert_dataset_v21_to_v30"
+    return f"python -m {script} --repo-id={repo_id} --root={root} --push-to-hub=false"
 
 
 def missing_files(meta: LeRobotDatasetMetadata) -> list[Path]:

@@ -181,6 +181,12 @@ class WorldModelEnv(EnvConfig):
         return self.episode_length
 
     @property
+    def judged_frames(self) -> int | None:
+        """Frames of a recorded episode by which its outcome is compared with the predicted one: those of an
+        imagined episode, or None, all, where imagination also begins in the middle of episodes."""
+        return None if self.dataset.branches else self.horizon
+
+    @property
     def gym_kwargs(self) -> dict[str, Any]:
         return {}
 

@@ -408,10 +408,11 @@ class Improvement:
 
     def _check(self) -> list[str]:
         data, split = self.checked()
+        # imagination that also begins in the middle of episodes reaches their ends
+        length: Flags = {} if self.branches else {"episode_length": self.length}
         flags: Flags = {
             "model.path": str(self.out / "world_model"), **data, "split": split,
-            "episode_length": self.length, **self._done(), "max_episodes": 200,
-            "output_dir": str(self.out / "check"),
+            **length, **self._done(), "max_episodes": 200, "output_dir": str(self.out / "check"),
         }  # fmt: skip
         return ["lerobot-wmrl-eval-world-model", *format_flags(flags)]
 

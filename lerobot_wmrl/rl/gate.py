@@ -73,7 +73,7 @@ class SuccessGate:
             recordings[FRESH] = self._fresh(self.recorder, iteration, checkpoint, folder / "rollouts")
         verdicts = {}
         for source, recording in recordings.items():
-            outcomes = predict_outcomes(self.env.model, recording).within(self.env.config.horizon)
+            outcomes = predict_outcomes(self.env.model, recording).within(self.env.config.judged_frames)
             verdicts[source] = gate_at(outcomes, self.env.config.done_threshold, self.env.config.done_frames)
             save_strips(self.env, recording, outcomes, folder, source)
         shutil.rmtree(folder / "rollouts.cache", ignore_errors=True)

@@ -1,5 +1,7 @@
 """A dataset that is named by its name on the hub alone."""
 
+import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -7,7 +9,7 @@ from lerobot.datasets import dataset_metadata, lerobot_dataset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wmrl.data import frame_cache
-from lerobot_wmrl.data.episodes import DatasetSource, TrainingData, read_episodes
+from lerobot_wmrl.data.episodes import DatasetSource, TrainingData, open_dataset, read_episodes
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig, train_world_model
 from tests.hub_server import Hub
 from tests.trained import tokenizer_config
@@ -59,3 +61,25 @@ def test_a_name_that_is_not_there_is_refused(published: LeRobotDataset) -> None:
         DatasetSource(repo_id="somebody/other").open()
     with pytest.raises(ValueError, match=r"cannot be downloaded"):
         DatasetSource(repo_id=NAME, revision="v9").open()
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v2.0"])
+def test_an_older_format_is_refused_with_the_command_that_converts_it(
+    version: str, published: LeRobotDataset, hub: Hub, tmp_path: Path
+) -> None:
+    """It is sound data: nobody is told to remove it."""
+    old = tmp_path / "old"
+    shutil.copytree(published.root, old)
+    info = json.loads((old / "meta" / "info.json").read_text())
+    (old / "meta" / "info.json").write_text(json.dumps({**info, "codebase_version": version}))
+    with pytest.raises(
+        ValueError, match=r"before LeRobotDataset v3.0; convert it: `python -m .*v21_to_v30 "
+    ) as e:
+        open_dataset(old)
+    assert f"--repo-id=old --root={old} --push-to-hub=false" in str(e.value)
+    repo = hub.dataset(NAME)
+    repo.refs = {"main": repo.refs["main"], version: repo.refs["main"]}
+    with pytest.raises(
+        ValueError, match=rf"dataset\.repo_id={NAME}: is in a format before .*--root=data/episodes"
+    ):
+        DatasetSource(repo_id=NAME).open()

@@ -125,6 +125,13 @@ def test_a_value_that_makes_a_cell_may_bring_more_variables(study_file: Path) ->
         read_cells(study_file, ["letter=c"])
 
 
+def test_a_value_that_makes_a_cell_replaces_an_inherited_variable(study_file: Path) -> None:
+    child = study_file.with_name("child.yaml")
+    child.write_text("extends: count.yaml\ncells: {word: [two, three]}\n")
+    cells = read_cells(child, ["output_dir=out"])
+    assert [study.variables["greeting"] for study in cells] == ["hello two", "hello three"]
+
+
 def test_only_what_the_step_itself_writes_is_deleted(tmp_path: Path) -> None:
     precious = tmp_path / "precious"
     precious.mkdir()
