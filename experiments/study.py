@@ -10,10 +10,10 @@ A file has these keys:
     budget     real episodes that all its methods may learn from: demonstrations, rollouts, play. `$budget` is
                the ledger, $output_dir/budget.json, which commands are given as --budget=$budget
     variables  names for commands; a later one may use an earlier one
-    cells      variables with a list of values each, which hold in place of those in `variables`: the study is
-               run once for every combination, in a folder `$cell` of its own, and publishes each one's results
-               as soon as it is finished. In place of a list, a mapping from each value to more variables,
-               which hold in its cells
+    cells      variables with a list of values each, which hold in place of those in `variables`: the study
+               is run once for every combination, in a folder `$cell` of its own, and publishes each one's
+               results as soon as it is finished. In place of a list, a mapping from each value to more
+               variables, which hold in its cells
     steps      name, command; `for`: repeat the step for every combination; `fresh: true`: delete first what
                an interrupted run of it has left, since the command refuses that
     collect    a function of this package, `module.function(study)`, that returns results by their stem

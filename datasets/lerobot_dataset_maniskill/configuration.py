@@ -11,6 +11,7 @@ from huggingface_hub.errors import HFValidationError
 from huggingface_hub.utils import validate_repo_id
 from lerobot.configs import parser
 from lerobot.configs.policies import PreTrainedConfig
+from lerobot.configs.rewards import RewardModelConfig
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_dataset_maniskill.planners import MOTIONS
@@ -111,9 +112,9 @@ class RecordConfig(RunConfig):
     --policy.type=wm_mpc --policy.world_model_path=…"""
 
     exploration: float = 0.0
-    """Noise on the translations of a policy's actions: the largest standard deviation, as a share of the
-    largest action. Each episode draws its own level from 0 to this one. The noise is correlated over about
-    ten steps."""
+    """Noise on a policy's actions: the largest standard deviation, as a share of half the range of each
+    component; in ManiSkill and in imagination on translations alone. Each episode draws its own level from 0
+    to this one. The noise is correlated over about ten steps."""
 
     budget: Path | None = None
     """Ledger of the real episodes that a method may learn from, a JSON file with limits (docs/protocol.md).
@@ -274,7 +275,7 @@ class RecordConfig(RunConfig):
         return {
             **self._env_content(),
             "depth": self.depth,
-            **({} if self.video else {"video": False}),
+            "video": self.video,
             "episode_length": getattr(self.env, "episode_length", None),
             "num_episodes": self.num_episodes,
             "part_episodes": self.part_episodes,
@@ -290,9 +291,9 @@ class RecordConfig(RunConfig):
         if isinstance(self.env, WorldModelEnv):
             return imagined_content(self.env)
         if self.elsewhere:
-            given = {"env": draccus.encode(self.env, EnvConfig), "like": asdict(self.like)}
-            columns = {} if self.like_columns else {"like_columns": False}
-            return given | columns | {"max_frames": self.max_frames}
+            env, like = draccus.encode(self.env, EnvConfig), asdict(self.like)
+            columns, limit = self.like_columns, self.max_frames
+            return {"env": env, "like": like, "like_columns": columns, "max_frames": limit}
         return self._simulated_content()
 
     def _policy_content(self) -> dict[str, Any]:
@@ -329,5 +330,7 @@ def imagined_content(env: WorldModelEnv) -> dict[str, Any]:
         "image_size": model.tokenizer.image_size,
         "done_threshold": env.done_threshold,
         "done_frames": env.done_frames,
-        "reward": env.reward.type,
+        "reward": draccus.encode(env.reward, RewardModelConfig),
+        "text_world_model": env.text_world_model_path,
+        "uncertainty": asdict(env.uncertainty),
     }

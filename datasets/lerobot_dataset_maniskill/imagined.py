@@ -62,7 +62,8 @@ class ImaginedPartRecorder:
     def _imagine(self, plans: Sequence[EpisodePlan]) -> list[tuple[str, list[Row]]]:
         """Return each episode's instruction and rows, to the k-frame done or to the horizon."""
         count = self.env.num_envs
-        noises = [ExplorationNoise(self.config.exploration, plan.seed, TRANSLATION) for plan in plans]
+        largest = self.config.exploration
+        noises = [ExplorationNoise(largest, plan.seed, TRANSLATION, plan.visit) for plan in plans]
         torch.manual_seed(plans[0].seed)
         for part in (self.policy, *self.processors):
             part.reset()

@@ -1,6 +1,7 @@
 """The list of episodes of a recording: a pure function of its configuration, so a recording can be
 resumed."""
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +25,7 @@ class EpisodePlan:
         scene: what is on the table.
         seed: of the episode.
         start: for an imagined episode, the index of the environment's start frame.
+        visit: for an imagined episode, how many earlier ones have the same start.
     """
 
     task: str
@@ -31,6 +33,7 @@ class EpisodePlan:
     scene: Scene
     seed: int
     start: int = 0
+    visit: int = 0
 
 
 @dataclass(frozen=True)
@@ -93,9 +96,14 @@ def imagined_episodes(config: RecordConfig) -> list[EpisodePlan]:
     starts, real = chosen_episodes(table, source), recorded_episodes(Path(table.dataset.root))
     plans = []
     for number in range(config.num_episodes):
-        start = (config.seed + number) % len(starts)
+        visit, start = number // len(starts), (config.seed + number) % len(starts)
         task, scene, seed = (int(real[name][starts[start]]) for name in ("task", "scene", "seed"))
-        plans.append(EpisodePlan(TASKS[task], POLICY, SCENES[scene], seed, start))
+        plans.append(EpisodePlan(TASKS[task], POLICY, SCENES[scene], seed, start, visit))
+    if plans and plans[-1].visit and not config.exploration:
+        logging.warning(
+            "%d episodes begin from %d starts: without --exploration a policy whose actions are not random "
+            "repeats itself in them", config.num_episodes, len(starts),
+        )  # fmt: skip
     return plans
 
 

@@ -77,7 +77,9 @@ def already_recorded(output_dir: Path, content: Mapping[str, Any], episodes: int
 
 def require_same(stored: Mapping[str, Any], content: Mapping[str, Any], folder: Path) -> None:
     """Raise FieldError unless both settings describe the same episodes."""
-    differing = different_settings({key: stored[key] for key in content if key in stored}, content, ())
+    # earlier versions left out what was as by default
+    before = {"video": True, "like_columns": True, **stored}
+    differing = different_settings({key: before[key] for key in content if key in before}, content, ())
     if differing:
         raise FieldError(
             "output_dir",

@@ -16,6 +16,9 @@ START_COLUMNS: Final = ("start.task", "start.scene", "start.seed", "start.kind")
 
 START_TASK, START_SCENE, START_SEED, START_KIND = START_COLUMNS
 
+DYNA: Final = "dyna"
+"""Folder of a training's output in which the world models of its Dyna rounds are."""
+
 EVALUATION_SEED: Final = 1_000_000
 """Recording and training seeds are below this number, evaluation seeds from it to the next."""
 

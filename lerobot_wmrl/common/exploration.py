@@ -21,10 +21,11 @@ class ExplorationNoise:
         largest: of the levels, as a share of `scale`.
         seed: of the episode.
         scale: half the range of each component, in the units of actions. (A,)
+        visit: how many earlier episodes have the same seed, whose noise was another.
     """
 
-    def __init__(self, largest: float, seed: int, scale: np.ndarray) -> None:
-        self.rng = np.random.default_rng((seed, EXPLORATION_STREAM))
+    def __init__(self, largest: float, seed: int, scale: np.ndarray, visit: int = 0) -> None:
+        self.rng = np.random.default_rng((seed, EXPLORATION_STREAM, visit))
         self.level = self.rng.uniform(0.0, largest) * scale
         self.state = self.rng.normal(size=len(scale))
 

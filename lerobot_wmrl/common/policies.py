@@ -195,7 +195,8 @@ def check_units(
         if known is None:
             continue
         mean, least, most = (torch.as_tensor(each).flatten().double().cpu() for each in (known, low, high))
-        strange = (mean < 2 * least - most) | (mean > 2 * most - least)
+        width = (most - least).clamp_min(1e-3 * most.abs())  # a constant component's mean was rounded
+        strange = (mean < least - width) | (mean > most + width)
         for component in strange.nonzero().flatten().tolist()[:1]:
             raise FieldError(
                 "policy.path", config.pretrained_path,

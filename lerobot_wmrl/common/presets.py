@@ -23,9 +23,6 @@ FOLDER: Final = Path(str(files("lerobot_wmrl") / "presets"))
 TYPE: Final = ".type"
 """Ends the flags that choose one of several classes, which share a prefix but not their settings."""
 
-PREFIX: Final = "lerobot-wmrl-"
-"""Begins the names of this project's console commands; files of presets go without it."""
-
 
 def expand_preset(argv: Sequence[str], command: str) -> list[str]:
     """Replace `--preset=NAME` in `argv` by that preset's flags for `command`.

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -15,9 +16,13 @@ METRICS_FILE = "metrics.jsonl"
 
 
 def append_metrics(output_dir: Path, step: int, metrics: Mapping[str, float]) -> None:
-    """Add one line `{"step": step, name: value, …}` to the run's metrics file."""
-    with (output_dir / METRICS_FILE).open("a") as file:
-        file.write(json.dumps({"step": step, **metrics}) + "\n")
+    """Add one line `{"step": step, name: value, …}` to the run's metrics file. It begins after a torn one."""
+    with (output_dir / METRICS_FILE).open("ab+") as file:
+        if size := file.seek(0, os.SEEK_END):
+            file.seek(size - 1)
+            if file.read() != b"\n":
+                file.write(b"\n")
+        file.write(json.dumps({"step": step, **metrics}).encode() + b"\n")
 
 
 def read_metrics(output_dir: Path) -> list[dict[str, Any]]:

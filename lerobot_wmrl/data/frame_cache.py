@@ -273,7 +273,8 @@ def decode_depth(dataset: LeRobotDataset, episode: int, key: str) -> Tensor:
         return torch.where(codes.int() > 0, torch.as_tensor(metres), 0.0)
     rows = dataset.meta.episodes[episode]
     indices = range(rows["dataset_from_index"], rows["dataset_to_index"])
-    maps = np.stack([np.asarray(image) for image in dataset.hf_dataset.with_format(None)[indices][key]])
+    stored = dataset.hf_dataset.with_format(None, columns=[key])[indices][key]
+    maps = np.stack([np.asarray(image) for image in stored])
     unit = info.get("depth_unit") or infer_depth_unit(maps.dtype)
     scale = 1.0 if unit == DEPTH_METER_UNIT else 1 / MM_PER_METRE
     return torch.from_numpy(maps.astype(np.float32) * np.float32(scale))[:, None]

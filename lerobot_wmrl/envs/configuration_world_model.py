@@ -29,7 +29,7 @@ class StartFrames(ChosenEpisodes):
         tasks: only episodes of these tasks, by name.
         scenes: only episodes of these scenes, by index.
         max_starts: number of starts at most, spread evenly over the episodes or saved frames; each needs a
-            goal frame.
+            goal frame. Of `resets` all are taken.
         branches: later frames of each episode of the dataset from which imagined episodes begin too, spread
             over those before its success (branched rollouts, Janner et al. 2019).
         frames: a file written by numpy.savez, in place of a dataset: `observation.images.<camera>`
@@ -61,6 +61,17 @@ class StartFrames(ChosenEpisodes):
                 "imagined episodes branch off from episodes of a dataset, at least 0 times",
                 "give a dataset; saved frames and resets are first frames",
             )  # fmt: skip
+        if self.branches >= self.max_starts:
+            raise FieldError(
+                "dataset.branches", self.branches,
+                f"an episode with so many branches has more than the {self.max_starts} starts of "
+                "`dataset.max_starts`", "raise that, or lower this",
+            )  # fmt: skip
+        if self.episodes is not None and not self.given:
+            raise FieldError(
+                "dataset.episodes", self.episodes, "chooses episodes of a dataset, and there is none",
+                "leave it out",
+            )  # fmt: skip
         if self.frames and (self.tasks or self.scenes or self.split != "all"):
             raise FieldError(
                 "dataset.frames", self.frames, "saved frames do not say their task, scene or split",
@@ -83,7 +94,7 @@ class WorldModelEnv(EnvConfig):
     Args:
         world_model_path: the action world model, a checkpoint or the output folder of its training.
         text_world_model_path: the text world model; not needed by rewards without a goal frame.
-        dataset: where imagined episodes start. Give one of `root`, `frames` and `resets`.
+        dataset: where imagined episodes start. Give one of `root`, `repo_id`, `frames` and `resets`.
         reward: `general` and its settings; `embedding` or `proxy` with the output folder of its training as
             `reward.pretrained_path`; or one of LeRobot's own, such as `reward_classifier`.
         episode_length: frames after which an episode is truncated; by default as many as the clips that the

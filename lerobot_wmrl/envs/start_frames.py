@@ -246,8 +246,8 @@ def read_saved_frames(path: Path, max_starts: int, config: WorldModelConfig) -> 
     """Read first frames from a file written by `numpy.savez`.
 
     Args:
-        path: a file with `observation.images.<camera>` (K, H, W, 3) uint8, `observation.state` (K, P) and
-            `task` (K,), the instructions.
+        path: a file with `observation.images.<camera>` (K, H, W, 3) uint8, `task` (K,), the instructions, and
+            `observation.state` (K, P), unless the world model has none.
         max_starts: number of frames to keep at most, spread evenly.
         config: configuration of the world model.
 
@@ -258,7 +258,8 @@ def read_saved_frames(path: Path, max_starts: int, config: WorldModelConfig) -> 
     found = read_arrays(path)
     side, shapes = config.tokenizer.image_size, config.tokenizer.frame_shapes
     images = {key: (height, width, 3) for key, (_, height, width) in shapes.items()}
-    wanted = {**images, OBS_STATE: (config.state_size,), INSTRUCTION: ()}
+    states = {OBS_STATE: (config.state_size,)} if config.state_size else {}
+    wanted = {**images, **states, INSTRUCTION: ()}
     count = max((len(found[name]) for name in wanted if name in found and found[name].ndim), default=0)
     for name, size in wanted.items():
         if name not in found or not count or found[name].shape != (count, *size):
@@ -269,11 +270,11 @@ def read_saved_frames(path: Path, max_starts: int, config: WorldModelConfig) -> 
     for name in shapes:
         if found[name].dtype != np.uint8:
             raise FieldError("dataset.frames", path, f"{name} is {found[name].dtype}, it must be uint8")
-    if not np.isfinite(found[OBS_STATE]).all():
-        raise FieldError("dataset.frames", path, f"{OBS_STATE} contains NaN or infinity")
     rows = evenly_spread(count, max_starts)
+    state = found[OBS_STATE][rows].astype(np.float32) if states else np.zeros((len(rows), 0), np.float32)
+    if not np.isfinite(state).all():
+        raise FieldError("dataset.frames", path, f"{OBS_STATE} contains NaN or infinity")
     instructions = [str(text) for text in found[INSTRUCTION][rows]]
-    state = found[OBS_STATE][rows].astype(np.float32)
     squares = np.stack([_squares(found[name][rows], side) for name in shapes], 1)
     return StartImages(squares, squares, state, instructions, np.full(len(rows), -1), without_depth)
 

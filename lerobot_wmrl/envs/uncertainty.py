@@ -57,7 +57,8 @@ class Uncertainty:
         return uncertainty > self.limit
 
     def weigh(self, reward: Tensor, entropy: Mapping[str, Tensor]) -> Tensor:
-        """Return the reward, less where the frame is uncertain. (B,) → (B,)"""
+        """Return the reward, less where the frame is uncertain. A loss stays as it is. (B,) → (B,)"""
         if self.limit is None or self.effect != "weight":
             return reward
-        return reward * (self.limit / entropy[self.signal].clamp_min(self.limit))
+        share = self.limit / entropy[self.signal].clamp_min(self.limit)
+        return torch.where(reward > 0, reward * share, reward)

@@ -113,7 +113,7 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         reward = self.reward.compute_reward({**observation, **parts, "hidden": imagined.hidden})
         reward = self.config.uncertainty.weigh(reward, uncertainty)
         parts |= {**uncertainty, "done_probability": imagined.done_logit.sigmoid()}
-        parts["clipped"] = (given != clipped).float().mean(1)
+        parts["clipped"] = (~given.isclose(clipped)).float().mean(1)
         info: dict[str, Any] = {"reward_parts": parts}
         finished = terminated | truncated
         any_finished, any_nan = torch.stack([finished.any(), clipped.isnan().any()]).tolist()

@@ -125,7 +125,8 @@ def opened(config: EnvConfig, n_envs: int, trust_remote_code: bool, policies: in
         yield made * policies if own else made
     finally:
         for envs in made:
-            for env in _flat(envs):
+            for adapter in _flat(envs):
+                env = getattr(adapter, "env", adapter)
                 if hasattr(env, "results"):
                     env.results.episodes.clear()  # the table by scene counts a seed for one policy
             close_envs(envs)

@@ -9,7 +9,7 @@ from lerobot.utils.constants import CHECKPOINTS_DIR, PRETRAINED_MODEL_DIR
 
 from lerobot_wmrl.common.checkpoints import resolve_checkpoint
 from lerobot_wmrl.common.command_line import CONFIG_FILE
-from lerobot_wmrl.common.constants import START_SCENE
+from lerobot_wmrl.common.constants import DYNA, START_SCENE
 from lerobot_wmrl.common.errors import FieldError, first_line
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.data.episodes import ChosenEpisodes, choose_episodes
@@ -109,11 +109,14 @@ def trained_inside(policy: str, world_model: str) -> str | None:
     """Return why a policy is not judged in a world model: it was trained there, or plans there.
 
     Trainings are followed back as far as their settings lie on this machine. Any checkpoint of the training
-    that made the world model counts.
+    that made the world model counts, one that was trained further on new rollouts (Dyna) too.
     """
-    for settings in _trainings(policy):
+    ancestors = [str(path) for path, _ in _trainings(world_model, "model")]
+    dyna = training_folder(policy) / DYNA
+    for _, settings in _trainings(policy, "policy"):
         used = (settings.get("env") or {}).get("world_model_path")
-        if used and same_training(used, world_model):
+        inside = dyna in Path(world_model).resolve().parents
+        if used and (inside or any(same_training(used, each) for each in ancestors)):
             return (
                 "it was trained in this world model, and may have learnt what only looks like success there"
             )
@@ -136,14 +139,17 @@ def learnt_from(world_model: str, rollouts: ChosenEpisodes, split: str) -> list[
     ]
 
 
-def _trainings(policy: str) -> Iterator[Mapping[str, Any]]:
-    """Yield the settings of the training that made a checkpoint, and of those that it goes back to."""
+def _trainings(checkpoint: str, trained: str) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """Yield a checkpoint and the settings of the training that made it, then those that it goes back to.
+
+    trained: name of the settings of what was trained, `policy` or `model`.
+    """
     seen = set()
-    while policy and policy not in seen:
-        seen.add(policy)
-        settings = read_json(resolve_checkpoint(policy) / CONFIG_FILE)
-        yield settings
-        policy = str((settings.get("policy") or {}).get("pretrained_path") or "")
+    while checkpoint and checkpoint not in seen:
+        seen.add(checkpoint)
+        settings = read_json(resolve_checkpoint(checkpoint) / CONFIG_FILE)
+        yield checkpoint, settings
+        checkpoint = str((settings.get(trained) or {}).get("pretrained_path") or "")
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -38,7 +38,7 @@ def require_simulator() -> None:
     if missing:
         raise NoSimulatorError(
             f"ManiSkill is needed here, and {', '.join(missing)} cannot be imported; install the extra: "
-            "pip install 'lerobot_env_wmrl[maniskill]'"
+            "pip install '.[maniskill]' in the clone of lerobot_wmrl"
         )
 
 

@@ -203,8 +203,15 @@ class Simulation:
         return self._frame()
 
     def step(self, action: np.ndarray) -> Frame:
-        """Apply one action (7,), clipped to the action box and to the workspace, for one control step."""
-        clipped = np.clip(np.asarray(action, np.float32), self._low, self._high)
+        """Apply one action (7,), clipped to the action box and to the workspace, for one control step.
+
+        Raises:
+            ValueError: it contains NaN.
+        """
+        given = np.asarray(action, np.float32)
+        if np.isnan(given).any():
+            raise ValueError(f"action: NaN in {given.tolist()}; nothing can be simulated after it")
+        clipped = np.clip(given, self._low, self._high)
         clipped[2] = max(clipped[2], WORKSPACE_FLOOR - self.tcp_position[2])
         self.episode.object_before = self.object_position
         self.env.step(torch.from_numpy(clipped)[None])

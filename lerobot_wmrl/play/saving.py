@@ -15,13 +15,10 @@ from lerobot.utils.constants import ACTION, DEFAULT_FEATURES
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.embodiment import Embodiment, check_same_robot
 from lerobot_wmrl.data.episodes import open_dataset
-from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.play.drive import Step
 from lerobot_wmrl.rl.recorders import episode_features, observation_row
 
 WAITING_SECONDS: Final = 30
-SUCCESS_FRAMES: Final = WorldModelEnv.done_frames
-"""Frames at the end of a successful episode in which success holds."""
 
 
 class SavedEpisodes:
@@ -31,13 +28,14 @@ class SavedEpisodes:
     Args:
         folder: of the dataset, which is new or has been written by this class.
         robot: whose actions and states these are.
+        held: frames at the end of a successful episode in which success holds.
 
     Raises:
         FieldError: the folder holds something else, or episodes of another robot.
     """
 
-    def __init__(self, folder: Path, robot: Embodiment) -> None:
-        self.folder, self.robot = folder.resolve(), robot
+    def __init__(self, folder: Path, robot: Embodiment, held: int) -> None:
+        self.folder, self.robot, self.held = folder.resolve(), robot, held
         self.name = f"local/{folder.name}"
         recover(self.folder)
         self.count = 0
@@ -69,7 +67,7 @@ class SavedEpisodes:
             for index, step in enumerate(driven):
                 if dataset is None:
                     dataset = self._open(folder, episode_features(step.before, self.robot, "image"))
-                solved = success and index >= count - SUCCESS_FRAMES
+                solved = success and index >= count - self.held
                 frame: dict[str, Any] = {
                     **observation_row(step.before, 0), ACTION: step.action, "task": instruction,
                     "next.reward": np.array([step.reward], np.float32),

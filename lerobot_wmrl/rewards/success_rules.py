@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from draccus import ChoiceRegistry
 
-from lerobot_wmrl.common.errors import FieldError, require_at_least
+from lerobot_wmrl.common.errors import FieldError, first_line, require_at_least
 
 if TYPE_CHECKING:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -24,8 +24,8 @@ FRAME_REWARDS: Final = ("reward_classifier", "proxy", "embedding")
 class SuccessRule(ChoiceRegistry):
     """What counts as success."""
 
-    def frames(self, dataset: "LeRobotDataset") -> np.ndarray:
-        """Mark the frames in which the task is solved. (N,)
+    def labels(self, dataset: "LeRobotDataset") -> np.ndarray:
+        """Return `next.success`: whether the task is solved in the frame after each row's action. (N,) bool
 
         Raises:
             FieldError: the rule does not fit the dataset.
@@ -50,12 +50,13 @@ class EndsRule(SuccessRule):
     def __post_init__(self) -> None:
         require_at_least(self, 1, "last")
 
-    def frames(self, dataset: "LeRobotDataset") -> np.ndarray:
+    def labels(self, dataset: "LeRobotDataset") -> np.ndarray:
         episode, frame, length = rows_of(dataset)
-        if self.episodes is None:
-            return np.asarray(frame >= length - self.last)
-        require_episodes("episodes", self.episodes, dataset)
-        return np.asarray((frame >= length - self.last) & np.isin(episode, self.episodes))
+        solved = frame >= length - self.last
+        if self.episodes is not None:
+            require_episodes("episodes", self.episodes, dataset)
+            solved &= np.isin(episode, self.episodes)
+        return seen_next(solved, dataset)
 
 
 @SuccessRule.register_subclass("first_frames")
@@ -70,7 +71,7 @@ class FirstFramesRule(SuccessRule):
 
     first: dict[int, int] = field(default_factory=dict)
 
-    def frames(self, dataset: "LeRobotDataset") -> np.ndarray:
+    def labels(self, dataset: "LeRobotDataset") -> np.ndarray:
         episode, frame, length = rows_of(dataset)
         require_episodes("first", self.first, dataset)
         solved = np.zeros(len(episode), bool)
@@ -82,23 +83,25 @@ class FirstFramesRule(SuccessRule):
                     f"its frames are 0 to {length[own][0] - 1}",
                 )  # fmt: skip
             solved |= own & (frame >= first)
-        return solved
+        return seen_next(solved, dataset)
 
 
 @SuccessRule.register_subclass("column")
 @dataclass
 class ColumnRule(SuccessRule):
-    """Frames in which a column of the dataset reaches a threshold, such as a reward or a label.
+    """Rows in which a column of the dataset reaches a threshold, such as `next.reward` or another label.
+
+    The column says of each row what its action leads to, as LeRobot's columns `next.…` do.
 
     Args:
         column: its name.
-        threshold: the value from which a frame counts.
+        threshold: the value from which a row counts.
     """
 
     column: str = "next.reward"
     threshold: float = 0.5
 
-    def frames(self, dataset: "LeRobotDataset") -> np.ndarray:
+    def labels(self, dataset: "LeRobotDataset") -> np.ndarray:
         feature = dataset.features.get(self.column)
         if feature is None or tuple(feature["shape"]) != (1,) or feature["dtype"] == "string":
             single = [name for name, each in dataset.features.items() if tuple(each["shape"]) == (1,)]
@@ -113,14 +116,15 @@ class ColumnRule(SuccessRule):
 @SuccessRule.register_subclass("reward_model")
 @dataclass
 class RewardModelRule(SuccessRule):
-    """Frames in which a reward model reaches a threshold: LeRobot's classifier, or one of this package.
+    """Rows in which a reward model reaches a threshold: LeRobot's classifier, or one of this package. Both
+    have learnt to predict `next.reward` of the row that they are shown.
 
     LeRobot's other reward models look at whole episodes, one instruction at a time. Let them write a column,
     and use the type `column`.
 
     Args:
         path: its checkpoint, a folder or a hub id.
-        threshold: the reward from which a frame counts. A classifier gives 0 or 1.
+        threshold: the reward from which a row counts. A classifier gives 0 or 1.
         device: where it runs; by default where the checkpoint says.
     """
 
@@ -128,7 +132,7 @@ class RewardModelRule(SuccessRule):
     threshold: float = 0.5
     device: str | None = None
 
-    def frames(self, dataset: "LeRobotDataset") -> np.ndarray:
+    def labels(self, dataset: "LeRobotDataset") -> np.ndarray:
         return reach(rewards_of(self, dataset), self.threshold)
 
 
@@ -137,6 +141,18 @@ def rows_of(dataset: "LeRobotDataset") -> tuple[np.ndarray, np.ndarray, np.ndarr
     rows = dataset.hf_dataset.with_format("numpy", columns=["episode_index", "frame_index"])[:]
     _, index, count = np.unique(rows["episode_index"], return_inverse=True, return_counts=True)
     return rows["episode_index"], rows["frame_index"], count[index]
+
+
+def seen_next(solved: np.ndarray, dataset: "LeRobotDataset") -> np.ndarray:
+    """Return for each row whether the next frame of its episode is solved. (N,)
+
+    The frame after an episode's last action is not recorded; it is taken to be like the last one.
+
+    Args:
+        solved: whether the task is solved in each row's own frame. (N,)
+    """
+    _, frame, length = rows_of(dataset)
+    return np.where(frame == length - 1, solved, np.roll(solved, -1))
 
 
 def require_episodes(name: str, episodes: Collection[int], dataset: "LeRobotDataset") -> None:
@@ -166,7 +182,7 @@ def reach(values: np.ndarray, threshold: float) -> np.ndarray:
 
 
 def rewards_of(rule: RewardModelRule, dataset: "LeRobotDataset") -> np.ndarray:
-    """Return what a reward model gives for every frame. (N,)
+    """Return what a reward model gives for every row. (N,)
 
     The model is shown what its configuration asks for, frames before and after included, as in lerobot-train.
     """
@@ -186,9 +202,8 @@ def rewards_of(rule: RewardModelRule, dataset: "LeRobotDataset") -> np.ndarray:
         folder = resolve_checkpoint(rule.path if Path(rule.path).is_dir() else snapshot_download(rule.path))
         config = RewardModelConfig.from_pretrained(folder)
     except Exception as error:  # a missing file, a type that nobody registered, or what the hub answers
-        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise FieldError(
-            "path", rule.path, f"no reward model of LeRobot there ({reason})",
+            "path", rule.path, f"no reward model of LeRobot there ({first_line(error)})",
             "give the checkpoint of one, as lerobot-train --reward_model.type=… makes it",
         ) from error  # fmt: skip
     if config.type not in FRAME_REWARDS:

@@ -22,9 +22,9 @@ class SelectionConfig:
 
     Args:
         freq: iterations between two measurements of success. Each one also saves a checkpoint. 0: off.
-        n_episodes: episodes of each task in a measurement, always from the same starts. They run in
-            `real_env` if it is set, from starts that are used neither for training nor for evaluation;
-            otherwise in the world model, from those of `dataset`.
+        n_episodes: episodes in a measurement, always from the same starts. They run in `real_env` if it is
+            set, so many of each task, from starts that are used neither for training nor for evaluation;
+            otherwise in the world model, from first frames of episodes spread over `dataset`, one of each.
         dataset: dataset whose first frames start the imagined episodes; by default `env.dataset`.
     """
 

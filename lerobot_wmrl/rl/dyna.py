@@ -12,7 +12,7 @@ from typing import Final
 
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 
-from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.constants import DYNA, EVALUATION_SEED
 from lerobot_wmrl.common.presets import Flags, format_flags
 from lerobot_wmrl.common.processes import run_subcommand
 from lerobot_wmrl.data.episodes import DatasetSource, open_dataset
@@ -60,7 +60,7 @@ class DynaRounds:
     output_dir: Path
     total: int
     budget: Path | None = None
-    name: str = "dyna"
+    name: str = DYNA
 
     def __post_init__(self) -> None:
         self.iterations = round_iterations(self.config.rounds, self.total)

@@ -80,13 +80,13 @@ def make_measures(settings: CallbackSettings, trained: Trained) -> dict[str, Mea
     def measure_in_training_env() -> Any:
         if not is_own(config):
             return evaluate_policy(config, policy, processors, episodes, SELECTION_SEED, num_envs=1)
-        measured_env = env
+        measured_env, count = env, episodes
         if isinstance(env, WorldModelVectorEnv):
             own = env.config.dataset
-            source = StartFrames(**vars(dataset)) if dataset.given else replace(own, branches=0)
-            if source != own:
-                measured_env = make_success_env(env, source)
-        return evaluate_within(measured_env, config, policy, processors, episodes, SELECTION_SEED)
+            source = StartFrames(**vars(dataset)) if dataset.given else own
+            measured_env = make_success_env(env, replace(source, max_starts=episodes, branches=0))
+            count = min(count, len(measured_env.starts))
+        return evaluate_within(measured_env, config, policy, processors, count, SELECTION_SEED)
 
     if isinstance(env, WorldModelVectorEnv):
         measures[IMAGINED] = measure_in_training_env

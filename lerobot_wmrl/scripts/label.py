@@ -59,11 +59,11 @@ def label(cfg: LabelConfig) -> None:
 
     dataset = cfg.dataset.open()
     check(cfg, dataset)
-    solved = cfg.success.frames(dataset)
+    success = cfg.success.labels(dataset)
     with writing("output_dir", cfg.output_dir, resumes=False):
-        write_labelled(dataset, solved, cfg.output_dir, cfg.repo_id or f"local/{cfg.output_dir.name}")
+        write_labelled(dataset, success, cfg.output_dir, cfg.repo_id or f"local/{cfg.output_dir.name}")
     episode, *_ = rows_of(dataset)
-    runs = [longest_run(solved[episode == index]) for index in np.unique(episode)]
+    runs = [longest_run(success[episode == index]) for index in np.unique(episode)]
     print("\n".join(report(runs, cfg)))
 
 
@@ -79,18 +79,18 @@ def check(cfg: LabelConfig, dataset: "LeRobotDataset") -> None:
         raise FieldError("output_dir", cfg.output_dir, "there is something already", "choose a new folder")
 
 
-def write_labelled(dataset: "LeRobotDataset", solved: np.ndarray, output_dir: Path, repo_id: str) -> None:
+def write_labelled(dataset: "LeRobotDataset", success: np.ndarray, output_dir: Path, repo_id: str) -> None:
     """Copy a dataset with `next.success` (N,) by LeRobot's own function; the folder is whole or absent."""
     from lerobot.datasets.dataset_tools import add_features
 
-    column = {SUCCESS: (solved[:, None], {"dtype": "bool", "shape": (1,), "names": None})}
+    column = {SUCCESS: (success[:, None], {"dtype": "bool", "shape": (1,), "names": None})}
     with whole_folder(output_dir) as partial:
         add_features(dataset, column, output_dir=partial, repo_id=repo_id)
 
 
-def longest_run(solved: np.ndarray) -> int:
-    """Return the largest number of solved frames in a row. (T,)"""
-    ends = np.flatnonzero(np.diff(np.concatenate([[False], solved, [False]])))
+def longest_run(success: np.ndarray) -> int:
+    """Return the largest number of successes in a row. (T,)"""
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], success, [False]])))
     return int(np.diff(ends)[::2].max(initial=0))
 
 

@@ -70,7 +70,7 @@ class PlayConfig(RunConfig):
         device: device of the models; by default the best one of this machine.
         output_dir: folder of the dataset of saved episodes. If it holds some, more are added.
         export: write the page into this new folder, and serve nothing. The world model then runs in the
-            visitor's browser. It needs `pip install "lerobot_env_wmrl[export]"` and npm.
+            visitor's browser. It needs `pip install ".[export]"` in the clone, and npm.
         export_starts: episodes of the dataset in whose first frames an exported page can begin.
     """
 
@@ -132,8 +132,9 @@ class PlayConfig(RunConfig):
         for package in ("onnx", "onnxscript", "onnxruntime"):
             if find_spec(package) is None:
                 raise FieldError(
-                    "export", folder, f"needs the package {package}", 'pip install "lerobot_env_wmrl[export]"'
-                )
+                    "export", folder, f"needs the package {package}",
+                    'pip install ".[export]" in the clone of lerobot_wmrl',
+                )  # fmt: skip
 
 
 def play(cfg: PlayConfig) -> None:
@@ -155,7 +156,7 @@ def play(cfg: PlayConfig) -> None:
     if cfg.export is not None:
         export(world, cfg.export, cfg.export_starts)
         return
-    saved = SavedEpisodes(cfg.output_dir, world.model.embodiment)
+    saved = SavedEpisodes(cfg.output_dir, world.model.embodiment, cfg.done_frames)
     server = PlayServer(world, saved, cfg.host)
     try:
         serve(server.application(), server.access, cfg.port, "Ctrl-C ends it")

@@ -164,7 +164,8 @@ class ActionWorldModelConfig(WorldModelConfig):
 @RewardModelConfig.register_subclass("text_world_model")
 @dataclass
 class TextWorldModelConfig(WorldModelConfig):
-    """Imagines a successful trajectory of an instruction (eq. 1 with c = i). Learns from optimal successes.
+    """Imagines a successful trajectory of an instruction (eq. 1 with c = i). Learns from successful
+    demonstrations, or from all successes of a dataset that does not say who acted.
 
     Args:
         text_encoder: id or folder of a pretrained T5 (T5, flan-T5, ByT5, mT5, umT5) that reads the

@@ -152,6 +152,7 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
         if stats is not None and size:
             mean = torch.as_tensor(stats[key]["mean"], dtype=torch.float32)
             std = torch.as_tensor(stats[key]["std"], dtype=torch.float32)
+            std = std.where(std != 1, 1 + torch.finfo(std.dtype).eps)  # 1 says that it never varies
             std = torch.where(std <= MIN_SPREAD * unit, 1.0, std).clamp_min(least)
         self.register_buffer(f"{name}_mean", mean)
         self.register_buffer(f"{name}_std", std)

@@ -326,7 +326,9 @@ def held_out_metrics(model: Any, table: EpisodeTable, batch_size: int) -> dict[s
     sampler.success_weight = 1.0
     model.eval()
     every = []
-    for batch in range(HELD_OUT_BATCHES):
-        loss, metrics = model(sampler(batch), 0.0)
-        every.append({"loss": loss.item(), **metrics})
+    with torch.random.fork_rng():
+        torch.manual_seed(0)  # the frames of a clip that are compared
+        for batch in range(HELD_OUT_BATCHES):
+            loss, metrics = model(sampler(batch), 0.0)
+            every.append({"loss": loss.item(), **metrics})
     return {name: float(np.mean([metrics[name] for metrics in every])) for name in every[0]}

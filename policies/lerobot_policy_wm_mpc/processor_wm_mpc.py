@@ -1,4 +1,5 @@
-"""Pre- and postprocessor of the planning policy: LeRobot's own. Images stay in [0, 1], actions in metres."""
+"""Pre- and postprocessor of the planning policy: LeRobot's own. Images stay in [0, 1], actions in the units
+of the dataset."""
 
 from typing import Any
 

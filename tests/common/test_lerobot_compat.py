@@ -41,6 +41,7 @@ UNDOCUMENTED = {
     "lerobot.datasets.depth_utils": {"MM_PER_METRE", "dequantize_depth"},
     "lerobot.datasets.factory": {"resolve_delta_timestamps"},
     "lerobot.datasets.io_utils": {"load_info", "write_info"},
+    "lerobot.datasets.utils": {"BackwardCompatibilityError"},
     "lerobot.datasets.video_utils": {"decode_video_frames"},
     "lerobot.envs.utils": {
         "NEW_ROLLOUT_OPTION", "FreezeAfterEpisodeEnd", "env_to_policy_features", "preprocess_observation",

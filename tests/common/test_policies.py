@@ -1,6 +1,7 @@
 """A checkpoint is loaded whole, or what is wrong with it is named."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -80,3 +81,13 @@ def test_a_policy_whose_actions_are_in_other_units_is_refused(
         return
     with pytest.raises(ValueError, match="elbow is 45 on average, in the environment it is between 0 and 1"):
         check_units(config, pipeline, names, low, high)
+
+
+def test_the_rounded_mean_of_a_constant_component_is_in_its_range(tmp_path: Path) -> None:
+    config = read_policy_config(str(save_untrained_policy(tmp_path)), [])
+    held = torch.tensor([0.3])
+    step = SimpleNamespace(stats={"action": {"mean": held.nextafter(torch.zeros(1))}})
+    check_units(config, SimpleNamespace(steps=[step]), ["gripper"], held, held)
+    step.stats = {"action": {"mean": held + 0.01}}
+    with pytest.raises(ValueError, match=r"gripper is 0\.31 on average"):
+        check_units(config, SimpleNamespace(steps=[step]), ["gripper"], held, held)

@@ -23,6 +23,7 @@ from lerobot_wmrl.evaluation.evidence import (
     read_references,
     replayed_rollouts,
     trained_inside,
+    training_folder,
 )
 from lerobot_wmrl.evaluation.gate import Outcomes
 from lerobot_wmrl.evaluation.judgement import Judgement
@@ -257,7 +258,7 @@ def test_a_policy_that_was_trained_in_the_world_model_is_refused(config, seeing,
     assert found[config.policies[1]]["refused"] is None
 
 
-def test_any_checkpoint_of_the_world_model_and_any_training_before_counts(config, trained_models):
+def test_any_checkpoint_of_the_world_model_and_any_training_before_counts(config, trained_models, tmp_path):
     """The second policy began with the first, which was trained in an earlier checkpoint of the world
     model.
     """
@@ -268,6 +269,13 @@ def test_any_checkpoint_of_the_world_model_and_any_training_before_counts(config
     assert trained_inside(second, model) is not None
     write(settings_of(second), {"env": None, "policy": {"pretrained_path": second}})
     assert trained_inside(second, model) is None
+    further = tmp_path / "further"
+    write(further / "train_config.json", {"model": {"pretrained_path": model}})
+    write(settings_of(first), {"env": {"type": "world_model", "world_model_path": model}})
+    assert trained_inside(first, str(further)) is not None, "it has learnt more since"
+    dyna = training_folder(first) / "dyna" / "000002" / "action_world_model"
+    write(dyna / "train_config.json", {})
+    assert trained_inside(first, str(dyna)) is not None, "the training's own"
     other = str(trained_models["frame_tokenizer"])
     write(settings_of(first), {"env": {"type": "world_model", "world_model_path": other}})
     assert trained_inside(first, model) is None

@@ -15,6 +15,7 @@ from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
 from lerobot_wmrl.common.constants import KINDS
 from lerobot_wmrl.common.policies import read_policy_config
+from lerobot_wmrl.data.episodes import open_dataset
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
@@ -94,6 +95,20 @@ def test_the_same_command_again_finds_it_complete_and_other_settings_are_refused
     config.env.done_frames = 1
     with pytest.raises(ValueError, match=r"other settings \(done_frames 2 → 1\)"):
         record(config)
+    config.env.done_frames, config.env.uncertainty.limit = 2, 0.5
+    with pytest.raises(ValueError, match=r"other settings \(uncertainty\.limit None → 0\.5\)"):
+        record(config)
+
+
+def test_a_start_that_comes_again_gets_other_noise(config, caplog):
+    """The seventh episode begins as the first one does."""
+    record(config)
+    assert "7 episodes begin from 6 starts: without --exploration" in caplog.text
+    config.exploration, config.output_dir = 0.5, config.output_dir.with_name("explored")
+    record(config)
+    for root, alike in ((config.root.with_name("imagined"), True), (config.root, False)):
+        actions = open_dataset(root).hf_dataset.with_format("numpy")["action"][:]
+        assert (actions[:LENGTH] == actions[6 * LENGTH :]).all() == alike
 
 
 def test_a_planner_acts_as_a_policy(config, trained_models):

@@ -17,6 +17,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.manifest import planned_parts
+from lerobot_dataset_maniskill.merging import require_same
 from lerobot_dataset_maniskill.recorder import follow_workers, missing_parts, record
 from lerobot_dataset_maniskill.writer import HOLD_FRAMES, find_damage
 from lerobot_wmrl.common.constants import KINDS
@@ -138,6 +139,13 @@ def test_the_same_command_again_says_that_it_is_done(
 def test_other_settings_and_foreign_folders_are_refused(recorded: Path, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"other settings.*seed 0 → 5"):
         record(config(recorded, seed=5))
+    stored, other = (config(recorded, video=video).recorded_content() for video in (True, False))
+    with pytest.raises(ValueError, match=r"other settings \(video True → False\)"):
+        require_same(stored, other, tmp_path)
+    del stored["video"]  # as earlier versions wrote it
+    require_same(stored, config(recorded, video=True).recorded_content(), tmp_path)
+    with pytest.raises(ValueError, match=r"other settings \(video True → False\)"):
+        require_same(stored, other, tmp_path)
     (tmp_path / "dataset").mkdir()
     (tmp_path / "dataset" / "thesis.txt").write_text("do not lose")
     with pytest.raises(ValueError, match="holds something else"):

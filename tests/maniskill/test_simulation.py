@@ -97,6 +97,12 @@ def test_actions_are_clipped_to_the_box(simulation: Simulation) -> None:
     np.testing.assert_allclose(states[0], states[1], atol=1e-6)
 
 
+def test_an_action_that_is_no_number_is_refused(simulation: Simulation) -> None:
+    simulation.reset(SCENES[0], 0)
+    with pytest.raises(ValueError, match=r"action: NaN in .*nothing can be simulated after it"):
+        simulation.step(np.full(7, np.nan, np.float32))
+
+
 def test_pushing_by_hand_succeeds_and_passing_above_does_not(simulation: Simulation) -> None:
     outcomes = []
     for height in (0.02, 0.12):

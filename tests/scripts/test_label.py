@@ -42,8 +42,10 @@ def lengths(root: Path) -> list[int]:
 def test_demonstrations_succeed_at_their_ends(
     unlabelled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """The last three frames are solved: so it is after the four last actions, one of which leads to the first
+    of them, and one to a frame that is not recorded."""
     found = label(monkeypatch, unlabelled, tmp_path / "labelled", "--success.type=ends")
-    assert found == [[False] * (n - 3) + [True] * 3 for n in lengths(unlabelled)]
+    assert found == [[False] * (n - 4) + [True] * 4 for n in lengths(unlabelled)]
     said = capsys.readouterr().out
     assert "6 episodes, of which 6 succeed and 0 fail" in said
     assert "There is no failure" in said
@@ -59,19 +61,21 @@ def test_the_others_fail_where_successes_are_named(
 ) -> None:
     flags = ["--success.episodes=[0,4]", "--success.last=1"]
     found = label(monkeypatch, unlabelled, tmp_path / "labelled", "--success.type=ends", *flags)
-    assert [sum(episode) for episode in found] == [1, 0, 0, 0, 1, 0]
+    assert [sum(episode) for episode in found] == [2, 0, 0, 0, 2, 0]
     said = capsys.readouterr().out
-    assert "2 of them for fewer than 3: these count with --env.done_frames=1" in said
+    assert "2 of them for fewer than 3: these count with --env.done_frames=2" in said
     assert "There is no failure" not in said
 
 
 def test_success_may_begin_at_a_frame(
     unlabelled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """A row says what its action leads to, so it succeeds where the next frame is solved."""
     flags = ["--success.type=first_frames", "--success.first={0: 5, 3: 2}"]
     found = label(monkeypatch, unlabelled, tmp_path / "labelled", *flags)
     expected = [
-        [frame >= {0: 5, 3: 2}.get(e, n) for frame in range(n)] for e, n in enumerate(lengths(unlabelled))
+        [frame + 1 >= {0: 5, 3: 2}.get(e, n + 1) for frame in range(n)]
+        for e, n in enumerate(lengths(unlabelled))
     ]
     assert found == expected
 

@@ -289,3 +289,16 @@ def test_small_actions_are_scaled_if_their_range_is_small():
         },
     )
     torch.testing.assert_close(model.action_std, torch.tensor([7e-4] * 5 + [1.0, 1.0]))
+
+
+def test_a_component_that_varies_by_one_is_not_taken_for_a_constant_one():
+    """A planner leaves components alone whose standard deviation is 1."""
+    robot = Embodiment(action_low=[-1.0] * 7, action_high=[1.0] * 7)
+    model = ActionWorldModelRewardModel(
+        ActionWorldModelConfig(**nested(SIZES), embodiment=robot),
+        dataset_stats={
+            "observation.state": {"mean": torch.zeros(8), "std": torch.ones(8)},
+            "action": {"mean": torch.zeros(7), "std": torch.tensor([1.0, 0.0, *[0.5] * 5])},
+        },
+    )
+    assert (model.action_std == 1).tolist() == [False, True, *[False] * 5]

@@ -30,6 +30,7 @@ from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.layers import ClipMemory
 from lerobot_wmrl.world_models.training import (
     golden_episodes,
+    held_out_metrics,
     make_joint_sampler,
     make_sampler,
     optimizer_step,
@@ -105,6 +106,17 @@ def test_held_out_episodes_are_not_learnt_from(kind, small_dataset, trained_mode
         learnt = make_sampler(model, table, chosen, batch_size=2, seed=0).episodes
         assert len(learnt)
         assert not held_out[learnt].any()
+
+
+@pytest.mark.parametrize("kind", ["action_world_model", "text_world_model"])
+def test_held_out_losses_are_the_same_again(kind, small_dataset, trained_models, monkeypatch):
+    """Noise on codes is for training."""
+    monkeypatch.setattr(EpisodeTable, "validation", property(lambda table: np.arange(6) % 2 == 0))
+    table, model = read_episodes(small_dataset), load_model(trained_models[kind], kind)
+    first = held_out_metrics(model, table, 2)
+    assert "loss" in first
+    torch.rand(1)
+    assert held_out_metrics(model, table, 2) == first
 
 
 def test_every_second_batch_is_of_a_further_dataset(small_dataset, trained_models):

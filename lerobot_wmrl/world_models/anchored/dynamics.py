@@ -54,7 +54,7 @@ class AnchoredDynamics(Dynamics):
         network, codebook = self.network, self.network.codebook
         codes = codebook.codes(clip.tokens)  # (B, T, S, C)
         steps = sample_steps(clip.valid, RENDERED_FRAMES)  # (B, K)
-        first = corrupt_codes(codes[:, :1], codebook)
+        first = corrupt_codes(codes[:, :1], codebook) if self.training else codes[:, :1]
         prediction = network(first, clip.state[:, :1], condition, codes.shape[1], steps, clip.context)
         known, target = (take_steps(x, steps) for x in (known_transitions(clip.valid), codes[:, 1:]))
         frames = weighted_frames(codebook, target, codes[:, :1], known)

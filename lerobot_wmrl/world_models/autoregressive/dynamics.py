@@ -127,7 +127,9 @@ class AutoregressiveDynamics(Dynamics):
 
         Against drift: noise, one-pass predictions of single frames, and whole rollouts from first frames.
         """
-        seen = real._replace(codes=corrupt_codes(real.codes, self.network.codebook))
+        seen = real
+        if self.training:
+            seen = real._replace(codes=corrupt_codes(real.codes, self.network.codebook))
         share = replaced_share(self.config.self_forcing, progress)
         if share > 0:
             guess, next_depth = self.network(seen.codes, seen.state, condition, depth=seen.depth)
