@@ -23,6 +23,8 @@ PALETTE: Final = (
     "#553c9a",
     "#b7791f",
     "#22543d",
+    "#f687b3",
+    "#a0aec0",
 )
 """Colours of methods, in their order."""
 

@@ -26,14 +26,20 @@ STUDIES: Final = ROOT / "experiments"
 
 SECOND_ROWS: Final = partial(value.rows_above, study=value.SECOND_STUDY, parts=value.SECOND_PARTS)
 
+TASKS_ROWS: Final = partial(value.rows_above, study=value.TASKS_STUDY, parts=value.TASKS_PARTS)
+
 SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     "value_push": ("Policies", value.value_push),
     "value_pick_place": ("Policies", value.value_pick_place),
     "value_pick_place_simulator": ("Policies", partial(SECOND_ROWS, ["simulated_ppo"])),
     "value_pick_place_dyna": ("Policies", partial(SECOND_ROWS, ["dyna"])),
     "value_pick_place_iterated": ("Policies", partial(SECOND_ROWS, ["iterated", "iterated_ppo"])),
+    "value_tasks": ("Policies", value.value_tasks),
+    "value_tasks_simulator": ("Policies", partial(TASKS_ROWS, ["simulated_ppo"])),
+    "value_tasks_ppo_distilled": ("Policies", partial(TASKS_ROWS, ["ppo_distilled"])),
     "value_four_tasks": ("Policies", value.value_four_tasks),
     "value_four_tasks_simulator": ("Policies", value.value_four_tasks_simulator),
+    "value_longer": ("Policies", partial(value.rows_above, ["longer", "longer_filtered"])),
     "value_others": ("Policies", value.value_others),
     "value_iterated": ("Policies", partial(value.rows_above, ["iterated", "iterated_ppo"])),
     "value_simulator": ("Policies", partial(value.rows_above, ["simulated_ppo"])),
@@ -80,8 +86,8 @@ Each section is a question, its answer, one table and its limits. The page is ge
 - Success is success in ManiSkill unless a column says otherwise. *Known* scenes are those that policies and
   world model were trained in; *unseen* ones are in no training data. Starts are held out in both.
 - Intervals in parentheses are 95 %: Wilson's for a share, bootstrap over episodes for a mean, bootstrap over
-  starts for a change. They cover other seeds of training where a table shows several seeds and their mean
-  (bootstrap over starts and seeds), and nowhere else.
+  starts for a change and in the studies of what imagination is worth. They cover other seeds of training
+  where a table shows several seeds and their mean (bootstrap over starts and seeds), and nowhere else.
 - All numbers come from CPUs but those of [speed_gpu](#speed_gpu) and where a GPU is named under the table,
   and all from earlier commits than the present one. The commit is under each table; *before* means that only
   the commit that added the numbers is known. Today's studies repeat the set-up, but not all have been run
@@ -148,7 +154,8 @@ def origin(study: str, results: Sequence[str], load: Load) -> str:
     commits = ", ".join(dict.fromkeys(named))
     machines = "; ".join(dict.fromkeys(source["machine"] for source in sources if "machine" in source))
     where = f", {machines}".replace(", 1 cores", ", 1 core") if machines else ""
-    where += "".join(f". {source['note']}" for source in sources if "note" in source).removesuffix(".")
+    notes = dict.fromkeys(source["note"].removesuffix(".") for source in sources if "note" in source)
+    where += "".join(f". {note}" for note in notes)
     parts = [f"Commit {commits}{where}"] if sources else []
     parts += [", ".join(f"[{Path(result).name}]({result})" for result in results)] if results else []
     return f"*{'; '.join([*parts, f'`python -m experiments.run experiments/{study}.yaml`'])}*"

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from scipy.stats import ttest_1samp
 
 from experiments import figures
 from experiments.cells import DOMAINS, Load, counted, paired, points, table
@@ -18,11 +19,13 @@ from lerobot_wmrl.improve.report.figures import tidy
 
 TITLES: Final = {
     "cloning": "BC of the demonstrations",
+    "longer": "BC of the demonstrations, three times as many steps",
     "filtered": "filtered BC: demonstrations and successful rollouts",
+    "longer_filtered": "filtered BC, three times as many steps",
     "iterated": "filtered BC, rollouts in three rounds",
     "weighted": "advantage-weighted BC (RA-BC)",
     "conditioned": "advantage-conditioned BC (RECAP)",
-    "simulated_ppo": "PPO in ManiSkill, as many steps as the rollouts",
+    "simulated_ppo": "PPO in ManiSkill, the steps of as many longest episodes",
     "imagined_ppo": "PPO in imagination",
     "planned": "PPO in imagination, then planning in it at test time",
     "dyna": "PPO in imagination, with rollouts in three rounds (Dyna)",
@@ -55,7 +58,8 @@ CONTROLS: Final = {
 }
 """What a control's world model learnt from."""
 
-BUDGET: Final = ("demonstrations", "rollouts", "seed")
+REAL_EPISODES: Final = ("demonstrations", "rollouts")
+BUDGET: Final = (*REAL_EPISODES, "seed")
 SCENES: Final = ("ind", "ood")
 """Where success is measured: in known and in unseen scenes."""
 
@@ -67,6 +71,7 @@ AIMED_SUCCESS: Final = (0.95, 0.88)
 
 STUDY: Final = "value_push"
 PARTS: Final = (
+    "value_longer",
     "value_others",
     "value_iterated",
     "value_simulator",
@@ -84,6 +89,11 @@ SECOND_PARTS: Final = (
     "value_pick_place_iterated",
 )
 """The same of the second task."""
+
+TASKS_STUDY: Final = "value_tasks"
+TASKS_PARTS: Final = ("value_tasks_simulator", "value_tasks_ppo_distilled")
+TASKS_GROUPS: Final = ("task", *REAL_EPISODES)
+"""The same of further tasks, and what their cells are grouped by."""
 
 FOUR_STUDY: Final = "value_four_tasks"
 FOUR_PART: Final = "value_four_tasks_simulator"
@@ -112,11 +122,14 @@ BC and planning."""
 """What its section says of its limits."""
 
 Cell = dict[str, Any]
-Groups = dict[tuple[int, int], list[Cell]]
-"""Cells, one a seed, by demonstrations and rollouts."""
+Groups = dict[tuple[Any, ...], list[Cell]]
+"""Cells, one a seed, by what they have in common: demonstrations and rollouts, and the task where there are
+several."""
 
 
-def groups(load: Load, study: str = STUDY, parts: Sequence[str] = PARTS) -> Groups:
+def groups(
+    load: Load, study: str = STUDY, parts: Sequence[str] = PARTS, by: Sequence[str] = REAL_EPISODES
+) -> Groups:
     """Return the published cells of a study, each with the methods of the same cell of its parts."""
     found: Groups = {}
     for each in read_cells(ROOT / "experiments" / f"{study}.yaml"):
@@ -124,7 +137,7 @@ def groups(load: Load, study: str = STUDY, parts: Sequence[str] = PARTS) -> Grou
         if cell:
             methods = {name: row for part in others if part for name, row in part["methods"].items()}
             whole = {**cell, "methods": {**cell["methods"], **methods}}
-            found.setdefault((cell["demonstrations"], cell["rollouts"]), []).append(whole)
+            found.setdefault(tuple(cell[name] for name in by), []).append(whole)
     return found
 
 
@@ -153,6 +166,12 @@ def gain(cells: Sequence[Cell], method: str, baseline: str, domain: str) -> Runs
     return RunsMean.over([[a - b for a, b in zip(*pair, strict=True)] for pair in pairs])
 
 
+def gains(cells: Sequence[Cell], method: str, baseline: str, domain: str) -> list[float]:
+    """Return the gain of each cell, which is one seed."""
+    both = [cell for cell in cells if {method, baseline} <= cell["methods"].keys()]
+    return [gain([cell], method, baseline, domain).mean for cell in both]
+
+
 def best(cells: Sequence[Cell], methods: Sequence[str], domain: str) -> str:
     """Return the method with the highest mean success, of those that have been run in all cells."""
     complete = [method for method in methods if all(method in cell["methods"] for cell in cells)]
@@ -173,20 +192,24 @@ PPO in imagination begins from the policy cloned from demonstrations and success
 cloned from the demonstrations alone where this one succeeds more often in the world model (256 starts or all,
 McNemar's test): {begun(cells)}. PPO in ManiSkill begins from the latter; its policy learns from the second
 iteration on. When it learnt from the fourth of ten on, it had 70 and 60 % with 8 demonstrations and 300
-rollouts, 88 and 74 % with 25, and 96 and 79 % with 50 (three seeds each).
+rollouts, 88 and 74 % with 25, and 96 and 79 % with 50 (three seeds each). Its learning rates and KL penalty
+are those that were tuned in imagination. With 8 and with 50 demonstrations it was run again on another
+machine, demonstrations and BC included. {from_the_same_start(cells)} PPO in imagination alone is not clearly better
+than PPO in ManiSkill from 25 demonstrations on.
 
 Planning changes what PPO's policy would do, and plans anew after eight actions. An episode of it takes
 {planned:.1f} s on one core, simulator included, one of the policy {policy:.1f} s.
 
 Both rules were chosen after a first run of seed 0's cells, on its models and other starts
-([pilot](pilots.md#where-ppo-begins-and-planning-after-it)). There planning adds to PPO in five of
-six rates; in the cells of other seeds it may not, as the table shows.
+([pilot](pilots.md#where-ppo-begins-and-planning-after-it)). In seed 0's cells planning adds to PPO in
+{planning_adds([cell for cell in cells if not cell["seed"]])} rates, in those of other seeds in
+{planning_adds([cell for cell in cells if cell["seed"]])}.
 
 RECAP and the distilled planner were moved into a [study of their own](#value_others) after a first run of two
 cells, in which others of their kind did better.
 
-No study has cells without rollouts or with play. Optimal demonstrations are cloned in
-[another](#cloning_control).
+No study has cells without rollouts or with play. The demonstrations have pauses and detours; BC of `optimal`
+ones is better than much of this table, in [two](#cloning_control) [studies](#driven).
 
 ![Success against real episodes](images/value_push.png)"""
 
@@ -221,9 +244,10 @@ def listed(parts: Sequence[str]) -> str:
     return "; ".join(parts) or "no budget"
 
 
-def spoken(budget: tuple[int, int]) -> str:
-    """`8 demonstrations and 300 rollouts`."""
-    return f"{budget[0]} demonstrations and {budget[1]:,} rollouts"
+def spoken(group: tuple[Any, ...]) -> str:
+    """`8 demonstrations and 300 rollouts`, after the task where the group has one."""
+    *task, demonstrations, rollouts = group
+    return ", ".join([*task, f"{demonstrations} demonstrations and {rollouts:,} rollouts"])
 
 
 def recorded_anew(load: Load) -> str:
@@ -237,11 +261,25 @@ def recorded_anew(load: Load) -> str:
                 f"{spoken((whole['demonstrations'], whole['rollouts']))}, seed {whole['seed']} "
                 f"({part['real_successes']} successes, the others {whole['real_successes']})"
             )
-    return (
-        f"In these cells it learnt from a recording of its own, of the same budget: {listed(found)}."
-        if found
-        else ""
-    )
+    return f"""In most cells all that it needs, PPO included, was run again. In these its recording was then
+another one of the same budget: {listed(found)}."""
+
+
+def from_the_same_start(cells: Sequence[Cell]) -> str:
+    """Return what imagination adds to PPO where both kinds began from BC of the demonstrations."""
+    both = [cell for cell in cells if cell["start"] == "cloning" and "simulated_ppo" in cell["methods"]]
+    gains = [
+        [gain([cell], "imagined_ppo", "simulated_ppo", domain).mean for cell in both] for domain in SCENES
+    ]
+    known, unseen = (f"{100 * float(np.mean(each)):.0f}" for each in gains)
+    return f"""In the {len(both)} cells where both kinds of PPO begin from BC of the demonstrations, that in
+imagination succeeds more often by {known} points in known and {unseen} in unseen scenes."""
+
+
+def planning_adds(cells: Sequence[Cell]) -> str:
+    """`7 of 8`: in how many rates planning after PPO is above PPO."""
+    gains = [gain([cell], "planned", "imagined_ppo", domain).mean for cell in cells for domain in SCENES]
+    return f"{sum(each > 0 for each in gains)} of {len(gains)}"
 
 
 def begun(cells: Sequence[Cell]) -> str:
@@ -264,12 +302,36 @@ def value_pick_place(load: Load) -> str:
     return f"""{comparison(found)}
 
 The policy that PPO begins from succeeds from {imagined:.0f} % of the recorded starts in imagination, and from
-{real:.0f} % of the known ones in ManiSkill: the world model recognises few of its successes.
+{real:.0f} % of the known ones in ManiSkill: the world model recognises few of its successes. {misled(cells)}
 
 In unseen scenes all methods mostly fail: 50 demonstrations in three scenes teach grasping in these. Not
 compared: PPO in ManiSkill where the table has no row of it, and planning at test time, which failed in a
 [pilot](pilots.md#pick-and-place), on whose episodes the done threshold was
 chosen too."""
+
+
+def value_tasks(load: Load) -> str:
+    """Return the section."""
+    return f"""{comparison(groups(load, TASKS_STUDY, TASKS_PARTS, TASKS_GROUPS), TASKS_GROUPS)}
+
+No setting was tried in these tasks. The number of demonstrations is the one with which push gains most."""
+
+
+def misled(cells: Sequence[Cell]) -> str:
+    """Return in which cells the world model preferred the policy that succeeds less often."""
+    said = []
+    for cell in cells:
+        known, unseen = (
+            {name: f"{100 * cell['methods'][name][domain]['share']:.0f}" for name in ("cloning", "filtered")}
+            for domain in SCENES
+        )
+        if cell["start"] == "cloning" and int(known["cloning"]) < int(known["filtered"]):
+            said.append(
+                f"With seed {cell['seed']} it preferred BC of the demonstrations ({known['cloning']} and "
+                f"{unseen['cloning']} %) to filtered BC ({known['filtered']} and {unseen['filtered']} %), "
+                "and PPO began from the worse one."
+            )
+    return " ".join(said)
 
 
 def value_four_tasks(load: Load) -> str:
@@ -389,36 +451,53 @@ def of_tasks(cell: Cell, tasks: Sequence[str]) -> Cell:
     return {"methods": methods}
 
 
-def comparison(found: Groups) -> str:
-    """Return for each budget the best with and without a world model, and a table of all methods."""
+def comparison(found: Groups, by: Sequence[str] = REAL_EPISODES) -> str:
+    """Return for each group the best with and without a world model, and a table of all methods."""
     answers, rows = [], []
-    for (demonstrations, rollouts), cells in found.items():
+    for group, cells in found.items():
         for domain in SCENES:
             ours, baseline = (best(cells, methods, domain) for methods in (IMAGINED, BASELINES))
-            gained = points(asdict(gain(cells, ours, baseline, domain)))
-            answers.append(
-                [demonstrations, rollouts, DOMAINS[domain], TITLES[baseline], TITLES[ours], gained]
-            )
+            answers.append([
+                *group, DOMAINS[domain], TITLES[baseline], TITLES[ours],
+                points(asdict(gain(cells, ours, baseline, domain))),
+                ", ".join(str(round(100 * each)) for each in gains(cells, ours, baseline, domain)),
+            ])  # fmt: skip
         rows += [
-            [demonstrations, rollouts, title, *(shares(cells, method, domain) for domain in SCENES),
+            [*group, title, *(shares(cells, method, domain) for domain in SCENES),
              minutes(cells, method)]
             for method, title in TITLES.items() if method in measured(cells, TITLES)
         ]  # fmt: skip
-    budget = ["demonstrations", "rollouts"]
     starts = len(outcomes(next(iter(found.values())), "cloning", "ind")[0])
-    return f"""The best method with a world model against the best without one, on the same real episodes and
-starts:
+    return f"""The best method with a world model against the best without one, on as many real episodes and
+the same starts:
 
-{table([*budget, "scenes", "best without", "best with", "gain"], answers)}
+{table([*by, "scenes", "best without", "best with", "gain", "by seed"], answers)}
+
+{beyond_seeds(found)}
 
 All methods:
 
-{table([*budget, "method", "known scenes", "unseen scenes", "minutes"], rows)}
+{table([*by, "method", "known scenes", "unseen scenes", "minutes"], rows)}
 
 Success of each seed over {starts} starts; with more than one seed, their mean. Intervals count starts, and
 seeds where there are several. Minutes are those of training on one core, without recording (Dyna records
 while it trains, and that is counted). The best method of each kind is chosen on the starts that are reported.
 PPO in imagination and the methods below it use a world model."""
+
+
+def beyond_seeds(found: Groups) -> str:
+    """Return which gains of the best method are above 0 by Student's t over the seeds alone."""
+    if all(len(cells) < 3 for cells in found.values()):
+        return "One or two seeds say little of others."
+    certain = []
+    for group, cells in found.items():
+        for domain in SCENES:
+            ours, baseline = (best(cells, methods, domain) for methods in (IMAGINED, BASELINES))
+            each = gains(cells, ours, baseline, domain)
+            if len(each) > 2 and (low := ttest_1samp(each, 0).confidence_interval().low) > 0:
+                certain.append(f"{spoken(group)}, {DOMAINS[domain]} scenes (from {100 * low:.0f} on)")
+    return f"""These intervals draw starts and seeds, and are too narrow where few seeds differ much. By
+Student's t over the gains of three seeds alone, a gain is above 0 with {listed(certain)}."""
 
 
 def rows_above(methods: Sequence[str], load: Load, study: str = STUDY, parts: Sequence[str] = PARTS) -> str:

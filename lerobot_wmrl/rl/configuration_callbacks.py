@@ -24,7 +24,7 @@ class SelectionConfig:
         freq: iterations between two measurements of success. Each one also saves a checkpoint. 0: off.
         n_episodes: episodes in a measurement, always from the same starts. They run in `real_env` if it is
             set, so many of each task, from starts that are used neither for training nor for evaluation;
-            otherwise in the world model, from first frames of episodes spread over `dataset`, one of each.
+            otherwise in the world model, from starts spread evenly over `dataset`.
         dataset: dataset whose first frames start the imagined episodes; by default `env.dataset`.
     """
 

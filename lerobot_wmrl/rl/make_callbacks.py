@@ -83,8 +83,9 @@ def make_measures(settings: CallbackSettings, trained: Trained) -> dict[str, Mea
         measured_env, count = env, episodes
         if isinstance(env, WorldModelVectorEnv):
             own = env.config.dataset
-            source = StartFrames(**vars(dataset)) if dataset.given else own
-            measured_env = make_success_env(env, replace(source, max_starts=episodes, branches=0))
+            source = StartFrames(**vars(dataset), branches=own.branches) if dataset.given else own
+            starts = max(episodes, 1 + own.branches)
+            measured_env = make_success_env(env, replace(source, max_starts=starts))
             count = min(count, len(measured_env.starts))
         return evaluate_within(measured_env, config, policy, processors, count, SELECTION_SEED)
 
