@@ -9,12 +9,6 @@ Load = Callable[[str], dict[str, Any]]
 DOMAINS: Final = {"ind": "known", "ood": "unseen", "drawn": "known, sampled tokens"}
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """Return a Markdown table."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join(f"| {' | '.join(str(cell) for cell in line)} |" for line in lines)
-
-
 def share(rate: Mapping[str, Any]) -> str:
     """`57 % (47–66)`: a share with Wilson's 95 % interval."""
     low, high = rate["wilson_95"]

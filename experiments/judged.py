@@ -11,10 +11,11 @@ import numpy as np
 from scipy.stats import binomtest, kendalltau, pearsonr
 
 from experiments import figures
-from experiments.cells import DOMAINS, Load, counted, table
+from experiments.cells import DOMAINS, Load, counted
 from experiments.study import ROOT, Study, read_cells
 from experiments.success import Results
 from experiments.value import policy_name
+from lerobot_wmrl.common.files import markdown_table as table
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.evaluation import comparison, judgement
 from lerobot_wmrl.evaluation.calibration import (

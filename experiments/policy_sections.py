@@ -3,7 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
-from experiments.cells import DOMAINS, Load, counted, paired, percents, points, share, table
+from experiments.cells import DOMAINS, Load, counted, paired, percents, points, share
+from lerobot_wmrl.common.files import markdown_table as table
 from lerobot_wmrl.improve.stages import CLONED, DISTILLED
 
 

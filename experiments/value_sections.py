@@ -12,8 +12,9 @@ from matplotlib.lines import Line2D
 from scipy.stats import ttest_1samp
 
 from experiments import figures
-from experiments.cells import DOMAINS, Load, counted, paired, points, table
+from experiments.cells import DOMAINS, Load, counted, paired, points
 from experiments.study import ROOT, read_cells
+from lerobot_wmrl.common.files import markdown_table as table
 from lerobot_wmrl.common.statistics import PairedChange, RunsMean
 from lerobot_wmrl.improve.report.figures import tidy
 
@@ -194,8 +195,8 @@ McNemar's test): {begun(cells)}. PPO in ManiSkill begins from the latter; its po
 iteration on. When it learnt from the fourth of ten on, it had 70 and 60 % with 8 demonstrations and 300
 rollouts, 88 and 74 % with 25, and 96 and 79 % with 50 (three seeds each). Its learning rates and KL penalty
 are those that were tuned in imagination. With 8 and with 50 demonstrations it was run again on another
-machine, demonstrations and BC included. {from_the_same_start(cells)} PPO in imagination alone is not clearly better
-than PPO in ManiSkill from 25 demonstrations on.
+machine, demonstrations and BC included. {from_the_same_start(cells)} PPO in imagination alone is not clearly
+better than PPO in ManiSkill from 25 demonstrations on.
 
 Planning changes what PPO's policy would do, and plans anew after eight actions. An episode of it takes
 {planned:.1f} s on one core, simulator included, one of the policy {policy:.1f} s.

@@ -3,7 +3,8 @@
 from collections.abc import Mapping
 from typing import Any, Final
 
-from experiments.cells import Load, counted, estimate, share, table
+from experiments.cells import Load, counted, estimate, share
+from lerobot_wmrl.common.files import markdown_table as table
 
 
 def policies(load: Load) -> str:

@@ -14,9 +14,9 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_dataset_maniskill.writer import VOCABULARY_FILE
 from lerobot_wmrl.common.constants import KINDS, TASKS
-from lerobot_wmrl.common.files import write_text
-from lerobot_wmrl.common.frame_strips import enlarged, evenly_spaced, in_a_row
-from lerobot_wmrl.common.statistics import Proportion
+from lerobot_wmrl.common.files import markdown_table, write_text
+from lerobot_wmrl.common.frame_strips import enlarged, in_a_row
+from lerobot_wmrl.common.statistics import Proportion, evenly_spread
 from lerobot_wmrl.maniskill.embodiment import FPS
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
@@ -124,12 +124,6 @@ def scene_rows(
         yield index, *(scene[part] for part in ("object", "container", "table", "split")), episodes
 
 
-def markdown_table(head: Sequence[str], rows: Iterator[tuple[Any, ...]]) -> str:
-    """Return a table in Markdown."""
-    cells = [head, ["---"] * len(head), *rows]
-    return "\n".join(f"| {' | '.join(str(cell) for cell in row)} |" for row in cells)
-
-
 def success_by_kind(table: Mapping[str, np.ndarray]) -> dict[str, tuple[int, int]]:
     """Count by kind. Returns kind → (successful episodes, episodes)."""
     kinds, success = table["kind"], table["success"]
@@ -189,7 +183,7 @@ def frames_to_success(dataset: LeRobotDataset) -> np.ndarray:
     end = len(success)
     if success.any():
         end = min(int(success.argmax()) + 2, end)  # success shows in the frame after its row
-    rows = [dataset[int(index)] for index in evenly_spaced(end, FRAMES)]
+    rows = [dataset[int(index)] for index in evenly_spread(end, FRAMES)]
     coloured = [name for name in dataset.meta.camera_keys if name not in dataset.meta.depth_keys]
     cameras = [np.stack([as_bytes(row[name].numpy()) for row in rows]) for name in coloured]
     return np.concatenate(cameras, 2).transpose(0, 2, 3, 1)

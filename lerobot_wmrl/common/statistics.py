@@ -1,4 +1,4 @@
-"""Proportions, means and other ratios with their uncertainty."""
+"""Proportions, means and other ratios with their uncertainty, and samples."""
 
 import math
 import warnings
@@ -204,3 +204,8 @@ class RunsMean:
         means = np.einsum("br,re,be->b", drawn_runs, table, drawn_starts)
         low, high = np.percentile(means, (2.5, 97.5))
         return cls(float(table.mean()), float(low), float(high))
+
+
+def evenly_spread(count: int, at_most: int) -> np.ndarray:
+    """Return at most `at_most` of the indices below `count`, the first and the last among them. (N,)"""
+    return np.linspace(0, count - 1, min(count, at_most)).astype(int)

@@ -107,7 +107,7 @@ class ClipSampler:
 
     def __post_init__(self) -> None:
         """Weigh success by how rare it is."""
-        done = np.concatenate([self.table.taught[rows] for rows in self.table.rows(self.episodes)])
+        done = np.concatenate([self.table.success_target[rows] for rows in self.table.rows(self.episodes)])
         odds = SUCCESS_SHARE / (1 - SUCCESS_SHARE)
         rarity = float(odds * (~done).sum() / done.sum()) if done.any() else 1.0
         self.success_weight = min(max(1.0, rarity), MOST_WEIGHT)
@@ -134,7 +134,7 @@ class ClipSampler:
             self._tensor(self.tokens[rows]).long(),
             self._tensor(self.table.state[rows]),
             self._tensor(self.table.action[rows]),
-            self._tensor(self.table.taught[rows]).float(),
+            self._tensor(self.table.success_target[rows]).float(),
             self._tensor(valid),
             self._tensor(known),
             [self.table.instructions[episode] for episode in episodes],
@@ -172,7 +172,7 @@ class FrameSampler:
 
     def __post_init__(self) -> None:
         """Find the frames that show success, and the share of draws that must fall on them besides."""
-        self.shown = np.append(False, self.table.taught[:-1])  # a frame follows the action before it,
+        self.shown = np.append(False, self.table.success_target[:-1])  # a frame follows the action before it,
         self.shown[self.table.start] = False  # and an episode's first frame none
         offsets = [np.flatnonzero(self.shown[rows]) for rows in self.table.rows(self.episodes)]
         counts, length = np.array([len(each) for each in offsets]), self.table.length[self.episodes]

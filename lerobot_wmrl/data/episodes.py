@@ -14,6 +14,7 @@ from lerobot.utils.constants import ACTION, DONE, OBS_IMAGE, OBS_IMAGES, OBS_STA
 from numpy.typing import ArrayLike
 
 from lerobot_wmrl.common.errors import FieldError, first_line, renamed
+from lerobot_wmrl.common.statistics import evenly_spread
 
 VIDEO_BACKEND: Final = "pyav"
 """pyav ships its own FFmpeg, torchcodec needs the system's. Speed matters little: frames are decoded once."""
@@ -132,7 +133,7 @@ class EpisodeTable:
         length: (E,), frames of each episode.
         instructions: one an episode, that of its first frame.
         columns: the dataset's further integer columns by name, (E,): their values at the first frames.
-        filled: what stands for `done` in training, (N,), where no frame shows success.
+        inferred_success: what stands for `done` in training, (N,), where no frame shows success.
     """
 
     dataset: LeRobotDataset
@@ -143,12 +144,12 @@ class EpisodeTable:
     length: np.ndarray
     instructions: list[str]
     columns: Mapping[str, np.ndarray] = field(default_factory=dict)
-    filled: np.ndarray | None = None
+    inferred_success: np.ndarray | None = None
 
     @property
-    def taught(self) -> np.ndarray:
+    def success_target(self) -> np.ndarray:
         """What models learn as success: `done`, or what stands for it. (N,)"""
-        return self.done if self.filled is None else self.filled
+        return self.done if self.inferred_success is None else self.inferred_success
 
     def column(self, name: str) -> np.ndarray:
         """Return an integer column's values, −1 where the dataset has no such column. (E,)"""
@@ -230,16 +231,15 @@ def download_dataset(repo_id: str, revision: str | None = None) -> LeRobotDatase
     """Download a dataset of the hub into LeRobot's cache and open it. FieldError if that fails."""
     try:
         return LeRobotDataset(repo_id, revision=revision, video_backend=VIDEO_BACKEND)
-    except OLDER_FORMAT as error:
-        copy = Path("data") / repo_id.rpartition("/")[2]
-        raise FieldError(
-            "dataset.repo_id", repo_id, NOT_V3,
-            f"convert a copy of it: `{conversion(repo_id, copy)}`, and give that, `dataset.root` {copy}",
-        ) from error  # fmt: skip
     except Exception as error:  # the hub's client, parquet and JSON each raise their own
-        reason = first_line(error)
+        if isinstance(error, OLDER_FORMAT) and revision is None:
+            copy = Path("data") / repo_id.rpartition("/")[2]
+            raise FieldError(
+                "dataset.repo_id", repo_id, NOT_V3,
+                f"convert a copy of it: `{conversion(repo_id, copy)}`, and give that, `dataset.root` {copy}",
+            ) from error  # fmt: skip
         raise FieldError(
-            "dataset.repo_id", repo_id, f"cannot be downloaded ({reason})",
+            "dataset.repo_id", repo_id, f"cannot be downloaded ({first_line(error)})",
             "correct the name, log in with `hf auth login` if it is private, or give a folder on disk, "
             "`dataset.root`",
         ) from error  # fmt: skip
@@ -283,7 +283,7 @@ def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
     frames = len(rows["episode_index"])
     _, start, length = np.unique(rows["episode_index"], return_index=True, return_counts=True)
     done = np.asarray(rows[success]).reshape(-1).astype(bool) if success else np.zeros(frames, bool)
-    filled, ending = None, end_at_success(done, start, length)
+    inferred, ending = None, end_at_success(done, start, length)
     # next.done may say no more than that episodes end
     if success != DONE and 2 * ending.sum() > np.logical_or.reduceat(done, start).sum():
         logging.warning(
@@ -291,7 +291,7 @@ def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
             "frames of those that do are taken for solved; record a few more, if you can",
             dataset.root, SOLVED_FRAMES,
         )  # fmt: skip
-        filled = solved_at_end(done, start[ending], length[ending])
+        inferred = solved_at_end(done, start[ending], length[ending])
     return EpisodeTable(
         dataset=dataset,
         state=as_columns(rows[OBS_STATE]) if OBS_STATE in rows else np.zeros((frames, 0), np.float32),
@@ -301,7 +301,7 @@ def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
         length=length,
         instructions=first_instructions(dataset, np.asarray(rows["task_index"]), start),
         columns={name: np.asarray(rows[name]).reshape(-1)[start] for name in further},
-        filled=filled,
+        inferred_success=inferred,
     )
 
 
@@ -409,11 +409,6 @@ def choose_episodes(
         those = "" if wanted is None else " of those that are asked for"
         raise FieldError("split", split, f"dataset {table.dataset.root} has no episode{those} in it")
     return episodes[evenly_spread(len(episodes), at_most)]
-
-
-def evenly_spread(count: int, at_most: int) -> np.ndarray:
-    """Return at most `at_most` of the indices below `count`, the first and the last among them."""
-    return np.linspace(0, count - 1, min(count, at_most)).astype(int)
 
 
 def frame_size(feature: Mapping[str, Any]) -> tuple[int, int]:

@@ -19,11 +19,11 @@ from torch import Tensor
 from lerobot_wmrl.common.constants import START_SCENE, START_TASK, TASKS
 from lerobot_wmrl.common.errors import FieldError, within
 from lerobot_wmrl.common.images import stretch, to_bytes
+from lerobot_wmrl.common.statistics import evenly_spread
 from lerobot_wmrl.data.budget import Ledger
 from lerobot_wmrl.data.episodes import (
     EpisodeTable,
     choose_episodes,
-    evenly_spread,
     read_episodes,
 )
 from lerobot_wmrl.data.frame_cache import cached_frames, frames_to_tensor
@@ -176,7 +176,8 @@ def check_starts(source: StartFrames, ledger: Ledger | None) -> None:
 
 def undecided_frames(table: EpisodeTable, episodes: np.ndarray) -> np.ndarray:
     """Return the number of frames before the first success of K episodes, all if there is none. (K,)"""
-    start, solved = table.start[episodes], np.append(np.flatnonzero(table.taught), len(table.taught))
+    done = table.success_target
+    start, solved = table.start[episodes], np.append(np.flatnonzero(done), len(done))
     return np.minimum(solved[np.searchsorted(solved, start)] - start, table.length[episodes])
 
 

@@ -1,7 +1,7 @@
 """Evaluation of a world model on recorded episodes: one pass over them, then metrics, tables, pictures."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -10,6 +10,7 @@ import numpy as np
 
 from lerobot_wmrl.common.constants import KINDS, PLAY, START_KIND
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.files import markdown_table
 from lerobot_wmrl.common.statistics import Estimate
 from lerobot_wmrl.data.frames import NO_CONTEXT
 from lerobot_wmrl.evaluation import pictures
@@ -218,12 +219,6 @@ def report_agreement(agreement: Agreement, folder: Path) -> Report:
     """Report the success of policies in both environments, and save policies.png in `folder`."""
     pictures.save_agreement(agreement, folder / "policies.png")
     return Report({"policies": agreement.as_json()}, agreement_table(agreement))
-
-
-def markdown_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Format head and rows, one a line."""
-    cells = [head, ["---"] * len(head), *rows]
-    return "\n".join(f"| {' | '.join(str(cell) for cell in row)} |" for row in cells)
 
 
 def headline_table(estimates: Mapping[str, Estimate]) -> str:

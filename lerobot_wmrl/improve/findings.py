@@ -110,7 +110,7 @@ def look(
         f"{success.sum()} episodes succeed, {(~success).sum()} fail",
     ]
     tasks = np.unique(table.column(START_TASK), return_counts=True)[1]
-    done = [table.taught[rows].sum() for rows in table.rows(range(len(success)))]
+    done = [table.success_target[rows].sum() for rows in table.rows(range(len(success)))]
     return Findings(
         lines=lines,
         missing=[

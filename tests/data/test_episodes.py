@@ -43,7 +43,7 @@ def test_where_episodes_merely_end_nothing_is_added(tmp_path: Path) -> None:
         })  # fmt: skip
     dataset.save_episode()
     dataset.finalize()
-    assert read_episodes(open_dataset(tmp_path / "d")).taught.tolist() == [False] * 4 + [True]
+    assert read_episodes(open_dataset(tmp_path / "d")).success_target.tolist() == [False] * 4 + [True]
 
 
 @pytest.mark.parametrize(
@@ -71,7 +71,7 @@ def test_where_no_frame_shows_success_the_last_ones_are_taken_for_it(
         dataset.save_episode()
     dataset.finalize()
     table = read_episodes(open_dataset(tmp_path / "d"))
-    assert table.taught.astype(int).tolist() == [frame for episode in read for frame in episode]
+    assert table.success_target.astype(int).tolist() == [frame for episode in read for frame in episode]
     assert table.done.astype(int).tolist() == [frame for episode in recorded for frame in episode]
     assert table.success.tolist() == [any(episode) for episode in recorded]
     assert ("no frame shows success" in caplog.text) == (recorded != read)

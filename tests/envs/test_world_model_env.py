@@ -470,9 +470,8 @@ def test_what_the_world_model_is_uncertain_of_ends_or_pays_less(config):
     assert terminated.tolist() == [True, True, False, False]
     assert not truncated.any()
     assert parts["token_entropy"].tolist() == [0, 1, 2, 3]
-    torch.testing.assert_close(less, paid * torch.tensor([1, 1 / 2, 1 / 4, 1 / 6]))
-    weight, entropy = Uncertainty(limit=0.5, effect="weight"), {"token_entropy": torch.tensor([2.0, 2.0])}
-    assert weight.weigh(torch.tensor([1.0, -1.0]), entropy).tolist() == [0.25, -1.0], "a loss is no smaller"
+    assert (paid < 0).any(), "a loss becomes no smaller"
+    torch.testing.assert_close(less, paid.where(paid < 0, paid * torch.tensor([1, 1 / 2, 1 / 4, 1 / 6])))
     for wrong in ({"limit": 0.0}, {"signal": "mood"}, {"effect": "scold"}):
         name, value = next(iter(wrong.items()))
         with pytest.raises(ValueError, match=rf"^uncertainty\.{name}={value}"):

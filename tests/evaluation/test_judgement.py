@@ -270,10 +270,12 @@ def test_any_checkpoint_of_the_world_model_and_any_training_before_counts(config
     write(settings_of(second), {"env": None, "policy": {"pretrained_path": second}})
     assert trained_inside(second, model) is None
     further = tmp_path / "further"
+    further.mkdir()
     write(further / "train_config.json", {"model": {"pretrained_path": model}})
     write(settings_of(first), {"env": {"type": "world_model", "world_model_path": model}})
     assert trained_inside(first, str(further)) is not None, "it has learnt more since"
     dyna = training_folder(first) / "dyna" / "000002" / "action_world_model"
+    dyna.mkdir(parents=True)
     write(dyna / "train_config.json", {})
     assert trained_inside(first, str(dyna)) is not None, "the training's own"
     other = str(trained_models["frame_tokenizer"])
