@@ -22,9 +22,10 @@ from lerobot_wmrl.common.files import write_json, writing
 from lerobot_wmrl.common.policies import check_weights
 from lerobot_wmrl.data.budget import Ledger, spending
 from lerobot_wmrl.data.episodes import open_dataset, read_episodes
+from lerobot_wmrl.data.features import describe_alike
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.envs.start_frames import check_starts
-from lerobot_wmrl.rl.recorders import RolloutRecorder, describe_alike
+from lerobot_wmrl.rl.recorders import RolloutRecorder
 
 SETTINGS_FILE: Final = Path("meta/rollouts.json")
 """The settings that decide the episodes."""

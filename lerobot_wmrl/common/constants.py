@@ -1,6 +1,9 @@
-"""Names and numbers that the recorder, the environments and the models agree on."""
+"""Names, types and numbers that the recorder, the environments and the models agree on."""
 
-from typing import Final
+from typing import Any, Final
+
+Observation = dict[str, Any]
+"""Tensors by LeRobot's names, batch first, and `task`: a list of instructions."""
 
 TASKS: Final = ("push", "pull", "pick_place", "move_to_aim")
 """Vocabulary of the column `start.task`."""

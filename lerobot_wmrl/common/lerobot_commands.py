@@ -1,13 +1,20 @@
-"""LeRobot's own commands as stages: each can be called again after an interruption."""
+"""LeRobot's own commands as stages, each of which can be called again after an interruption, and its
+environments as flags."""
 
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import draccus
+from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import CHECKPOINTS_DIR, PRETRAINED_MODEL_DIR
+from lerobot.utils.utils import flatten_dict
 
 from lerobot_wmrl.common.checkpoints import LAST_CHECKPOINT
 from lerobot_wmrl.common.presets import Flags, format_flags
+
+DERIVED = ("features", "features_map")
+"""Settings of an environment that are derived from others."""
 
 
 def train_command(folder: Path, flags: Sequence[str]) -> list[str]:
@@ -41,3 +48,19 @@ def edit_command(folder: Path, operation: str, flags: Flags) -> list[str]:
     shutil.rmtree(folder, ignore_errors=True)
     new = {"new_repo_id": f"local/{folder.name}", "new_root": str(folder), "operation.type": operation}
     return ["lerobot-edit-dataset", *format_flags(new | dict(flags))]
+
+
+def env_flags(env: EnvConfig, prefix: str = "env") -> Flags:
+    """Return `env.type` and the settings that differ from their defaults, as a command takes them.
+
+    prefix: of the flags, `env` or `real_env`.
+    """
+    given, default = (flatten_dict(draccus.encode(each, EnvConfig), sep=".") for each in (env, type(env)()))
+    differing = [name for name in given if given[name] != default.get(name)]
+    chosen = {
+        name
+        for name in given
+        if name.endswith(".type") and any(each.startswith(name.removesuffix("type")) for each in differing)
+    }
+    kept = [name for name in given if name in {*differing, *chosen} and name.split(".")[0] not in DERIVED]
+    return {f"{prefix}.type": env.type, **{f"{prefix}.{name}": given[name] for name in kept}}

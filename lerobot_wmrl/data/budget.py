@@ -26,6 +26,7 @@ import numpy as np
 from lerobot_wmrl.common.constants import KINDS, PLAY, POLICY, START_COLUMNS, START_KIND
 from lerobot_wmrl.common.errors import FieldError, require_at_least
 from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.common.presets import Flags
 from lerobot_wmrl.data.episodes import EpisodeTable
 
 DEMONSTRATIONS: Final = "demonstrations"
@@ -210,3 +211,8 @@ def episode_digests(table: EpisodeTable) -> list[str]:
         sha256(start.tobytes() + actions.astype("<f4").tobytes()).hexdigest()
         for start, actions in zip(starts, rows, strict=True)
     ]
+
+
+def budget_flags(budget: Path | None) -> Flags:
+    """Return the flag that keeps a command within the budget of this training, if it has one."""
+    return {} if budget is None else {"budget": str(budget)}

@@ -9,7 +9,7 @@ from lerobot_wmrl.common.checkpoints import last_checkpoint
 from lerobot_wmrl.common.command_line import RunConfig
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
-from lerobot_wmrl.common.lerobot_commands import train_command
+from lerobot_wmrl.common.lerobot_commands import env_flags, train_command
 from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.common.presets import Flags, format_flags, preset_flags, presets_of
 from lerobot_wmrl.common.stages import Stage
@@ -21,7 +21,6 @@ from lerobot_wmrl.improve.report.page import Page, stage_records
 from lerobot_wmrl.improve.report.results import curve, lerobot_train_curve, read_place
 from lerobot_wmrl.improve.report.words import verdict
 from lerobot_wmrl.improve.stages import Improvement
-from lerobot_wmrl.rl.recorders import env_flags
 
 SEED_STRIDE: Final = 100_000
 """Demo seed s records and trains with seeds from s·SEED_STRIDE on, below EVALUATION_SEED."""

@@ -9,9 +9,8 @@ import torch
 from lerobot.utils.constants import OBS_IMAGE, OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
+from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.images import to_bytes
-
-Observation = dict[str, Any]
 
 
 class EvaluationAdapter(gym.vector.VectorEnv):

@@ -13,11 +13,10 @@ from lerobot.envs.utils import NEW_ROLLOUT_OPTION, preprocess_observation
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
+from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.errors import within
 from lerobot_wmrl.common.policies import check_fit
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
-
-Observation = dict[str, Any]
 
 
 def make_tensor_env(config: EnvConfig, n_envs: int, device: str) -> gym.vector.VectorEnv:

@@ -12,6 +12,7 @@ from lerobot.rewards.factory import make_reward_model
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
+from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.start_frames import Goals, StartImages, Starts, load_starts, read_start_images
@@ -29,8 +30,6 @@ from lerobot_wmrl.world_models.modeling_world_model import (
     ActionWorldModelRewardModel,
     TextWorldModelRewardModel,
 )
-
-Observation = dict[str, Any]
 
 
 class WorldModelVectorEnv(gym.vector.VectorEnv):

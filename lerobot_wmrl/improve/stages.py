@@ -21,7 +21,7 @@ from lerobot_wmrl.common.constants import (
     START_TASK,
 )
 from lerobot_wmrl.common.errors import STOPPED
-from lerobot_wmrl.common.lerobot_commands import edit_command, merge_command, train_command
+from lerobot_wmrl.common.lerobot_commands import edit_command, env_flags, merge_command, train_command
 from lerobot_wmrl.common.policies import check_units, load_processors
 from lerobot_wmrl.common.presets import Flags, format_flags
 from lerobot_wmrl.common.stages import FAILED, Stage, never, read_record
@@ -33,7 +33,6 @@ from lerobot_wmrl.evaluation.comparison import RESULTS, chosen_policy, most_succ
 from lerobot_wmrl.improve.configuration_improve import ROLLOUT_SEED_OFFSET, ImproveConfig
 from lerobot_wmrl.improve.findings import LONGEST_IMAGINATION, Findings, look, usual_length
 from lerobot_wmrl.improve.sizes import Sizes
-from lerobot_wmrl.rl.recorders import env_flags
 
 SFT: Final = "SFT policy"
 CLONED: Final = "further BC on successes"

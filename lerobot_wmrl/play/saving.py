@@ -15,8 +15,8 @@ from lerobot.utils.constants import ACTION, DEFAULT_FEATURES
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.embodiment import Embodiment, check_same_robot
 from lerobot_wmrl.data.episodes import open_dataset
+from lerobot_wmrl.data.features import episode_features, observation_row
 from lerobot_wmrl.play.drive import Step
-from lerobot_wmrl.rl.recorders import episode_features, observation_row
 
 WAITING_SECONDS: Final = 30
 

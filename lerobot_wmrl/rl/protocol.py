@@ -7,12 +7,11 @@ steps or when a new episode begins.
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 from torch import Tensor, nn
 
-Observation = dict[str, Any]
-"""Tensors by LeRobot's names, batch first, and `task`: a list of instructions."""
+from lerobot_wmrl.common.constants import Observation
 
 
 class ActionSample(Protocol):

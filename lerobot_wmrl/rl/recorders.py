@@ -1,36 +1,34 @@
 """Recording what a policy does outside the world model, for the gate and for Dyna rounds."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-import draccus
 import numpy as np
 import torch
-from lerobot.configs import PreTrainedConfig, RGBEncoderConfig
-from lerobot.datasets.io_utils import load_info, write_info
+from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs import make_env, make_env_pre_post_processors
 from lerobot.envs.configs import EnvConfig
 from lerobot.scripts.lerobot_eval import rollout
-from lerobot.utils.constants import ACTION, DEFAULT_FEATURES, OBS_IMAGE, OBS_STATE, PRETRAINED_MODEL_DIR
-from lerobot.utils.utils import flatten_dict
+from lerobot.utils.constants import ACTION, PRETRAINED_MODEL_DIR
 from torch import Tensor
 from tqdm import trange
 
-from lerobot_wmrl.common.constants import KINDS, POLICY, START_KIND, START_SEED
+from lerobot_wmrl.common.constants import KINDS, POLICY, START_KIND, START_SEED, Observation
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.exploration import ExplorationNoise
 from lerobot_wmrl.common.files import whole_folder
-from lerobot_wmrl.common.images import to_bytes
+from lerobot_wmrl.common.lerobot_commands import env_flags
 from lerobot_wmrl.common.policies import load_policy, load_processors, read_policy_config
 from lerobot_wmrl.common.presets import Flags, format_flags
 from lerobot_wmrl.common.processes import run_subcommand
-from lerobot_wmrl.data.budget import Ledger, spending
-from lerobot_wmrl.data.embodiment import HIGH, LOW, Embodiment, read_embodiment, recorded_range
+from lerobot_wmrl.data.budget import Ledger, budget_flags, spending
+from lerobot_wmrl.data.embodiment import Embodiment, read_embodiment, recorded_range
 from lerobot_wmrl.data.episodes import open_dataset, read_episodes
+from lerobot_wmrl.data.features import encoder_of, episode_features, matched, observation_row
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 
@@ -39,11 +37,6 @@ IMAGE_WRITERS = 4
 
 FRAME_LIMIT = "_max_episode_steps"
 """Attribute of an environment that ends LeRobot's rollouts."""
-
-DERIVED = ("features", "features_map")
-"""Settings of an environment that are derived from others."""
-
-Observation = dict[str, Any]
 
 
 class Recorder(Protocol):
@@ -248,99 +241,6 @@ class RolloutRecorder:
         return success
 
 
-def episode_features(observation: Observation, robot: Embodiment, camera: str) -> dict[str, dict[str, Any]]:
-    """Describe the columns of what a robot does: a batch of its observations, actions, reward and success.
-
-    camera: how images are stored, image or video.
-    """
-    flag, number = ({"dtype": kind, "shape": (1,), "names": None} for kind in ("bool", "float32"))
-    return {
-        **observation_features(observation, robot.state_names, camera),
-        ACTION: {
-            "dtype": "float32", "shape": (len(robot.action_names),), "names": robot.action_names,
-            "info": {LOW: robot.action_low, HIGH: robot.action_high},
-        },
-        "next.reward": number, "next.success": flag, "next.done": flag,
-    }  # fmt: skip
-
-
-def observation_row(observation: Observation, row: int) -> dict[str, np.ndarray]:
-    """Return one row of a batch of observations as a dataset holds it: images (H, W, 3) uint8."""
-    return {
-        key: to_bytes(value[row]).permute(1, 2, 0).cpu().numpy()
-        if key.startswith(OBS_IMAGE)
-        else value[row].cpu().numpy().astype(np.float32)
-        for key, value in observation.items()
-        if isinstance(value, Tensor)
-    }
-
-
-def observation_features(
-    observation: Observation, state_names: Sequence[str], camera: str
-) -> dict[str, dict[str, Any]]:
-    """Describe the columns of a batch of observations; `camera` is how images are stored, image or video."""
-    features: dict[str, dict[str, Any]] = {}
-    for key, value in observation.items():
-        if not isinstance(value, Tensor):
-            continue
-        if key.startswith(OBS_IMAGE):
-            _, channels, height, width = value.shape
-            shape = (height, width, channels)
-            features[key] = {"dtype": camera, "shape": shape, "names": ["height", "width", "channels"]}
-        else:
-            names = list(state_names) if key == OBS_STATE and state_names else None
-            features[key] = {"dtype": "float32", "shape": tuple(value.shape[1:]), "names": names}
-    return features
-
-
-def matched(own: Mapping[str, Any], columns: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the features with which a recording of `own` can be merged with a dataset of `columns`.
-
-    Raises:
-        FieldError: the dataset has a column that a rollout lacks, or has in another shape.
-    """
-    wanted = {name: dict(feature) for name, feature in columns.items() if name not in DEFAULT_FEATURES}
-    for name, feature in wanted.items():
-        found = tuple(own[name]["shape"]) if name in own else None
-        if found != tuple(feature["shape"]):
-            raise FieldError(
-                "like.root", name, f"the dataset has it with shape {tuple(feature['shape'])}, a rollout has "
-                f"{found or 'none'}",
-                "give `like_columns=false`, and the recording as `dataset.more` to what learns from it",
-            )  # fmt: skip
-        if "info" in feature and feature["dtype"] == "video":
-            feature.pop("info")  # the encoder's, which LeRobot writes
-    return wanted
-
-
-def video_info(feature: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a dataset, also of an earlier version, says of its videos."""
-    return feature.get("info") or feature.get("video_info") or {}
-
-
-def encoder_of(columns: Mapping[str, Any]) -> RGBEncoderConfig | None:
-    """Return the encoder of a dataset's videos, with which others can be merged; None if it has none."""
-    videos = [feature for feature in columns.values() if feature["dtype"] == "video"]
-    return RGBEncoderConfig.from_video_info(video_info(videos[0])) if videos else None
-
-
-def describe_alike(root: Path, columns: Mapping[str, Any]) -> None:
-    """Describe the columns of a whole recording as another dataset does, word for word.
-
-    LeRobot merges no datasets whose descriptions differ, be it in notes of an earlier version. Videos that
-    are encoded in another way keep theirs: they must not be merged.
-    """
-
-    def encoding(feature: Mapping[str, Any]) -> list[Any]:
-        return [video_info(feature).get(f"video.{name}") for name in ("codec", "pix_fmt")]
-
-    info = load_info(root)
-    for name, feature in info.features.items():
-        if feature["dtype"] != "video" or encoding(feature) == encoding(columns[name]):
-            info.features[name] = dict(columns[name])
-    write_info(info, root)
-
-
 def robot_of(config: EnvConfig, env: Any, like: Any | None) -> Embodiment:
     """Return the robot of an environment.
 
@@ -406,24 +306,3 @@ class RecordingProcessors:
         kept = np.clip(chosen, self.robot.action_low, self.robot.action_high).astype(np.float32)
         self.actions.append(kept)
         return torch.from_numpy(kept)
-
-
-def budget_flags(budget: Path | None) -> Flags:
-    """Return the flag that keeps a command within the budget of this training, if it has one."""
-    return {} if budget is None else {"budget": str(budget)}
-
-
-def env_flags(env: EnvConfig, prefix: str = "env") -> Flags:
-    """Return `env.type` and the settings that differ from their defaults, as a command takes them.
-
-    prefix: of the flags, `env` or `real_env`.
-    """
-    given, default = (flatten_dict(draccus.encode(each, EnvConfig), sep=".") for each in (env, type(env)()))
-    differing = [name for name in given if given[name] != default.get(name)]
-    chosen = {
-        name
-        for name in given
-        if name.endswith(".type") and any(each.startswith(name.removesuffix("type")) for each in differing)
-    }
-    kept = [name for name in given if name in {*differing, *chosen} and name.split(".")[0] not in DERIVED]
-    return {f"{prefix}.type": env.type, **{f"{prefix}.{name}": given[name] for name in kept}}

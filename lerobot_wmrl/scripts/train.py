@@ -387,7 +387,7 @@ def evaluation(cfg: TrainConfig, path: str, shared: bool = False) -> str:
 
     `shared`: for others, who do not have this machine's folders.
     """
-    from lerobot_wmrl.rl.recorders import env_flags
+    from lerobot_wmrl.common.lerobot_commands import env_flags
 
     evaluated: Any = cfg.real_env or cfg.env
     settings = dict(env_flags(evaluated))

@@ -14,6 +14,7 @@ from torch.distributions import Normal
 
 from lerobot_policy_cnn.configuration_cnn import MAX_STD, MIN_STD, CnnConfig, check_std
 from lerobot_policy_cnn.networks import ObservationEncoder, Readout
+from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.images import random_shift
 
 STATE_LIMIT = 10.0
@@ -42,8 +43,6 @@ SUMMARY = (
     "is untrained until `lerobot-wmrl-train` improves the policy by reinforcement learning, in a world model "
     "or in ManiSkill."
 )
-
-Observation = dict[str, Any]
 
 
 class GaussianSample(NamedTuple):

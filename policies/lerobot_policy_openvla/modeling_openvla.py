@@ -48,9 +48,9 @@ from lerobot_policy_openvla.prompts import (
     train_tokenizer,
 )
 from lerobot_policy_openvla.sizes import Sizes
+from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.precision import require_exact_updates
 
-Observation = dict[str, Any]
 VALUE_HEAD = "value_head"
 
 

@@ -8,6 +8,7 @@ from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
 from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
+from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.policies import (
     check_fit,
@@ -20,8 +21,6 @@ from lerobot_wmrl.data.frames import Context, Frames
 from lerobot_wmrl.world_models.checkpoint import check_same_tokenizer, load_model
 from lerobot_wmrl.world_models.modeling_frame_tokenizer import stack_cameras
 from lerobot_wmrl.world_models.planning import Planner
-
-Observation = dict[str, Any]
 
 
 class WmMpcPolicy(PreTrainedPolicy):

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from lerobot_wmrl.common.lerobot_commands import env_flags
 from lerobot_wmrl.data.episodes import DatasetSource
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
@@ -16,7 +17,7 @@ from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.configuration_callbacks import GateConfig
 from lerobot_wmrl.rl.gate import SuccessGate
-from lerobot_wmrl.rl.recorders import ManiSkillRecorder, env_flags
+from lerobot_wmrl.rl.recorders import ManiSkillRecorder
 
 BELIEVES_ALL, BELIEVES_NONE = 0.0001, 0.9999
 """Done thresholds."""
