@@ -58,10 +58,10 @@ class Schedule:
     log_freq: int = 1
 
 
-Algorithm = PolicyGradient | Distillation
+TrainableAlgorithm = PolicyGradient | Distillation
 
 
-def make_algorithm(policy: Any, config: RLAlgorithmConfig, output_dir: Path) -> Algorithm:
+def make_algorithm(policy: Any, config: RLAlgorithmConfig, output_dir: Path) -> TrainableAlgorithm:
     """Return the algorithm that `config` describes, to train `policy` in `output_dir`."""
     if isinstance(config, DistillationConfig):
         return Distillation(policy, config, output_dir)
@@ -70,7 +70,7 @@ def make_algorithm(policy: Any, config: RLAlgorithmConfig, output_dir: Path) -> 
 
 
 def train(
-    env: gym.vector.VectorEnv, algorithm: Algorithm, pipeline: Pipeline, rollout: RolloutBuffer,
+    env: gym.vector.VectorEnv, algorithm: TrainableAlgorithm, pipeline: Pipeline, rollout: RolloutBuffer,
     schedule: Schedule, output_dir: Path, save_pretrained: Callable[[Path], None],
     callbacks: Sequence[Callback] = (), wandb: Any = None,
 ) -> None:  # fmt: skip
@@ -116,7 +116,7 @@ def train(
 
 
 def iterate(
-    env: Any, algorithm: Algorithm, pipeline: Pipeline, rollout: RolloutBuffer, schedule: Schedule
+    env: Any, algorithm: TrainableAlgorithm, pipeline: Pipeline, rollout: RolloutBuffer, schedule: Schedule
 ) -> dict[str, float]:
     """Run one iteration of the algorithm on seeds of its own, and return metrics."""
     rank, processes = rank_and_size()
@@ -138,7 +138,9 @@ def make_tracker(
     return Tracker(output_dir, meters, SHOWN, schedule.log_freq, wandb)
 
 
-def save(algorithm: Algorithm, output_dir: Path, total: int, save_pretrained: Callable[[Path], None]) -> Path:
+def save(
+    algorithm: TrainableAlgorithm, output_dir: Path, total: int, save_pretrained: Callable[[Path], None]
+) -> Path:
     """Write a whole checkpoint or none: policy, algorithm, optimiser, random states, iteration."""
     random_states = gather_random_states()
 
@@ -153,7 +155,7 @@ def save(algorithm: Algorithm, output_dir: Path, total: int, save_pretrained: Ca
     return checkpoint_dir(output_dir, algorithm.iteration, total)
 
 
-def resume(algorithm: Algorithm, output_dir: Path) -> Path | None:
+def resume(algorithm: TrainableAlgorithm, output_dir: Path) -> Path | None:
     """Load the latest checkpoint in `output_dir`, if there is one, and return it."""
     checkpoint = latest_checkpoint(output_dir)
     if checkpoint is None:
