@@ -20,10 +20,9 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from tqdm import tqdm
 
 from lerobot_wmrl.common.constants import TASKS
-from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.common.files import markdown_table, write_json
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.data.episodes import EpisodeTable, open_dataset, read_episodes
-from lerobot_wmrl.evaluation.report import markdown_table
 from lerobot_wmrl.maniskill.cameras import Rendering
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 from lerobot_wmrl.maniskill.scenes import SCENES

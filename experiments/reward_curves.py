@@ -30,7 +30,7 @@ from scipy.stats import spearmanr
 from torch import Tensor
 
 from experiments.figures import COLOURS, tidy
-from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.common.files import markdown_table, write_json
 from lerobot_wmrl.common.statistics import Estimate
 from lerobot_wmrl.data.episodes import EpisodeTable, open_dataset, read_episodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
@@ -38,7 +38,6 @@ from lerobot_wmrl.envs.start_frames import chosen_episodes
 from lerobot_wmrl.envs.uncertainty import SIGNALS
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv, make_world_model_env
 from lerobot_wmrl.evaluation.gate import Outcomes
-from lerobot_wmrl.evaluation.report import markdown_table
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.world_models.checkpoint import load_model

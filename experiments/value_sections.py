@@ -262,6 +262,8 @@ def recorded_anew(load: Load) -> str:
                 f"{spoken((whole['demonstrations'], whole['rollouts']))}, seed {whole['seed']} "
                 f"({part['real_successes']} successes, the others {whole['real_successes']})"
             )
+    if not found:
+        return ""
     return f"""In most cells all that it needs, PPO included, was run again. In these its recording was then
 another one of the same budget: {listed(found)}."""
 
@@ -269,6 +271,8 @@ another one of the same budget: {listed(found)}."""
 def from_the_same_start(cells: Sequence[Cell]) -> str:
     """Return what imagination adds to PPO where both kinds began from BC of the demonstrations."""
     both = [cell for cell in cells if cell["start"] == "cloning" and "simulated_ppo" in cell["methods"]]
+    if not both:
+        return ""
     gains = [
         [gain([cell], "imagined_ppo", "simulated_ppo", domain).mean for cell in both] for domain in SCENES
     ]
@@ -497,8 +501,9 @@ def beyond_seeds(found: Groups) -> str:
             each = gains(cells, ours, baseline, domain)
             if len(each) > 2 and (low := ttest_1samp(each, 0).confidence_interval().low) > 0:
                 certain.append(f"{spoken(group)}, {DOMAINS[domain]} scenes (from {100 * low:.0f} on)")
-    return f"""These intervals draw starts and seeds, and are too narrow where few seeds differ much. By
-Student's t over the gains of three seeds alone, a gain is above 0 with {listed(certain)}."""
+    said = f"a gain is above 0 with {listed(certain)}" if certain else "no gain is clearly above 0"
+    return f"""These intervals draw starts and seeds, and with three seeds they are too narrow. By Student's t
+over the gains of three seeds alone, {said}."""
 
 
 def rows_above(methods: Sequence[str], load: Load, study: str = STUDY, parts: Sequence[str] = PARTS) -> str:

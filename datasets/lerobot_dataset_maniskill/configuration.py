@@ -323,6 +323,8 @@ def imagined_content(env: WorldModelEnv) -> dict[str, Any]:
     from lerobot_wmrl.world_models.checkpoint import read_config
 
     model: Any = read_config(env.world_model_path, "action_world_model")
+    reward = draccus.encode(env.reward, RewardModelConfig)
+    elsewhere = {each.name for each in fields(RewardModelConfig)} - {"pretrained_path"}
     return {
         "world_model": env.world_model_path,
         "starts": asdict(env.dataset),
@@ -330,7 +332,8 @@ def imagined_content(env: WorldModelEnv) -> dict[str, Any]:
         "image_size": model.tokenizer.image_size,
         "done_threshold": env.done_threshold,
         "done_frames": env.done_frames,
-        "reward": draccus.encode(env.reward, RewardModelConfig),
+        "reward": env.reward.type,
+        "reward_settings": {name: value for name, value in reward.items() if name not in elsewhere},
         "text_world_model": env.text_world_model_path,
         "uncertainty": asdict(env.uncertainty),
     }

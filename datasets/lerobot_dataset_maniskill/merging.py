@@ -16,6 +16,9 @@ from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.maniskill.embodiment import FPS
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
+BY_DEFAULT: Final = {"video": True, "like_columns": True}
+"""Settings that earlier versions left out where they were so."""
+
 WHOLE: Final = [0, 1]
 """Value of `shard` for a recording that is not split."""
 
@@ -77,9 +80,9 @@ def already_recorded(output_dir: Path, content: Mapping[str, Any], episodes: int
 
 def require_same(stored: Mapping[str, Any], content: Mapping[str, Any], folder: Path) -> None:
     """Raise FieldError unless both settings describe the same episodes."""
-    # earlier versions left out what was as by default
-    before = {"video": True, "like_columns": True, **stored}
-    differing = different_settings({key: before[key] for key in content if key in before}, content, ())
+    before, now = {**BY_DEFAULT, **stored}, {**BY_DEFAULT, **content}
+    both = before.keys() & now.keys()  # other versions know other settings
+    differing = different_settings({key: before[key] for key in both}, {key: now[key] for key in both}, ())
     if differing:
         raise FieldError(
             "output_dir",
@@ -128,7 +131,7 @@ def check_set(shards: Sequence[Path], contents: Sequence[Mapping[str, Any]]) -> 
     """Raise FieldError for a shard of another recording, one that occurs twice, or one that is missing."""
     if not shards:
         raise FieldError("merge_shards", "[]", "give the folders of all shards")
-    first = contents[0]
+    first, *_ = contents = [{**BY_DEFAULT, **content} for content in contents]
     for shard, content in zip(shards, contents, strict=True):
         differing = [key for key in first if key != "shard" and content.get(key) != first[key]]
         if differing or content["shard"][1] != first["shard"][1]:

@@ -21,7 +21,7 @@ class ExplorationNoise:
         largest: of the levels, as a share of `scale`.
         seed: of the episode.
         scale: half the range of each component, in the units of actions. (A,)
-        visit: how many earlier episodes have the same seed, whose noise was another.
+        visit: number of earlier episodes with this seed; each has noise of its own.
     """
 
     def __init__(self, largest: float, seed: int, scale: np.ndarray, visit: int = 0) -> None:

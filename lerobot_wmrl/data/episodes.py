@@ -23,6 +23,7 @@ OLDER_FORMAT: Final = (BackwardCompatibilityError, NotImplementedError)
 """What LeRobot raises for version 2.1, and for those before."""
 
 NOT_V3: Final = "is in a format before LeRobotDataset v3.0"
+CONVERT: Final = "convert it (LeRobot converts v2.1; what is older, first by an earlier LeRobot to v2.1)"
 
 VALIDATION_EVERY: Final = 20
 """Every twentieth episode is held out from the training of tokenizers and world models."""
@@ -211,7 +212,7 @@ def open_dataset(root: str | Path, repo_id: str | None = None) -> LeRobotDataset
             "dataset.root",
             root,
             NOT_V3,
-            f"convert it: `{conversion(name, root)}` keeps the old files beside it",
+            f"{CONVERT}: `{conversion(name, root)}` keeps the old files beside it",
         ) from error
     except Exception as error:  # parquet, JSON, datasets and the hub each raise their own
         reason = first_line(error.__cause__ or error)
@@ -236,7 +237,7 @@ def download_dataset(repo_id: str, revision: str | None = None) -> LeRobotDatase
             copy = Path("data") / repo_id.rpartition("/")[2]
             raise FieldError(
                 "dataset.repo_id", repo_id, NOT_V3,
-                f"convert a copy of it: `{conversion(repo_id, copy)}`, and give that, `dataset.root` {copy}",
+                f"{CONVERT}: `{conversion(repo_id, copy)}` makes a copy, `dataset.root` {copy}",
             ) from error  # fmt: skip
         raise FieldError(
             "dataset.repo_id", repo_id, f"cannot be downloaded ({first_line(error)})",

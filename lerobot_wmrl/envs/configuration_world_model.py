@@ -33,7 +33,8 @@ class StartFrames(ChosenEpisodes):
         branches: later frames of each episode of the dataset from which imagined episodes begin too, spread
             over those before its success (branched rollouts, Janner et al. 2019).
         frames: a file written by numpy.savez, in place of a dataset: `observation.images.<camera>`
-            (K, H, W, 3) uint8, `observation.state` (K, P) and `task` (K,), the instructions.
+            (K, H, W, 3) uint8, `task` (K,), the instructions, and `observation.state` (K, P), if the world
+            model has one.
         resets: number of start frames to take from ManiSkill, in place of a dataset, of `tasks` (push by
             default), `scenes` and the split `ind` (by default) or `ood`.
     """

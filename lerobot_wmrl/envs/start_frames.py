@@ -70,7 +70,10 @@ class StartImages(NamedTuple):
 
     def of_task(self, task: int) -> "StartImages":
         """Return the starts of one task, an index into `TASKS`."""
-        rows = np.flatnonzero(self.tasks == task)
+        return self.chosen(np.flatnonzero(self.tasks == task))
+
+    def chosen(self, rows: np.ndarray) -> "StartImages":
+        """Return some of the starts, by their indices."""
 
         def depth(model: WorldModelRewardModel) -> Tensor | None:
             every = self.depth(model)

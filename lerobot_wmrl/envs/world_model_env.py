@@ -13,6 +13,7 @@ from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
 from lerobot_wmrl.common.constants import Observation
+from lerobot_wmrl.common.statistics import evenly_spread
 from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.start_frames import Goals, StartImages, Starts, load_starts, read_start_images
@@ -286,9 +287,11 @@ def make_env_at(
     return WorldModelVectorEnv(models.model, starts, goals, models.reward, config, n_envs)
 
 
-def make_success_env(env: WorldModelVectorEnv, source: StartFrames) -> WorldModelVectorEnv:
-    """Return an environment that counts successes: the same world model and as many imaginations, other
-    starts, success as the reward and no goals."""
+def make_success_env(env: WorldModelVectorEnv, source: StartFrames, at_most: int) -> WorldModelVectorEnv:
+    """Return an environment that counts successes: the same world model and as many imaginations, at most so
+    many of other starts, spread evenly, success as the reward and no goals."""
     reward = make_reward_model(GeneralConfig(alpha=1.0, device=env.device.type))
     models = WorldModels(env.model, None, make_similarity("tokenizer", env.device), reward)
-    return make_env_at(read_start_images(source, env.model.config), models, env.config, env.num_envs)
+    starts = read_start_images(source, env.model.config)
+    starts = starts.chosen(evenly_spread(len(starts.images), at_most))
+    return make_env_at(starts, models, env.config, env.num_envs)

@@ -25,7 +25,7 @@ class SelectionConfig:
         n_episodes: episodes in a measurement, always from the same starts. They run in `real_env` if it is
             set, so many of each task, from starts that are used neither for training nor for evaluation;
             otherwise in the world model, from starts spread evenly over `dataset`.
-        dataset: dataset whose first frames start the imagined episodes; by default `env.dataset`.
+        dataset: dataset in whose episodes the imagined ones begin; by default `env.dataset`.
     """
 
     freq: int = 0

@@ -1,7 +1,6 @@
 """Construction of a training's callbacks from its configuration."""
 
 import logging
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -83,9 +82,11 @@ def make_measures(settings: CallbackSettings, trained: Trained) -> dict[str, Mea
         measured_env, count = env, episodes
         if isinstance(env, WorldModelVectorEnv):
             own = env.config.dataset
-            source = StartFrames(**vars(dataset), branches=own.branches) if dataset.given else own
-            starts = max(episodes, 1 + own.branches)
-            measured_env = make_success_env(env, replace(source, max_starts=starts))
+            if dataset.given:
+                source = StartFrames(**vars(dataset), max_starts=own.max_starts, branches=own.branches)
+                measured_env = make_success_env(env, source, episodes)
+            elif not own.resets:
+                measured_env = make_success_env(env, own, episodes)
             count = min(count, len(measured_env.starts))
         return evaluate_within(measured_env, config, policy, processors, count, SELECTION_SEED)
 

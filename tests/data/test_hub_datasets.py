@@ -73,7 +73,7 @@ def test_an_older_format_is_refused_with_the_command_that_converts_it(
     info = json.loads((old / "meta" / "info.json").read_text())
     (old / "meta" / "info.json").write_text(json.dumps({**info, "codebase_version": version}))
     with pytest.raises(
-        ValueError, match=r"before LeRobotDataset v3.0; convert it: `python -m .*v21_to_v30 "
+        ValueError, match=r"before LeRobotDataset v3.0; convert it .*: `python -m .*v21_to_v30 "
     ) as e:
         open_dataset(old)
     assert f"--repo-id=old --root={old} --push-to-hub=false" in str(e.value)

@@ -153,7 +153,7 @@ def test_copies_of_a_policy_share_their_weights_and_nothing_else(world):
 def test_saved_episodes_are_a_dataset_that_grows(world, saved, small_dataset):
     """Across visits and restarts; what was driven is in it, and success only where it was."""
     for index, success in enumerate([True, False]):
-        place = type(saved)(saved.folder, saved.robot)
+        place = type(saved)(saved.folder, saved.robot, saved.held)
         visit = Visit(world, place)
         visit.answer({"do": "begin", "episode": index, "frame": 0})
         for action in some_actions(5):
@@ -190,7 +190,7 @@ def test_a_save_that_is_interrupted_loses_no_episode(world, saved, monkeypatch):
     with pytest.raises(ZeroDivisionError):
         visit.answer({"do": "save", "success": True})
     monkeypatch.undo()
-    assert type(saved)(saved.folder, saved.robot).count == 1
+    assert type(saved)(saved.folder, saved.robot, saved.held).count == 1
     visit.answer({"do": "save", "success": False})
     assert read_episodes(LeRobotDataset("local/driven", root=saved.folder)).success.tolist() == [True, False]
 
@@ -201,11 +201,11 @@ def test_a_replacement_that_was_cut_between_its_two_moves_is_put_back(world, sav
     visit.answer({"do": "step", "driver": "you", "action": [0.0] * 7})
     visit.answer({"do": "save", "success": True})
     saved.folder.replace(saved.folder.with_name(".driven.old"))
-    assert type(saved)(saved.folder, saved.robot).count == 1
+    assert type(saved)(saved.folder, saved.robot, saved.held).count == 1
 
 
 def test_two_servers_can_save_into_one_folder(world, saved):
-    visits = [Visit(world, each) for each in (saved, type(saved)(saved.folder, saved.robot))]
+    visits = [Visit(world, each) for each in (saved, type(saved)(saved.folder, saved.robot, saved.held))]
     for visit in visits:
         visit.answer({"do": "begin", "episode": 0, "frame": 0})
         visit.answer({"do": "step", "driver": "you", "action": [0.0] * 7})
@@ -217,7 +217,7 @@ def test_two_servers_can_save_into_one_folder(world, saved):
 
 def test_a_folder_with_other_columns_is_refused_and_kept(world, saved, make_synthetic_dataset):
     make_synthetic_dataset(saved.folder, episodes=1)
-    visit = Visit(world, type(saved)(saved.folder, saved.robot))
+    visit = Visit(world, type(saved)(saved.folder, saved.robot, saved.held))
     visit.answer({"do": "begin", "episode": 0, "frame": 0})
     visit.answer({"do": "step", "driver": "you", "action": [0.0] * 7})
     with pytest.raises(FieldError, match=r"^output_dir=.*; choose a new folder"):
@@ -228,21 +228,21 @@ def test_a_folder_with_other_columns_is_refused_and_kept(world, saved, make_synt
 def test_episodes_of_another_robot_are_not_mixed(world, saved, make_synthetic_dataset):
     make_synthetic_dataset(saved.folder, episodes=1)
     with pytest.raises(FieldError, match=r"^output_dir=.*has learnt 10, use|^output_dir=.*frames a second"):
-        type(saved)(saved.folder, replace(saved.robot, fps=10))
+        type(saved)(saved.folder, replace(saved.robot, fps=10), saved.held)
 
 
 def test_an_empty_folder_and_a_link_hold_episodes_like_any_other(world, saved, tmp_path):
     real = tmp_path / "elsewhere"
     real.mkdir()
     saved.folder.symlink_to(real)
-    place = type(saved)(saved.folder, saved.robot)
+    place = type(saved)(saved.folder, saved.robot, saved.held)
     visit = Visit(world, place)
     visit.answer({"do": "begin", "episode": 0, "frame": 0})
     visit.answer({"do": "step", "driver": "you", "action": [0.0] * 7})
     for index in range(2):
         assert visit.answer({"do": "save", "success": True})["saved"] == index
     assert saved.folder.is_symlink()
-    assert type(saved)(saved.folder, saved.robot).count == 2
+    assert type(saved)(saved.folder, saved.robot, saved.held).count == 2
 
 
 @pytest.mark.parametrize("at", [1, 4])
@@ -274,7 +274,7 @@ def test_an_error_midway_loses_nothing(drive, act, at, monkeypatch):
 def test_success_is_judged_by_the_last_frames_where_the_episode_goes_on(make_world, saved):
     """And labelled in them alone."""
     world = make_world(done_frames=2)
-    visit = Visit(world, saved)
+    visit = Visit(world, type(saved)(saved.folder, saved.robot, world.done_frames))
     visit.answer({"do": "begin", "episode": 0, "frame": 0})
     step = world.models.model.step
     logits = iter([-20.0, -20.0, 20.0, 20.0, 20.0])
@@ -286,7 +286,7 @@ def test_success_is_judged_by_the_last_frames_where_the_episode_goes_on(make_wor
         world.models.model.step = step
     assert visit.answer({"do": "save"})["success"]
     table = read_episodes(LeRobotDataset("local/driven", root=saved.folder))
-    assert table.done.tolist() == [False, False, True, True, True]
+    assert table.done.tolist() == [False, False, False, True, True]
 
 
 def test_axes_spring_back_where_their_range_is_centred_and_grippers_stay(world):

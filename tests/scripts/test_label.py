@@ -42,8 +42,8 @@ def lengths(root: Path) -> list[int]:
 def test_demonstrations_succeed_at_their_ends(
     unlabelled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The last three frames are solved: so it is after the four last actions, one of which leads to the first
-    of them, and one to a frame that is not recorded."""
+    """The last three frames are solved, so the last four rows succeed: the first of them leads to these
+    frames, and what the last leads to is not recorded."""
     found = label(monkeypatch, unlabelled, tmp_path / "labelled", "--success.type=ends")
     assert found == [[False] * (n - 4) + [True] * 4 for n in lengths(unlabelled)]
     said = capsys.readouterr().out

@@ -117,7 +117,7 @@ def load_mplib() -> tuple[Any, Any]:
         FieldError: if it is not installed.
     """
     if importlib.util.find_spec("mplib") is None:
-        remedy = "install it with pip install 'lerobot_env_wmrl[maniskill]' (Linux), or leave `planner` out"
+        remedy = "install it with pip install '.[maniskill]' in the clone (Linux), or leave `planner` out"
         raise FieldError("planner", "mplib", "MPLib is not installed", remedy)
     restore_copy_into()
     import mplib
