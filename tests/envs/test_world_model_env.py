@@ -15,6 +15,7 @@ from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelE
 from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
 from lerobot_wmrl.envs.start_frames import branch_frames
 from lerobot_wmrl.envs.uncertainty import Uncertainty
+from lerobot_wmrl.envs.world_model_env import make_success_env
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH
 from lerobot_wmrl.rewards.configuration_rewards import EmbeddingConfig, GeneralConfig, ProxyConfig
 from lerobot_wmrl.rewards.modeling_rewards import EmbeddingRewardModel, ProxyRewardModel
@@ -357,6 +358,12 @@ def test_models_that_do_not_fit_together_are_refused(config, small_dataset, trai
         replace(config, text_world_model_path=str(trained_models["action_world_model"])).create_tensor_env(1)
 
 
+def test_success_is_counted_from_starts_all_over_the_dataset(env):
+    counting = make_success_env(env, env.config.dataset, 3)
+    assert torch.equal(counting.starts.images, env.starts.images[[0, 2, 5]])
+    assert len(make_success_env(env, env.config.dataset, 50).starts) == 6, "none twice"
+
+
 @pytest.mark.parametrize(("given", "message"), [
     ({"frames": Path("starts.npz"), "tasks": [TASKS[0]]}, "saved frames do not say their task"),
     ({"frames": Path("starts.npz"), "split": "ood"}, "saved frames do not say their task, scene or split"),
@@ -364,6 +371,8 @@ def test_models_that_do_not_fit_together_are_refused(config, small_dataset, trai
     ({"resets": -1}, r"^dataset\.resets=-1: must be at least 1"),
     ({"resets": 2, "branches": 1}, r"^dataset\.branches=1: .*; saved frames and resets are first frames"),
     ({"root": "data", "branches": -1}, r"^dataset\.branches=-1: .* branch off from episodes of a dataset"),
+    ({"root": "data", "branches": 9, "max_starts": 9}, r"^dataset\.branches=9: .* more than the 9 starts"),
+    ({"resets": 2, "episodes": [1]}, r"^dataset\.episodes=\[1\]: .*leave it out"),
 ])  # fmt: skip
 def test_what_starts_cannot_be_chosen_by_is_refused(config, given, message):
     """Rather than ignored."""

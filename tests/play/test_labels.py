@@ -128,7 +128,9 @@ def test_somebody_labels_by_keys_and_the_dataset_is_written(chromium: WebDriver,
     assert not command.is_alive()
     table = read_episodes(open_dataset(tmp_path / "labelled"))
     ends = [table.done[a : a + n] for a, n in zip(table.start, table.length, strict=True)]
-    assert [int(each.sum()) for each in ends] == [3, 0, int(table.length[2]) - 2, 0, 0, 3]
+    assert [int(each.sum()) for each in ends] == [4, 0, int(table.length[2]) - 1, 0, 0, 4], (
+        "the action before a solved frame succeeds"
+    )
     assert all(each[-1] for each in (ends[0], ends[2], ends[5]))
 
 

@@ -65,6 +65,10 @@ def test_outcomes_are_judged_by_as_many_frames_as_are_imagined(
     monkeypatch.setattr(env, "config", replace(env.config, episode_length=4))
     found = gate.run(0, tmp_path, tmp_path / "gate")["labelled"]
     assert (found["recall"]["n"], found["false_positive_rate"]["n"]) == (0, 6)
+    branching = replace(env.config, dataset=replace(env.config.dataset, branches=1))
+    monkeypatch.setattr(env, "config", branching)
+    found = gate.run(0, tmp_path, tmp_path / "whole")["labelled"]
+    assert (found["recall"]["n"], found["false_positive_rate"]["n"]) == (4, 2), "imagined from later frames"
 
 
 def test_above_the_limit_it_stops_or_warns_with_advice(

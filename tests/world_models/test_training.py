@@ -26,6 +26,8 @@ from lerobot_wmrl.data.frame_cache import cached_frames, cached_tokens
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.scripts.eval_world_model import EvalWorldModelConfig, eval_world_model
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig
+from lerobot_wmrl.world_models.anchored import dynamics as anchored
+from lerobot_wmrl.world_models.autoregressive import dynamics as autoregressive
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.layers import ClipMemory
 from lerobot_wmrl.world_models.training import (
@@ -113,10 +115,20 @@ def test_held_out_losses_are_the_same_again(kind, small_dataset, trained_models,
     """Noise on codes is for training."""
     monkeypatch.setattr(EpisodeTable, "validation", property(lambda table: np.arange(6) % 2 == 0))
     table, model = read_episodes(small_dataset), load_model(trained_models[kind], kind)
+    clip = make_sampler(model, table, None, batch_size=2, seed=0)(0)
+    corrupted = []
+
+    def corrupt(codes, codebook):
+        corrupted.append(model.training)
+        return codes
+
+    for dynamics in (anchored, autoregressive):
+        monkeypatch.setattr(dynamics, "corrupt_codes", corrupt)
     first = held_out_metrics(model, table, 2)
-    assert "loss" in first
     torch.rand(1)
     assert held_out_metrics(model, table, 2) == first
+    model.train()(clip, 0.0)
+    assert corrupted == [True]
 
 
 def test_every_second_batch_is_of_a_further_dataset(small_dataset, trained_models):
