@@ -117,6 +117,13 @@ def test_the_readme_says_what_was_measured() -> None:
         tasks = json.loads(found.read_text())["tasks"].values()
         shares = ([task[domain][method]["share"] for task in tasks] for domain in ("ind", "ood"))
         assert f"{'/'.join(f'{100 * np.mean(each):.0f}' for each in shares)} after {words}" in text
+    longer = [json.loads(path.read_text()) for path in (results / "value_longer").glob("*.json")]
+    for demonstrations in {cell["demonstrations"] for cell in longer}:
+        found = [
+            cell["methods"]["longer_filtered"] for cell in longer if cell["demonstrations"] == demonstrations
+        ]
+        shares = ([each[domain]["share"] for each in found] for domain in ("ind", "ood"))
+        assert f"{'/'.join(f'{100 * np.mean(each):.0f}' for each in shares)} with {demonstrations}" in text
     driven = [json.loads(path.read_text()) for path in (results / "driven").glob("*.json")]
     optimal = [cell["methods"]["optimal_cloning"] for cell in driven]
     shares = ([each[domain]["share"] for each in optimal] for domain in ("ind", "ood"))
