@@ -516,7 +516,7 @@ def trained_longer(found: Groups) -> str:
         gain([cell], "longer_filtered", "filtered", domain).mean
         for cells in longer.values() for cell in cells for domain in SCENES
     ]  # fmt: skip
-    return f"""**Longer BC is a stronger baseline.** Filtered BC for three times as many steps was run last,
+    return f"""**Was BC stopped too early?** Filtered BC for three times as many steps was run last,
 and in some cells alone: {which}. In {sum(rise > 0 for rise in rises)} of {len(rises)} rates it succeeds more
 often, by {100 * min(rises):.0f} to {100 * max(rises):.0f} points. What is left of the gains there:
 
