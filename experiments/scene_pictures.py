@@ -13,8 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from lerobot_dataset_maniskill.planners import TASK_KINDS, follow_plan
-from lerobot_wmrl.common.frame_strips import in_a_row
-from lerobot_wmrl.common.statistics import evenly_spread
+from lerobot_wmrl.common.frame_strips import evenly_spaced, in_a_row
 from lerobot_wmrl.maniskill.cameras import CAMERAS, Rendering
 from lerobot_wmrl.maniskill.objects import OBJECTS
 from lerobot_wmrl.maniskill.scenes import SCENES, Scene
@@ -66,7 +65,7 @@ def episode(simulation: Simulation, scene: Scene, kind: str, seed: int) -> np.nd
 
 def strip(frames: np.ndarray) -> np.ndarray:
     """Return a few evenly spaced frames beside each other."""
-    return in_a_row(frames[evenly_spread(len(frames), STRIP_FRAMES)])
+    return in_a_row(frames[evenly_spaced(len(frames), STRIP_FRAMES)])
 
 
 def make_parser() -> argparse.ArgumentParser:

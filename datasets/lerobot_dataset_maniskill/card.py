@@ -15,8 +15,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot_dataset_maniskill.writer import VOCABULARY_FILE
 from lerobot_wmrl.common.constants import KINDS, TASKS
 from lerobot_wmrl.common.files import markdown_table, write_text
-from lerobot_wmrl.common.frame_strips import enlarged, in_a_row
-from lerobot_wmrl.common.statistics import Proportion, evenly_spread
+from lerobot_wmrl.common.frame_strips import enlarged, evenly_spaced, in_a_row
+from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.maniskill.embodiment import FPS
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
@@ -183,7 +183,7 @@ def frames_to_success(dataset: LeRobotDataset) -> np.ndarray:
     end = len(success)
     if success.any():
         end = min(int(success.argmax()) + 2, end)  # success shows in the frame after its row
-    rows = [dataset[int(index)] for index in evenly_spread(end, FRAMES)]
+    rows = [dataset[int(index)] for index in evenly_spaced(end, FRAMES)]
     coloured = [name for name in dataset.meta.camera_keys if name not in dataset.meta.depth_keys]
     cameras = [np.stack([as_bytes(row[name].numpy()) for row in rows]) for name in coloured]
     return np.concatenate(cameras, 2).transpose(0, 2, 3, 1)

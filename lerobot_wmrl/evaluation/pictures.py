@@ -12,9 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_wmrl.common.frame_strips import GAP, enlarged, in_a_row
+from lerobot_wmrl.common.frame_strips import GAP, enlarged, evenly_spaced, in_a_row
 from lerobot_wmrl.common.images import to_bytes
-from lerobot_wmrl.common.statistics import evenly_spread
 from lerobot_wmrl.evaluation.agreement import Agreement
 from lerobot_wmrl.evaluation.gate import SWEEP_FRAMES, SWEEP_THRESHOLDS, Gate
 from lerobot_wmrl.evaluation.goals import Goals
@@ -53,12 +52,12 @@ def save_animation(frames: np.ndarray, path: Path) -> None:
 
 def save_strip(frames: np.ndarray, path: Path) -> None:
     """Save a few evenly spaced frames of (T, H, W, 3) in one row."""
-    enlarged(in_a_row(frames[evenly_spread(len(frames), STRIP_FRAMES)]), SCALE).save(path)
+    enlarged(in_a_row(frames[evenly_spaced(len(frames), STRIP_FRAMES)]), SCALE).save(path)
 
 
 def save_goals(goals: Goals, path: Path) -> None:
     """Save a sheet of start, goal frame and nearest recorded final frame for some episodes."""
-    shown = evenly_spread(len(goals.episodes), SHOWN_GOALS)
+    shown = evenly_spaced(len(goals.episodes), SHOWN_GOALS)
     rows = {"start": goals.start[shown], "goal": goals.goal[shown]}
     if goals.finals is not None and (goals.nearest >= 0).all():
         rows["nearest final"] = goals.finals.images[goals.nearest[shown]]
