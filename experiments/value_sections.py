@@ -26,7 +26,7 @@ TITLES: Final = {
     "iterated": "filtered BC, rollouts in three rounds",
     "weighted": "advantage-weighted BC (RA-BC)",
     "conditioned": "advantage-conditioned BC (RECAP)",
-    "simulated_ppo": "PPO in ManiSkill, the steps of as many longest episodes",
+    "simulated_ppo": "PPO in ManiSkill, as many episodes of full length as rollouts",
     "imagined_ppo": "PPO in imagination",
     "planned": "PPO in imagination, then planning in it at test time",
     "dyna": "PPO in imagination, with rollouts in three rounds (Dyna)",
@@ -179,6 +179,11 @@ def best(cells: Sequence[Cell], methods: Sequence[str], domain: str) -> str:
     return max(complete, key=lambda method: RunsMean.over(outcomes(cells, method, domain)).mean)
 
 
+def best_pair(cells: Sequence[Cell], domain: str) -> tuple[str, str]:
+    """Return the best method with a world model, and the best one without."""
+    return best(cells, IMAGINED, domain), best(cells, BASELINES, domain)
+
+
 def value_push(load: Load) -> str:
     """Return the section, with the methods of all studies on the same data, and the figure."""
     found = groups(load)
@@ -221,11 +226,8 @@ def aims(found: Groups) -> str:
     """Return which of the study's aims are reached, with which budgets."""
     above, planner, most = [], [], 0.0
     for budget, cells in found.items():
-        gains = [
-            gain(cells, best(cells, IMAGINED, domain), best(cells, BASELINES, domain), domain)
-            for domain in SCENES
-        ]
-        if all(each.mean >= AIMED_GAIN and each.low > 0 for each in gains):
+        gained = [gain(cells, *best_pair(cells, domain), domain) for domain in SCENES]
+        if all(each.mean >= AIMED_GAIN and each.low > 0 for each in gained):
             above.append(spoken(budget))
         else:
             most = max(most, RunsMean.over(outcomes(cells, best(cells, BASELINES, "ind"), "ind")).mean)
@@ -276,18 +278,17 @@ def from_the_same_start(cells: Sequence[Cell]) -> str:
     both = [cell for cell in cells if cell["start"] == "cloning" and "simulated_ppo" in cell["methods"]]
     if not both:
         return ""
-    gains = [
-        [gain([cell], "imagined_ppo", "simulated_ppo", domain).mean for cell in both] for domain in SCENES
-    ]
-    known, unseen = (f"{100 * float(np.mean(each)):.0f}" for each in gains)
+    known, unseen = (
+        f"{100 * gain(both, 'imagined_ppo', 'simulated_ppo', domain).mean:.0f}" for domain in SCENES
+    )
     return f"""In the {len(both)} cells where both kinds of PPO begin from BC of the demonstrations, that in
 imagination succeeds more often by {known} points in known and {unseen} in unseen scenes."""
 
 
 def planning_adds(cells: Sequence[Cell]) -> str:
     """`7 of 8`: in how many rates planning after PPO is above PPO."""
-    gains = [gain([cell], "planned", "imagined_ppo", domain).mean for cell in cells for domain in SCENES]
-    return f"{sum(each > 0 for each in gains)} of {len(gains)}"
+    added = [each for domain in SCENES for each in gains(cells, "planned", "imagined_ppo", domain)]
+    return f"{sum(each > 0 for each in added)} of {len(added)}"
 
 
 def begun(cells: Sequence[Cell]) -> str:
@@ -489,11 +490,11 @@ def best_gains(found: Groups, by: Sequence[str]) -> str:
     rows = []
     for group, cells in found.items():
         for domain in SCENES:
-            ours, baseline = (best(cells, methods, domain) for methods in (IMAGINED, BASELINES))
+            pair = best_pair(cells, domain)
             rows.append([
-                *group, DOMAINS[domain], TITLES[baseline], TITLES[ours],
-                points(asdict(gain(cells, ours, baseline, domain))),
-                ", ".join(str(round(100 * each)) for each in gains(cells, ours, baseline, domain)),
+                *group, DOMAINS[domain], *(TITLES[method] for method in reversed(pair)),
+                points(asdict(gain(cells, *pair, domain))),
+                ", ".join(str(round(100 * each)) for each in gains(cells, *pair, domain)),
             ])  # fmt: skip
     return table([*by, "scenes", "best without", "best with", "gain", "by seed"], rows)
 
@@ -513,8 +514,9 @@ def trained_longer(found: Groups) -> str:
         for group, cells in longer.items()
     ])  # fmt: skip
     rises = [
-        gain([cell], "longer_filtered", "filtered", domain).mean
-        for cells in longer.values() for cell in cells for domain in SCENES
+        rise
+        for cells in longer.values() for domain in SCENES
+        for rise in gains(cells, "longer_filtered", "filtered", domain)
     ]  # fmt: skip
     return f"""**Was BC stopped too early?** Filtered BC for three times as many steps was run last,
 and in some cells alone: {which}. In {sum(rise > 0 for rise in rises)} of {len(rises)} rates it succeeds more
@@ -532,8 +534,7 @@ def beyond_seeds(found: Groups) -> str:
     certain = []
     for group, cells in found.items():
         for domain in SCENES:
-            ours, baseline = (best(cells, methods, domain) for methods in (IMAGINED, BASELINES))
-            each = gains(cells, ours, baseline, domain)
+            each = gains(cells, *best_pair(cells, domain), domain)
             if len(each) > 2 and (low := ttest_1samp(each, 0).confidence_interval().low) > 0:
                 certain.append(f"{spoken(group)}, {DOMAINS[domain]} scenes (from {100 * low:.0f} on)")
     said = f"a gain is above 0 with {listed(certain)}" if certain else "no gain is clearly above 0"

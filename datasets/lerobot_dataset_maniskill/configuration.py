@@ -291,9 +291,12 @@ class RecordConfig(RunConfig):
         if isinstance(self.env, WorldModelEnv):
             return imagined_content(self.env)
         if self.elsewhere:
-            env, like = draccus.encode(self.env, EnvConfig), asdict(self.like)
-            columns, limit = self.like_columns, self.max_frames
-            return {"env": env, "like": like, "like_columns": columns, "max_frames": limit}
+            return {
+                "env": draccus.encode(self.env, EnvConfig),
+                "like": asdict(self.like),
+                "like_columns": self.like_columns,
+                "max_frames": self.max_frames,
+            }
         return self._simulated_content()
 
     def _policy_content(self) -> dict[str, Any]:
@@ -324,7 +327,7 @@ def imagined_content(env: WorldModelEnv) -> dict[str, Any]:
 
     model: Any = read_config(env.world_model_path, "action_world_model")
     reward = draccus.encode(env.reward, RewardModelConfig)
-    elsewhere = {each.name for each in fields(RewardModelConfig)} - {"pretrained_path"}
+    general = {each.name for each in fields(RewardModelConfig)} - {"pretrained_path"}  # device, hub
     return {
         "world_model": env.world_model_path,
         "starts": asdict(env.dataset),
@@ -333,7 +336,7 @@ def imagined_content(env: WorldModelEnv) -> dict[str, Any]:
         "done_threshold": env.done_threshold,
         "done_frames": env.done_frames,
         "reward": env.reward.type,
-        "reward_settings": {name: value for name, value in reward.items() if name not in elsewhere},
+        "reward_settings": {name: value for name, value in reward.items() if name not in general},
         "text_world_model": env.text_world_model_path,
         "uncertainty": asdict(env.uncertainty),
     }

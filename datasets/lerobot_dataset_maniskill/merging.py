@@ -80,9 +80,8 @@ def already_recorded(output_dir: Path, content: Mapping[str, Any], episodes: int
 
 def require_same(stored: Mapping[str, Any], content: Mapping[str, Any], folder: Path) -> None:
     """Raise FieldError unless both settings describe the same episodes."""
-    before, now = {**BY_DEFAULT, **stored}, {**BY_DEFAULT, **content}
-    both = before.keys() & now.keys()  # other versions know other settings
-    differing = different_settings({key: before[key] for key in both}, {key: now[key] for key in both}, ())
+    before = {**BY_DEFAULT, **stored}
+    differing = different_settings({key: before[key] for key in content if key in before}, content, ())
     if differing:
         raise FieldError(
             "output_dir",

@@ -22,9 +22,6 @@ VIDEO_BACKEND: Final = "pyav"
 OLDER_FORMAT: Final = (BackwardCompatibilityError, NotImplementedError)
 """What LeRobot raises for version 2.1, and for those before."""
 
-NOT_V3: Final = "is in a format before LeRobotDataset v3.0"
-CONVERT: Final = "convert it (LeRobot converts v2.1; what is older, first by an earlier LeRobot to v2.1)"
-
 VALIDATION_EVERY: Final = 20
 """Every twentieth episode is held out from the training of tokenizers and world models."""
 
@@ -208,12 +205,7 @@ def open_dataset(root: str | Path, repo_id: str | None = None) -> LeRobotDataset
         if not missing:
             return LeRobotDataset(name, root=root, video_backend=VIDEO_BACKEND)
     except OLDER_FORMAT as error:
-        raise FieldError(
-            "dataset.root",
-            root,
-            NOT_V3,
-            f"{CONVERT}: `{conversion(name, root)}` keeps the old files beside it",
-        ) from error
+        raise older_format("dataset.root", root, name, root) from error
     except Exception as error:  # parquet, JSON, datasets and the hub each raise their own
         reason = first_line(error.__cause__ or error)
         raise FieldError(
@@ -235,10 +227,7 @@ def download_dataset(repo_id: str, revision: str | None = None) -> LeRobotDatase
     except Exception as error:  # the hub's client, parquet and JSON each raise their own
         if isinstance(error, OLDER_FORMAT) and revision is None:
             copy = Path("data") / repo_id.rpartition("/")[2]
-            raise FieldError(
-                "dataset.repo_id", repo_id, NOT_V3,
-                f"{CONVERT}: `{conversion(repo_id, copy)}` makes a copy, `dataset.root` {copy}",
-            ) from error  # fmt: skip
+            raise older_format("dataset.repo_id", repo_id, repo_id, copy) from error
         raise FieldError(
             "dataset.repo_id", repo_id, f"cannot be downloaded ({first_line(error)})",
             "correct the name, log in with `hf auth login` if it is private, or give a folder on disk, "
@@ -246,10 +235,16 @@ def download_dataset(repo_id: str, revision: str | None = None) -> LeRobotDatase
         ) from error  # fmt: skip
 
 
-def conversion(repo_id: str, root: str | Path) -> str:
-    """Return LeRobot's command that converts a dataset in a folder, where it is or after downloading it."""
-    script = "lerobot.scripts.convert_dataset_v21_to_v30"
-    return f"python -m {script} --repo-id={repo_id} --root={root} --push-to-hub=false"
+def older_format(field: str, value: object, repo_id: str, root: str | Path) -> FieldError:
+    """Return the error about a dataset before v3.0, with the command that converts it into the folder `root`:
+    what is there, or what it downloads."""
+    script = "python -m lerobot.scripts.convert_dataset_v21_to_v30"
+    return FieldError(
+        field, value, "is in a format before LeRobotDataset v3.0",
+        "convert it (LeRobot converts v2.1; what is older, first by an earlier LeRobot to v2.1): "
+        f"`{script} --repo-id={repo_id} --root={root} --push-to-hub=false`, and give `dataset.root` {root}. "
+        "The old files are kept beside it",
+    )  # fmt: skip
 
 
 def missing_files(meta: LeRobotDatasetMetadata) -> list[Path]:

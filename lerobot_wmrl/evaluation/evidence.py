@@ -111,11 +111,11 @@ def trained_inside(policy: str, world_model: str) -> str | None:
     Trainings are followed back as far as their settings lie on this machine. Any checkpoint of the training
     that made the world model counts, one that was trained further on new rollouts (Dyna) too.
     """
-    ancestors = [str(path) for path, _ in _trainings(world_model, "model")]
-    dyna = training_folder(policy) / DYNA
-    for _, settings in _trainings(policy, "policy"):
+    ancestors = [path for path, _ in _trainings(world_model, "model")]
+    folders = Path(world_model).resolve().parents
+    for checkpoint, settings in _trainings(policy, "policy"):
         used = (settings.get("env") or {}).get("world_model_path")
-        inside = dyna in Path(world_model).resolve().parents
+        inside = training_folder(checkpoint) / DYNA in folders
         if used and (inside or any(same_training(used, each) for each in ancestors)):
             return (
                 "it was trained in this world model, and may have learnt what only looks like success there"

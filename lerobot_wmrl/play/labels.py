@@ -18,7 +18,7 @@ import numpy as np
 from lerobot_wmrl.common.errors import FieldError, require_at_least
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.play.checks import LAST_PORT, whole_number
-from lerobot_wmrl.rewards.success_rules import SuccessRule, rows_of, seen_next
+from lerobot_wmrl.rewards.success_rules import SuccessRule, next_frame_solved, rows_of
 
 if TYPE_CHECKING:
     from aiohttp import web
@@ -64,7 +64,7 @@ class ByHandRule(SuccessRule):
                 f"\n{len(page.labels)} of {len(page.lengths)} episodes have a label, kept in {self.file}; "
                 "the same command goes on"
             )
-        return seen_next(solved_frames(page.labels, dataset), dataset)
+        return next_frame_solved(solved_frames(page.labels, dataset), dataset)
 
 
 class LabelPage:

@@ -56,7 +56,7 @@ class EndsRule(SuccessRule):
         if self.episodes is not None:
             require_episodes("episodes", self.episodes, dataset)
             solved &= np.isin(episode, self.episodes)
-        return seen_next(solved, dataset)
+        return next_frame_solved(solved, dataset)
 
 
 @SuccessRule.register_subclass("first_frames")
@@ -83,7 +83,7 @@ class FirstFramesRule(SuccessRule):
                     f"its frames are 0 to {length[own][0] - 1}",
                 )  # fmt: skip
             solved |= own & (frame >= first)
-        return seen_next(solved, dataset)
+        return next_frame_solved(solved, dataset)
 
 
 @SuccessRule.register_subclass("column")
@@ -143,7 +143,7 @@ def rows_of(dataset: "LeRobotDataset") -> tuple[np.ndarray, np.ndarray, np.ndarr
     return rows["episode_index"], rows["frame_index"], count[index]
 
 
-def seen_next(solved: np.ndarray, dataset: "LeRobotDataset") -> np.ndarray:
+def next_frame_solved(solved: np.ndarray, dataset: "LeRobotDataset") -> np.ndarray:
     """Return for each row whether the next frame of its episode is solved. (N,)
 
     The frame after an episode's last action is not recorded; it is taken to be like the last one.

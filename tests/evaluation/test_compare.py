@@ -5,6 +5,7 @@ import sys
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import cloudpickle
@@ -336,3 +337,14 @@ def test_each_policy_has_environments_of_its_own_where_resets_may_be_counted(ima
         assert first["pusht"][0] is not second["pusht"][0]
     with opened(imagination, 1, False, policies=2) as (first, second):
         assert first is second
+
+
+def test_no_table_by_scene_is_shown_for_several_policies(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It would have the outcomes of the first one; tensor environments keep it behind their adapter."""
+    kept = SimpleNamespace(results=SimpleNamespace(episodes={"start": True}))
+    left = []
+    monkeypatch.setattr(running, "make_env", lambda *_, **__: {"push": {0: SimpleNamespace(env=kept)}})
+    monkeypatch.setattr(running, "close_envs", lambda envs: left.append(dict(kept.results.episodes)))
+    with opened(WmrlManiSkillEnv(), 1, False, 2):
+        pass
+    assert left == [{}]
