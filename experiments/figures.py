@@ -25,6 +25,8 @@ PALETTE: Final = (
     "#22543d",
     "#f687b3",
     "#a0aec0",
+    "#276749",
+    "#c05621",
 )
 """Colours of methods, in their order."""
 

@@ -13,7 +13,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from lerobot_dataset_maniskill.planners import TASK_KINDS, follow_plan
-from lerobot_wmrl.common.frame_strips import evenly_spaced, in_a_row
+from lerobot_wmrl.common.frame_strips import in_a_row
+from lerobot_wmrl.common.statistics import evenly_spaced
 from lerobot_wmrl.maniskill.cameras import CAMERAS, Rendering
 from lerobot_wmrl.maniskill.objects import OBJECTS
 from lerobot_wmrl.maniskill.scenes import SCENES, Scene

@@ -196,7 +196,7 @@ def read_keys(path: Path) -> dict[str, Any]:
     Raises:
         ValueError: a key is unknown, or a step that is only named is not one of the extended study.
     """
-    content: dict[str, Any] = yaml.safe_load(path.read_text())
+    content: dict[str, Any] = yaml.load(path.read_text(), yaml.CSafeLoader)  # ten times as fast
     if unknown := content.keys() - KEYS:
         raise ValueError(
             f"{path}: unknown key {', '.join(sorted(unknown))}; there are {', '.join(sorted(KEYS))}"

@@ -40,6 +40,10 @@ SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     "value_four_tasks": ("Policies", value.value_four_tasks),
     "value_four_tasks_simulator": ("Policies", value.value_four_tasks_simulator),
     "value_longer": ("Policies", partial(value.rows_above, ["longer", "longer_filtered"])),
+    "value_longer_imagined": (
+        "Policies",
+        partial(value.rows_above, ["longer_imagined_ppo", "longer_ppo_distilled"]),
+    ),
     "value_others": ("Policies", value.value_others),
     "value_iterated": ("Policies", partial(value.rows_above, ["iterated", "iterated_ppo"])),
     "value_simulator": ("Policies", partial(value.rows_above, ["simulated_ppo"])),

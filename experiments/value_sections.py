@@ -35,12 +35,14 @@ TITLES: Final = {
     "distilled": "planner distilled in imagination",
     "distilled_ppo": "planner distilled, then PPO in imagination",
     "ppo_distilled": "PPO in imagination, then the planner distilled",
+    "longer_imagined_ppo": "PPO in imagination, from the longer BC",
+    "longer_ppo_distilled": "PPO in imagination, from the longer BC, then the planner distilled",
 }
 """Methods in the order of the table."""
 
 IMAGINED: Final = (
     "imagined_ppo", "planned", "dyna", "iterated_ppo", "imagined_cloning", "distilled", "distilled_ppo",
-    "ppo_distilled",
+    "ppo_distilled", "longer_imagined_ppo", "longer_ppo_distilled",
 )  # fmt: skip
 """Methods that use a world model."""
 
@@ -73,6 +75,7 @@ AIMED_SUCCESS: Final = (0.95, 0.88)
 STUDY: Final = "value_push"
 PARTS: Final = (
     "value_longer",
+    "value_longer_imagined",
     "value_others",
     "value_iterated",
     "value_simulator",

@@ -15,8 +15,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot_dataset_maniskill.writer import VOCABULARY_FILE
 from lerobot_wmrl.common.constants import KINDS, TASKS
 from lerobot_wmrl.common.files import markdown_table, write_text
-from lerobot_wmrl.common.frame_strips import enlarged, evenly_spaced, in_a_row
-from lerobot_wmrl.common.statistics import Proportion
+from lerobot_wmrl.common.frame_strips import enlarged, in_a_row
+from lerobot_wmrl.common.statistics import Proportion, evenly_spaced
 from lerobot_wmrl.maniskill.embodiment import FPS
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 

@@ -332,7 +332,7 @@ def imagined_content(env: WorldModelEnv) -> dict[str, Any]:
         "world_model": env.world_model_path,
         "starts": asdict(env.dataset),
         "cameras": list(model.tokenizer.cameras),
-        "image_size": model.tokenizer.image_size,
+        "image_size": model.tokenizer.square_side,
         "done_threshold": env.done_threshold,
         "done_frames": env.done_frames,
         "reward": env.reward.type,

@@ -35,11 +35,19 @@ class ImaginedPartRecorder:
         self.config, self.folder, self.done_frames = config, folder, config.imagination.done_frames
         self.env: Any = config.imagination.create_tensor_env(min(config.part_episodes, config.num_episodes))
         shown = {name: tuple(space.shape) for name, space in self.env.single_observation_space.items()}
-        if shown.get(OBS_STATE) != (len(STATE_NAMES),):
+        lacking = [
+            what
+            for what, known in (
+                (f"state ({len(STATE_NAMES)} values)", shown.get(OBS_STATE) == (len(STATE_NAMES),)),
+                ("frames (squares of one size)", self.env.model.config.tokenizer.square_side is not None),
+            )
+            if not known
+        ]
+        if lacking:
             raise FieldError(
                 "env.world_model_path",
                 config.imagination.world_model_path,
-                f"does not imagine the recorder's state ({len(STATE_NAMES)} values)",
+                f"does not imagine the recorder's {' and '.join(lacking)}",
                 "train it on a dataset that lerobot-wmrl-record recorded",
             )
         fit_to_environment(config.policy, shown, len(ACTION_NAMES))
@@ -50,7 +58,7 @@ class ImaginedPartRecorder:
     def record(self, part: Part, report: Report) -> None:
         """Record a part. Its folder appears under its final name only when it is whole."""
         shown = self.env.model.config.tokenizer
-        with whole_part(self.config, self.folder, part, shown.cameras, shown.image_size) as dataset:
+        with whole_part(self.config, self.folder, part, shown.cameras, shown.square_side) as dataset:
             for plan, (instruction, rows) in zip(part.episodes, self._imagine(part.episodes), strict=True):
                 start = StartColumns(instruction, task_of(plan.task).index, plan)
                 for before, action, outcome in rows:

@@ -17,22 +17,15 @@ Running the same command again continues an interrupted recording, or reports th
 
 import importlib.resources
 from collections.abc import Sequence
-from dataclasses import fields
 from pathlib import Path
-from typing import Final
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_wmrl.common.command_line import run_command
 from lerobot_wmrl.common.errors import renamed, suggestion
 from lerobot_wmrl.common.files import writing
-from lerobot_wmrl.common.presets import format_flags, read_settings
-from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.common.presets import TYPE, format_flags, read_settings
+from lerobot_wmrl.common.settings import settings_of
 from lerobot_wmrl.maniskill.scenes import describe_scenes
-
-RECIPE_KEYS: Final = {
-    *(field.name for field in fields(RecordConfig)),
-    *(f"env.{name}" for name in ("type", *(field.name for field in fields(WmrlManiSkillEnv)))),
-}
 
 
 def expand_recipes(argv: Sequence[str]) -> list[str]:
@@ -64,13 +57,14 @@ def recipe_flags(path: Path) -> list[str]:
         settings = read_settings(path, whole=("kinds",))
     except ValueError as error:
         raise ValueError(f"--recipe={error}") from error
+    types = {name.removesuffix(TYPE): str(value) for name, value in settings.items() if name.endswith(TYPE)}
+    paths = {f"{name}.path" for name in RecordConfig.path_fields}
+    known = {*(each.name for each in settings_of(RecordConfig, types)), *paths}
     for name in settings:
-        if name not in RECIPE_KEYS:
+        if name not in known:
             prefix, _, key = name.rpartition(".")
-            beside = sorted(
-                each.rpartition(".")[2] for each in RECIPE_KEYS if each.rpartition(".")[0] == prefix
-            )
-            hint = suggestion(key, beside, prefix and f"{prefix}.")
+            beside = sorted(each.rpartition(".")[2] for each in known if each.rpartition(".")[0] == prefix)
+            hint = suggestion(key, beside, prefix and f"{prefix}.") if beside else "see --help"
             raise ValueError(f"--recipe={path}: the key {name} is unknown; {hint}")
     return format_flags(settings)
 

@@ -223,27 +223,30 @@ def said_in_flags(error: BaseException, config_class: type, argv: Sequence[str])
 
     Args:
         error: a FieldError knows its field, relative to the configuration that raised it, and names others in
-            backquotes. Any other error keeps its message.
+            backquotes, as `Stopped` does. Any other error keeps its message.
         config_class: of the command.
         argv: what was typed.
     """
-    if not isinstance(error, FieldError):
+    if not isinstance(error, FieldError | Stopped):
         return str(error)
     typed = typed_flags(argv)
     known = {each.name: each.default for each in settings_of(config_class, chosen_types(argv))}
     known |= {name.rpartition(".")[0]: None for name in known if "." in name}
-    flag = flag_of(error.field, error.value, typed) or flag_of(error.field, error.value, known)
-    groups = (flag or "").removesuffix(error.field).split(".")[:-1]
+    field, value = (error.field, error.value) if isinstance(error, FieldError) else ("", None)
+    flag = field and (flag_of(field, value, typed) or flag_of(field, value, known))
+    groups = (flag or "").removesuffix(field).split(".")[:-1]
 
     def as_flag(match: re.Match[str]) -> str:
         nearest = (".".join([*groups[:count], match[1]]) for count in range(len(groups), -1, -1))
         found = next((name for name in nearest if name in known or name in typed), None)
-        found = found or flag_of(match[1], None, known)
+        found = found or flag_of(match[1], None, typed) or flag_of(match[1], None, known)
         return f"--{found}{match[2]}" if found else match[0]
 
+    if isinstance(error, Stopped):
+        return re.sub(FIELD, as_flag, str(error))
     problem, remedy = (re.sub(FIELD, as_flag, text) for text in (error.problem, error.remedy))
-    value = "" if error.value in (None, "") else f"={format_value(error.value)}"
-    said = f"{f'--{flag}' if flag else error.field}{value}: {problem}"
+    given = "" if value in (None, "") else f"={format_value(value)}"
+    said = f"{f'--{flag}' if flag else field}{given}: {problem}"
     return f"{said}; {remedy}" if remedy else said
 
 

@@ -7,11 +7,6 @@ GAP = 2
 """White pixels between two frames."""
 
 
-def evenly_spaced(length: int, count: int) -> np.ndarray:
-    """Return at most `count` indices from 0 to `length` - 1, both included. (N,) int64"""
-    return np.linspace(0, length - 1, min(count, length)).round().astype(int)
-
-
 def in_a_row(frames: np.ndarray) -> np.ndarray:
     """Place frames side by side. (N, H, W, 3) uint8 → (H, N·W + gaps, 3)"""
     gap = np.full((frames.shape[1], GAP, 3), 255, np.uint8)

@@ -68,6 +68,8 @@ def load_policy(config: PreTrainedConfig) -> Any:
             return load_with_adapters(config).eval()
         policy_class = get_policy_class(config.type)
         return policy_class.from_pretrained(str(config.pretrained_path), config=config, strict=True)
+    except torch.OutOfMemoryError:
+        raise
     except (SafetensorError, RuntimeError, OSError) as error:
         raise _unreadable(config, error) from error
 

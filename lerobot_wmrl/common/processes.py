@@ -60,8 +60,16 @@ def find_program(name: str) -> str:
     beside = Path(sys.executable).with_name(name)
     found = str(beside) if beside.is_file() else shutil.which(name)
     if found is None:
-        raise ValueError(f"the command {name} is not installed: run `make setup`")
+        raise not_installed(name)
     return found
+
+
+def not_installed(name: str) -> ValueError:
+    """Return the error about a console command that no package installs."""
+    return ValueError(
+        f"the command {name} is not installed: install its package into this environment (in a checkout of "
+        "lerobot_wmrl: `make setup`)"
+    )
 
 
 def die_with(parent: int) -> None:

@@ -32,7 +32,7 @@ from lerobot_wmrl.common.command_line import RunConfig, different_settings, run_
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.files import foreign_files, write_json
 from lerobot_wmrl.common.precision import keep_freed_memory
-from lerobot_wmrl.common.processes import die_with, find_program, own_progress_lock
+from lerobot_wmrl.common.processes import die_with, find_program, not_installed, own_progress_lock
 
 MARKER = "settings.json"
 
@@ -215,7 +215,7 @@ def entry_point(program: str) -> Callable[[], int | None]:
     """Return the function that the console command calls. Raises ValueError if no package installs it."""
     found = importlib.metadata.entry_points(group="console_scripts", name=program)
     if not found:
-        raise ValueError(f"the command {program} is not installed: run `make setup`")
+        raise not_installed(program)
     return next(iter(found)).load()
 
 

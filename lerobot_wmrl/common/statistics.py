@@ -206,6 +206,6 @@ class RunsMean:
         return cls(float(table.mean()), float(low), float(high))
 
 
-def evenly_spread(count: int, at_most: int) -> np.ndarray:
-    """Return at most `at_most` of the indices below `count`, the first and the last among them. (N,)"""
-    return np.linspace(0, count - 1, min(count, at_most)).astype(int)
+def evenly_spaced(count: int, limit: int) -> np.ndarray:
+    """Return at most `limit` of the indices below `count`, the first and the last among them. (N,) int64"""
+    return np.linspace(0, count - 1, min(count, limit)).round().astype(int)

@@ -116,7 +116,7 @@ class ClipSampler:
         """Draw the batch of one training step."""
         rng = np.random.default_rng([self.seed, step])
         episodes = rng.choice(self.episodes, self.batch_size)
-        room = np.maximum(self.table.length[episodes] - 2, 1)
+        room = np.maximum(self.table.length[episodes] - min(self.clip_length, 3) + 1, 1)
         offsets = np.where(rng.random(self.batch_size) < self.from_start, 0, rng.integers(0, room))
         return self.clips(episodes, offsets)
 

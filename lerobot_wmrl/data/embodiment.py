@@ -6,13 +6,14 @@ A world model keeps this in its checkpoint. Environment, planner and evaluation 
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import pyarrow.dataset
 from lerobot.utils.constants import ACTION, OBS_STATE
 
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.data.episodes import read_actions
 
 LOW, HIGH = "low", "high"
 """Keys of the recorded range of a feature, lists of one number a component, in the feature's `info`."""
@@ -53,11 +54,13 @@ class Embodiment:
 def component_names(feature: Mapping[str, Any]) -> list[str]:
     """Return one name for each component of a feature, their numbers where the dataset has no names.
 
-    LeRobot's datasets have a list of names, or a dictionary with such a list, such as {"motors": […]}.
+    LeRobot's datasets have a list of names, a dictionary with such lists ({"motors": […]}), or one whose keys
+    are the names.
     """
     size, names = int(np.prod(feature["shape"])), feature.get("names")
     if isinstance(names, Mapping):
-        names = next(iter(names.values())) if len(names) == 1 else list(names)
+        lists = [part for part in names.values() if isinstance(part, list)]
+        names = [name for part in lists for name in part] or list(names)
     if not isinstance(names, Sequence) or len(names) != size:
         return [str(component) for component in range(size)]
     return [str(name) for name in names]
@@ -110,9 +113,7 @@ def observed_range(meta: Any) -> tuple[list[float], list[float]]:
     tenth of their distance: a single wrong value would widen it at will. A component whose quantiles are the
     same, such as a gripper that hardly ever moves, keeps its extremes.
     """
-    files = sorted((meta.root / "data").rglob("*.parquet"))
-    table = pyarrow.dataset.dataset(files, format="parquet").to_table(columns=[ACTION])
-    actions = np.stack(table[ACTION].to_pylist()).astype(np.float64).reshape(table.num_rows, -1)
+    actions = read_actions(Path(meta.root))
     finite = actions[np.isfinite(actions).all(1)]
     if not len(finite):
         raise FieldError("dataset.root", meta.root, "none of its actions is finite", "record it again")

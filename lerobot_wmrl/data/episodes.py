@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import pyarrow.compute
+import pyarrow.dataset
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.utils import BackwardCompatibilityError
@@ -14,7 +16,7 @@ from lerobot.utils.constants import ACTION, DONE, OBS_IMAGE, OBS_IMAGES, OBS_STA
 from numpy.typing import ArrayLike
 
 from lerobot_wmrl.common.errors import FieldError, first_line, renamed
-from lerobot_wmrl.common.statistics import evenly_spread
+from lerobot_wmrl.common.statistics import evenly_spaced
 
 VIDEO_BACKEND: Final = "pyav"
 """pyav ships its own FFmpeg, torchcodec needs the system's. Speed matters little: frames are decoded once."""
@@ -211,12 +213,13 @@ def open_dataset(root: str | Path, repo_id: str | None = None) -> LeRobotDataset
         raise FieldError(
             "dataset.root",
             root,
-            f"cannot be opened ({reason}): it is corrupted",
-            "remove it and record it again",
+            f"cannot be opened ({reason})",
+            "see that its files may be read and are whole; what is torn, copy or download again, and only if "
+            "there is no other copy, record it again",
         ) from error
     raise FieldError(
         "dataset.root", root, f"{len(missing)} files are missing, the first is {missing[0]}",
-        "copy the dataset again, or remove it and record it again",
+        "copy or download the dataset again, and only if there is no other copy, record it again",
     )  # fmt: skip
 
 
@@ -373,6 +376,14 @@ def parquet_files(root: Path) -> list[Path]:
     return sorted((root / "data").rglob("*.parquet"))
 
 
+def read_actions(root: Path) -> np.ndarray:
+    """Read all actions of a dataset on disk. (rows, A) float64"""
+    table = pyarrow.dataset.dataset(parquet_files(root), format="parquet").to_table(columns=[ACTION])
+    column = table[ACTION]
+    values = column if pyarrow.types.is_floating(column.type) else pyarrow.compute.list_flatten(column)
+    return values.to_numpy().astype(np.float64).reshape(table.num_rows, -1)
+
+
 def choose_episodes(
     table: EpisodeTable, split: str, at_most: int, further: Mapping[str, np.ndarray] | None = None,
     wanted: np.ndarray | None = None,
@@ -404,7 +415,7 @@ def choose_episodes(
     if not len(episodes):
         those = "" if wanted is None else " of those that are asked for"
         raise FieldError("split", split, f"dataset {table.dataset.root} has no episode{those} in it")
-    return episodes[evenly_spread(len(episodes), at_most)]
+    return episodes[evenly_spaced(len(episodes), at_most)]
 
 
 def frame_size(feature: Mapping[str, Any]) -> tuple[int, int]:

@@ -8,6 +8,7 @@ brought to the grid of the tokens: metres, 0 where nothing was measured, one cam
 import hashlib
 import json
 import os
+import socket
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
@@ -42,7 +43,10 @@ class FrameEncoder(Protocol):
         """S, tokens of all cameras."""
 
     def parameters(self) -> Iterator[torch.nn.Parameter]:
-        """Return its weights, which the caches' names depend on."""
+        """Return its weights, which lie on its device."""
+
+    def state_dict(self) -> Mapping[str, Tensor]:
+        """Return weights and running statistics, which the caches' names depend on."""
 
     def context(self, images: Tensor) -> Context:
         """Return the context of first frames (B, N, 3, H, W) in [0, 1]."""
@@ -161,7 +165,8 @@ def encoded_path(
     name: str, dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer: FrameEncoder
 ) -> Path:
     """Return the path of the cache `name`, which is valid for these weights, cameras and files alone."""
-    weights = hashlib.sha256(b"".join(p.detach().cpu().numpy().tobytes() for p in tokenizer.parameters()))
+    state = tokenizer.state_dict().values()
+    weights = hashlib.sha256(b"".join(tensor.detach().cpu().numpy().tobytes() for tensor in state))
     key = digest([weights.hexdigest(), *camera_keys, *file_stamps(dataset)])
     return cache_dir(dataset) / f"{name}-{key}.npy"
 
@@ -199,8 +204,9 @@ def decode_video(dataset: LeRobotDataset, episode: int, key: str) -> Tensor:
         )  # fmt: skip
     except Exception as error:
         raise ValueError(
-            f"dataset {dataset.root}: episode {episode}: {key}: {path.name} cannot be decoded ({error}); "
-            "delete the dataset and record it again with the same command"
+            f"dataset {dataset.root}: episode {episode}: {key}: {path.name} cannot be decoded ({error}). If "
+            "`ffprobe` cannot read it either, copy or download this file again, and only if there is no "
+            "other copy, record it again"
         ) from error
 
 
@@ -210,10 +216,11 @@ def memory_map(
     """Return the array at `path`, written by `fill` if missing; the file appears only once it is whole."""
     if not path.is_file():
         path.parent.mkdir(parents=True, exist_ok=True)
-        for torn in path.parent.glob("*.partial"):
-            if not psutil.pid_exists(int(torn.suffixes[-2][1:])):
+        host = socket.gethostname()  # others may share the folder, and their processes are not seen here
+        for torn in path.parent.glob(f"*.{host}-*.partial"):
+            if not psutil.pid_exists(int(torn.stem.rpartition("-")[2])):
                 torn.unlink(missing_ok=True)
-        partial = path.with_suffix(f".{os.getpid()}.partial")
+        partial = path.with_suffix(f".{host}-{os.getpid()}.partial")
         target = np.lib.format.open_memmap(partial, mode="w+", dtype=dtype, shape=shape)
         try:
             fill(target)

@@ -10,6 +10,7 @@ from gymnasium.vector import AutoresetMode
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
+from lerobot_wmrl.common.actions import clip_actions
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.maniskill_env import image_observations, observation_space
@@ -37,6 +38,7 @@ class BatchedManiSkillEnv(gym.vector.VectorEnv):
         self.device, self.max_episode_steps = self.simulation.device, config.horizon
         self._elapsed = torch.zeros(n_envs, dtype=torch.long, device=self.device)
         self._progress = torch.zeros(n_envs, device=self.device)
+        self._low, self._high = (torch.tensor(box, device=self.device) for box in (ACTION_LOW, ACTION_HIGH))
         self._rng = np.random.default_rng()
         self.single_action_space = gym.spaces.Box(
             np.array(ACTION_LOW, np.float32), np.array(ACTION_HIGH, np.float32)
@@ -58,19 +60,19 @@ class BatchedManiSkillEnv(gym.vector.VectorEnv):
 
     def step(self, action: Tensor) -> tuple[dict[str, Any], Tensor, Tensor, Tensor, dict[str, Any]]:
         """Simulate one control step of every episode. action (B, 7)"""
-        frame = self.simulation.step(action)
+        clipped, share = clip_actions(action.to(self.device).float(), self._low, self._high)
+        frame = self.simulation.step(clipped)
         self._elapsed += 1
         terminated = frame.success
         truncated = (self._elapsed >= self.max_episode_steps) & ~terminated
         reward = self.config.reward.step_reward(terminated.float(), frame.reward, self._progress)
         self._progress = frame.reward
-        observation, info = self._observation(frame), {}
+        observation = self._observation(frame)
+        info: dict[str, Any] = {"reward_parts": {"clipped": share}}
         ended = terminated | truncated
         if bool(ended.any()):
-            info = {
-                "final_obs": observation,
-                "final_info": {"is_success": terminated, "episode_length": self._elapsed.clone()},
-            }
+            info["final_obs"] = observation
+            info["final_info"] = {"is_success": terminated, "episode_length": self._elapsed.clone()}
             if self.restart:
                 rows = ended.nonzero()[:, 0].tolist()
                 observation = self._observation(self._begin(self._draw_seeds(len(rows)), rows))

@@ -1,6 +1,5 @@
 """Adapters for lerobot-eval: a tensor environment in numpy, and a counter of steps."""
 
-import logging
 from typing import Any
 
 import gymnasium as gym
@@ -9,6 +8,7 @@ import torch
 from lerobot.utils.constants import OBS_IMAGE, OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
+from lerobot_wmrl.common.actions import warn_of_clipped
 from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.images import to_bytes
 
@@ -101,11 +101,7 @@ class EvaluationAdapter(gym.vector.VectorEnv):
 
     def close(self, **kwargs: Any) -> None:
         """Close the environment, and say how many actions it could not take as they were."""
-        if any(self._clipped):
-            logging.warning(
-                "%.1f %% of the components of the policy's actions were out of range, and clipped to it",
-                100 * np.mean(self._clipped),
-            )
+        warn_of_clipped(self._clipped)
         self._clipped = []
         self.env.close(**kwargs)
 

@@ -1,6 +1,6 @@
 """Any environment of LeRobot's for reinforcement learning: tensors in, tensors out."""
 
-from typing import Any
+from typing import Any, Final
 
 import gymnasium as gym
 import numpy as np
@@ -13,10 +13,14 @@ from lerobot.envs.utils import NEW_ROLLOUT_OPTION, preprocess_observation
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
+from lerobot_wmrl.common.actions import clip_actions
 from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.errors import within
 from lerobot_wmrl.common.policies import check_fit
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+
+SAME_START: Final = 0.01
+"""Difference between two starts that rendering may make: of pixels in [0, 1], or in the state's units."""
 
 
 def make_tensor_env(config: EnvConfig, n_envs: int, device: str) -> gym.vector.VectorEnv:
@@ -101,7 +105,10 @@ class LeRobotTensorEnv(gym.vector.VectorEnv):
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin B episodes, from `seed`, `seed` + 1, … or from the seeds given."""
+        """Begin B episodes, from `seed`, `seed` + 1, … or from the seeds given.
+
+        What a seed decides is up to the environment, see `repeats_starts`.
+        """
         seeds: list[Any] = [None] * self.num_envs
         if seed is not None:
             seeds = (
@@ -115,9 +122,10 @@ class LeRobotTensorEnv(gym.vector.VectorEnv):
         if bool(actions.isnan().any()):
             rows = actions.isnan().any(1).nonzero().flatten().tolist()
             raise ValueError(f"action: NaN in environments {rows}")
-        given = self.after({ACTION: actions})[ACTION].detach().cpu().numpy().astype(np.float32)
+        given = self.after({ACTION: actions})[ACTION].detach().cpu().float()
         box: Any = self.single_action_space
-        taken = np.clip(given, box.low, box.high)
+        clipped, share = clip_actions(given, torch.from_numpy(box.low), torch.from_numpy(box.high))
+        taken = clipped.numpy()
         reward, flags = np.zeros(self.num_envs, np.float32), np.zeros((3, self.num_envs), bool)
         for row, env in enumerate(self.envs):
             observation, gained, terminated, truncated, info = env.step(taken[row : row + 1])
@@ -126,7 +134,7 @@ class LeRobotTensorEnv(gym.vector.VectorEnv):
             self._seen[row] = self._observe(row, final_observation(observation, info))
         ended = flags[0] | flags[1]
         result = self._stacked(self._seen)
-        info = {"reward_parts": {"clipped": self._vector((given != taken).mean(1).astype(np.float32))}}
+        info = {"reward_parts": {"clipped": share.to(self.device)}}
         if ended.any():
             info["final_obs"] = result
             info["final_info"] = {
@@ -136,6 +144,15 @@ class LeRobotTensorEnv(gym.vector.VectorEnv):
                 self._seen[row] = self._begin(row, None)
             result = self._stacked(self._seen)
         return result, self._vector(reward), self._vector(flags[0]), self._vector(flags[1]), info
+
+    def repeats_starts(self) -> bool:
+        """Return whether a seed decides the start. In LIBERO the number of resets does."""
+        first, again = (self._begin(0, seed=0) for _ in range(2))
+        return all(
+            torch.allclose(value, again[name], atol=SAME_START)
+            for name, value in first.items()
+            if isinstance(value, Tensor)
+        )
 
     def close_extras(self, **kwargs: Any) -> None:
         for env in self.envs:

@@ -12,6 +12,7 @@ from lerobot.envs.utils import FreezeAfterEpisodeEnd
 from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
+from lerobot_wmrl.common.actions import clip_actions
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.scene_results import CountingAsyncVectorEnv, CountingSyncVectorEnv
@@ -148,7 +149,7 @@ class ManiSkillTensorEnv(gym.vector.VectorEnv):
         self.single_observation_space = observation_space(config)
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, n_envs)
         self.max_episode_steps = config.horizon
-        self._low, self._high = np.array(ACTION_LOW, np.float32), np.array(ACTION_HIGH, np.float32)
+        self._low, self._high = torch.tensor(ACTION_LOW), torch.tensor(ACTION_HIGH)
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -158,9 +159,9 @@ class ManiSkillTensorEnv(gym.vector.VectorEnv):
         return self._tensors(observation, self._instructions), {}
 
     def step(self, action: Tensor) -> tuple[dict[str, Any], Tensor, Tensor, Tensor, dict[str, Any]]:
-        clipped = np.clip(action.detach().cpu().numpy(), self._low, self._high)
+        clipped, share = clip_actions(action.detach().cpu().float(), self._low, self._high)
         before = self._instructions
-        observation, reward, terminated, truncated, info = self.envs.step(clipped)
+        observation, reward, terminated, truncated, info = self.envs.step(clipped.numpy())
         ended = terminated | truncated
         if ended.any():
             self._instructions = [
@@ -168,7 +169,7 @@ class ManiSkillTensorEnv(gym.vector.VectorEnv):
                 for old, new, over in zip(before, info["instruction"], ended, strict=True)
             ]
         result = self._tensors(observation, self._instructions)
-        extra: dict[str, Any] = {}
+        extra: dict[str, Any] = {"reward_parts": {"clipped": share.to(self.device)}}
         if ended.any():
             extra["final_obs"] = self._tensors(_final_observation(observation, info, ended), before)
             extra["final_info"] = {

@@ -19,7 +19,7 @@ from torch import Tensor
 from lerobot_wmrl.common.constants import START_SCENE, START_TASK, TASKS
 from lerobot_wmrl.common.errors import FieldError, within
 from lerobot_wmrl.common.images import stretch, to_bytes
-from lerobot_wmrl.common.statistics import evenly_spread
+from lerobot_wmrl.common.statistics import evenly_spaced
 from lerobot_wmrl.data.budget import Ledger
 from lerobot_wmrl.data.episodes import (
     EpisodeTable,
@@ -274,7 +274,7 @@ def read_saved_frames(path: Path, max_starts: int, config: WorldModelConfig) -> 
     for name in shapes:
         if found[name].dtype != np.uint8:
             raise FieldError("dataset.frames", path, f"{name} is {found[name].dtype}, it must be uint8")
-    rows = evenly_spread(count, max_starts)
+    rows = evenly_spaced(count, max_starts)
     state = found[OBS_STATE][rows].astype(np.float32) if states else np.zeros((len(rows), 0), np.float32)
     if not np.isfinite(state).all():
         raise FieldError("dataset.frames", path, f"{OBS_STATE} contains NaN or infinity")
@@ -303,12 +303,17 @@ def simulate_first_frames(source: StartFrames, config: WorldModelConfig) -> Star
     """Render the first frames of ManiSkill's resets with seeds 0, 1, …
 
     Consecutive seeds visit the scenes in turn, then the next task.
+
+    Raises:
+        FieldError: the dataset's frames, which they have to be like, are no squares of one size.
     """
     tasks, sizes = source.tasks or TASKS[:1], config.tokenizer
     assert sizes is not None, "a trained world model knows its tokenizer"
+    remedy = "start in the dataset's episodes (`dataset.root`)"
+    side = maniskill_side(sizes, "dataset.resets", source.resets, remedy)
     env = WmrlManiSkillEnv(
         task=tasks[0], split="ood" if source.split == "ood" else "ind", scenes=source.scenes,
-        cameras=list(sizes.cameras), image_size=resets_side(sizes),
+        cameras=list(sizes.cameras), image_size=side,
     )  # fmt: skip
     with within("dataset"):
         scenes = env.selected_scenes()
@@ -326,19 +331,19 @@ def simulate_first_frames(source: StartFrames, config: WorldModelConfig) -> Star
     return StartImages(images, images, state, instructions, np.array(indices), without_depth)
 
 
-def resets_side(sizes: TokenizerConfig) -> int:
-    """Return the side of the frames that ManiSkill renders for its resets, the dataset's.
+def maniskill_side(sizes: TokenizerConfig, field: str, value: object, remedy: str) -> int:
+    """Return the side of the frames that ManiSkill renders, that of the dataset's.
 
     Raises:
-        FieldError: the dataset's frames are no squares of one size.
+        FieldError: about this field and value, with this remedy; the dataset's are no squares of one size.
     """
-    sides = {side for _, *size in sizes.frame_shapes.values() for side in size}
-    if len(sides) > 1:
+    if sizes.square_side is None:
         raise FieldError(
-            "dataset.resets", sorted(sides), "are the sides of the dataset's frames; ManiSkill's are squares",
-            "start in the dataset's episodes (`dataset.root`)",
+            field, value,
+            "ManiSkill's frames are squares of one size, those that the world model has learnt from are not",
+            remedy,
         )  # fmt: skip
-    return sides.pop()
+    return sizes.square_side
 
 
 def without_depth(model: WorldModelRewardModel) -> None:

@@ -12,8 +12,9 @@ from lerobot.rewards.factory import make_reward_model
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
+from lerobot_wmrl.common.actions import clip_actions
 from lerobot_wmrl.common.constants import Observation
-from lerobot_wmrl.common.statistics import evenly_spread
+from lerobot_wmrl.common.statistics import evenly_spaced
 from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.start_frames import Goals, StartImages, Starts, load_starts, read_start_images
@@ -102,8 +103,7 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         Raises:
             ValueError: the actions have another shape, or contain NaN; then reset before the next step.
         """
-        given = self._checked(actions)
-        clipped = given.clamp(self.action_low, self.action_high)
+        clipped, share = clip_actions(self._checked(actions), self.action_low, self.action_high)
         imagined = self.model.step(self._imagination, clipped)
         uncertainty = entropies(imagined)
         terminated, truncated = self._advance(imagined, uncertainty)
@@ -113,7 +113,7 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         reward = self.reward.compute_reward({**observation, **parts, "hidden": imagined.hidden})
         reward = self.config.uncertainty.weigh(reward, uncertainty)
         parts |= {**uncertainty, "done_probability": imagined.done_logit.sigmoid()}
-        parts["clipped"] = (~given.isclose(clipped)).float().mean(1)
+        parts["clipped"] = share
         info: dict[str, Any] = {"reward_parts": parts}
         finished = terminated | truncated
         any_finished, any_nan = torch.stack([finished.any(), clipped.isnan().any()]).tolist()
@@ -293,5 +293,5 @@ def make_success_env(env: WorldModelVectorEnv, source: StartFrames, at_most: int
     reward = make_reward_model(GeneralConfig(alpha=1.0, device=env.device.type))
     models = WorldModels(env.model, None, make_similarity("tokenizer", env.device), reward)
     starts = read_start_images(source, env.model.config)
-    starts = starts.chosen(evenly_spread(len(starts.images), at_most))
+    starts = starts.chosen(evenly_spaced(len(starts.images), at_most))
     return make_env_at(starts, models, env.config, env.num_envs)

@@ -127,9 +127,16 @@ def trained_inside(policy: str, world_model: str) -> str | None:
 
 
 def learnt_from(world_model: str, rollouts: ChosenEpisodes, split: str) -> list[str]:
-    """Return a warning if the world model has learnt from the rollouts that it is checked on."""
-    source = read_json(resolve_checkpoint(world_model) / CONFIG_FILE).get("dataset") or {}
-    roots = [source.get("root") or source.get("repo_id"), *source.get("more", ())]
+    """Return a warning if the world model has learnt from the rollouts that it is checked on.
+
+    Trainings that it was continued from count too, as far as their settings lie on this machine.
+    """
+    sources = [settings.get("dataset") or {} for _, settings in _trainings(world_model, "model")]
+    roots = [
+        root
+        for source in sources
+        for root in (source.get("root") or source.get("repo_id"), *source.get("more", ()))
+    ]
     known = any(root and (root == rollouts.name or _same(Path(root), Path(rollouts.name))) for root in roots)
     if not known or "validation" in split.split(","):
         return []

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from tqdm import trange
 
-from lerobot_wmrl.common.statistics import Estimate, Proportion, evenly_spread
+from lerobot_wmrl.common.statistics import Estimate, Proportion, evenly_spaced
 from lerobot_wmrl.data.frame_cache import frames_to_tensor
 from lerobot_wmrl.evaluation.image_metrics import psnr
 from lerobot_wmrl.evaluation.replay import Recording
@@ -146,7 +146,7 @@ def final_rows(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     """Return at most `MAX_FINALS` successful episodes and the rows of their first frames with success."""
     table = recording.table
     episodes = table.success.nonzero()[0]
-    episodes = episodes[evenly_spread(len(episodes), MAX_FINALS)]
+    episodes = episodes[evenly_spaced(len(episodes), MAX_FINALS)]
     rows = [
         start + min(int(table.done[start : start + n].argmax()) + 1, n - 1)
         for start, n in zip(table.start[episodes], table.length[episodes], strict=True)

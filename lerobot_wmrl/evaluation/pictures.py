@@ -4,16 +4,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
-from lerobot_wmrl.common.frame_strips import GAP, enlarged, evenly_spaced, in_a_row
+from lerobot_wmrl.common.frame_strips import GAP, enlarged, in_a_row
 from lerobot_wmrl.common.images import to_bytes
+from lerobot_wmrl.common.statistics import evenly_spaced
 from lerobot_wmrl.evaluation.agreement import Agreement
 from lerobot_wmrl.evaluation.gate import SWEEP_FRAMES, SWEEP_THRESHOLDS, Gate
 from lerobot_wmrl.evaluation.goals import Goals
@@ -63,7 +61,8 @@ def save_goals(goals: Goals, path: Path) -> None:
         rows["nearest final"] = goals.finals.images[goals.nearest[shown]]
     pictures = {title: to_uint8(images) for title, images in rows.items()}
     size = 1.5 * len(shown), 1.7 * len(pictures)
-    figure, axes = plt.subplots(len(pictures), len(shown), figsize=size, squeeze=False)
+    figure = Figure(figsize=size)
+    axes = figure.subplots(len(pictures), len(shown), squeeze=False)
     for line, (title, images) in zip(axes, pictures.items(), strict=True):
         for axis, cameras in zip(line, images, strict=True):
             axis.imshow(np.concatenate(list(cameras), 1))
@@ -81,7 +80,8 @@ def save_reward_curves(curves: dict[str, dict[str, Any]], path: Path) -> None:
         ("similarity", "similarity to the goal"),
         ("return", "return"),
     )
-    figure, axes = plt.subplots(1, len(panels), figsize=(10, 2.8))
+    figure = Figure(figsize=(10, 2.8))
+    axes = figure.subplots(1, len(panels))
     for axis, (key, title) in zip(axes, panels, strict=True):
         for name, curve in curves.items():
             axis.plot(curve[key], label=name)
@@ -106,7 +106,8 @@ def save_accuracy(by_step: Mapping[str, Any], path: Path) -> None:
         for title, lines in ACCURACY_PANELS.items()
         if any(f"{name}_by_step" in by_step for name in lines)
     }
-    figure, axes = plt.subplots(1, len(panels), figsize=(3.6 * len(panels), 2.8), squeeze=False)
+    figure = Figure(figsize=(3.6 * len(panels), 2.8))
+    axes = figure.subplots(1, len(panels), squeeze=False)
     for axis, (title, lines) in zip(axes[0], panels.items(), strict=True):
         for name, label in lines.items():
             mean, low, high = (
@@ -123,7 +124,8 @@ def save_accuracy(by_step: Mapping[str, Any], path: Path) -> None:
 
 def save_sweep(gates: Sequence[Gate], path: Path) -> None:
     """Plot false positives and recall by threshold, a line for each number of frames."""
-    figure, axes = plt.subplots(1, 2, figsize=(8, 2.8))
+    figure = Figure(figsize=(8, 2.8))
+    axes = figure.subplots(1, 2)
     panels = {"false_positives": ("false positives (%)", 5), "recall": ("recall (%)", 90)}
     for axis, (name, (title, limit)) in zip(axes, panels.items(), strict=True):
         for frames in SWEEP_FRAMES:
@@ -138,7 +140,8 @@ def save_sweep(gates: Sequence[Gate], path: Path) -> None:
 
 def save_agreement(agreement: Agreement, path: Path) -> None:
     """Plot a point a policy with Wilson intervals, beside the diagonal."""
-    figure, axes = plt.subplots(figsize=(4.2, 4))
+    figure = Figure(figsize=(4.2, 4))
+    axes = figure.subplots()
     axes.plot((0, 1), (0, 1), color="#999", linewidth=1, linestyle="--")
     for imagined, real in agreement.policies.values():
         axes.errorbar(
@@ -154,7 +157,6 @@ def save_agreement(agreement: Agreement, path: Path) -> None:
     _save(figure, path)
 
 
-def _save(figure: Any, path: Path) -> None:
+def _save(figure: Figure, path: Path) -> None:
     figure.tight_layout()
     figure.savefig(path, dpi=110)
-    plt.close(figure)

@@ -11,7 +11,7 @@ from torch import Tensor
 from tqdm import trange
 
 from lerobot_wmrl.common.files import write_json
-from lerobot_wmrl.common.statistics import evenly_spread
+from lerobot_wmrl.common.statistics import evenly_spaced
 from lerobot_wmrl.data.episodes import EpisodeTable, choose_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames, frames_to_tensor
 from lerobot_wmrl.evaluation.image_metrics import motion_mask, psnr_from_mse
@@ -132,7 +132,7 @@ def _rows(table: EpisodeTable, episodes: np.ndarray, at_most: int) -> tuple[np.n
     lengths = table.length[episodes]
     starts = np.repeat(table.start[episodes], lengths)
     rows = np.concatenate([table.start[episode] + np.arange(table.length[episode]) for episode in episodes])
-    kept = evenly_spread(len(rows), at_most)
+    kept = evenly_spaced(len(rows), at_most)
     return rows[kept], starts[kept]
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lerobot_wmrl.common.images import to_bytes
 from lerobot_wmrl.data.clips import Clip
 from lerobot_wmrl.data.frame_cache import frames_to_tensor
 from lerobot_wmrl.data.frames import Frames
@@ -66,7 +67,7 @@ def reward_along_episode(
         "similarity": similarity[1:].tolist(),
         "return": earned.cumsum(0).tolist(),
         "goal_reached": bool(goal.reached[0]),
-        "goal_frame": (picture * 255).round().byte().cpu().numpy(),
+        "goal_frame": to_bytes(picture).cpu().numpy(),
         "final_frame": np.asarray(recording.frames[rows][-1]),
     }
 

@@ -25,6 +25,7 @@ from lerobot_wmrl.common.lerobot_commands import edit_command, env_flags, merge_
 from lerobot_wmrl.common.policies import check_units, load_processors
 from lerobot_wmrl.common.presets import Flags, format_flags
 from lerobot_wmrl.common.stages import FAILED, Stage, never, read_record
+from lerobot_wmrl.common.statistics import evenly_spaced
 from lerobot_wmrl.data.embodiment import Embodiment, read_embodiment
 from lerobot_wmrl.data.episodes import SUCCESS, ChosenEpisodes, DatasetSource, EpisodeTable, read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
@@ -67,6 +68,9 @@ LARGEST_DISCOUNT: Final = 0.999
 
 SELECTIONS: Final = 4
 """Measurements of success in the real environment during RL at most, beside one before it."""
+
+MAX_STARTS: Final = 1024
+"""Frames in which imagination may begin, in all."""
 
 IMAGINED_STARTS: Final = 256
 """Imagined episodes of each policy that choose which one to improve, at most."""
@@ -322,7 +326,7 @@ class Improvement:
         return {
             "env.type": "world_model", "env.world_model_path": str(self.out / "world_model"),
             **{f"env.{name}": value for name, value in self.data.flags().items()},
-            "env.dataset.max_starts": 1024, "env.dataset.branches": self.branches,
+            "env.dataset.max_starts": MAX_STARTS, "env.dataset.branches": self.branches,
             "env.reward.type": "general", "env.reward.alpha": 1, "env.episode_length": self.length,
             **{f"env.{name}": value for name, value in self._success_criterion().items()},
         }  # fmt: skip
@@ -331,11 +335,12 @@ class Improvement:
         return [program, f"--preset={self.config.preset}", *format_flags(flags)]
 
     def _fewest(self) -> int:
-        """Return the number of episodes that are learnt from, of the task that has the fewest."""
-        if not self.config.rollouts:
+        """Return the number of episodes that imagination begins in, of the task that has the fewest."""
+        kept = MAX_STARTS // (1 + self.branches)
+        if not self.config.rollouts and self.found.total <= kept:
             return self.found.fewest
         tasks = self.learnt().column(START_TASK)
-        return int(np.unique(tasks, return_counts=True)[1].min())
+        return int(np.unique(tasks[evenly_spaced(len(tasks), kept)], return_counts=True)[1].min())
 
     def _columns(self) -> list[str]:
         name = f"local/{self.found.root.name}"

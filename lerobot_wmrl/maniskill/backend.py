@@ -19,8 +19,8 @@ one."""
 
 NO_RENDERER: Final = (
     "SAPIEN finds no device to render with. It needs a GPU with Vulkan, or Mesa's software driver (24+): "
-    "run `make setup`, which installs one where it may, or install the package mesa-vulkan-drivers "
-    "(on Debian 12 from bookworm-backports) together with libvulkan1"
+    "install the package mesa-vulkan-drivers (on Debian 12 from bookworm-backports) together with "
+    "libvulkan1; in a checkout of lerobot_wmrl, `make setup` does it where it may"
 )
 
 

@@ -15,7 +15,7 @@ from PIL import Image
 
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.files import whole_folder, write_text
-from lerobot_wmrl.common.statistics import evenly_spread
+from lerobot_wmrl.common.statistics import evenly_spaced
 from lerobot_wmrl.data.episodes import EpisodeTable
 from lerobot_wmrl.data.frame_cache import cached_frames
 from lerobot_wmrl.play.graphs import ExportedWorldModel, export_graphs
@@ -67,7 +67,7 @@ def export_page(world: World, folder: Path, starts: int) -> str:
         FieldError: the world model cannot be exported, or the runtime cannot be had.
     """
     assert world.table is not None, "the command has asked for a dataset"
-    rows = evenly_spread(len(world.table.start), starts)
+    rows = evenly_spaced(len(world.table.start), starts)
     with whole_folder(folder) as partial:
         static, frames = partial / "static", partial / "frames"
         static.mkdir(parents=True)

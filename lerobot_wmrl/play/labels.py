@@ -5,7 +5,6 @@
 
 import asyncio
 import json
-import sys
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from lerobot_wmrl.common.errors import FieldError, require_at_least
+from lerobot_wmrl.common.errors import FieldError, Stopped, require_at_least
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.play.checks import LAST_PORT, whole_number
 from lerobot_wmrl.rewards.success_rules import SuccessRule, next_frame_solved, rows_of
@@ -59,11 +58,11 @@ class ByHandRule(SuccessRule):
         page = LabelPage(self, dataset)
         try:
             serve(page.application(), page.access, self.port, "its button goes on", page.finished)
-        except KeyboardInterrupt:
-            sys.exit(
-                f"\n{len(page.labels)} of {len(page.lengths)} episodes have a label, kept in {self.file}; "
+        except KeyboardInterrupt as interrupt:
+            raise Stopped(
+                f"{len(page.labels)} of {len(page.lengths)} episodes have a label, kept in {self.file}; "
                 "the same command goes on"
-            )
+            ) from interrupt
         return next_frame_solved(solved_frames(page.labels, dataset), dataset)
 
 

@@ -17,7 +17,7 @@ from lerobot_wmrl.data.frame_cache import cached_frames
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.envs.lerobot_env import make_tensor_env
-from lerobot_wmrl.envs.start_frames import StartImages, observed_frame, recorded_frames, resets_side
+from lerobot_wmrl.envs.start_frames import StartImages, maniskill_side, observed_frame, recorded_frames
 from lerobot_wmrl.envs.world_model_env import WorldModels, load_world_models
 from lerobot_wmrl.play.checks import instruction, is_numbers, whole_number
 from lerobot_wmrl.play.drive import Drive, RealEpisode, Recorded
@@ -253,7 +253,8 @@ def load_world(
     if isinstance(real_env, WmrlManiSkillEnv):
         if len(real_env.task_names) > 1:
             raise FieldError("real_env.task", real_env.task, "a drive needs a single task", "choose one")
-        side = resets_side(world.sizes)
+        remedy = "choose the environment that the dataset was recorded in"
+        side = maniskill_side(world.sizes, "real_env.type", real_env.type, remedy)
         real_env = replace(real_env, cameras=list(world.sizes.cameras), image_size=side)
     world.real_env = real_env
     if dataset.given:

@@ -90,7 +90,7 @@ class SuccessGate:
         latest = records[max(records)]
         said = f"{latest['warning']}. {REMEDIES}" if latest["failed"] else latest["warning"]
         if latest["failed"] and self.config.action == "stop":
-            raise TrainingStopped(f"{said}; or train nonetheless with `gate.action` warn")
+            raise TrainingStopped(f"{said}; or train nonetheless with `gate.action=warn`")
         if said:
             logging.warning(colored(said, "red", attrs=["bold"]))
 

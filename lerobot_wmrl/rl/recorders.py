@@ -1,6 +1,6 @@
 """Recording what a policy does outside the world model, for the gate and for Dyna rounds."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +17,7 @@ from lerobot.utils.constants import ACTION, PRETRAINED_MODEL_DIR
 from torch import Tensor
 from tqdm import trange
 
+from lerobot_wmrl.common.actions import clip_actions, warn_of_clipped
 from lerobot_wmrl.common.constants import KINDS, POLICY, START_KIND, START_SEED, Observation
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.exploration import ExplorationNoise
@@ -169,20 +170,29 @@ class RolloutRecorder:
     def record(self, folder: Path, seeds: Sequence[int], report: Callable[[bool], None]) -> None:
         """Record a dataset in `folder`, which appears when it is whole: one episode from each seed.
 
+        Where the environment has several tasks, consecutive seeds belong to different ones; the dataset has
+        the episodes of one task after those of another.
+
         report: is told of every episode whether it succeeds.
         """
-        dataset = None
-        size = self.envs[0].num_envs
+        dataset, clipped = None, list[float]()
         with whole_folder(folder) as partial:
-            for first in range(0, len(seeds), size):
-                chosen = seeds[first : first + size]
-                turn = chosen[0] // size % len(self.envs)
-                seen, taken = self._roll_out(self.envs[turn], chosen)
+            for env, chosen in self._batches(seeds):
+                seen, taken = self._roll_out(env, chosen)
+                clipped += seen.clipped
                 dataset = dataset or self._create(partial, seen.observations[0])
                 for row, seed in enumerate(chosen):
                     report(self._add_episode(dataset, seen, taken, row, seed))
             assert dataset is not None, "there is no seed"
             dataset.finalize()
+        warn_of_clipped(clipped)
+
+    def _batches(self, seeds: Sequence[int]) -> Iterator[tuple[Any, Sequence[int]]]:
+        """Yield the environments of a task, and the seeds of the next episodes in them."""
+        for task, env in enumerate(self.envs):
+            own = [seed for seed in seeds if seed % len(self.envs) == task]
+            for first in range(0, len(own), env.num_envs):
+                yield env, own[first : first + env.num_envs]
 
     def _roll_out(self, env: Any, seeds: Sequence[int]) -> tuple["RecordingProcessors", dict[str, Tensor]]:
         """Return what the policy saw and did from these seeds, and LeRobot's record of the outcome."""
@@ -293,6 +303,8 @@ class RecordingProcessors:
     robot: Embodiment
     observations: list[Observation] = field(default_factory=list)
     actions: list[np.ndarray] = field(default_factory=list)
+    clipped: list[float] = field(default_factory=list)
+    """Shares of the components of the policy's actions that were out of range."""
 
     def preprocess(self, observation: Observation) -> Observation:
         """Keep a batch of observations in LeRobot's names, and prepare it for the policy."""
@@ -302,7 +314,10 @@ class RecordingProcessors:
 
     def postprocess(self, action: Tensor) -> Tensor:
         """Return the policy's actions in the dataset's units, with noise, within their range. (B, A)"""
-        chosen = self.after(action).cpu().numpy() + np.stack([noise() for noise in self.noises])
-        kept = np.clip(chosen, self.robot.action_low, self.robot.action_high).astype(np.float32)
-        self.actions.append(kept)
-        return torch.from_numpy(kept)
+        low, high = torch.tensor(self.robot.action_low), torch.tensor(self.robot.action_high)
+        chosen = self.after(action).cpu().float()
+        self.clipped += clip_actions(chosen, low, high)[1].tolist()
+        noise = torch.from_numpy(np.stack([noise() for noise in self.noises])).float()
+        kept = (chosen + noise).clamp(low, high)
+        self.actions.append(kept.numpy())
+        return kept

@@ -184,13 +184,19 @@ def check_distillation(algorithm: DistillationConfig, env: EnvConfig) -> None:
 
 
 def check_tasks(cfg: TrainConfig, env: Any) -> None:
-    """Raise FieldError if a task has no environment, or for GRPO with several tasks."""
-    tasks = getattr(env, "tasks", 1)
-    if isinstance(cfg.algorithm, GRPOConfig) and tasks > 1:
+    """Raise FieldError if a task has no environment, or if GRPO finds no two episodes from the same start."""
+    tasks, grpo = getattr(env, "tasks", 1), isinstance(cfg.algorithm, GRPOConfig)
+    if grpo and tasks > 1:
         raise FieldError(
             "algorithm.type", cfg.algorithm.type,
             f"compares episodes from the same start, and the environment has {tasks} tasks",
             "choose one task, or ppo",
+        )  # fmt: skip
+    if grpo and hasattr(env, "repeats_starts") and not env.repeats_starts():
+        raise FieldError(
+            "algorithm.type", cfg.algorithm.type,
+            "compares episodes from the same start, and in this environment a seed does not decide it",
+            "choose ppo",
         )  # fmt: skip
     if tasks > env.num_envs:
         raise FieldError(

@@ -102,6 +102,8 @@ def load_model(
     folder = resolve_checkpoint(path)
     try:
         return get_reward_model_class(config.type).from_pretrained(str(folder), config=config, strict=True)
+    except torch.OutOfMemoryError:
+        raise
     except (SafetensorError, RuntimeError, OSError) as error:
         raise ValueError(
             f"{path}: model.safetensors cannot be read ({error}). It is truncated or of another version: "

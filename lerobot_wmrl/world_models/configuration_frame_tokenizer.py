@@ -123,6 +123,12 @@ class TokenizerConfig:
         return {key: (3, *size) for key, size in zip(self.camera_keys, sizes, strict=True)}  # type: ignore[misc]
 
     @property
+    def square_side(self) -> int | None:
+        """Side of the frames as the dataset has them, None unless all are squares of one size."""
+        sides = {side for _, *size in self.frame_shapes.values() for side in size}
+        return sides.pop() if len(sides) == 1 else None
+
+    @property
     def camera_keys(self) -> list[str]:
         """The dataset's keys of the cameras."""
         return [camera_key(camera) for camera in self.cameras]

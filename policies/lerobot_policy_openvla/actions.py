@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import pyarrow.parquet as pq
 import torch
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.episodes import parquet_files
+from lerobot_wmrl.data.embodiment import component_names
+from lerobot_wmrl.data.episodes import parquet_files, read_actions
 
 BINS: Final = 256
 EDGES: Final = np.linspace(-1, 1, BINS)
@@ -91,23 +91,15 @@ def dataset_statistics(dataset_meta: Any) -> NormStats | None:
 
     LeRobot's own quantiles are means over the episodes' quantiles, which differ.
     """
-    files = parquet_files(Path(dataset_meta.root))
-    if not files:
+    root = Path(dataset_meta.root)
+    if not parquet_files(root):
         return None
-    actions = np.concatenate([read_actions(file) for file in files])
-    names = component_names(dataset_meta.features[ACTION].get("names"), actions.shape[1])
+    actions = read_actions(root)
     return {
-        "action": action_statistics(actions, names),
+        "action": action_statistics(actions, component_names(dataset_meta.features[ACTION])),
         "num_transitions": len(actions),
         "num_trajectories": int(dataset_meta.total_episodes),
     }
-
-
-def read_actions(file: Path) -> np.ndarray:
-    """Read the actions of one of a dataset's files (N, A)."""
-    column = pq.read_table(file, columns=[ACTION]).column(ACTION)
-    values = [chunk.flatten().to_numpy(zero_copy_only=False) for chunk in column.chunks]
-    return np.concatenate(values).reshape(len(column), -1).astype(np.float64)
 
 
 def action_statistics(actions: np.ndarray, names: Sequence[str]) -> dict[str, list[Any]]:
@@ -118,16 +110,8 @@ def action_statistics(actions: np.ndarray, names: Sequence[str]) -> dict[str, li
         "max": actions.max(axis=0), "q01": np.quantile(actions, 0.01, axis=0),
         "q99": np.quantile(actions, 0.99, axis=0),
     }  # fmt: skip
-    mask = [not (GRIPPER in name and inside) for name, inside in zip(names, bounded, strict=True)]
+    mask = [not (GRIPPER in name.lower() and inside) for name, inside in zip(names, bounded, strict=True)]
     return {**{name: value.tolist() for name, value in statistics.items()}, "mask": mask}
-
-
-def component_names(names: Any, count: int) -> list[str]:
-    """Return `count` names of a dataset's feature, given as a list, a dict of lists, or nothing."""
-    if isinstance(names, Mapping):
-        names = [name for part in names.values() for name in (part if isinstance(part, list) else [part])]
-    known = [str(name).lower() for name in names or ()]
-    return known if len(known) == count else [""] * count
 
 
 def used_statistics(norm_stats: NormStats) -> NormStats:

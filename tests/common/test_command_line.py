@@ -11,7 +11,7 @@ from lerobot_wmrl.common.command_line import (
     parse_flags,
     said_in_flags,
 )
-from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.errors import FieldError, Stopped
 from lerobot_wmrl.common.settings import settings_of
 from lerobot_wmrl.scripts.train import TrainConfig
 
@@ -56,7 +56,9 @@ class Config(RunConfig):
         (FieldError("length", 60, "too long"), [], "--real.length=60: too long"),
         (FieldError("iterations", "", "is missing"), [], "--iterations: is missing"),
         (FieldError("width", 7, "odd", "see `config.json`"), [], "width=7: odd; see `config.json`"),
-        (ValueError("no file"), [], "no file"),
+        (ValueError("no `length`"), [], "no `length`"),
+        (Stopped("lower `reward.gamma`"), ["--real.reward.gamma=1"], "lower --real.reward.gamma"),
+        (Stopped("give fewer `iterations=2`"), [], "give fewer --iterations=2"),
     ],
 )
 def test_a_field_is_said_as_its_flag(error: ValueError, typed: list[str], message: str) -> None:

@@ -215,5 +215,5 @@ def test_with_cuda_a_stage_is_a_fresh_program(tmp_path: Path, monkeypatch: pytes
 
 
 def test_a_command_that_is_not_installed_is_named() -> None:
-    with pytest.raises(ValueError, match=r"lerobot-wmrl-nothing is not installed: run `make setup`"):
+    with pytest.raises(ValueError, match=r"lerobot-wmrl-nothing is not installed: install .*`make setup`"):
         entry_point("lerobot-wmrl-nothing")

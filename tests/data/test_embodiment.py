@@ -45,7 +45,7 @@ def degrees(frames: int = 400) -> np.ndarray:
 
 @pytest.mark.parametrize(("names", "found"), [
     (["x", "y"], ["x", "y"]), ({"motors": ["x", "y"]}, ["x", "y"]), ({"x": 0, "y": 1}, ["x", "y"]),
-    (None, ["0", "1"]), (["x"], ["0", "1"]), ({"a": ["x"], "b": ["y"]}, ["a", "b"]),
+    (None, ["0", "1"]), (["x"], ["0", "1"]), ({"a": ["x"], "b": ["y"]}, ["x", "y"]),
 ])  # fmt: skip
 def test_components_have_names(names: object, found: list[str]) -> None:
     assert component_names({"shape": (2,), "names": names}) == found

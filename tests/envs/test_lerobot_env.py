@@ -1,5 +1,6 @@
 """Environments of LeRobot's own for RL, with PushT."""
 
+import itertools
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -69,6 +70,28 @@ class TwoTasks(PushtEnv):
         lengths = (self.episode_length, 2 * self.episode_length)
         made = [PushtEnv(episode_length=length).create_envs(n_envs)["pusht"][0] for length in lengths]
         return {"pusht": dict(enumerate(made))}
+
+
+@EnvConfig.register_subclass("unseeded")
+@dataclass
+class Unseeded(PushtEnv):
+    """PushT whose starts depend on the number of resets, as LIBERO's do."""
+
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, Any]]:
+        made = PushtEnv(episode_length=self.episode_length).create_envs(n_envs)
+        (env,) = made["pusht"].values()
+        reset, count = env.reset, itertools.count()
+        env.reset = lambda seed, options: reset(seed=[next(count)], options=options)
+        return made
+
+
+def test_grpo_needs_starts_that_seeds_decide(env: LeRobotTensorEnv) -> None:
+    grpo = TrainConfig(algorithm=GRPOConfig())
+    check_tasks(grpo, env)
+    unseeded = LeRobotTensorEnv(Unseeded(episode_length=STEPS), B, "cpu")
+    check_tasks(TrainConfig(), unseeded)
+    with pytest.raises(ValueError, match="a seed does not decide it; choose ppo"):
+        check_tasks(grpo, unseeded)
 
 
 def test_several_tasks_are_shared_out_and_the_longest_episode_counts() -> None:

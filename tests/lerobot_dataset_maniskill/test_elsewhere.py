@@ -164,6 +164,14 @@ def test_tasks_take_turns_across_the_parts_of_a_recording() -> None:
     assert asked == ["a", "b", "c", "a", "b"]
 
 
+def test_tasks_share_out_fewer_episodes_than_environments() -> None:
+    """Else some would never be visited, and a gate over them passed unseen."""
+    recorder = RolloutRecorder.__new__(RolloutRecorder)
+    recorder.envs = [SimpleNamespace(num_envs=2, name=name) for name in "abc"]
+    batches = [(env.name, list(seeds)) for env, seeds in recorder._batches(range(7, 15))]
+    assert batches == [("a", [9, 12]), ("b", [7, 10]), ("b", [13]), ("c", [8, 11]), ("c", [14])]
+
+
 def test_an_interrupted_recording_continues_and_a_whole_one_is_left_alone(
     config: RecordConfig, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

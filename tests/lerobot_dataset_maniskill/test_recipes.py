@@ -32,6 +32,14 @@ def test_flags_stand_where_the_recipe_stood(recipe: Callable[[str], Path]) -> No
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize("text", [
+    "policy: {path: /policy}\nenv: {type: pusht}\nlike: {root: /data}",
+    "policy: {type: wm_mpc, horizon: 8}\nenv: {type: world_model, world_model_path: /model}",
+])  # fmt: skip
+def test_a_recipe_may_hold_any_flag_of_the_command(text: str, recipe: Callable[[str], Path]) -> None:
+    assert recipe_flags(recipe(text))
+
+
 @pytest.mark.parametrize("size", SIZES)
 def test_every_packaged_recipe_plans_only_what_training_may_see(size: str, tmp_path: Path) -> None:
     arguments = [*expand_recipes([f"--preset={size}"]), f"--output_dir={tmp_path / 'dataset'}"]

@@ -14,7 +14,6 @@ from lerobot_policy_openvla.actions import (
     action_statistics,
     adopt_statistics,
     choose_key,
-    component_names,
     dataset_statistics,
     lerobot_statistics,
 )
@@ -47,15 +46,9 @@ def test_quantiles_are_those_of_all_actions(
 
 
 def test_a_gripper_that_leaves_its_range_is_normalised() -> None:
-    names = ["x", "left_gripper", "gripper_width"]
+    names = ["x", "left_Gripper", "gripper_width"]
     actions = np.array([[0.5, -1.0, 0.0], [0.1, 1.0, 80.0]])
     assert action_statistics(actions, names)["mask"] == [True, False, True]
-
-
-def test_names_of_components_come_in_several_forms() -> None:
-    assert component_names({"motors": ["dx", "Gripper"]}, 2) == ["dx", "gripper"]
-    assert component_names(["dx", "dy"], 2) == ["dx", "dy"]
-    assert component_names(None, 2) == component_names(["dx"], 2) == ["", ""]
 
 
 def test_the_processors_normalise_by_the_datasets_own_statistics(
