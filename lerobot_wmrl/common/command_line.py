@@ -9,13 +9,15 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr
 from dataclasses import dataclass
 from difflib import get_close_matches
+from functools import cache
 from io import StringIO
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import draccus
 from draccus.utils import ParsingError
-from draccus.wrappers import docstring
+from draccus.wrappers import docstring, field_wrapper
 from lerobot.configs import parser
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import flatten_dict, init_logging
@@ -105,7 +107,7 @@ def parse_flags[Config: RunConfig](config_class: type[Config]) -> Config:
 
     said = StringIO()
     try:
-        with redirect_stderr(said), without_help_texts():
+        with redirect_stderr(said), parsed_quickly():
             return parsed()
     except SystemExit as stopped:
         reason = stopped.__context__ and cause(stopped.__context__)
@@ -115,14 +117,16 @@ def parse_flags[Config: RunConfig](config_class: type[Config]) -> Config:
 
 
 @contextmanager
-def without_help_texts() -> Iterator[None]:
-    """Keep draccus from looking for every flag's help text in source files, which takes seconds."""
-    look_up = docstring.get_attribute_docstring
+def parsed_quickly() -> Iterator[None]:
+    """Keep draccus from looking for every flag's help text in source files, which takes seconds, and from
+    inspecting the same few classes of argparse anew for every flag."""
+    look_up, inspected = docstring.get_attribute_docstring, field_wrapper.inspect
     docstring.get_attribute_docstring = lambda *_: docstring.AttributeDocString()
+    field_wrapper.inspect = SimpleNamespace(getfullargspec=cache(inspect.getfullargspec))
     try:
         yield
     finally:
-        docstring.get_attribute_docstring = look_up
+        docstring.get_attribute_docstring, field_wrapper.inspect = look_up, inspected
 
 
 def parsing_error(said: str, config_class: type[RunConfig]) -> str:
@@ -165,7 +169,7 @@ def refusal(name: str, config_class: type[RunConfig]) -> str | None:
     if chosen is None:
         return None
     try:
-        with without_help_texts(), redirect_stderr(StringIO()):
+        with parsed_quickly(), redirect_stderr(StringIO()):
             draccus.parse(chosen, args=parser.get_cli_overrides(name))
     except (ParsingError, SystemExit) as error:
         reason = cause(error)

@@ -23,7 +23,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 
 import lerobot_env_wmrl  # noqa: F401 (registers what LeRobot is to know)
 from lerobot_wmrl.common import stages
-from lerobot_wmrl.common.command_line import parse_flags, without_help_texts
+from lerobot_wmrl.common.command_line import parse_flags, parsed_quickly
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.rewards.configuration_rewards import EmbeddingConfig
 
@@ -73,7 +73,7 @@ def check(command: str) -> None:
             for name, package in parse_plugin_args(PLUGIN_DISCOVERY_SUFFIX, flags).items():
                 load_plugin(package)
                 flags = filter_arg(name, flags)
-            with without_help_texts():
+            with parsed_quickly():
                 draccus.parse(LEROBOT[program], args=without_paths(flags))
         else:
             assert program in SHELL, f"{program}: not a command that is known here"
