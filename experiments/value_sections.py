@@ -158,6 +158,11 @@ def outcomes(cells: Sequence[Cell], method: str, domain: str) -> list[list[int]]
     return [cell["methods"][method][domain]["outcomes"] for cell in cells if method in cell["methods"]]
 
 
+def mean(cells: Sequence[Cell], method: str, domain: str) -> float:
+    """Return a method's success, as a share, over the cells in which it has been run."""
+    return float(np.mean(outcomes(cells, method, domain)))
+
+
 def measured(cells: Sequence[Cell], methods: Iterable[str]) -> list[str]:
     """Return the methods that have been run in any of the cells."""
     return [method for method in methods if any(method in cell["methods"] for cell in cells)]
@@ -173,13 +178,13 @@ def gain(cells: Sequence[Cell], method: str, baseline: str, domain: str) -> Runs
 def gains(cells: Sequence[Cell], method: str, baseline: str, domain: str) -> list[float]:
     """Return the gain of each cell, which is one seed."""
     both = [cell for cell in cells if {method, baseline} <= cell["methods"].keys()]
-    return [gain([cell], method, baseline, domain).mean for cell in both]
+    return [mean([cell], method, domain) - mean([cell], baseline, domain) for cell in both]
 
 
 def best(cells: Sequence[Cell], methods: Sequence[str], domain: str) -> str:
     """Return the method with the highest mean success, of those that have been run in all cells."""
     complete = [method for method in methods if all(method in cell["methods"] for cell in cells)]
-    return max(complete, key=lambda method: RunsMean.over(outcomes(cells, method, domain)).mean)
+    return max(complete, key=lambda method: mean(cells, method, domain))
 
 
 def best_pair(cells: Sequence[Cell], domain: str) -> tuple[str, str]:
@@ -233,10 +238,10 @@ def aims(found: Groups) -> str:
         if all(each.mean >= AIMED_GAIN and each.low > 0 for each in gained):
             above.append(spoken(budget))
         else:
-            most = max(most, RunsMean.over(outcomes(cells, best(cells, BASELINES, "ind"), "ind")).mean)
+            most = max(most, mean(cells, best(cells, BASELINES, "ind"), "ind"))
         if not measured(cells, ["ppo_distilled"]):
             continue
-        rates = [RunsMean.over(outcomes(cells, "ppo_distilled", domain)).mean for domain in SCENES]
+        rates = [mean(cells, "ppo_distilled", domain) for domain in SCENES]
         if all(rate >= aimed for rate, aimed in zip(rates, AIMED_SUCCESS, strict=True)):
             planner.append(f"{spoken(budget)}, in {minutes(cells, 'ppo_distilled')} minutes")
     known, unseen = (f"{100 * rate:.0f}" for rate in AIMED_SUCCESS)

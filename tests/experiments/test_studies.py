@@ -60,6 +60,11 @@ def test_every_result_is_made_by_exactly_one_study() -> None:
     assert due <= committed <= set(made), "a study with cells may have published some of them"
 
 
+def test_what_cells_publish_is_collected() -> None:
+    """No step writes it, and a study does not inherit how: hours later nothing could be published."""
+    assert [name for name, cells in CELLS.items() if len(cells) > 1 and not cells[0].collect] == []
+
+
 def test_every_study_with_results_has_a_section() -> None:
     told = {name for name, study in STUDIES.items() if any(r.endswith(".json") for r in study.results)}
     assert told == SECTIONS.keys()
