@@ -82,8 +82,9 @@ def run_command[Config: RunConfig](
             return
         function(parse_flags(config_class))
     except (ValueError, OSError, ParsingError) as error:
-        print(f"error: {said_in_flags(cause(error), config_class, sys.argv[1:])}", file=sys.stderr)
-        sys.exit(STOPPED if isinstance(error, Stopped) else 1)
+        kind, status = ("stopped", STOPPED) if isinstance(error, Stopped) else ("error", 1)
+        print(f"{kind}: {said_in_flags(cause(error), config_class, sys.argv[1:])}", file=sys.stderr)
+        sys.exit(status)
 
 
 def help_of(function: Callable[..., None], config_class: type) -> str:

@@ -9,6 +9,7 @@ from mani_skill.utils import sapien_utils
 from transforms3d.euler import euler2quat
 
 from lerobot_wmrl.maniskill.cameras import VIEWS, WRIST, Rendering
+from lerobot_wmrl.maniskill.shaders import sensor_shaders
 
 AMBIENT: Final = (0.45, 0.45, 0.45)
 SUN: Final = (1.5, 1.5, 1.5)
@@ -40,7 +41,10 @@ def camera_config(name: str, image_size: int, robot: Any) -> CameraConfig:
         image_size: pixels of each side.
         robot: ManiSkill's articulation, on whose hand the wrist camera is mounted.
     """
-    frame = {"uid": name, "width": image_size, "height": image_size, "near": NEAR, "far": FAR}
+    frame = {
+        "uid": name, "width": image_size, "height": image_size, "near": NEAR, "far": FAR,
+        "shader_config": sensor_shaders(),
+    }  # fmt: skip
     if name in VIEWS:
         view = VIEWS[name]
         return CameraConfig(pose=sapien_utils.look_at(view.eye, view.target), fov=view.fov, **frame)

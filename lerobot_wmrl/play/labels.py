@@ -182,6 +182,7 @@ class LabelPage:
         if not self.complete:
             missing = len(self.lengths) - len(self.labels)
             raise web.HTTPConflict(text=f"{missing} episodes have no label")
+        await request.read()  # else the server may wait ten seconds for the rest of it before it ends
         self.done.set()
         return web.json_response({})
 

@@ -118,6 +118,9 @@ def test_the_tensor_environment_keeps_the_last_observation_of_an_episode(
     for step in range(HORIZON):
         observation, reward, terminated, truncated, info = env.step(raise_gripper)
         assert ("final_obs" in info) == (step == HORIZON - 1)
+        assert info["reward_parts"]["clipped"].tolist() == [0]
+    *_, beyond = env.step(torch.tensor([[9.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0]]))
+    assert beyond["reward_parts"]["clipped"].tolist() == pytest.approx([1 / 7])
     assert reward.dtype == torch.float32
     assert truncated.all()
     assert not terminated.any()

@@ -301,6 +301,11 @@ def test_rollouts_that_the_world_model_has_learnt_from_are_warned_about(
     shutil.copytree(resolve_checkpoint(config.world_model.path), copy)
     write(copy / "train_config.json", {"dataset": {"root": "demonstrations", "more": [str(tmp_path)]}})
     assert learnt_from(str(copy), ChosenEpisodes(str(tmp_path)), "all") != []
+    further = write(tmp_path / "further" / "train_config.json", {
+        "dataset": {"root": "rollouts"}, "model": {"pretrained_path": str(copy)},
+    })  # fmt: skip
+    write(further.parent / "config.json", {})
+    assert learnt_from(str(further.parent), ChosenEpisodes(str(tmp_path)), "all") != [], "from the first on"
 
 
 def test_rollouts_count_within_the_length_of_an_episode_and_must_both_succeed_and_fail(

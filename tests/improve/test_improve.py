@@ -222,6 +222,19 @@ def test_imagination_begins_all_over_the_rollouts_too(
     assert improvement.branches == branches
 
 
+def test_no_start_is_imagined_twice_where_one_task_has_few(
+    make_synthetic_dataset: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Imagination begins in some of the episodes of a large dataset, and in fewer still of each task."""
+    root = make_synthetic_dataset(tmp_path / "merged", episodes=6).root
+    tasks = read_episodes(open_dataset(root)).column("start.task")
+    assert len(np.unique(tasks)) == 1
+    monkeypatch.setattr(stages, "MAX_STARTS", 4)
+    improvement = improvement_of(tmp_path, total=6, fewest=6)
+    improvement.config.dataset = ChosenEpisodes(str(root))
+    assert "--n_episodes=4" in improvement.compare(tmp_path, improvement.imagination(), 256)
+
+
 def test_another_round_does_not_double_the_frames_of_a_rollout(tmp_path: Path) -> None:
     improvement = improvement_of(tmp_path, longest=80)
     improvement.config.rollouts, improvement.config.real_env = 3, PushtEnv()

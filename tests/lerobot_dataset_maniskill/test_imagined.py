@@ -21,6 +21,7 @@ from lerobot_wmrl.maniskill.recordings import recorded_episodes
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 from tests.rl.checkpoints import save_untrained_policy
+from tests.trained import action_config, run_training, train_tokenizer
 
 LENGTH = 4
 IMAGE = "observation.images.third_view"
@@ -98,6 +99,17 @@ def test_the_same_command_again_finds_it_complete_and_other_settings_are_refused
     config.env.done_frames, config.env.uncertainty.limit = 2, 0.5
     with pytest.raises(ValueError, match=r"other settings \(uncertainty\.limit None → 0\.5\)"):
         record(config)
+
+
+def test_frames_have_the_size_of_the_dataset_not_of_the_tokenizer(config, make_synthetic_dataset, tmp_path):
+    """As policies see them, to whatever the tokenizer resizes them."""
+    large = make_synthetic_dataset(tmp_path / "large", size=48)
+    tokenizer = train_tokenizer(large.root, tmp_path / "tokenizer")
+    model = run_training(action_config(tokenizer), large.root, tmp_path / "model")
+    config.env.world_model_path, config.env.dataset.root = str(model), str(large.root)
+    config.__post_init__()
+    record(config)
+    assert open_dataset(config.root).features[IMAGE]["shape"] == (48, 48, 3)
 
 
 def test_a_start_that_comes_again_gets_other_noise(config, caplog):

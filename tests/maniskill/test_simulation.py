@@ -1,11 +1,15 @@
 """What the simulator does with a seed, a scene and an action."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import sapien
+from lerobot.utils.constants import HF_LEROBOT_HOME
+from mani_skill.render import PREBUILT_SHADER_CONFIGS
 from transforms3d.quaternions import qconjugate, qmult, quat2axangle
 
-from lerobot_wmrl.maniskill import backend
+from lerobot_wmrl.maniskill import backend, rendering, shaders
 from lerobot_wmrl.maniskill.cameras import IMAGE_SIZE, ROBOT_MESH_DETAIL, VIEWS, Rendering
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH
 from lerobot_wmrl.maniskill.episode import WORKSPACE_FLOOR, Frame
@@ -126,6 +130,33 @@ def test_every_scene_looks_different_and_only_its_object_is_on_the_table(simulat
     for first in range(len(SCENES)):
         for second in range(first):
             assert np.abs(pictures[first] - pictures[second]).mean() > 0.5
+
+
+def test_shaders_without_the_table_draw_the_same_pictures(
+    simulation: Simulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert Path(shaders.sensor_shaders().shader_pack).is_relative_to(HF_LEROBOT_HOME)
+    rewritten = simulation.reset(SCENES[2], 5)
+    monkeypatch.setattr(rendering, "sensor_shaders", lambda: PREBUILT_SHADER_CONFIGS[shaders.PACK])
+    original = Simulation(simulation.task, SCENES[:3], simulation.rendering)
+    expected = original.reset(SCENES[2], 5)
+    original.close()
+    for camera, image in rewritten.images.items():
+        assert np.array_equal(image, expected.images[camera])
+
+
+def test_other_shaders_than_those_known_are_taken_as_they_are() -> None:
+    assert shaders.without_table("vec4 color = texture(samplerColor, uv);") == (
+        "vec4 color = texture(samplerColor, uv);"
+    )
+
+
+def test_files_are_written_by_whoever_is_first(tmp_path: Path) -> None:
+    folder = tmp_path / "shaders" / "0123"
+    for text in ("first", "second"):
+        shaders.write_once(folder, {"minimal/a.frag": text})
+    assert (folder / "minimal" / "a.frag").read_text() == "first"
+    assert [path.name for path in folder.parent.iterdir()] == ["0123"]
 
 
 def test_a_lighter_robot_looks_like_the_full_one_and_is_what_is_drawn() -> None:

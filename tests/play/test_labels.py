@@ -156,7 +156,7 @@ def test_ctrl_c_keeps_the_labels_and_says_so(unlabelled, rule, tmp_path):
     command.send_signal(signal.SIGINT)
     said = command.communicate(timeout=60)[1]
     assert said.strip().splitlines()[-1] == (
-        f"1 of 6 episodes have a label, kept in {rule.file}; the same command goes on"
+        f"stopped: 1 of 6 episodes have a label, kept in {rule.file}; the same command goes on"
     )
     assert "Traceback" not in said
     assert not (tmp_path / "labelled").exists()

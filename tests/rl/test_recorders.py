@@ -1,6 +1,7 @@
 """A policy is recorded in an environment that nobody here has built: PushT, by LeRobot's own plugin."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -59,6 +60,16 @@ def test_seeds_decide_the_start_and_noise_stays_in_range(checkpoint: Path, tmp_p
     assert other.action.std() > 1
     assert (other.action >= 0).all()
     assert (other.action <= 512).all()
+
+
+def test_what_the_policy_does_out_of_range_is_reported_and_noise_is_not(
+    checkpoint: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    recorded(checkpoint, tmp_path / "noise", exploration=1.0)
+    assert "out of range" not in caplog.text
+    narrow = replace(ROBOT, action_high=[512.0, AIM - 1])
+    EnvRecorder(PushtEnv(episode_length=STEPS), narrow, "cpu").record(checkpoint, 1, 7, tmp_path / "narrow")
+    assert "50.0 % of the components of the policy's actions were out of range" in caplog.text
 
 
 def test_what_is_recorded_is_not_recorded_again_and_is_entered_in_the_ledger(
