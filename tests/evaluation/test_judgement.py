@@ -301,6 +301,7 @@ def test_rollouts_that_the_world_model_has_learnt_from_are_warned_about(
     shutil.copytree(resolve_checkpoint(config.world_model.path), copy)
     write(copy / "train_config.json", {"dataset": {"root": "demonstrations", "more": [str(tmp_path)]}})
     assert learnt_from(str(copy), ChosenEpisodes(str(tmp_path)), "all") != []
+    (tmp_path / "further").mkdir()
     further = write(tmp_path / "further" / "train_config.json", {
         "dataset": {"root": "rollouts"}, "model": {"pretrained_path": str(copy)},
     })  # fmt: skip

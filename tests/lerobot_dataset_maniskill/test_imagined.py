@@ -107,7 +107,8 @@ def test_frames_have_the_size_of_the_dataset_not_of_the_tokenizer(config, make_s
     tokenizer = train_tokenizer(large.root, tmp_path / "tokenizer")
     model = run_training(action_config(tokenizer), large.root, tmp_path / "model")
     config.env.world_model_path, config.env.dataset.root = str(model), str(large.root)
-    config.__post_init__()
+    policy = save_untrained_policy(tmp_path / "large_policy", size=48, actions=7)
+    config.policy = read_policy_config(str(policy), [])
     record(config)
     assert open_dataset(config.root).features[IMAGE]["shape"] == (48, 48, 3)
 
