@@ -51,7 +51,7 @@ def write_card(root: Path, repo_id: str, table: Mapping[str, np.ndarray]) -> Non
     """Write the pictures, then the card, of a dataset.
 
     Args:
-        root: of the dataset.
+        root: root of the dataset.
         repo_id: its name.
         table: its episodes, as `lerobot_wmrl.maniskill.recordings.recorded_episodes` reads them.
     """

@@ -23,7 +23,7 @@ class EpisodePlan:
         task: with `scene` and `seed`, decides the start.
         kind: how its actions are made, one of `constants.KINDS`.
         scene: what is on the table.
-        seed: of the episode.
+        seed: seed of the episode.
         start: for an imagined episode, the index of the environment's start frame.
         visit: for an imagined episode, how many earlier ones have the same start.
     """

@@ -26,7 +26,7 @@ def publish(api: HfApi, root: Path, repo_id: str, private: bool) -> None:
 
     Args:
         api: the client.
-        root: of the dataset.
+        root: root of the dataset.
         repo_id: its name on the hub.
         private: whether it must be private there.
 

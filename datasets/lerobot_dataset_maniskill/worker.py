@@ -177,8 +177,8 @@ def serve_parts(config: RecordConfig, folder: Path, parts: Any, results: Any) ->
     """Record parts from the queue until None comes, or until the command is gone. Runs in a worker process.
 
     Args:
-        config: of the recording.
-        folder: for the sub-datasets.
+        config: configuration of the recording.
+        folder: folder for the sub-datasets.
         parts: queue of `Part`, ended by None.
         results: queue for `EpisodeResult`, the index of each whole part, and errors.
     """

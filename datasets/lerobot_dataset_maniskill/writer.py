@@ -157,7 +157,7 @@ def find_damage(root: Path, episodes: int) -> str | None:
     """Check a dataset without decoding its pictures.
 
     Args:
-        root: of the dataset.
+        root: root of the dataset.
         episodes: how many it should have.
 
     Returns:

@@ -69,7 +69,7 @@ def run_command[Config: RunConfig](
 
     Args:
         function: what the command does; the docstring of its module introduces `--help`.
-        config_class: of its settings.
+        config_class: class of its settings.
         expand: replaces the flags that stand for others (`--preset`).
     """
     register_third_party_plugins()
@@ -229,7 +229,7 @@ def said_in_flags(error: BaseException, config_class: type, argv: Sequence[str])
     Args:
         error: a FieldError knows its field, relative to the configuration that raised it, and names others in
             backquotes, as `Stopped` does. Any other error keeps its message.
-        config_class: of the command.
+        config_class: class of the command's settings.
         argv: what was typed.
     """
     if not isinstance(error, FieldError | Stopped):

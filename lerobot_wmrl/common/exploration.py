@@ -18,8 +18,8 @@ class ExplorationNoise:
     trajectory, to where the policy may be once it has changed.
 
     Args:
-        largest: of the levels, as a share of `scale`.
-        seed: of the episode.
+        largest: the highest of the noise levels, as a share of `scale`.
+        seed: seed of the episode.
         scale: half the range of each component, in the units of actions. (A,)
         visit: number of earlier episodes with this seed; each has noise of its own.
     """

@@ -53,7 +53,7 @@ def edit_command(folder: Path, operation: str, flags: Flags) -> list[str]:
 def env_flags(env: EnvConfig, prefix: str = "env") -> Flags:
     """Return `env.type` and the settings that differ from their defaults, as a command takes them.
 
-    prefix: of the flags, `env` or `real_env`.
+    prefix: prefix of the flags, `env` or `real_env`.
     """
     given, default = (flatten_dict(draccus.encode(each, EnvConfig), sep=".") for each in (env, type(env)()))
     differing = [name for name in given if given[name] != default.get(name)]

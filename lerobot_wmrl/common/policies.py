@@ -219,8 +219,8 @@ def load_with_adapters(config: PreTrainedConfig, **options: Any) -> Any:
     """Load the policy that an adapter was trained on, with the adapter, ready to be trained further.
 
     Args:
-        config: of the checkpoint that holds the adapter.
-        options: for the policy's `from_pretrained`.
+        config: configuration of the checkpoint that holds the adapter.
+        options: options for the policy's `from_pretrained`.
 
     Raises:
         ValueError: the policy that was adapted is not there.

@@ -35,7 +35,7 @@ class Setting:
         kind: its type, as shown to a user.
         default: MISSING where there is none.
         explanation: one paragraph; empty if the source has none.
-        depth: of the configuration that holds it, 0 for the command's own.
+        depth: depth of the configuration that holds it, 0 for the command's own.
     """
 
     name: str
@@ -53,7 +53,7 @@ def settings_of(
     Args:
         config: a dataclass, or an instance whose values are the defaults.
         types: dotted name of a field → the registered type that is chosen for it (`{"env": "world_model"}`).
-        prefix, depth: of the names.
+        prefix, depth: what the names begin with, and how many configurations hold them.
     """
     types = types or {}
     cls = config if isinstance(config, type) else type(config)

@@ -38,7 +38,7 @@ class Clip(NamedTuple):
         instructions: B of them.
         features: (B, T, F) of the frames, by the tokenizer's success classifier, if it has one.
         depth: (B, T, S) metres of each token, for models that look at depth.
-        context: of the B episodes' first frames, for models that look at it.
+        context: context of the B episodes' first frames, for models that look at it.
         success_weight: of a frame with success in the loss of done.
     """
 
@@ -84,7 +84,7 @@ class ClipSampler:
         clip_length: T.
         from_start: share of clips that begin with their episode.
         batch_size: B.
-        seed: of the draws, another one in every process.
+        seed: seed of the draws, another one in every process.
         device: where the clips go.
         depth: (rows, S) metres of each token, for models that look at depth.
         context: (E, N, C, g, g) of the episodes' first frames, for models that look at it.
@@ -158,7 +158,7 @@ class FrameSampler:
         episodes: indices of the episodes to draw from.
         cameras: N names.
         batch_size: B.
-        seed: of the draws, another one in every process.
+        seed: seed of the draws, another one in every process.
         device: where the frames go.
     """
 

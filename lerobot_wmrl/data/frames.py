@@ -54,7 +54,7 @@ class Frames:
     Args:
         tokens: (B, S), the tokenizer's.
         state: (B, P), in the dataset's units.
-        context: of the first frames of the B episodes, where the tokenizer is conditioned on them.
+        context: context of the first frames of the B episodes, where the tokenizer is conditioned on them.
         depth: (B, S) metres of each token, for world models that look at depth.
     """
 

@@ -54,7 +54,7 @@ class DemoConfig(RunConfig):
     Args:
         output_dir: folder of everything the demo makes.
         seed: seed of recording, training and PPO. The evaluation seeds stay the same.
-        size: of every stage, `tiny` or `demo`.
+        size: size of every stage, `tiny` or `demo`.
         demonstrations: planned episodes with a human's pauses and detours that the first policy is cloned
             from.
         rollouts: noisy rollouts of that policy, labelled as successes and failures.

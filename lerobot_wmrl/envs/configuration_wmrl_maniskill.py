@@ -125,7 +125,7 @@ class WmrlManiSkillEnv(EnvConfig):
         require_simulator()
         from lerobot_wmrl.maniskill.simulation import Simulation
 
-        self._use_assets()
+        use_assets(self.assets)
         return Simulation(tasks_of(self.task)[0], self.selected_scenes(), self._rendering(depth))
 
     def create_batched_simulation(self, n_envs: int, device: str) -> "BatchedSimulation":
@@ -151,17 +151,13 @@ class WmrlManiSkillEnv(EnvConfig):
                 "a batched simulation has one task",
                 "choose one, or set `batched` to false",
             )
-        self._use_assets()
+        use_assets(self.assets)
         scenes = self.selected_scenes()
         return BatchedSimulation(task, scenes, self._rendering(depth=False), n_envs, device)
 
     def describe_assets(self) -> dict[str, Any] | None:
         """Describe the user's own meshes by their content; None if there are none."""
         return None if self.assets is None else describe_assets(self.assets)
-
-    def _use_assets(self) -> None:
-        if self.assets is not None:
-            use_assets(self.assets)
 
     def _rendering(self, depth: bool) -> Rendering:
         return Rendering(

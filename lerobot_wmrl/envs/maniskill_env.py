@@ -112,7 +112,7 @@ def make_vector_env(
     """Return an environment of each configuration, with SAME_STEP autoreset.
 
     Args:
-        configs: of one task each; images are of the same cameras and size.
+        configs: configurations of one task each; images are of the same cameras and size.
         use_async_envs: whether each has a process of its own.
         freeze: whether episodes stop as lerobot-eval wants it. Success by scene is then logged on closing.
     """

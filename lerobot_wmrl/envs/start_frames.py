@@ -385,7 +385,7 @@ def imagine_goals(
     Args:
         frames: the first frames of the K starts, as the text model is given them.
         instructions: one for each.
-        features: of the first frames, as `measure` computes them, [(K·N, …)].
+        features: features of the first frames, as `measure` computes them, [(K·N, …)].
     """
     goals = [
         imagine_goal(model, frames[part], instructions[part])

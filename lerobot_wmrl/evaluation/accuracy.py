@@ -89,7 +89,7 @@ def compare_frames(
     Args:
         images: recorded frames (T + 1, N, 3, H, W).
         imagined_tokens: (T, S), of all frames but the first.
-        context: of the first frame, one row.
+        context: context of the first frame, one row.
         lpips: LPIPS, None to leave it out.
         horizon: frames over which the measures of the episode are taken.
 

@@ -63,7 +63,7 @@ def evaluate_policy(
 
     Args:
         processors: the policy's pre- and postprocessor.
-        seed: of the first episode; each further one adds one.
+        seed: seed of the first episode; each further one adds one.
     """
     made: Any = make_env(env, min(num_envs, episodes), use_async_envs=runs_in_processes(env))
     envs = {suite: {task: StepCounter(one) for task, one in tasks.items()} for suite, tasks in made.items()}

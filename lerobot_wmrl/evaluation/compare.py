@@ -157,7 +157,7 @@ def run_comparison(
 
     Args:
         envs: those of each policy.
-        seed: of the first start of each task; each further one adds one.
+        seed: seed of the first start of each task; each further one adds one.
         save: called after every block.
     """
     while not comparison.finished:

@@ -120,7 +120,7 @@ def trained_inside(policy: str, world_model: str) -> str | None:
             return (
                 "it was trained in this world model, and may have learnt what only looks like success there"
             )
-    planner = read_json(resolve_checkpoint(policy) / "config.json").get("world_model_path")
+    planner = stored_settings(resolve_checkpoint(policy) / "config.json").get("world_model_path")
     if planner and same_training(planner, world_model):
         return "it plans in this world model, and finds what only looks like success there"
     return None
@@ -154,12 +154,12 @@ def _trainings(checkpoint: str, trained: str) -> Iterator[tuple[str, Mapping[str
     seen = set()
     while checkpoint and checkpoint not in seen:
         seen.add(checkpoint)
-        settings = read_json(resolve_checkpoint(checkpoint) / CONFIG_FILE)
+        settings = stored_settings(resolve_checkpoint(checkpoint) / CONFIG_FILE)
         yield checkpoint, settings
         checkpoint = str((settings.get(trained) or {}).get("pretrained_path") or "")
 
 
-def read_json(path: Path) -> dict[str, Any]:
+def stored_settings(path: Path) -> dict[str, Any]:
     """Return the content of a file of settings, nothing if there is none."""
     content = json.loads(path.read_text()) if path.is_file() else {}
     return content if isinstance(content, dict) else {}

@@ -103,7 +103,7 @@ class EpisodeReplay:
 
     Args:
         episode: its index.
-        context: of its first frame, one row.
+        context: context of its first frame, one row.
         tokens: (C, S).
         done_probability: (T,).
         state: (C, P).

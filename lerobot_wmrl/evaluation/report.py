@@ -96,9 +96,9 @@ class Evaluation:
     """Measures of one pass over recorded episodes.
 
     Args:
-        accuracy: of every episode, in order.
+        accuracy: accuracy of every episode, in order.
         attempts: the episodes that attempt a task.
-        outcomes: of these; none if success was not recorded.
+        outcomes: outcomes of these; none if success was not recorded.
         shown: replays of the shortest success and the shortest failure, by name.
     """
 

@@ -34,7 +34,7 @@ class Findings:
         missing: what it lacks, and what that costs.
         cameras: names of the cameras that the policy looks at.
         frame_side: the shorter side of their frames in pixels.
-        pixels: of all these cameras' frames.
+        pixels: pixels of all these cameras' frames.
         episodes: how many there are.
         held_out: how many of them are held out from training.
         fewest: how many there are of the task that has the fewest.

@@ -41,7 +41,7 @@ class Episode:
     Args:
         task: with `scene` and `seed`, decides the start.
         scene: what is on the table.
-        seed: of the episode.
+        seed: seed of the episode.
     """
 
     object_start: np.ndarray

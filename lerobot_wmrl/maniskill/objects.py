@@ -133,6 +133,9 @@ OBJECTS: Final[dict[str, ObjectSpec]] = {
 
 `use_assets` replaces some by a user's own meshes."""
 
+BUILT_IN: Final = dict(OBJECTS)
+"""The same, without a user's meshes."""
+
 CONTAINERS: Final = {
     spec.name: spec
     for spec in (
@@ -155,9 +158,9 @@ MIN_ASSET_HEIGHT: Final = 0.02
 """Least height (m) that a closed gripper can push."""
 
 
-def use_assets(path: Path) -> None:
-    """Replace the objects that the file names by its meshes, in this process."""
-    OBJECTS.update(read_assets(path))
+def use_assets(path: Path | None) -> None:
+    """Replace the objects that the file names by its meshes, and no others, in this process."""
+    OBJECTS.update({**BUILT_IN, **(read_assets(path) if path else {})})
 
 
 def read_assets(path: Path) -> dict[str, ObjectSpec]:

@@ -46,9 +46,9 @@ class RealEpisode:
     """An episode of a real environment. It waits when it has ended.
 
     Args:
-        name: of the environment.
+        name: name of the environment.
         env: a tensor environment of one episode.
-        seed: of its start.
+        seed: seed of its start.
     """
 
     def __init__(self, name: str, env: gym.vector.VectorEnv, seed: int) -> None:
@@ -77,7 +77,7 @@ class Drive:
     Args:
         start: the frame where it begins.
         models: the world models.
-        config: of the imagined episodes.
+        config: configuration of the imagined episodes.
         recorded: what followed in the dataset, if it begins there.
         real: a real episode with the same start, if there is one.
     """

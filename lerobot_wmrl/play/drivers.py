@@ -28,11 +28,11 @@ class Driver(Protocol):
         """Return the next action. (1, A)"""
 
 
-class LoadedPolicy:
+class DrivingPolicy:
     """A policy for one visitor. Copies share the weights; each has its own memory of an episode.
 
     Args:
-        config: of the policy.
+        config: configuration of the policy.
         shown: what the world model shows: LeRobot's names with their shapes.
         names, low, high: of the components of its actions, and their range. (A,) each
     """
@@ -47,7 +47,7 @@ class LoadedPolicy:
         check_units(config, self.processors[1], names, low, high)
         self.pipeline = make_pipeline(config, *self.processors)
 
-    def copy(self) -> "LoadedPolicy":
+    def copy(self) -> "DrivingPolicy":
         """Return the policy for another visitor."""
         shared = {id(each): each for each in (*self.policy.parameters(), *self.policy.buffers())}
         other = copy.copy(self)
@@ -71,7 +71,7 @@ class LoadedPolicy:
 class PolicyDriver:
     """A policy of LeRobot acts."""
 
-    def __init__(self, policy: LoadedPolicy) -> None:
+    def __init__(self, policy: DrivingPolicy) -> None:
         self.policy = policy
 
     def reset(self) -> None:
@@ -85,12 +85,12 @@ class PlannerDriver:
     """The planner searches actions that succeed in the world model, and executes the beginning of a plan.
 
     Args:
-        settings: of the search.
+        settings: settings of the search.
         done_frames: consecutive done frames that make a success.
-        policy: whose actions it changes, if there is one.
+        policy: policy whose actions it changes, if there is one.
     """
 
-    def __init__(self, settings: PlannerSettings, done_frames: int, policy: LoadedPolicy | None) -> None:
+    def __init__(self, settings: PlannerSettings, done_frames: int, policy: DrivingPolicy | None) -> None:
         self.settings, self.done_frames, self.policy = settings, done_frames, policy
         self.reset()
 

@@ -59,7 +59,7 @@ def export_page(world: World, folder: Path, starts: int) -> str:
     """Write the page; the folder is whole or absent. Return how well the exported networks agree.
 
     Args:
-        world: with a dataset.
+        world: world with a dataset.
         folder: is new.
         starts: episodes of the dataset, spread evenly, in whose first frames a drive can begin.
 

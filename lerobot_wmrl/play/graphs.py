@@ -76,7 +76,7 @@ class Graph(nn.Module):
     """A part of a world model that reads and returns named tensors.
 
     Args:
-        model: with anchored dynamics.
+        model: model with anchored dynamics.
         reads: names of the inputs, in their order.
     """
 
@@ -177,7 +177,7 @@ def export_graphs(model: ActionWorldModelRewardModel, folder: Path) -> None:
     """Write `start.onnx`, `scene.onnx` and `step.onnx`.
 
     Args:
-        model: on the CPU.
+        model: model on the CPU.
         folder: that exists.
 
     Raises:
@@ -236,7 +236,7 @@ class ExportedWorldModel:
     """The graphs in a folder, run here as a page runs them there.
 
     Args:
-        folder: with the three graphs.
+        folder: folder with the three graphs.
         window: steps after which a scene is encoded anew.
     """
 

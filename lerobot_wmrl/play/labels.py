@@ -71,7 +71,7 @@ class LabelPage:
 
     Args:
         rule: its settings.
-        dataset: whose episodes are labelled.
+        dataset: dataset whose episodes are labelled.
 
     Raises:
         FieldError: the file holds the labels of another dataset.

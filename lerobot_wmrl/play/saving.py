@@ -26,8 +26,8 @@ class SavedEpisodes:
     servers add to it.
 
     Args:
-        folder: of the dataset, which is new or has been written by this class.
-        robot: whose actions and states these are.
+        folder: folder of the dataset, which is new or has been written by this class.
+        robot: robot whose actions and states these are.
         held: frames at the end of a successful episode in which success holds.
 
     Raises:
@@ -51,7 +51,7 @@ class SavedEpisodes:
         """Add an episode. Return its index.
 
         Args:
-            steps: of the drive.
+            steps: steps of the drive.
             count: how many there are.
             instruction: the task.
             success: whether it succeeds at its end.

@@ -21,7 +21,7 @@ from lerobot_wmrl.envs.start_frames import StartImages, maniskill_side, observed
 from lerobot_wmrl.envs.world_model_env import WorldModels, load_world_models
 from lerobot_wmrl.play.checks import instruction, is_numbers, whole_number
 from lerobot_wmrl.play.drive import Drive, RealEpisode, Recorded
-from lerobot_wmrl.play.drivers import Driver, LoadedPolicy, PlannerDriver, PolicyDriver, RecordedDriver
+from lerobot_wmrl.play.drivers import Driver, DrivingPolicy, PlannerDriver, PolicyDriver, RecordedDriver
 from lerobot_wmrl.world_models.checkpoint import check_dataset
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 from lerobot_wmrl.world_models.configuration_planner import PlannerSettings
@@ -43,10 +43,10 @@ class World:
 
     Args:
         models: the world models.
-        config: of the imagined episodes.
+        config: configuration of the imagined episodes.
         done_frames: consecutive done frames that make a success, by which an episode is judged even where it
             does not end.
-        table: of the dataset in whose frames episodes can begin.
+        table: table of the dataset in whose frames episodes can begin.
         policy: that can act.
         real_env: that takes the same actions, and whose resets episodes can begin in.
     """
@@ -55,7 +55,7 @@ class World:
     config: WorldModelEnv
     done_frames: int
     table: EpisodeTable | None = None
-    policy: LoadedPolicy | None = None
+    policy: DrivingPolicy | None = None
     real_env: EnvConfig | None = None
     uploads: dict[str, StartImages] = field(default_factory=dict)
 
@@ -179,8 +179,8 @@ class World:
         """Keep pictures, one for each camera, as a place to begin.
 
         Args:
-            name: of the place.
-            images: by camera.
+            name: name of the place.
+            images: images by camera.
             state: (P,) in the dataset's units; None for a world model that predicts no state.
             task: the instruction.
 
@@ -238,8 +238,8 @@ def load_world(
     """Load what `config` names, and check that dataset and policy fit the world model.
 
     Args:
-        config: of the imagined episodes.
-        dataset: in whose frames they can begin, if it is given.
+        config: configuration of the imagined episodes.
+        dataset: dataset in whose frames they can begin, if it is given.
         policy: that can act.
         real_env: that takes the same actions.
         end_at_success: whether an episode ends when it succeeds.
@@ -263,7 +263,7 @@ def load_world(
     if policy is not None:
         shown = world.model.observation_shapes
         names, (low, high) = world.model.embodiment.action_names, models.model.action_range()
-        world.policy = LoadedPolicy(policy, shown, names, low, high)
+        world.policy = DrivingPolicy(policy, shown, names, low, high)
     return world
 
 

@@ -101,7 +101,7 @@ class Distillation(RLAlgorithm):
             env: the world model.
             pipeline: the policy's processors.
             rollout: gives the number of steps and holds the observations.
-            seed: of this process's first environment in this iteration.
+            seed: seed of this process's first environment in this iteration.
             last: whether this is the training's last iteration.
         """
         started = time.perf_counter()

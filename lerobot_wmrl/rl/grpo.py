@@ -13,7 +13,7 @@ def group_advantages(returns: Tensor, least_std: float) -> tuple[Tensor, Tensor]
     """Return (R − mean) / std within each group (Shao et al. 2024, section 4.1.2), and which have a signal.
 
     Args:
-        returns: of each episode, (B / G, G).
+        returns: returns of each episode, (B / G, G).
         least_std: groups whose returns have a smaller standard deviation have no signal.
 
     Returns:

@@ -28,7 +28,7 @@ class Part:
     Args:
         tensors: observations with images as bytes, `task` as an index into the instructions, `action`, and
             for chunks `action_is_pad`; (N, …) each.
-        instructions: of the tasks.
+        instructions: instructions of the tasks.
     """
 
     tensors: dict[str, Tensor]
@@ -42,7 +42,7 @@ class Labels:
     """Labels of a dataset, and those of all iterations, one file each, so that a resumed training has them.
 
     Args:
-        folder: of the files.
+        folder: folder of the files.
         process: number of this process, which has files of its own.
     """
 

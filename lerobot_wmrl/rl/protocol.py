@@ -67,9 +67,9 @@ class Pipeline:
     """A policy's processors as functions.
 
     Args:
-        prepare: from a stored observation to the policy's.
-        to_action: from raw actions to the environment's actions.
-        store: from the environment's observation to the stored one.
+        prepare: turns a stored observation into the policy's.
+        to_action: turns raw actions into the environment's.
+        store: turns the environment's observation into the stored one.
     """
 
     prepare: Callable[[Observation], Observation]

@@ -49,10 +49,10 @@ class Recorder(Protocol):
         """Record a dataset in `folder`, unless it is there. Episode i starts from `seed` + i.
 
         Args:
-            checkpoint: of the policy.
+            checkpoint: checkpoint of the policy.
             episodes: how many.
-            seed: of the first one.
-            folder: of the dataset.
+            seed: seed of the first episode.
+            folder: folder of the dataset.
             exploration: largest noise on the actions, as a share of half their range.
         """
 
@@ -94,7 +94,7 @@ class EnvRecorder:
     Args:
         env: the environment; if it has several tasks, they take turns.
         robot: names and range of the actions, and names of the state, as the world model has them.
-        device: of the policy.
+        device: device of the policy.
         budget: ledger in which the episodes are entered; None without.
         num_envs: episodes at once.
     """
@@ -136,7 +136,7 @@ class RolloutRecorder:
         like_columns: take its columns too, so that the new one can be merged with it.
         num_envs: episodes at once.
         video: store the cameras as videos; without `like`, which decides it.
-        max_frames: of an episode, if the environment's own limit is not lower.
+        max_frames: limit of an episode, if the environment's own limit is not lower.
     """
 
     def __init__(
@@ -294,7 +294,7 @@ class RecordingProcessors:
     Args:
         before, after: the policy's pre- and postprocessor.
         noises: what is added to the actions, one for each environment.
-        robot: whose range the actions keep.
+        robot: robot whose range the actions keep.
     """
 
     before: Any

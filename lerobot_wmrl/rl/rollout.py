@@ -24,7 +24,7 @@ class RolloutBuffer:
     Args:
         steps: T.
         num_envs: B.
-        device: of the tensors.
+        device: device of the tensors.
         longest: steps of the longest possible episode; T by default.
     """
 

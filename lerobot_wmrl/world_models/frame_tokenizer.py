@@ -156,7 +156,7 @@ class FrameTokenizer(nn.Module):
             images: (B, N, 3, H, W) in [0, 1].
             weight: (B, N, 1, H, W), what each pixel counts; 1 by default.
             perceptual: a further loss on reconstructions and images.
-            context: of the episodes' first frames, with the option `context`.
+            context: context of the episodes' first frames, with the option `context`.
 
         Returns:
             The loss () and metrics, among them the PSNR in dB, the perplexity of the

@@ -98,7 +98,7 @@ def publish_evaluation(name: str, text: str, files: Mapping[str, bytes]) -> None
     Args:
         name: the model's on the hub, user/name.
         text: what was found, in Markdown. It shows pictures by their paths, `evaluation/…`.
-        files: of the folder `evaluation`, by name.
+        files: files of the folder `evaluation`, by name.
 
     Raises:
         FieldError: it may not be written, or the hub cannot be reached.

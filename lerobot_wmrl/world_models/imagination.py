@@ -94,7 +94,7 @@ class ImaginationMixin:
             frames: B of them.
             act: images (B, N, 3, H, W) of N cameras, states (B, P) → actions (B, A), in the dataset's units.
             steps: T.
-            images: of the B frames; by default they are decoded.
+            images: images of the B frames; by default they are decoded.
 
         Returns:
             (B, T, A)

@@ -83,10 +83,11 @@ def next_frame_loss(
     Computed in float32, whatever the network computes in.
 
     Args:
-        prediction: for every row of the clip. Its first K logits are of the target frames, in their order.
+        prediction: prediction for every row of the clip. Its first K logits are of the target frames, in
+            their order.
         codebook: code book of the tokens.
         target: the frames whose tokens are learnt.
-        clip: with normalised states.
+        clip: clip with normalised states.
 
     Returns:
         The loss (), and its parts by name.

@@ -146,7 +146,7 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
     ) -> None:
         """Register mean and standard deviation of the feature `key`, the latter at least `least`.
 
-        unit: in which `MIN_SPREAD` is measured.
+        unit: unit in which `MIN_SPREAD` is measured.
         """
         mean, std = torch.zeros(size), torch.ones(size)
         if stats is not None and size:

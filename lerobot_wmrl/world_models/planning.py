@@ -39,7 +39,7 @@ def plan_knots(
     Args:
         objective: value of action sequences.
         mean: knots to begin with (B, N, A).
-        std: of the first samples (A,).
+        std: standard deviation of the first samples (A,).
         low, high: bounds of actions (A,).
 
     Returns:
@@ -75,11 +75,11 @@ class Planner:
     Args:
         model: the action world model to plan in.
         text_model: maximise the similarity of the last frame to its goal frames, in place of success.
-        settings: of the search.
+        settings: settings of the search.
         done_frames: consecutive done frames that make a success.
         averaged: follow the mean of the last elites in place of the best sample.
         low, high: bounds of actions (A,).
-        seed: of the samples.
+        seed: seed of the samples.
     """
 
     def __init__(

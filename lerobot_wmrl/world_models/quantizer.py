@@ -29,7 +29,7 @@ class Quantized(NamedTuple):
         values: (F, K, g, g), through which gradients pass as if nothing was rounded.
         tokens: (F, g, g) int64.
         loss: (), 0 outside training.
-        metrics: to log in training.
+        metrics: metrics to log in training.
     """
 
     values: Tensor

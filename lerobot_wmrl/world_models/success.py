@@ -133,7 +133,7 @@ class PredictedSuccess(nn.Module):
     """Predict the classifier's features of frames that are not seen, and read success from them.
 
     Args:
-        width: of the hidden states.
+        width: width of the hidden states.
         cameras: N.
     """
 

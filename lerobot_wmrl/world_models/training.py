@@ -102,7 +102,7 @@ def make_sampler(
         table: the dataset.
         chosen: indices of episodes to learn from, all by default; held-out episodes are left out.
         batch_size: frames (tokenizer) or clips (world models) a batch.
-        seed: of the draws.
+        seed: seed of the draws.
         done_known: False if done must not be learnt from this table.
 
     Raises:

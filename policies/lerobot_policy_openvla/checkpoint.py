@@ -192,8 +192,8 @@ def write_openvla(
 
     Args:
         folder: created if it does not exist.
-        weights: by OpenVLA's names.
-        sizes: of the model; needed where no original configuration is among `companions`.
+        weights: weights by OpenVLA's names.
+        sizes: sizes of the model; needed where no original configuration is among `companions`.
         companions: written as they are, but for the statistics.
         norm_stats: added to those that the checkpoint came with, and put in place of those that differ.
     """

@@ -30,7 +30,7 @@ def compute_dtype(name: str, device: str, random_start: bool = False) -> torch.d
 
     Args:
         name: auto, float32 or bfloat16.
-        device: of the policy.
+        device: device of the policy.
         random_start: whether weights are random. `auto` is float32 then, since all weights must be trained.
 
     Raises:
@@ -80,8 +80,8 @@ def fill(module: nn.Module, tensors: Iterable[tuple[str, Tensor]], device: str, 
     """Load all weights into a module, in the number format they have.
 
     Args:
-        tensors: by the names of the module's weights.
-        source: to name in errors: ValueError if a weight is missing, unknown or of another shape.
+        tensors: tensors by the names of the module's weights.
+        source: source to name in errors: ValueError if a weight is missing, unknown or of another shape.
     """
     expected = module.state_dict()
     loaded: dict[str, Tensor] = {}

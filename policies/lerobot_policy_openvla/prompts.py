@@ -110,7 +110,7 @@ def train_tokenizer(instructions: Sequence[str], vocabulary: int) -> Tokenizer:
     <unk>, <s>, </s>, the bytes, what was learnt, and last the 256 action tokens.
 
     Args:
-        instructions: to learn from.
+        instructions: instructions to learn from.
         vocabulary: number of ids.
 
     Raises:

@@ -97,7 +97,7 @@ class Proposal:
     """What a policy would do in the next steps, in the world model's imagination.
 
     Args:
-        config: of the planning policy, with the path of the other one.
+        config: configuration of the planning policy, with the path of the other one.
         model: the world model.
         low, high: bounds of actions (A,).
 

@@ -21,7 +21,7 @@ class ImaginedRobotConfig(RobotConfig):
 
     Args:
         world_model_path: the action world model, a checkpoint or the output folder of its training.
-        dataset: in whose frames episodes begin, one after the other.
+        dataset: dataset in whose frames episodes begin, one after the other.
         first_start: number of the frame in which the first episode begins.
         episode_time_s: seconds after which the next episode begins, `dataset.episode_time_s` of the command.
             None if keys alone end one.

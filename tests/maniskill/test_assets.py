@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
-from lerobot_wmrl.maniskill.objects import OBJECTS, read_assets
+from lerobot_wmrl.maniskill.objects import BUILT_IN, OBJECTS, read_assets
 from lerobot_wmrl.maniskill.scenes import SCENES
 
 
@@ -37,6 +37,8 @@ def test_a_mesh_takes_the_place_of_an_object(assets: Path) -> None:
         np.testing.assert_allclose(simulation.object_position, simulation.episode.object_start, atol=0.01)
     finally:
         simulation.close()
+    WmrlManiSkillEnv(scenes=[scene.index], image_size=64).create_simulation().close()
+    assert OBJECTS == BUILT_IN, "they are not those of the next environment"
 
 
 @pytest.mark.parametrize(

@@ -58,7 +58,7 @@ def follow_plan(
         task: name of the task.
         scene: what is on the table.
         start: how the episode starts.
-        kind: of the plan, `constants.KINDS` without "policy".
+        kind: kind of the plan, `constants.KINDS` without "policy".
         rng: source of the plan's and the actions' randomness.
         motion: how the gripper gets from one waypoint to the next.
     """

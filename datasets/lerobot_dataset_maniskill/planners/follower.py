@@ -26,7 +26,7 @@ class Waypoint:
     """A position that the gripper goes to.
 
     Args:
-        position: of the TCP (3,), metres.
+        position: position of the TCP (3,), metres.
         tolerance: distance (m) within which the waypoint counts as reached.
         gripper: gripper command on the way there.
         dwell: steps to stay once there, for the fingers to close or open.

@@ -75,10 +75,10 @@ class Page:
         improvement: what was done.
         title: the page's heading.
         seed: that the command was given.
-        records: of the command's stages, in order.
+        records: records of the command's stages, in order.
         places: where the policies were compared.
         replays: folders with pictures of replayed episodes, by whose they are.
-        curves: of trainings beside those of the improvement, by title.
+        curves: curves of trainings beside those of the improvement, by title.
     """
 
     improvement: Improvement

@@ -41,7 +41,7 @@ class Curve(NamedTuple):
     Args:
         x: the training's progress.
         y: the number.
-        unit: of the progress, `step` or `iteration`.
+        unit: unit of the progress, `step` or `iteration`.
     """
 
     x: list[float]
@@ -55,7 +55,7 @@ class Place:
 
     Args:
         name: the place, as a phrase: `in pusht`.
-        comparison: of the policies, by what they are.
+        comparison: comparison of the policies, by what they are.
     """
 
     name: str

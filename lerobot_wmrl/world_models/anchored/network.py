@@ -235,12 +235,12 @@ class AnchoredNetwork(FrameNetwork):
         B·J clips, and each frame is encoded once.
 
         Args:
-            codes: of the first frame, (B, 1, S, C).
-            state: of the first frame, (B, 1, P), normalised.
-            condition: of every step, tokens (B·J, T or 1, M, D).
+            codes: codes of the first frame, (B, 1, S, C).
+            state: state of the first frame, (B, 1, P), normalised.
+            condition: condition of every step, tokens (B·J, T or 1, M, D).
             length: steps, T.
             steps: (B·J, K), those whose next frame is rendered; by default all.
-            context: of the first frame.
+            context: context of the first frame.
         """
         memory = ClipMemory(length, self.window, self.head_width, codes.device)
         mean = condition.mean().expand(-1, length, -1)  # (B·J, T, D)

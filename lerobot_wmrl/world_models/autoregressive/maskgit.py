@@ -108,7 +108,7 @@ class MaskGit(nn.Module):
             network: the one that made the first pass.
             first: pass over frames (B, T, …).
             target: codes (B, T − 1, S, C) of the frames after all but the last.
-            weight: of their tokens, (B, T − 1, S).
+            weight: weight of their tokens, (B, T − 1, S).
         """
         following = torch.cat([target, first.codes[:, -1:]], 1)  # (B, T, S, C)
         chance = torch.rand(following.shape[:2], device=target.device)[..., None]

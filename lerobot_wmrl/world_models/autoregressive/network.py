@@ -170,7 +170,7 @@ class SpatialTemporalTransformer(nn.Module):
             condition: tokens (B, T or 1, M, D).
             memory: what a frame sees along time.
             added: for each layer, what joins the tokens after it; nothing by default.
-            fusion: for each layer, a projection of the tokens after it, for another transformer.
+            fusion: fusion for each layer, a projection of the tokens after it, for another transformer.
 
         Returns:
             Tokens (B, T, S, D), and the projections.
