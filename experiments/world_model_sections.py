@@ -304,7 +304,7 @@ def speed(load: Load) -> str:
         load("environment_speed")["by_number"][-1],
         load("planning_speed")["by_searches"][-1],
     )
-    page = load("play_speed")
+    page, start = load("play_speed"), load("simulator_start")
     return f"""On two CPU cores 64 imaginations are {faster["stock meshes"]["64"]:.0f} times as fast as one
 process of ManiSkill with its own robot meshes, {faster["light meshes"]["64"]:.0f} times as fast as with our
 light ones.
@@ -321,7 +321,11 @@ environments rewards add {100 * min(environment["costs_more"].values()):.0f} to
 {100 * max(environment["costs_more"].values()):.0f} % to imagination. Recording a step takes
 {1000 * recording["cpu_s_per_step"]["light meshes"]:.0f} ms of CPU, ManiSkill's own table
 {1000 * recording["cpu_s_per_step"]["ManiSkill's own"]:.0f} ms; two processes record
-{rate["episodes_per_minute"]["two processes"]:.0f} episodes a minute.
+{rate["episodes_per_minute"]["two processes"]:.0f} episodes a minute. Without a GPU a process
+has its first picture after {start["cpu_s"]["ours"]:.1f} s of CPU beyond its imports. With SAPIEN's own
+shaders, which need a table that the pictures do not show, it is
+{start["cpu_s"]["ours, SAPIEN's shaders"]:.1f} s, in ManiSkill's own table
+{start["cpu_s"]["ManiSkill's own"]:.1f} s.
 
 Planning for {planning["searches"]} imaginations at once, on one core and in the preset `demo`, predicts
 {planning["frames_per_s"]["open_loop"]:,.0f} frames a second,
