@@ -78,13 +78,17 @@ def measure(kind: str) -> float:
         return pool.apply(KINDS[kind])
 
 
-def main() -> None:
-    """Measure, print, write."""
+def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--output", type=Path, default=RESULTS / "simulator_start.json", help="JSON file")
-    given = parser.parse_args()
+    return parser
+
+
+def main() -> None:
+    """Measure, print, write."""
+    given = make_parser().parse_args()
     runs = [{kind: measure(kind) for kind in KINDS} for _ in range(REPETITIONS)]
     seconds = {kind: float(np.median([run[kind] for run in runs])) for kind in KINDS}
     figures = {

@@ -532,7 +532,30 @@ often, by {100 * min(rises):.0f} to {100 * max(rises):.0f} points. What is left 
 
 {best_gains(longer, REAL_EPISODES)}
 
-PPO and the planner have not begun from it yet. It has a recording of its own of the same seeds."""
+It has a recording of its own of the same seeds. {from_longer(longer)}"""
+
+
+def from_longer(found: Groups) -> str:
+    """Return the success of PPO in imagination, and of the planner distilled, that begin from longer BC."""
+    begun_there = {
+        group: have
+        for group, cells in found.items()
+        if (have := [cell for cell in cells if "longer_imagined_ppo" in cell["methods"]])
+    }
+    if not begun_there:
+        return "PPO and the planner have not begun from it yet."
+    said = []
+    for group, cells in begun_there.items():
+        after, planner, before = (
+            " and ".join(f"{100 * mean(cells, method, domain):.0f}" for domain in SCENES)
+            for method in ("longer_imagined_ppo", "longer_ppo_distilled", "longer_filtered")
+        )
+        seeds = ", ".join(str(cell["seed"]) for cell in cells)
+        said.append(
+            f"with {spoken(group)} (seed {seeds}), PPO in imagination has {after} % (known, unseen scenes) "
+            f"from its {before} %, and the planner distilled after it {planner} %"
+        )
+    return f"Begun from it, {'; '.join(said)}."
 
 
 def beyond_seeds(found: Groups) -> str:
