@@ -217,10 +217,10 @@ def memory_map(
     if not path.is_file():
         path.parent.mkdir(parents=True, exist_ok=True)
         host = socket.gethostname()  # others may share the folder, and their processes are not seen here
-        for torn in path.parent.glob(f"*.{host}-*.partial"):
-            if not psutil.pid_exists(int(torn.stem.rpartition("-")[2])):
+        for torn in path.parent.glob(f"*.{host}+*.partial"):
+            if not psutil.pid_exists(int(torn.stem.rpartition("+")[2])):
                 torn.unlink(missing_ok=True)
-        partial = path.with_suffix(f".{host}-{os.getpid()}.partial")
+        partial = path.with_suffix(f".{host}+{os.getpid()}.partial")
         target = np.lib.format.open_memmap(partial, mode="w+", dtype=dtype, shape=shape)
         try:
             fill(target)

@@ -124,7 +124,9 @@ class LeRobotTensorEnv(gym.vector.VectorEnv):
             raise ValueError(f"action: NaN in environments {rows}")
         given = self.after({ACTION: actions})[ACTION].detach().cpu().float()
         box: Any = self.single_action_space
-        clipped, share = clip_actions(given, torch.from_numpy(box.low), torch.from_numpy(box.high))
+        clipped, share = clip_actions(
+            given, torch.as_tensor(box.low).float(), torch.as_tensor(box.high).float()
+        )
         taken = clipped.numpy()
         reward, flags = np.zeros(self.num_envs, np.float32), np.zeros((3, self.num_envs), bool)
         for row, env in enumerate(self.envs):

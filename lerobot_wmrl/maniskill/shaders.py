@@ -70,6 +70,7 @@ def write_once(folder: Path, texts: Mapping[str, str]) -> None:
         for name, text in texts.items():
             (partial / name).parent.mkdir(exist_ok=True)
             (partial / name).write_text(text)
+        partial.chmod(0o755)  # other users may share the folder
         partial.rename(folder)
     except OSError:
         if not folder.exists():  # else another process was faster
