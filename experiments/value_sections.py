@@ -168,6 +168,12 @@ def measured(cells: Sequence[Cell], methods: Iterable[str]) -> list[str]:
     return [method for method in methods if any(method in cell["methods"] for cell in cells)]
 
 
+def having(found: Groups, method: str) -> Groups:
+    """Return the cells in which a method has been run, without groups that have none."""
+    kept = {group: [cell for cell in cells if method in cell["methods"]] for group, cells in found.items()}
+    return {group: cells for group, cells in kept.items() if cells}
+
+
 def gain(cells: Sequence[Cell], method: str, baseline: str, domain: str) -> RunsMean:
     """Return how much more often a method succeeds than a baseline on the same data and starts."""
     both = [cell for cell in cells if {method, baseline} <= cell["methods"].keys()]
@@ -509,11 +515,7 @@ def best_gains(found: Groups, by: Sequence[str]) -> str:
 
 def trained_longer(found: Groups) -> str:
     """Return what is left of the gains in the cells in which BC was also trained for longer."""
-    longer = {
-        group: have
-        for group, cells in found.items()
-        if (have := [cell for cell in cells if "longer_filtered" in cell["methods"]])
-    }
+    longer = having(found, "longer_filtered")
     if not longer:
         return ""
     which = listed([
@@ -537,15 +539,8 @@ It has a recording of its own of the same seeds. {from_longer(longer)}"""
 
 def from_longer(found: Groups) -> str:
     """Return the success of PPO in imagination, and of the planner distilled, that begin from longer BC."""
-    begun_there = {
-        group: have
-        for group, cells in found.items()
-        if (have := [cell for cell in cells if "longer_imagined_ppo" in cell["methods"]])
-    }
-    if not begun_there:
-        return "PPO and the planner have not begun from it yet."
     said = []
-    for group, cells in begun_there.items():
+    for group, cells in having(found, "longer_imagined_ppo").items():
         after, planner, before = (
             " and ".join(f"{100 * mean(cells, method, domain):.0f}" for domain in SCENES)
             for method in ("longer_imagined_ppo", "longer_ppo_distilled", "longer_filtered")
@@ -555,7 +550,7 @@ def from_longer(found: Groups) -> str:
             f"with {spoken(group)} (seed {seeds}), PPO in imagination has {after} % (known, unseen scenes) "
             f"from its {before} %, and the planner distilled after it {planner} %"
         )
-    return f"Begun from it, {'; '.join(said)}."
+    return f"Begun from it, {'; '.join(said)}." if said else "PPO and the planner have not begun from it yet."
 
 
 def beyond_seeds(found: Groups) -> str:

@@ -18,6 +18,7 @@ from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.exploration import ExplorationNoise
 from lerobot_wmrl.common.policies import fit_to_environment, load_policy, load_processors
 from lerobot_wmrl.envs.evaluation_adapter import images_to_numpy
+from lerobot_wmrl.envs.start_frames import maniskill_side
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW, ACTION_NAMES, STATE_NAMES, TRANSLATION
 from lerobot_wmrl.maniskill.episode import Frame
 from lerobot_wmrl.maniskill.tasks import task_of
@@ -35,21 +36,14 @@ class ImaginedPartRecorder:
         self.config, self.folder, self.done_frames = config, folder, config.imagination.done_frames
         self.env: Any = config.imagination.create_tensor_env(min(config.part_episodes, config.num_episodes))
         shown = {name: tuple(space.shape) for name, space in self.env.single_observation_space.items()}
-        lacking = [
-            what
-            for what, known in (
-                (f"state ({len(STATE_NAMES)} values)", shown.get(OBS_STATE) == (len(STATE_NAMES),)),
-                ("frames (squares of one size)", self.env.model.config.tokenizer.square_side is not None),
-            )
-            if not known
-        ]
-        if lacking:
+        path, remedy = config.imagination.world_model_path, "train it on what lerobot-wmrl-record recorded"
+        if shown.get(OBS_STATE) != (len(STATE_NAMES),):
             raise FieldError(
-                "env.world_model_path",
-                config.imagination.world_model_path,
-                f"does not imagine the recorder's {' and '.join(lacking)}",
-                "train it on a dataset that lerobot-wmrl-record recorded",
-            )
+                "env.world_model_path", path,
+                f"does not imagine the recorder's state ({len(STATE_NAMES)} values)", remedy,
+            )  # fmt: skip
+        self.cameras = self.env.model.config.tokenizer.cameras
+        self.side = maniskill_side(self.env.model.config.tokenizer, "env.world_model_path", path, remedy)
         fit_to_environment(config.policy, shown, len(ACTION_NAMES))
         self.policy: Any = load_policy(config.policy).eval()
         self.processors = load_processors(config.policy)
@@ -57,8 +51,7 @@ class ImaginedPartRecorder:
 
     def record(self, part: Part, report: Report) -> None:
         """Record a part. Its folder appears under its final name only when it is whole."""
-        shown = self.env.model.config.tokenizer
-        with whole_part(self.config, self.folder, part, shown.cameras, shown.square_side) as dataset:
+        with whole_part(self.config, self.folder, part, self.cameras, self.side) as dataset:
             for plan, (instruction, rows) in zip(part.episodes, self._imagine(part.episodes), strict=True):
                 start = StartColumns(instruction, task_of(plan.task).index, plan)
                 for before, action, outcome in rows:

@@ -20,10 +20,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
-from lerobot_wmrl.common.command_line import run_command
+from lerobot_wmrl.common.command_line import chosen_types, run_command
 from lerobot_wmrl.common.errors import renamed, suggestion
 from lerobot_wmrl.common.files import writing
-from lerobot_wmrl.common.presets import TYPE, format_flags, read_settings
+from lerobot_wmrl.common.presets import format_flags, read_settings
 from lerobot_wmrl.common.settings import settings_of
 from lerobot_wmrl.maniskill.scenes import describe_scenes
 
@@ -57,16 +57,16 @@ def recipe_flags(path: Path) -> list[str]:
         settings = read_settings(path, whole=("kinds",))
     except ValueError as error:
         raise ValueError(f"--recipe={error}") from error
-    types = {name.removesuffix(TYPE): str(value) for name, value in settings.items() if name.endswith(TYPE)}
+    flags = format_flags(settings)
     paths = {f"{name}.path" for name in RecordConfig.path_fields}
-    known = {*(each.name for each in settings_of(RecordConfig, types)), *paths}
+    known = {*(each.name for each in settings_of(RecordConfig, chosen_types(flags))), *paths}
     for name in settings:
         if name not in known:
             prefix, _, key = name.rpartition(".")
             beside = sorted(each.rpartition(".")[2] for each in known if each.rpartition(".")[0] == prefix)
             hint = suggestion(key, beside, prefix and f"{prefix}.") if beside else "see --help"
             raise ValueError(f"--recipe={path}: the key {name} is unknown; {hint}")
-    return format_flags(settings)
+    return flags
 
 
 def run(config: RecordConfig) -> None:

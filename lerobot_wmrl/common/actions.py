@@ -15,7 +15,7 @@ def clip_actions(actions: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Te
         (B,).
     """
     clipped = actions.clamp(low, high)
-    return clipped, (~actions.isclose(clipped)).float().mean(1)
+    return clipped, (~actions.isclose(clipped, equal_nan=True)).float().mean(1)
 
 
 def warn_of_clipped(shares: Sequence[float]) -> None:

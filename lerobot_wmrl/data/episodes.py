@@ -380,7 +380,7 @@ def read_actions(root: Path) -> np.ndarray:
     """Read all actions of a dataset on disk. (rows, A) float64"""
     table = pyarrow.dataset.dataset(parquet_files(root), format="parquet").to_table(columns=[ACTION])
     column = table[ACTION]
-    values = column if pyarrow.types.is_floating(column.type) else pyarrow.compute.list_flatten(column)
+    values = pyarrow.compute.list_flatten(column) if pyarrow.types.is_nested(column.type) else column
     return values.to_numpy().astype(np.float64).reshape(table.num_rows, -1)
 
 

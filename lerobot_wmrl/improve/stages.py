@@ -25,11 +25,12 @@ from lerobot_wmrl.common.lerobot_commands import edit_command, env_flags, merge_
 from lerobot_wmrl.common.policies import check_units, load_processors
 from lerobot_wmrl.common.presets import Flags, format_flags
 from lerobot_wmrl.common.stages import FAILED, Stage, never, read_record
-from lerobot_wmrl.common.statistics import evenly_spaced
 from lerobot_wmrl.data.embodiment import Embodiment, read_embodiment
 from lerobot_wmrl.data.episodes import SUCCESS, ChosenEpisodes, DatasetSource, EpisodeTable, read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.envs.lerobot_env import check_real_env
+from lerobot_wmrl.envs.start_frames import chosen_episodes
 from lerobot_wmrl.evaluation.comparison import RESULTS, chosen_policy, most_successful
 from lerobot_wmrl.improve.configuration_improve import ROLLOUT_SEED_OFFSET, ImproveConfig
 from lerobot_wmrl.improve.findings import LONGEST_IMAGINATION, Findings, look, usual_length
@@ -336,11 +337,11 @@ class Improvement:
 
     def _fewest(self) -> int:
         """Return the number of episodes that imagination begins in, of the task that has the fewest."""
-        kept = MAX_STARTS // (1 + self.branches)
-        if not self.config.rollouts and self.found.total <= kept:
+        if not self.config.rollouts and self.found.total * (1 + self.branches) <= MAX_STARTS:
             return self.found.fewest
-        tasks = self.learnt().column(START_TASK)
-        return int(np.unique(tasks[evenly_spaced(len(tasks), kept)], return_counts=True)[1].min())
+        table = self.learnt()
+        begun = chosen_episodes(table, StartFrames(max_starts=MAX_STARTS, branches=self.branches))
+        return int(np.unique(table.column(START_TASK)[begun], return_counts=True)[1].min())
 
     def _columns(self) -> list[str]:
         name = f"local/{self.found.root.name}"

@@ -217,9 +217,9 @@ def _specification(path: Path, name: str, entry: dict[str, Any]) -> ObjectSpec:
     _check_size(path, name, half_size, scale)
     centre = (low + high) / 2
     return replace(
-        OBJECTS[name], shape="mesh", half_size=tuple(half_size.tolist()),
+        BUILT_IN[name], shape="mesh", half_size=tuple(half_size.tolist()),
         mesh=MeshFile(str(file.resolve()), scale, tuple(centre.tolist())),
-        label=str(entry.get("label", OBJECTS[name].label)), density=density,
+        label=str(entry.get("label", BUILT_IN[name].label)), density=density,
     )  # fmt: skip
 
 

@@ -28,31 +28,39 @@ DECLARATION: Final = re.compile(r"^layout\(.*\) uniform sampler2D samplerBRDFLUT
 LOOK_UP: Final = re.compile(r"texture\(samplerBRDFLUT, [^;]*\)\.xy")
 
 
-@cache
 def sensor_shaders() -> ShaderConfig:
     """Return the shaders, for the cameras of an environment, and set the format of their pictures.
 
-    They lie in LeRobot's folder. Where nothing can be written there, or SAPIEN's are other ones, SAPIEN's are
-    taken as they are.
+    ManiSkill sets the format for packs that it knows by name alone.
     """
     original = PREBUILT_SHADER_CONFIGS[PACK]
-    set_shader_pack(original)  # sets the formats; ManiSkill does so for packs that it knows by name alone
-    source = Path(sapien.__file__).parent / "vulkan_shader"
-    texts = {
-        str(path.relative_to(source)): path.read_text()
-        for folder in FOLDERS
-        for path in sorted((source / folder).iterdir())
-    }
-    changed = {name: without_table(text) for name, text in texts.items()}
-    if changed == texts or any("samplerBRDFLUT" in text for text in changed.values()):
-        return original
-    digest = hashlib.sha256("".join(f"{name}{text}" for name, text in changed.items()).encode()).hexdigest()
-    folder = HF_LEROBOT_HOME / "shaders" / digest[:12]
+    set_shader_pack(original)
+    folder = rewritten(Path(sapien.__file__).parent / "vulkan_shader")
+    return original if folder is None else replace(original, shader_pack=str(folder / PACK))
+
+
+@cache
+def rewritten(source: Path) -> Path | None:
+    """Return a folder, within LeRobot's, with the shaders of `source` without the table.
+
+    None where they are other ones, or the folder cannot be written or is not whole: SAPIEN's are taken then.
+    """
     try:
+        texts = {
+            str(path.relative_to(source)): path.read_text()
+            for folder in FOLDERS
+            for path in sorted((source / folder).iterdir())
+        }
+        changed = {name: without_table(text) for name, text in texts.items()}
+        if changed == texts or any("samplerBRDFLUT" in text for text in changed.values()):
+            return None
+        digest = hashlib.sha256("".join(f"{name}{text}" for name, text in changed.items()).encode())
+        folder = HF_LEROBOT_HOME / "shaders" / digest.hexdigest()[:12]
         write_once(folder, changed)
-    except OSError:
-        return original
-    return replace(original, shader_pack=str(folder / PACK))
+        whole = all((folder / name).read_text() == text for name, text in changed.items())
+    except (OSError, UnicodeDecodeError):
+        return None
+    return folder if whole else None
 
 
 def without_table(text: str) -> str:

@@ -46,7 +46,7 @@ class Recorder(Protocol):
     def record(
         self, checkpoint: Path, episodes: int, seed: int, folder: Path, exploration: float = 0.0
     ) -> None:
-        """Record a dataset in `folder`, unless it is there. Episode i starts from `seed` + i.
+        """Record a dataset in `folder`, unless it is there: one episode from each of `seed`, `seed` + 1, …
 
         Args:
             checkpoint: checkpoint of the policy.

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
@@ -233,6 +234,10 @@ def test_no_start_is_imagined_twice_where_one_task_has_few(
     improvement = improvement_of(tmp_path, total=6, fewest=6)
     improvement.config.dataset = ChosenEpisodes(str(root))
     assert "--n_episodes=4" in improvement.compare(tmp_path, improvement.imagination(), 256)
+    table = read_episodes(open_dataset(root))
+    two = replace(table, columns={**table.columns, "start.task": np.array([0, 0, 0, 0, 1, 1])})
+    monkeypatch.setattr(type(improvement), "learnt", lambda self: two)
+    assert "--n_episodes=1" in improvement.compare(tmp_path, improvement.imagination(), 256)
 
 
 def test_another_round_does_not_double_the_frames_of_a_rollout(tmp_path: Path) -> None:

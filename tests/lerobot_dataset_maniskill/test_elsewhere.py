@@ -170,6 +170,8 @@ def test_tasks_share_out_fewer_episodes_than_environments() -> None:
     recorder.envs = [SimpleNamespace(num_envs=2, name=name) for name in "abc"]
     batches = [(env.name, list(seeds)) for env, seeds in recorder._batches(range(7, 15))]
     assert batches == [("a", [9, 12]), ("b", [7, 10]), ("b", [13]), ("c", [8, 11]), ("c", [14])]
+    recorder.envs = [SimpleNamespace(num_envs=8, name=name) for name in "abc"]
+    assert [env.name for env, _ in recorder._batches(range(7, 10))] == ["a", "b", "c"]
 
 
 def test_an_interrupted_recording_continues_and_a_whole_one_is_left_alone(

@@ -145,7 +145,18 @@ def test_shaders_without_the_table_draw_the_same_pictures(
         assert np.array_equal(image, expected.images[camera])
 
 
-def test_other_shaders_than_those_known_are_taken_as_they_are() -> None:
+@pytest.mark.parametrize("files", [
+    {}, {"minimal/a.frag": b"void main() {}"}, {"minimal/a.frag": b"\xff"},
+    {"minimal/a.frag": b"int samplerBRDFLUT;"},
+])  # fmt: skip
+def test_shaders_of_another_sapien_are_taken_as_they_are(files: dict[str, bytes], tmp_path: Path) -> None:
+    for name, content in {"common/b.glsl": b"", **files}.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(content)
+    assert shaders.rewritten(tmp_path) is None
+
+
+def test_what_does_not_read_the_table_is_not_changed() -> None:
     assert shaders.without_table("vec4 color = texture(samplerColor, uv);") == (
         "vec4 color = texture(samplerColor, uv);"
     )
