@@ -51,6 +51,15 @@ def sampler(small_dataset, trained_models) -> ClipSampler:
     return ClipSampler(table, tokens, np.arange(6), 12, 0.75, batch_size=8, seed=3, device="cpu")
 
 
+@pytest.mark.parametrize(("clip_length", "frames"), [(2, 2), (3, 3), (12, 3)])
+def test_clips_begin_late_enough_to_show_the_last_transition(sampler, monkeypatch, clip_length, frames):
+    """The last ones have `frames` frames of their episode."""
+    monkeypatch.setattr(ClipSampler, "clips", lambda self, episodes, offsets: (episodes, offsets))
+    short = replace(sampler, clip_length=clip_length)
+    left = [short.table.length[episodes] - offsets for episodes, offsets in map(short, range(200))]
+    assert np.concatenate(left).min() == frames
+
+
 def test_batches_are_a_function_of_seed_and_step(sampler):
     first, again, other = sampler(5), sampler(5), sampler(6)
     assert torch.equal(first.action, again.action)
