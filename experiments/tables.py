@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from experiments import foreign, judged
+from experiments import foreign, four_tasks_section, judged
 from experiments import policy_sections as policies
 from experiments import value_sections as value
 from experiments import world_model_sections as world_models
@@ -37,8 +37,9 @@ SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     "value_tasks": ("Policies", value.value_tasks),
     "value_tasks_simulator": ("Policies", partial(TASKS_ROWS, ["simulated_ppo"])),
     "value_tasks_ppo_distilled": ("Policies", partial(TASKS_ROWS, ["ppo_distilled"])),
-    "value_four_tasks": ("Policies", value.value_four_tasks),
-    "value_four_tasks_simulator": ("Policies", value.value_four_tasks_simulator),
+    "value_four_tasks": ("Policies", four_tasks_section.section),
+    "value_four_tasks_simulator": ("Policies", four_tasks_section.simulator),
+    "value_four_tasks_others": ("Policies", four_tasks_section.others),
     "value_longer": ("Policies", partial(value.rows_above, ["longer", "longer_filtered"])),
     "value_longer_imagined": (
         "Policies",
@@ -183,7 +184,7 @@ def main() -> None:
         return
     load, images = loader(DOCS), DOCS / "images"
     value.draw_value(load, images / "value_push.png")
-    value.draw_four_tasks(load, images / "value_four_tasks.png")
+    four_tasks_section.draw(load, images / "value_four_tasks.png")
     write_text(target, page)
     print(f"wrote {target.relative_to(ROOT)}")
 

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from scipy.stats import ttest_1samp
 
 from experiments import figures
-from experiments.cells import DOMAINS, Load, counted, paired, points
+from experiments.cells import DOMAINS, Load, paired, points
 from experiments.study import ROOT, read_cells
 from lerobot_wmrl.common.files import markdown_table as table
 from lerobot_wmrl.common.statistics import PairedChange, RunsMean
@@ -98,32 +98,6 @@ TASKS_STUDY: Final = "value_tasks"
 TASKS_PARTS: Final = ("value_tasks_simulator", "value_tasks_ppo_distilled")
 TASKS_GROUPS: Final = ("task", *REAL_EPISODES)
 """The same of further tasks, and what their cells are grouped by."""
-
-FOUR_STUDY: Final = "value_four_tasks"
-FOUR_PART: Final = "value_four_tasks_simulator"
-"""Stems of the study of one policy for four tasks, and of the one that adds a method to its table."""
-
-SHORT: Final = {
-    "cloning": "BC",
-    "longer": "longer BC",
-    "filtered": "filtered BC",
-    "simulated_ppo": "PPO in ManiSkill",
-    "imagined_ppo": "PPO in imagination",
-}
-"""Methods of the four tasks, as picture and table name them, in their order."""
-
-FOUR_LIMITS: Final = """\
-The world model is not told the task: it knows it if the first frame shows it. The done threshold was
-chosen on these held-out rollouts of seed 0: a first run of PPO with 0.9, at which no success of
-pick_place and move_to_aim is recognised, was ended unmeasured. The world model and filtered BC learnt
-on a GPU, where the frames came compressed as video (H.264, 4:4:4): what that changes of the filtered
-policy's actions is 7 % of their error. BC was trained longer after a first comparison without it, in which
-PPO began from the BC of 5,000 steps: 88 and 78 % in known and unseen scenes of push, 73 and 70 of pull, 64
-and 44 of pick_place, 78 and 78 of move_to_aim, 76 and 67 of all (docs/results of commit 1e99306). From the
-better policy PPO ends no higher on average, and 20 points lower in pick_place; in training, imagined success
-ends at 67 % in both runs. Not compared: filtered BC for more than 8,000 steps, weighted BC, RECAP, iterated
-BC and planning."""
-"""What its section says of its limits."""
 
 Cell = dict[str, Any]
 Groups = dict[tuple[Any, ...], list[Cell]]
@@ -355,123 +329,6 @@ def misled(cells: Sequence[Cell]) -> str:
                 "and PPO began from the worse one."
             )
     return " ".join(said)
-
-
-def value_four_tasks(load: Load) -> str:
-    """Return the section: each task's success after every method, the gate, and where PPO began."""
-    cells = four_cells(load)
-    first, methods = cells[0], four_methods(cells)
-    titles = [SHORT[method] for method in methods]
-    tasks = list(first["tasks"])
-    baselines = [method for method in methods if method not in IMAGINED]
-    rows = []
-    for title, pooled in {**{task: [task] for task in tasks}, "all four": tasks}.items():
-        own = [of_tasks(cell, pooled) for cell in cells]
-        for domain in SCENES:
-            gained = gain(own, "imagined_ppo", best(own, baselines, domain), domain)
-            each = (shares(own, method, domain) for method in methods)
-            rows.append([title, DOMAINS[domain], *each, points(asdict(gained))])
-    gates = [
-        [cell["seed"], task, counted(gate["false_positive_rate"]), counted(gate["recall"])]
-        for cell in cells
-        for task, gate in cell["gate"].items()
-    ]
-    spent = ", ".join(f"{cell['minutes']['imagined_ppo']:.0f}" for cell in cells)
-    start = ", ".join(SHORT[cell["start"]] for cell in cells)
-
-    def believed(method: str) -> str:
-        return ", ".join(f"{100 * cell['imagined'][method]:.0f}" for cell in cells)
-
-    return f"""{first["demonstrations"]} demonstrations and {first["rollouts"]} rollouts, a quarter of them of
-each task, in all 64 known scenes; {first["starts"]} starts of each task, the same for all methods. The policy
-is told the task in words.
-
-{table(["task", "scenes", *titles, f"{titles[-1]} against the best other"], rows)}
-
-![Success in four tasks, seed {first["seed"]}](images/value_four_tasks.png)
-
-{over_cloning([of_tasks(cell, tasks) for cell in cells], methods)}
-
-PPO in imagination begins from the policy that succeeds most often there: {start}. In the world model BC
-succeeds from {believed("cloning")} % of recorded starts, longer BC from {believed("longer")} %, filtered BC
-from {believed("filtered")} %. All its training took {spent} minutes, some of them on a GPU.
-
-The world model on held-out rollouts, at the done threshold of PPO:
-
-{table(["seed", "task", "false positives", "recall"], gates)}
-
-{FOUR_LIMITS}"""
-
-
-def four_cells(load: Load) -> list[Cell]:
-    """Return the published cells of the four tasks, each with the methods of the same cell of its part."""
-    cells = []
-    for study in read_cells(ROOT / "experiments" / f"{FOUR_STUDY}.yaml"):
-        found, part = (published(load, stem, study.variables["cell"]) for stem in (FOUR_STUDY, FOUR_PART))
-        if found:
-            cells.append(joined(found, part))
-    return cells
-
-
-def four_methods(cells: Sequence[Cell]) -> list[str]:
-    """Return the methods that have been run in all cells of the four tasks."""
-    return [method for method in SHORT if all(method in cell["minutes"] for cell in cells)]
-
-
-def draw_four_tasks(load: Load, path: Path) -> None:
-    """Draw the success of every method in each task, of the first published seed. Nothing without one."""
-    first = four_cells(load)[:1]
-    if not first:
-        return
-    tasks = first[0]["tasks"].items()
-    by_domain = {domain: {"policies": {task: rates[domain] for task, rates in tasks}} for domain in SCENES}
-    figures.draw_improvement(by_domain, path, {name: SHORT[name] for name in four_methods(first)})
-
-
-def over_cloning(cells: Sequence[Cell], methods: Sequence[str]) -> str:
-    """Return what each kind of PPO gains over the best BC, in all tasks together."""
-    cloned = [method for method in methods if not method.endswith("_ppo")]
-    said = []
-    for method in (each for each in methods if each not in cloned):
-        known, unseen = (
-            points(asdict(gain(cells, method, best(cells, cloned, domain), domain))) for domain in SCENES
-        )
-        said.append(f"{SHORT[method]} gains {known} in known and {unseen} in unseen scenes")
-    return f"Over the best BC, in all four tasks, {'; '.join(said)}."
-
-
-def value_four_tasks_simulator(load: Load) -> str:
-    """Return the section, whose numbers are in the table of the four tasks."""
-    cell = load(f"{FOUR_PART}/{read_cells(ROOT / 'experiments' / f'{FOUR_PART}.yaml')[0].variables['cell']}")
-    return f"""Its column is in [the table above](#{FOUR_STUDY}): {SHORT["simulated_ppo"]}. Training took
-{cell["minutes"]["simulated_ppo"]:.0f} minutes, those of BC among them."""
-
-
-def joined(cell: Cell, part: Cell | None) -> Cell:
-    """Return a cell of four tasks with the methods of the same cell of another study, if it is there."""
-    if part is None:
-        return cell
-    tasks = {
-        task: {domain: {**rates, **part["tasks"][task][domain]} for domain, rates in domains.items()}
-        for task, domains in cell["tasks"].items()
-    }
-    return {**cell, "minutes": {**cell["minutes"], **part["minutes"]}, "tasks": tasks}
-
-
-def of_tasks(cell: Cell, tasks: Sequence[str]) -> Cell:
-    """Return a cell of these tasks alone, their starts one after the other."""
-    methods = {
-        method: {
-            domain: {
-                "outcomes": [
-                    each for task in tasks for each in cell["tasks"][task][domain][method]["outcomes"]
-                ]
-            }
-            for domain in SCENES
-        }
-        for method in cell["minutes"]
-    }
-    return {"methods": methods}
 
 
 def comparison(found: Groups, by: Sequence[str] = REAL_EPISODES) -> str:

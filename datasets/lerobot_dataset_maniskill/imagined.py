@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.manifest import EpisodePlan, Part
-from lerobot_dataset_maniskill.worker import EpisodeResult, Report, whole_part
+from lerobot_dataset_maniskill.worker import EpisodeResult, Report, out_of_range, whole_part
 from lerobot_dataset_maniskill.writer import Outcome, StartColumns, add_step
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.exploration import ExplorationNoise
@@ -52,16 +52,18 @@ class ImaginedPartRecorder:
     def record(self, part: Part, report: Report) -> None:
         """Record a part. Its folder appears under its final name only when it is whole."""
         with whole_part(self.config, self.folder, part, self.cameras, self.side) as dataset:
-            for plan, (instruction, rows) in zip(part.episodes, self._imagine(part.episodes), strict=True):
+            for plan, (instruction, rows, clipped) in zip(
+                part.episodes, self._imagine(part.episodes), strict=True
+            ):
                 start = StartColumns(instruction, task_of(plan.task).index, plan)
                 for before, action, outcome in rows:
                     add_step(dataset, start, before, action, outcome)
                 dataset.save_episode()
-                report(EpisodeResult(part.index, plan.kind, not rows[-1][-1].truncated))
+                report(EpisodeResult(part.index, plan.kind, not rows[-1][-1].truncated, clipped))
 
     @torch.no_grad()
-    def _imagine(self, plans: Sequence[EpisodePlan]) -> list[tuple[str, list[Row]]]:
-        """Return each episode's instruction and rows, to the k-frame done or to the horizon."""
+    def _imagine(self, plans: Sequence[EpisodePlan]) -> list[tuple[str, list[Row], list[float]]]:
+        """Return each episode's instruction, rows to the k-frame done or the horizon, and clipped shares."""
         count = self.env.num_envs
         largest = self.config.exploration
         noises = [ExplorationNoise(largest, plan.seed, TRANSLATION, plan.visit) for plan in plans]
@@ -73,25 +75,30 @@ class ImaginedPartRecorder:
         instructions = list(observation["task"])
         before = self._frames(observation, torch.zeros(count))
         rows: list[list[Row]] = [[] for _ in plans]
+        clipped: list[list[float]] = [[] for _ in plans]
         running = set(range(len(plans)))
         while running:
-            action = self._act(observation, noises)
+            action, shares = self._act(observation, noises)
             observation, reward, terminated, truncated, info = self.env.step(torch.from_numpy(action))
             after = self._frames(info.get("final_obs", observation), reward)
             for index in running:
                 outcome = Outcome(after[index], bool(truncated[index]))
                 rows[index].append((before[index], action[index], outcome))
+                clipped[index].append(shares[index])
             running -= set((terminated | truncated).nonzero().flatten().tolist())
             before = after
         ended = [with_success(each, self.done_frames) for each in rows]
-        return list(zip(instructions, ended, strict=False))
+        return list(zip(instructions, ended, clipped, strict=False))
 
-    def _act(self, observation: dict[str, Any], noises: list[ExplorationNoise]) -> np.ndarray:
-        """Return actions (B, 7) inside the action box."""
+    def _act(
+        self, observation: dict[str, Any], noises: list[ExplorationNoise]
+    ) -> tuple[np.ndarray, list[float]]:
+        """Return actions (B, 7) inside the action box, and the shares of the policy's that were not (B,)."""
         chosen = self.policy.select_action(self.pipeline.prepare(observation))
-        action = self.pipeline.to_action(chosen).cpu().numpy()
+        given = self.pipeline.to_action(chosen).cpu()
+        action = given.numpy().copy()
         action[: len(noises), :3] += np.stack([noise() for noise in noises])
-        return np.clip(action, ACTION_LOW, ACTION_HIGH).astype(np.float32)
+        return np.clip(action, ACTION_LOW, ACTION_HIGH).astype(np.float32), out_of_range(given)
 
     def _frames(self, observation: dict[str, Any], reward: Tensor) -> list[Frame]:
         """Return what each environment shows, in the simulator's form, as if it were no success."""

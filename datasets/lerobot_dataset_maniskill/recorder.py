@@ -19,6 +19,7 @@ from lerobot_dataset_maniskill.manifest import Part, planned_parts
 from lerobot_dataset_maniskill.merging import already_recorded, finish, merge_folders, require_same
 from lerobot_dataset_maniskill.worker import EpisodeResult, PartRecorder, Report, serve_parts
 from lerobot_dataset_maniskill.writer import find_damage
+from lerobot_wmrl.common.actions import warn_of_clipped
 from lerobot_wmrl.common.constants import EVALUATION_SEED, GATE_SEED, KINDS
 from lerobot_wmrl.common.errors import FieldError, within
 from lerobot_wmrl.common.files import foreign_files, write_json, writing
@@ -163,19 +164,25 @@ def record_parts(config: RecordConfig, work: Path, parts: list[Part]) -> None:
 
 @contextmanager
 def progress_bar(episodes: int, missing: list[Part]) -> Iterator[Report]:
-    """Show the episodes that are reported to it, the time left, and each kind's success rate."""
+    """Show the episodes that are reported to it, the time left, and each kind's success rate.
+
+    At the end it says how many components of a policy's actions were out of range.
+    """
     done = episodes - count_episodes(missing)
     seen: Counter[str] = Counter()
     won: Counter[str] = Counter()
+    clipped: list[float] = []
     with tqdm(total=episodes, initial=done, unit="episode", desc="record") as bar:
 
         def report(result: EpisodeResult) -> None:
             seen[result.kind] += 1
             won[result.kind] += result.success
+            clipped.extend(result.clipped)
             bar.set_postfix({kind: f"{won[kind] / seen[kind]:.0%}" for kind in KINDS if seen[kind]}, False)
             bar.update()
 
         yield report
+    warn_of_clipped(clipped)
 
 
 def record_in_parallel(

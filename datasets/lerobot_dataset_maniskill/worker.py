@@ -18,12 +18,14 @@ import numpy as np
 import torch
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from torch import Tensor
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.manifest import EpisodePlan, Part
 from lerobot_dataset_maniskill.planners import MOTIONS, follow_plan
 from lerobot_dataset_maniskill.planners.kinds import PLAY_STEPS
 from lerobot_dataset_maniskill.writer import HOLD_FRAMES, Outcome, StartColumns, add_step, create_dataset
+from lerobot_wmrl.common.actions import clip_actions
 from lerobot_wmrl.common.constants import KINDS, PLAY
 from lerobot_wmrl.common.exploration import ExplorationNoise
 from lerobot_wmrl.common.policies import load_policy, load_processors
@@ -40,6 +42,9 @@ if TYPE_CHECKING:
 class Driver(Protocol):
     """Chooses the actions of an episode: (7,) float32, inside the action box."""
 
+    clipped: list[float]
+    """Of each step of the episode, the share of the action's components that were brought into the box."""
+
     def begin(self, simulation: "Simulation", plan: EpisodePlan) -> None:
         """Prepare for an episode that has just been reset."""
 
@@ -52,6 +57,7 @@ class PlannerDriver:
 
     def __init__(self, planner: str) -> None:
         self.motion = MOTIONS[planner]()
+        self.clipped: list[float] = []  # it plans within the box
 
     def begin(self, simulation: "Simulation", plan: EpisodePlan) -> None:
         rng = np.random.default_rng((plan.seed, KINDS.index(plan.kind), simulation.task.index))
@@ -72,6 +78,7 @@ class PolicyDriver:
 
     def begin(self, simulation: "Simulation", plan: EpisodePlan) -> None:
         torch.manual_seed(plan.seed)
+        self.clipped = []
         self.noise = ExplorationNoise(self.exploration, plan.seed, TRANSLATION)
         self.policy.reset()
         self.preprocess.reset()
@@ -80,9 +87,17 @@ class PolicyDriver:
     @torch.no_grad()
     def act(self, simulation: "Simulation", frame: Frame) -> np.ndarray:
         batch = self.preprocess(policy_observation(frame, simulation.instruction))
-        action = self.postprocess(self.policy.select_action(batch)).squeeze(0).cpu().numpy()
+        chosen = self.postprocess(self.policy.select_action(batch)).cpu()
+        self.clipped += out_of_range(chosen)
+        action = chosen.squeeze(0).numpy()
         action[:3] += self.noise()
         return np.clip(action, ACTION_LOW, ACTION_HIGH).astype(np.float32)
+
+
+def out_of_range(actions: Tensor) -> list[float]:
+    """Return the share of the components of each action (B, 7) that are outside the action box."""
+    _, shares = clip_actions(actions.float(), torch.tensor(ACTION_LOW), torch.tensor(ACTION_HIGH))
+    return shares.tolist()
 
 
 def policy_observation(frame: Frame, instruction: str) -> dict[str, Any]:
@@ -96,11 +111,20 @@ def policy_observation(frame: Frame, instruction: str) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class EpisodeResult:
-    """What the progress bar shows of an episode."""
+    """What the command says of an episode.
+
+    Args:
+        part: index of the part that it belongs to.
+        kind: what it was recorded as.
+        success: whether it succeeds.
+        clipped: of each step, the share of the components of a policy's action that were out of range;
+            nothing where a planner acts.
+    """
 
     part: int
     kind: str
     success: bool
+    clipped: Sequence[float] = ()
 
 
 Report = Callable[[EpisodeResult], None]
@@ -137,7 +161,8 @@ class PartRecorder:
         env = self.config.maniskill
         with whole_part(self.config, self.folder, part, env.cameras, env.image_size) as dataset:
             for plan in part.episodes:
-                report(EpisodeResult(part.index, plan.kind, self._record_episode(dataset, plan)))
+                success = self._record_episode(dataset, plan)
+                report(EpisodeResult(part.index, plan.kind, success, self.driver.clipped))
 
     def _steps(self, plan: EpisodePlan) -> int:
         """Return the largest number of rows of an episode."""

@@ -179,10 +179,11 @@ class RolloutRecorder:
         with whole_folder(folder) as partial:
             for env, chosen in self._batches(seeds):
                 seen, taken = self._roll_out(env, chosen)
-                clipped += seen.clipped
                 dataset = dataset or self._create(partial, seen.observations[0])
                 for row, seed in enumerate(chosen):
-                    report(self._add_episode(dataset, seen, taken, row, seed))
+                    length = int(taken["done"][row].int().argmax()) + 1
+                    report(self._add_episode(dataset, seen, taken, row, seed, length))
+                    clipped += [float(shares[row]) for shares in seen.clipped[:length]]
             assert dataset is not None, "there is no seed"
             dataset.finalize()
         warn_of_clipped(clipped)
@@ -229,9 +230,9 @@ class RolloutRecorder:
         taken: dict[str, Tensor],
         row: int,
         seed: int,
+        length: int,
     ) -> bool:
         """Add the episode of one environment of a rollout. Return whether it succeeds."""
-        length = int(taken["done"][row].int().argmax()) + 1
         success = bool(taken["success"][row, length - 1])
         labelled = "next.success" in dataset.features  # else next.done is taken for it
         for step in range(length):
@@ -303,8 +304,8 @@ class RecordingProcessors:
     robot: Embodiment
     observations: list[Observation] = field(default_factory=list)
     actions: list[np.ndarray] = field(default_factory=list)
-    clipped: list[float] = field(default_factory=list)
-    """Shares of the components of the policy's actions that were out of range."""
+    clipped: list[Tensor] = field(default_factory=list)
+    """Of each step, the share of the components of the policy's actions that were out of range. (B,)"""
 
     def preprocess(self, observation: Observation) -> Observation:
         """Keep a batch of observations in LeRobot's names, and prepare it for the policy."""
@@ -316,7 +317,7 @@ class RecordingProcessors:
         """Return the policy's actions in the dataset's units, with noise, within their range. (B, A)"""
         low, high = torch.tensor(self.robot.action_low), torch.tensor(self.robot.action_high)
         chosen = self.after(action).cpu().float()
-        self.clipped += clip_actions(chosen, low, high)[1].tolist()
+        self.clipped.append(clip_actions(chosen, low, high)[1])
         noise = torch.from_numpy(np.stack([noise() for noise in self.noises])).float()
         kept = (chosen + noise).clamp(low, high)
         self.actions.append(kept.numpy())

@@ -9,7 +9,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.manifest import EpisodePlan, planned_parts
 from lerobot_dataset_maniskill.recorder import merge, missing_parts
-from lerobot_dataset_maniskill.worker import PartRecorder
+from lerobot_dataset_maniskill.worker import PartRecorder, PlannerDriver
 from lerobot_dataset_maniskill.writer import Outcome, StartColumns, add_step
 from lerobot_wmrl.common.constants import TASKS
 from lerobot_wmrl.maniskill.episode import Frame
@@ -28,7 +28,7 @@ class MadeUpRecorder(PartRecorder):
     """Writes made-up episodes where the recorder writes simulated ones."""
 
     def __init__(self, config: RecordConfig, folder: Path) -> None:
-        self.config, self.folder = config, folder
+        self.config, self.folder, self.driver = config, folder, PlannerDriver(config.planner)
 
     def _record_episode(self, dataset: LeRobotDataset, plan: EpisodePlan) -> bool:
         rng = np.random.default_rng(plan.seed)

@@ -141,6 +141,14 @@ def test_a_planner_acts_as_a_policy(config, trained_models):
         record(config)
 
 
+def test_what_a_policy_does_out_of_range_is_reported(config, tmp_path, caplog):
+    record(config)
+    assert "out of range" not in caplog.text
+    policy = read_policy_config(str(save_untrained_policy(tmp_path / "far", actions=7, constant=2.0)), [])
+    record(replace(config, output_dir=tmp_path / "clipped", policy=policy))
+    assert "100.0 % of the components of the policy's actions were out of range" in caplog.text
+
+
 def test_a_policy_without_weights_is_refused(config):
     config.policy = CnnConfig(device="cpu")
     with pytest.raises(
