@@ -61,8 +61,10 @@ class PlannerDriver:
 
     def begin(self, simulation: "Simulation", plan: EpisodePlan) -> None:
         rng = np.random.default_rng((plan.seed, KINDS.index(plan.kind), simulation.task.index))
-        start = simulation.current_start
-        self.follower = follow_plan(simulation.task.name, plan.scene, start, plan.kind, rng, self.motion)
+        episode = simulation.episode
+        self.follower = follow_plan(
+            simulation.task.name, episode.scene, episode.start, plan.kind, rng, self.motion
+        )
 
     def act(self, simulation: "Simulation", frame: Frame) -> np.ndarray:
         return self.follower.act(simulation.tcp_position, simulation.object_position)

@@ -142,7 +142,7 @@ def write_vocabulary(root: Path, recording: Mapping[str, Any]) -> None:
         {
             "tasks": list(TASKS),
             "kinds": list(KINDS),
-            "scenes": [vars(scene) for scene in SCENES],
+            "scenes": [scene.as_json() for scene in SCENES],
             "action_low": list(ACTION_LOW),
             "action_high": list(ACTION_HIGH),
             "hold_frames": HOLD_FRAMES,

@@ -15,8 +15,8 @@ from lerobot_wmrl.common.errors import FieldError, require_at_least
 from lerobot_wmrl.maniskill.backend import render_backend, require_simulator
 from lerobot_wmrl.maniskill.cameras import CAMERAS, IMAGE_SIZE, ROBOT_MESH_DETAIL, Rendering
 from lerobot_wmrl.maniskill.embodiment import ACTION_NAMES, FPS, STATE_NAMES
-from lerobot_wmrl.maniskill.objects import describe_assets, read_assets, use_assets
-from lerobot_wmrl.maniskill.scenes import Scene, scenes_of
+from lerobot_wmrl.maniskill.objects import describe_assets, read_assets
+from lerobot_wmrl.maniskill.scenes import Scene, scenes_of, with_meshes
 from lerobot_wmrl.maniskill.tasks import tasks_of
 from lerobot_wmrl.rewards.general import RuleBasedReward
 
@@ -125,8 +125,7 @@ class WmrlManiSkillEnv(EnvConfig):
         require_simulator()
         from lerobot_wmrl.maniskill.simulation import Simulation
 
-        use_assets(self.assets)
-        return Simulation(tasks_of(self.task)[0], self.selected_scenes(), self._rendering(depth))
+        return Simulation(tasks_of(self.task)[0], self._scenes_with_meshes(), self._rendering(depth))
 
     def create_batched_simulation(self, n_envs: int, device: str) -> "BatchedSimulation":
         """Return a simulator of `n_envs` episodes of one task at once.
@@ -151,13 +150,16 @@ class WmrlManiSkillEnv(EnvConfig):
                 "a batched simulation has one task",
                 "choose one, or set `batched` to false",
             )
-        use_assets(self.assets)
-        scenes = self.selected_scenes()
+        scenes = self._scenes_with_meshes()
         return BatchedSimulation(task, scenes, self._rendering(depth=False), n_envs, device)
 
     def describe_assets(self) -> dict[str, Any] | None:
         """Describe the user's own meshes by their content; None if there are none."""
         return None if self.assets is None else describe_assets(self.assets)
+
+    def _scenes_with_meshes(self) -> tuple[Scene, ...]:
+        meshes = {} if self.assets is None else read_assets(self.assets)
+        return with_meshes(self.selected_scenes(), meshes)
 
     def _rendering(self, depth: bool) -> Rendering:
         return Rendering(

@@ -17,7 +17,7 @@ from lerobot_wmrl.maniskill.backend import render_backend
 from lerobot_wmrl.maniskill.cameras import Rendering
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW
 from lerobot_wmrl.maniskill.episode import WORKSPACE_FLOOR, Episode
-from lerobot_wmrl.maniskill.objects import OBJECTS
+from lerobot_wmrl.maniskill.objects import ObjectSpec
 from lerobot_wmrl.maniskill.robot import GRIPPER_OPEN
 from lerobot_wmrl.maniskill.scenes import Scene
 from lerobot_wmrl.maniskill.simulation import TabletopEnv, arrangement
@@ -45,14 +45,14 @@ class BatchedTabletopEnv(TabletopEnv):
         builder.initial_pose = sapien.Pose(p=[0.0, 0.0, SHELF - SHELF_HALF_SIZE[2]])
         builder.build_static(name="shelf")
 
-    def parking_places(self, movable: Sequence[str], fixed: Sequence[str]) -> dict[str, sapien.Pose]:
+    def parking_places(self, movable: Sequence[ObjectSpec], fixed: Sequence[str]) -> dict[str, sapien.Pose]:
         """Return places on the shelf for objects, below it for everything else."""
         side = int(np.ceil(np.sqrt(len(movable))))
         offset = SHELF_SPACING * (side - 1) / 2
         places = {name: sapien.Pose(p=[0.0, 0.0, CELLAR - index]) for index, name in enumerate(fixed)}
-        for index, name in enumerate(movable):
+        for index, spec in enumerate(movable):
             x, y = (SHELF_SPACING * cell - offset for cell in divmod(index, side))
-            places[name] = sapien.Pose(p=[x, y, SHELF + OBJECTS[name].half_size[2] + SHELF_GAP])
+            places[spec.name] = sapien.Pose(p=[x, y, SHELF + spec.half_size[2] + SHELF_GAP])
         return places
 
     def place_rows(self, rows: Sequence[int], episodes: Sequence[Episode]) -> None:
@@ -102,7 +102,7 @@ class BatchedSimulation:
 
     Args:
         task: defines starts, success and reward.
-        scenes: the scenes that may be asked for.
+        scenes: the scenes that may be asked for, with a user's meshes if there are any.
         rendering: which pictures are taken; light and cameras do not vary here.
         num_envs: B; 1 on the CPU.
         device: "cpu", "cuda" or "cuda:1" and so on, of physics and pictures.
@@ -132,7 +132,8 @@ class BatchedSimulation:
         Returns:
             The frame of all B rows.
         """
-        started = [Episode(self.task, scene, seed) for scene, seed in zip(scenes, seeds, strict=True)]
+        own = [self.env.scenes[scene.index] for scene in scenes]
+        started = [Episode(self.task, scene, seed) for scene, seed in zip(own, seeds, strict=True)]
         running = {**dict(enumerate(self.episodes)), **dict(zip(rows, started, strict=True))}
         self.episodes = [running[row] for row in range(self.env.num_envs)]
         self.env.place_rows(rows, started)

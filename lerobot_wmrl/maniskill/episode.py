@@ -6,7 +6,6 @@ from typing import Final
 import numpy as np
 
 from lerobot_wmrl.maniskill.embodiment import FPS
-from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS
 from lerobot_wmrl.maniskill.scenes import Scene
 from lerobot_wmrl.maniskill.tasks import Situation, Task
 
@@ -57,7 +56,7 @@ class Episode:
     def situation(self, position: np.ndarray, tcp: np.ndarray, opening: float) -> Situation:
         """Return what the task judges when the object is at `position` (3,), the TCP at `tcp` (3,)."""
         return Situation(
-            self.start, OBJECTS[self.scene.object], CONTAINERS[self.scene.container],
+            self.start, self.scene.object_spec, self.scene.container_spec,
             self.object_start, position, tcp, opening,
             float(np.linalg.norm(position - self.object_before)) * FPS,
         )  # fmt: skip

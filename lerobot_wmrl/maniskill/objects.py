@@ -4,6 +4,7 @@ Nothing is downloaded. Units are metres, z points up, the table top is at z = 0.
 """
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -89,7 +90,7 @@ CUP: Profile = ((0.75, -1.0), (1.0, 1.0))
 
 GREEN: Final[Colour] = (0.10, 0.38, 0.08)
 
-OBJECTS: Final[dict[str, ObjectSpec]] = {
+OBJECTS: Final[Mapping[str, ObjectSpec]] = {
     spec.name: spec
     for spec in (
         ObjectSpec("sponge", "box", (0.030, 0.034, 0.022), (0.95, 0.72, 0.08), "yellow sponge"),
@@ -129,12 +130,7 @@ OBJECTS: Final[dict[str, ObjectSpec]] = {
         ObjectSpec("glue_stick", "cylinder", (0.018, 0.018, 0.036), (0.45, 0.12, 0.62), "purple glue stick"),
     )
 }  # fmt: skip
-"""Twenty objects that differ in shape, size and colour, each narrow enough for the gripper (8 cm).
-
-`use_assets` replaces some by a user's own meshes."""
-
-BUILT_IN: Final = dict(OBJECTS)
-"""The same, without a user's meshes."""
+"""Twenty objects that differ in shape, size and colour, each narrow enough for the gripper (8 cm)."""
 
 CONTAINERS: Final = {
     spec.name: spec
@@ -156,11 +152,6 @@ MAX_ASSET_WIDTH: Final = 0.072
 
 MIN_ASSET_HEIGHT: Final = 0.02
 """Least height (m) that a closed gripper can push."""
-
-
-def use_assets(path: Path | None) -> None:
-    """Replace the objects that the file names by its meshes, and no others, in this process."""
-    OBJECTS.update({**BUILT_IN, **(read_assets(path) if path else {})})
 
 
 def read_assets(path: Path) -> dict[str, ObjectSpec]:
@@ -217,9 +208,9 @@ def _specification(path: Path, name: str, entry: dict[str, Any]) -> ObjectSpec:
     _check_size(path, name, half_size, scale)
     centre = (low + high) / 2
     return replace(
-        BUILT_IN[name], shape="mesh", half_size=tuple(half_size.tolist()),
+        OBJECTS[name], shape="mesh", half_size=tuple(half_size.tolist()),
         mesh=MeshFile(str(file.resolve()), scale, tuple(centre.tolist())),
-        label=str(entry.get("label", BUILT_IN[name].label)), density=density,
+        label=str(entry.get("label", OBJECTS[name].label)), density=density,
     )  # fmt: skip
 
 

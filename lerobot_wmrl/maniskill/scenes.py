@@ -3,13 +3,13 @@
 Imports no simulator.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import product
-from typing import Final, Literal, get_args
+from typing import Any, Final, Literal, get_args
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS, TABLES
+from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS, TABLES, ContainerSpec, ObjectSpec
 
 Split = Literal["ind", "ood"]
 SPLITS: Final[tuple[str, ...]] = get_args(Split)
@@ -26,6 +26,7 @@ class Scene:
         table: key of `objects.TABLES`.
         split: "ind" (in domain: recorded and trained on) or "ood" (held out). An "ood" scene has either an
             object that no "ind" scene has, or a new combination of known things.
+        mesh: a user's own mesh in the object's place.
     """
 
     index: int
@@ -33,6 +34,21 @@ class Scene:
     container: str
     table: str
     split: Split
+    mesh: ObjectSpec | None = None
+
+    @property
+    def object_spec(self) -> ObjectSpec:
+        """What the object is: the user's mesh, else what `objects.OBJECTS` says."""
+        return self.mesh or OBJECTS[self.object]
+
+    @property
+    def container_spec(self) -> ContainerSpec:
+        """What `objects.CONTAINERS` says of the container."""
+        return CONTAINERS[self.container]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return what datasets store of a scene."""
+        return {field: getattr(self, field) for field in ("index", "object", "container", "table", "split")}
 
 
 UNSEEN_OBJECTS: Final = frozenset({"lime", "carrot"})
@@ -89,6 +105,11 @@ def scenes_of(split: str, scenes: Sequence[int] | None = None) -> tuple[Scene, .
             "lerobot-wmrl-record --list_scenes=true shows them",
         )
     return tuple(members[index] for index in scenes)
+
+
+def with_meshes(scenes: Sequence[Scene], meshes: Mapping[str, ObjectSpec]) -> tuple[Scene, ...]:
+    """Return scenes with a user's meshes in place of the objects that are named like them."""
+    return tuple(replace(scene, mesh=meshes.get(scene.object)) for scene in scenes)
 
 
 def scene_for_seed(scenes: Sequence[Scene], seed: int) -> Scene:

@@ -5,7 +5,7 @@ Every object and container of the scenes is built once. Only the active scene's 
 others are parked out of sight. Changing the scene therefore costs nothing, where rebuilding it would cost
 most of a second."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -20,7 +20,7 @@ from lerobot_wmrl.maniskill.backend import render_backend
 from lerobot_wmrl.maniskill.cameras import VIEWS, Rendering
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW, FPS
 from lerobot_wmrl.maniskill.episode import WORKSPACE_FLOOR, Episode, Frame
-from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS
+from lerobot_wmrl.maniskill.objects import CONTAINERS, ObjectSpec
 from lerobot_wmrl.maniskill.rendering import AMBIENT, SUN, SUN_DIRECTION, Variation, camera_config
 from lerobot_wmrl.maniskill.robot import (
     BASE_POSITION,
@@ -67,7 +67,7 @@ class TabletopEnv(BaseEnv):
         sim_backend: str = "physx_cpu",
         **kwargs: Any,
     ) -> None:
-        self.scenes, self.rendering = tuple(scenes), rendering
+        self.scenes, self.rendering = {scene.index: scene for scene in scenes}, rendering
         super().__init__(
             num_envs=num_envs, obs_mode="none", reward_mode="none", control_mode=CONTROL_MODE,
             robot_uids=BaseAxesPanda.uid, sim_backend=sim_backend, **kwargs,
@@ -88,10 +88,12 @@ class TabletopEnv(BaseEnv):
             lighten_meshes(self.agent.robot, self.rendering.robot_mesh_detail)
 
     def _load_scene(self, options: dict) -> None:
-        names = {kind: _names(self.scenes, kind) for kind in ("object", "container", "table")}
-        self.parking = self.parking_places(names["object"], [*names["container"], *names["table"], CARPET])
+        names = {kind: _names(self.scenes.values(), kind) for kind in ("object", "container", "table")}
+        specs = {scene.object: scene.object_spec for scene in self.scenes.values()}
+        movable = [specs[name] for name in names["object"]]
+        self.parking = self.parking_places(movable, [*names["container"], *names["table"], CARPET])
         places, scene = self.parking, self.scene
-        self.objects = {n: build_object(scene, OBJECTS[n], places[n]) for n in names["object"]}
+        self.objects = {spec.name: build_object(scene, spec, places[spec.name]) for spec in movable}
         self.containers = {n: build_container(scene, CONTAINERS[n], places[n]) for n in names["container"]}
         self.carpets = {CARPET: build_carpet(scene, places[CARPET])}
         self.tables = {n: build_table(scene, n, places[n]) for n in names["table"]}
@@ -100,14 +102,14 @@ class TabletopEnv(BaseEnv):
                 body.set_angular_damping(ANGULAR_DAMPING)
         self.inverse_kinematics = InverseKinematics(self.agent)
 
-    def parking_places(self, movable: Sequence[str], fixed: Sequence[str]) -> dict[str, sapien.Pose]:
+    def parking_places(self, movable: Sequence[ObjectSpec], fixed: Sequence[str]) -> dict[str, sapien.Pose]:
         """Return where each thing is while no episode needs it.
 
         Args:
-            movable: names of the objects.
+            movable: the objects.
             fixed: names of what never moves by itself: containers, tables, the mat.
         """
-        names = [*movable, *fixed]
+        names = [*(spec.name for spec in movable), *fixed]
         return {
             name: sapien.Pose(p=[PARKING[0], PARKING[1] + 3.0 * index, PARKING[2]])
             for index, name in enumerate(names)
@@ -144,7 +146,7 @@ class TabletopEnv(BaseEnv):
 
 def arrangement(scene: Scene, start: Start) -> dict[str, sapien.Pose]:
     """Return the poses of the table and of what stands on it, by name."""
-    height = OBJECTS[scene.object].half_size[2]
+    height = scene.object_spec.half_size[2]
     places = {
         scene.table: sapien.Pose(p=TABLE_POSITION),
         scene.container: sapien.Pose(p=[*start.container_xy, 0.0]),
@@ -155,7 +157,7 @@ def arrangement(scene: Scene, start: Start) -> dict[str, sapien.Pose]:
     return places
 
 
-def _names(scenes: Sequence[Scene], field: str) -> list[str]:
+def _names(scenes: Iterable[Scene], field: str) -> list[str]:
     return sorted({getattr(scene, field) for scene in scenes})
 
 
@@ -181,7 +183,7 @@ class Simulation:
 
     Args:
         task: defines starts, success and reward; another task may be set before a reset.
-        scenes: the scenes that may be asked for.
+        scenes: the scenes that may be asked for, with a user's meshes if there are any.
         rendering: which pictures are taken.
     """
 
@@ -196,8 +198,8 @@ class Simulation:
 
     def reset(self, scene: Scene, seed: int) -> Frame:
         """Set up the start of (task, scene, seed). The same arguments give the same frame."""
-        self.episode = Episode(self.task, scene, seed)
-        self.env.place(scene, self.episode.start)
+        self.episode = Episode(self.task, self.env.scenes[scene.index], seed)
+        self.env.place(self.episode.scene, self.episode.start)
         self.variation.draw(seed, self.task.index, scene.index)
         self.episode.begin(self.object_position)
         return self._frame()

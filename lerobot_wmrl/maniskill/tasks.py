@@ -12,7 +12,7 @@ import numpy as np
 
 from lerobot_wmrl.common.constants import TASKS as TASK_NAMES
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS, ContainerSpec, ObjectSpec
+from lerobot_wmrl.maniskill.objects import ContainerSpec, ObjectSpec
 from lerobot_wmrl.maniskill.scenes import Scene
 
 SCENERY_XY: Final = (0.02, -0.19)
@@ -116,9 +116,7 @@ class Task(ABC):
         """Return the start of (task, scene, seed). The same arguments give the same start."""
         rng = np.random.default_rng((seed, self.index, scene.index))
         template = self.templates[rng.integers(len(self.templates))]
-        instruction = template.format(
-            object=OBJECTS[scene.object].label, container=CONTAINERS[scene.container].label
-        )
+        instruction = template.format(object=scene.object_spec.label, container=scene.container_spec.label)
         return self.sample_start(rng, instruction)
 
     @abstractmethod

@@ -1,6 +1,5 @@
 """A user's mesh in place of an object: as big as it is, called what it is called, or refused with reasons."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -8,20 +7,18 @@ import pytest
 import trimesh
 
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
-from lerobot_wmrl.maniskill.objects import BUILT_IN, OBJECTS, read_assets
+from lerobot_wmrl.maniskill.objects import read_assets
 from lerobot_wmrl.maniskill.scenes import SCENES
 
 
 @pytest.fixture
-def assets(tmp_path: Path) -> Iterator[Path]:
+def assets(tmp_path: Path) -> Path:
     """A file that replaces the lemon by a capsule whose units are millimetres and whose origin is its end."""
     capsule = trimesh.creation.capsule(height=30.0, radius=20.0)
     capsule.apply_translation((100.0, 0.0, 0.0))
     capsule.export(tmp_path / "capsule.obj")
     (tmp_path / "assets.yaml").write_text("lemon: {mesh: capsule.obj, label: shiny capsule, scale: 0.001}\n")
-    before = dict(OBJECTS)
-    yield tmp_path / "assets.yaml"
-    OBJECTS.update(before)
+    return tmp_path / "assets.yaml"
 
 
 def test_a_mesh_takes_the_place_of_an_object(assets: Path) -> None:
@@ -30,15 +27,19 @@ def test_a_mesh_takes_the_place_of_an_object(assets: Path) -> None:
     try:
         simulation.reset(scene, 0)
         assert "shiny capsule" in simulation.instruction
-        assert OBJECTS["lemon"].half_size == pytest.approx((0.02, 0.02, 0.035), abs=1e-4)
+        assert simulation.episode.scene.object_spec.half_size == pytest.approx((0.02, 0.02, 0.035), abs=1e-4)
         resting = [simulation.step(np.zeros(7)) for _ in range(10)]
         assert resting[-1].images["third_view"].std() > 5
         assert simulation.object_position[2] == pytest.approx(0.035, abs=0.005)
         np.testing.assert_allclose(simulation.object_position, simulation.episode.object_start, atol=0.01)
+        beside = WmrlManiSkillEnv(scenes=[scene.index], image_size=64).create_simulation()
+        beside.reset(scene, 0)
+        assert "lemon" in beside.instruction, "an environment without the mesh is not changed by it"
+        beside.close()
+        simulation.reset(scene, 1)
+        assert "shiny capsule" in simulation.instruction
     finally:
         simulation.close()
-    WmrlManiSkillEnv(scenes=[scene.index], image_size=64).create_simulation().close()
-    assert OBJECTS == BUILT_IN, "they are not those of the next environment"
 
 
 @pytest.mark.parametrize(

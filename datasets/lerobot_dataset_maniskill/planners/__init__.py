@@ -9,7 +9,7 @@ from lerobot_dataset_maniskill.planners.follower import Follower, Plan
 from lerobot_dataset_maniskill.planners.grasp import MoveToAimPlanner, PickPlacePlanner
 from lerobot_dataset_maniskill.planners.kinds import TASK_KINDS, Planner
 from lerobot_dataset_maniskill.planners.slide import PullPlanner, PushPlanner
-from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS, ContainerSpec, ObjectSpec
+from lerobot_wmrl.maniskill.objects import ContainerSpec, ObjectSpec
 from lerobot_wmrl.maniskill.scenes import Scene
 from lerobot_wmrl.maniskill.tasks import Start
 
@@ -62,6 +62,6 @@ def follow_plan(
         rng: source of the plan's and the actions' randomness.
         motion: how the gripper gets from one waypoint to the next.
     """
-    setting = OBJECTS[scene.object], CONTAINERS[scene.container], start
+    setting = scene.object_spec, scene.container_spec, start
     plan = PLANNERS[task](*setting).plan(kind, rng)
     return Follower(motion(plan, *setting), rng)
