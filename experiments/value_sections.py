@@ -227,8 +227,8 @@ def aims(found: Groups) -> str:
     known, unseen = (f"{100 * rate:.0f}" for rate in AIMED_SUCCESS)
     return f"""We had aimed at {100 * AIMED_GAIN:.0f} points more than the best method without a world model,
 in known and in unseen scenes, with two of three numbers of demonstrations. It is so with {listed(above)}
-alone, and less certain against longer BC. With more of either, less is left to gain: the best method
-without one reaches up to
+alone, where the best of those is BC trained for longer, which was not run with every budget. With more
+demonstrations or rollouts, less is left to gain: the best method without one reaches up to
 {100 * most:.0f} % in known scenes. Of the planner distilled after PPO we had expected {known} and {unseen} %
 within 30 minutes. It reaches both rates with {listed(planner)}."""
 
@@ -377,7 +377,7 @@ def trained_longer(found: Groups) -> str:
         return ""
     which = listed([
         f"{spoken(group)}, seed{'s' if len(cells) > 1 else ''} "
-        + " and ".join(str(cell["seed"]) for cell in cells)
+        + ", ".join(str(cell["seed"]) for cell in cells)
         for group, cells in longer.items()
     ])  # fmt: skip
     rises = [
