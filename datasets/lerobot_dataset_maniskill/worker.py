@@ -77,6 +77,7 @@ class PolicyDriver:
         self.policy: Any = load_policy(config).eval()
         self.preprocess, self.postprocess = load_processors(config)
         self.exploration = exploration
+        self.clipped: list[float] = []
 
     def begin(self, simulation: "Simulation", plan: EpisodePlan) -> None:
         torch.manual_seed(plan.seed)
