@@ -39,14 +39,14 @@ COMPARED: Final = (
 LIMITS: Final = """\
 The world model is not told the task: it knows it if the first frame shows it. The done threshold was chosen
 on these held-out rollouts of seed 0: a first run of PPO with 0.9, at which no success of pick_place and
-move_to_aim is recognised, was ended unmeasured. The world models and the longer and filtered BC learnt on a
-GPU, where the frames came compressed as video (H.264, 4:4:4), but seed 0's longer BC: what that changes of
-the filtered policy's actions is 7 % of their error. With seed 0, BC was trained longer after a first
-comparison without it, in which PPO began from the BC of 5,000 steps: 88 and 78 % in known and unseen scenes
-of push, 73 and 70 of pull, 64 and 44 of pick_place, 78 and 78 of move_to_aim, 76 and 67 of all
-(docs/results of commit 1e99306). From the better policy PPO ends no higher on average, and 20 points lower
-in pick_place; in training, imagined success ends at 67 % in both runs. Not compared: weighted BC, RECAP,
-iterated BC and planning."""
+move_to_aim is recognised, was ended unmeasured. The world model and filtered BC learnt on a GPU, where the
+frames came compressed as video (H.264, 4:4:4): what that changes of the filtered policy's actions is 7 % of
+their error. With seed 0, BC was trained longer after a first comparison without it, in which PPO began from
+the BC of 5,000 steps: 88 and 78 % in known and unseen scenes of push, 73 and 70 of pull, 64 and 44 of
+pick_place, 78 and 78 of move_to_aim, 76 and 67 of all (docs/results of commit 1e99306). From the better
+policy PPO ends no higher on average, and 20 points lower in pick_place; in training, imagined success ends
+at 67 % in both runs. Not compared: filtered BC for more than 8,000 steps where the table has no column of
+it, weighted BC, RECAP, iterated BC and planning."""
 """What the section says of its limits."""
 
 
