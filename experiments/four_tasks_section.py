@@ -134,7 +134,7 @@ def of_tasks(cell: Cell, tasks: Sequence[str]) -> Cell:
         }
         for method in cell["minutes"]
     }
-    return {"seed": cell["seed"], "methods": methods}
+    return {"methods": methods}
 
 
 def gain_over(cells: Sequence[Cell], method: str, others: Sequence[str], domain: str) -> str:

@@ -96,9 +96,9 @@ class ImaginedPartRecorder:
         """Return actions (B, 7) inside the action box, and the shares of the policy's that were not (B,)."""
         chosen = self.policy.select_action(self.pipeline.prepare(observation))
         given = self.pipeline.to_action(chosen).cpu()
-        action = given.numpy().copy()
+        shares, action = out_of_range(given), given.numpy()
         action[: len(noises), :3] += np.stack([noise() for noise in noises])
-        return np.clip(action, ACTION_LOW, ACTION_HIGH).astype(np.float32), out_of_range(given)
+        return np.clip(action, ACTION_LOW, ACTION_HIGH).astype(np.float32), shares
 
     def _frames(self, observation: dict[str, Any], reward: Tensor) -> list[Frame]:
         """Return what each environment shows, in the simulator's form, as if it were no success."""

@@ -43,7 +43,7 @@ class Driver(Protocol):
     """Chooses the actions of an episode: (7,) float32, inside the action box."""
 
     clipped: list[float]
-    """Of each step of the episode, the share of the action's components that were brought into the box."""
+    """Of each step of the episode, the share of the components that were out of the box before any noise."""
 
     def begin(self, simulation: "Simulation", plan: EpisodePlan) -> None:
         """Prepare for an episode that has just been reset."""
