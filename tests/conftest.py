@@ -1,6 +1,7 @@
 """What several test packages need: a small LeRobotDataset made without the simulator."""
 
 import json
+import logging
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -20,6 +21,13 @@ def ordinary_priority() -> None:
     """Give up the real-time priority that SVT-AV1 gives the thread in which root encodes a video: processes
     that a test starts would have it too, and keep all others from running."""
     give_up_priority()
+
+
+@pytest.fixture(autouse=True)
+def ordinary_log_level() -> None:
+    """Log from INFO on, whatever a test before has set: LeRobot's commands let every library's DEBUG lines through,
+    and a test that looks for words in the log would find theirs."""
+    logging.getLogger().setLevel(logging.INFO)
 
 
 def give_up_priority() -> None:
