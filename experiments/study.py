@@ -254,8 +254,9 @@ def repeated(entry: Mapping[str, Any], variables: Mapping[str, Any]) -> list[Ste
 
 def fill(text: str, variables: Mapping[str, Any]) -> str:
     """Replace every `$name`. ValueError names one that is not known."""
+    template = Template(text)
     try:
-        return Template(text).substitute({name: as_text(value) for name, value in variables.items()})
+        return template.substitute({name: as_text(variables[name]) for name in template.get_identifiers()})
     except KeyError as error:
         raise ValueError(f"${error.args[0]} in {text!r}: there is no such variable") from None
 

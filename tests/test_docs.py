@@ -124,6 +124,13 @@ def test_the_readme_says_what_was_measured() -> None:
         ]
         shares = ([each[domain]["share"] for each in found] for domain in ("ind", "ood"))
         assert f"{'/'.join(f'{100 * np.mean(each):.0f}' for each in shares)} with {demonstrations}" in text
+    pick_place = [json.loads(path.read_text()) for path in (results / "value_pick_place").glob("*.json")]
+    assert {cell["demonstrations"] for cell in pick_place} == {50}
+    better, worse = (
+        best_success(pick_place, methods, "ind") for methods in (("imagined_ppo",), ("filtered",))
+    )
+    assert best_success(pick_place, BASELINES, "ind") == worse
+    assert f"PPO gained {better - worse} points in known scenes" in text
     driven = [json.loads(path.read_text()) for path in (results / "driven").glob("*.json")]
     optimal = [cell["methods"]["optimal_cloning"] for cell in driven]
     shares = ([each[domain]["share"] for each in optimal] for domain in ("ind", "ood"))

@@ -5,6 +5,7 @@ import shlex
 import sys
 import tomllib
 from contextlib import suppress
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,12 @@ LEROBOT: dict[str, type[Any]] = {
 }
 SHELL = {"cp", "ln", "source", "pip", "make", "hf", "apt", ".uv/bin/uv"}
 
+PATH = re.compile(r"[^=,\[]*/[^,\]]*")
+PARSED: set[tuple[str, ...]] = set()
+"""Commands that programs take, without their numbers and paths."""
+
+registered = cache(register_third_party_plugins)
+
 
 class Stopped(BaseException):
     """A command has said how it parses its flags."""
@@ -56,9 +63,18 @@ def words_of(command: str) -> list[str]:
 def check(command: str) -> None:
     """Raise an error if the program of a command would not take its flags.
 
-    Checkpoints need not be there: nothing looks into its world model here.
+    Checkpoints need not be there: nothing looks into its world model here. Parsing takes long: of commands that
+    differ in numbers and paths alone, one is parsed.
     """
-    program, *flags = (word for word in words_of(command) if word != "--help")
+    words = words_of(command)
+    without_numbers = tuple(re.sub(r"\d+(\.\d+)?(e-?\d+)?", "0", PATH.sub("/", word)) for word in words)
+    if without_numbers not in PARSED:
+        parse(words)
+        PARSED.add(without_numbers)
+
+
+def parse(words: list[str]) -> None:
+    program, *flags = (word for word in words if word != "--help")
     unseen = {"__post_init__": lambda self: None}
     with patch.multiple(WorldModelEnv, **unseen), patch.multiple(EmbeddingConfig, **unseen):
         if program == "torchrun":
@@ -69,7 +85,7 @@ def check(command: str) -> None:
         elif program in SCRIPTS:
             check_ours(SCRIPTS[program].partition(":")[0], flags)
         elif program in LEROBOT:
-            register_third_party_plugins()
+            registered()
             for name, package in parse_plugin_args(PLUGIN_DISCOVERY_SUFFIX, flags).items():
                 load_plugin(package)
                 flags = filter_arg(name, flags)
