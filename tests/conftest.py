@@ -25,8 +25,8 @@ def ordinary_priority() -> None:
 
 @pytest.fixture(autouse=True)
 def ordinary_log_level() -> None:
-    """Log from INFO on, whatever a test before has set: LeRobot's commands let every library's DEBUG lines through,
-    and a test that looks for words in the log would find theirs."""
+    """Log from INFO on, whatever a test before has set: LeRobot's commands let every library's DEBUG lines
+    through, and a test that looks for words in the log would find theirs."""
     logging.getLogger().setLevel(logging.INFO)
 
 

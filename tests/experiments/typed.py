@@ -63,8 +63,8 @@ def words_of(command: str) -> list[str]:
 def check(command: str) -> None:
     """Raise an error if the program of a command would not take its flags.
 
-    Checkpoints need not be there: nothing looks into its world model here. Parsing takes long: of commands that
-    differ in numbers and paths alone, one is parsed.
+    Checkpoints need not be there: nothing looks into its world model here. Parsing takes long: of commands
+    that differ in numbers and paths alone, one is parsed.
     """
     words = words_of(command)
     without_numbers = tuple(re.sub(r"\d+(\.\d+)?(e-?\d+)?", "0", PATH.sub("/", word)) for word in words)
