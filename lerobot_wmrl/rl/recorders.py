@@ -1,5 +1,6 @@
 """Recording what a policy does outside the world model, for the gate and for Dyna rounds."""
 
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -27,7 +28,7 @@ from lerobot_wmrl.common.policies import load_policy, load_processors, read_poli
 from lerobot_wmrl.common.presets import Flags, format_flags
 from lerobot_wmrl.common.processes import run_subcommand
 from lerobot_wmrl.data.budget import Ledger, budget_flags, spending
-from lerobot_wmrl.data.embodiment import Embodiment, read_embodiment, recorded_range
+from lerobot_wmrl.data.embodiment import Embodiment, observed_range, read_embodiment, recorded_range
 from lerobot_wmrl.data.episodes import open_dataset, read_episodes
 from lerobot_wmrl.data.features import encoder_of, episode_features, matched, observation_row
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
@@ -156,6 +157,7 @@ class RolloutRecorder:
             for each in self.envs:
                 each.set_attr(FRAME_LIMIT, min(max_frames, each.get_attr(FRAME_LIMIT)[0]))
         self.robot = robot or robot_of(env, self.envs[0], like)
+        self.range_is_guessed = robot is None and like is None and not isinstance(env, WorldModelEnv)
         if like is not None and like_columns and like.fps != env.fps:
             raise FieldError(
                 "like.root", like.root, f"has {like.fps} frames a second, the environment {env.fps}",
@@ -187,6 +189,11 @@ class RolloutRecorder:
             assert dataset is not None, "there is no seed"
             dataset.finalize()
         warn_of_clipped(clipped)
+        if any(clipped) and self.range_is_guessed:
+            logging.warning(
+                "the range is that of the action space of %s; if the environment takes more, record again "
+                "with `like.root`, a dataset of the same robot whose actions show it", self.config.type,
+            )  # fmt: skip
 
     def _batches(self, seeds: Sequence[int]) -> Iterator[tuple[Any, Sequence[int]]]:
         """Yield the environments of a task, and the seeds of the next episodes in them."""
@@ -259,7 +266,9 @@ def robot_of(config: EnvConfig, env: Any, like: Any | None) -> Embodiment:
         config: the environment's.
         env: the environment.
         like: metadata of a dataset of the same robot, whose names are taken, and whose range if it states
-            one; without it, the range is that of the environment's action space, and numbers are the names.
+            one. Else the range is that of the environment's action space, widened to the actions in `like`:
+            an environment may take more than its space says, as LeRobot's Aloha does (joint angles, "from -1
+            to 1"). Without `like`, numbers are the names.
 
     Raises:
         FieldError: the actions of both have other numbers of components, or neither says how large they are.
@@ -276,10 +285,16 @@ def robot_of(config: EnvConfig, env: Any, like: Any | None) -> Embodiment:
                 "like.root", like.root, f"its actions have {count} components, the environment's {len(low)}",
                 "give a dataset of the same robot",
             )  # fmt: skip
-        stated = recorded_range(like.features[ACTION]) is not None
-        return read_embodiment(
-            like, Embodiment() if stated or not bounded else Embodiment(action_low=low, action_high=high)
-        )
+        if recorded_range(like.features[ACTION]) is not None or not bounded:
+            return read_embodiment(like, Embodiment())
+        shown = observed_range(like)
+        widest = np.minimum(low, shown[0]).tolist(), np.maximum(high, shown[1]).tolist()
+        if widest != (low, high):
+            logging.warning(
+                "%s says that its actions are from %s to %s; those of the dataset go beyond, and so may the "
+                "policy's", config.type, low, high,
+            )  # fmt: skip
+        return read_embodiment(like, Embodiment(action_low=widest[0], action_high=widest[1]))
     if not bounded:
         raise FieldError(
             "env.type", config.type, "does not say between which values its actions are",

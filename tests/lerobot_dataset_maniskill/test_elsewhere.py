@@ -199,9 +199,14 @@ def test_an_interrupted_recording_continues_and_a_whole_one_is_left_alone(
         record_elsewhere(config)
 
 
-def test_without_demonstrations_the_environment_says_what_the_actions_are(config: RecordConfig) -> None:
+def test_without_demonstrations_the_environment_says_what_the_actions_are(
+    config: RecordConfig, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    far = save_untrained_policy(tmp_path / "far", OBS_IMAGE, size=96, actions=2, constant=600.0)
+    config.policy = read_policy_config(str(far), [])
     config.like, config.video = DatasetSource(), False
     record_elsewhere(config)
+    assert "the range is that of the action space of pusht; if the environment takes more" in caplog.text
     features = open_dataset(config.root).features
     assert features["action"]["info"] == {"low": [0.0, 0.0], "high": [512.0, 512.0]}
     assert features[OBS_IMAGE]["dtype"] == "image"

@@ -3,9 +3,12 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from gymnasium.spaces import Box
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import PushtEnv
 from lerobot.utils.constants import OBS_IMAGE
 
@@ -13,7 +16,7 @@ from lerobot_wmrl.common.constants import KINDS, POLICY, START_KIND
 from lerobot_wmrl.data.embodiment import Embodiment, check_same_robot
 from lerobot_wmrl.data.episodes import EpisodeTable, open_dataset, read_episodes
 from lerobot_wmrl.evaluation.agreement import policy_outcomes
-from lerobot_wmrl.rl.recorders import EnvRecorder
+from lerobot_wmrl.rl.recorders import EnvRecorder, robot_of
 from tests.rl.checkpoints import save_untrained_policy
 
 STEPS, AIM = 5, 250.0
@@ -70,6 +73,25 @@ def test_what_the_policy_does_out_of_range_is_reported_and_noise_is_not(
     narrow = replace(ROBOT, action_high=[512.0, AIM - 1])
     EnvRecorder(PushtEnv(episode_length=STEPS), narrow, "cpu").record(checkpoint, 1, 7, tmp_path / "narrow")
     assert "50.0 % of the components of the policy's actions were out of range" in caplog.text
+
+
+def test_actions_may_go_as_far_as_those_of_the_same_robots_dataset(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """LeRobot's Aloha takes joint angles, and says that they are from -1 to 1."""
+    features = {"action": {"dtype": "float32", "shape": (2,), "names": ["elbow", "gripper"]}}
+    dataset = LeRobotDataset.create("local/joints", 50, features, root=tmp_path / "joints")
+    for elbow in np.linspace(-0.5, 1.16, 20, dtype=np.float32):
+        dataset.add_frame({"action": np.array([elbow, 0], np.float32), "task": "insert"})
+    dataset.save_episode()
+    dataset.finalize()
+    env = SimpleNamespace(single_action_space=Box(-1, 1, (2,)))
+    robot = robot_of(PushtEnv(), env, dataset.meta)
+    assert robot.action_names == ["elbow", "gripper"]
+    assert (robot.action_low, robot.action_high) == ([-1, -1], [pytest.approx(1.16), 1])
+    assert "those of the dataset go beyond" in caplog.text
+    dataset.meta.features["action"]["info"] = {"low": [-2.0, 0.0], "high": [2.0, 1.0]}
+    assert robot_of(PushtEnv(), env, dataset.meta).action_high == [2, 1], "what it states goes before both"
 
 
 def test_what_is_recorded_is_not_recorded_again_and_is_entered_in_the_ledger(
