@@ -9,9 +9,9 @@ from typing import Any, Final
 import numpy as np
 import pyarrow.compute
 import pyarrow.dataset
-from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.datasets.io_utils import load_info
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.datasets.utils import BackwardCompatibilityError
+from lerobot.datasets.utils import EPISODES_DIR, BackwardCompatibilityError
 from lerobot.utils.constants import ACTION, DONE, OBS_IMAGE, OBS_IMAGES, OBS_STATE
 from numpy.typing import ArrayLike
 
@@ -203,7 +203,7 @@ def open_dataset(root: str | Path, repo_id: str | None = None) -> LeRobotDataset
         )
     name = repo_id or Path(root).name
     try:
-        missing = missing_files(LeRobotDatasetMetadata(name, root=root))
+        missing = missing_files(Path(root))
         if not missing:
             return LeRobotDataset(name, root=root, video_backend=VIDEO_BACKEND)
     except OLDER_FORMAT as error:
@@ -250,13 +250,27 @@ def older_format(field: str, value: object, repo_id: str, root: str | Path) -> F
     )  # fmt: skip
 
 
-def missing_files(meta: LeRobotDatasetMetadata) -> list[Path]:
-    """Return files that the metadata names and that are not there; LeRobot would ask the hub for them."""
-    named = set()
-    for episode in range(meta.total_episodes):
-        named.add(meta.get_data_file_path(episode))
-        named.update(meta.get_video_file_path(episode, key) for key in meta.video_keys)
-    return sorted(path for path in named if not (Path(meta.root) / path).is_file())
+def missing_files(root: Path) -> list[Path]:
+    """Return files that the table of episodes names and that are not there; LeRobot would ask the hub for
+    them.
+
+    The table is read without LeRobot's metadata, which takes as long to open as the whole dataset, and looks
+    each path up by itself. Where there is no table, LeRobot says why: the dataset's version is older.
+    """
+    if not (root / EPISODES_DIR).is_dir():
+        return []
+    info, named = load_info(root), set[Path]()
+    files = [("data", info.data_path)]
+    for key, feature in info.features.items():
+        if feature["dtype"] == "video":
+            files.append((f"videos/{key}", str(info.video_path)))
+    table = pyarrow.dataset.dataset(root / EPISODES_DIR, format="parquet")
+    for kind, pattern in files:
+        places = table.to_table([f"{kind}/chunk_index", f"{kind}/file_index"]).to_pydict().values()
+        for chunk, file in set(zip(*places, strict=True)):
+            key = kind.removeprefix("videos/")
+            named.add(Path(pattern.format(video_key=key, chunk_index=chunk, file_index=file)))
+    return sorted(path for path in named if not (root / path).is_file())
 
 
 def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
