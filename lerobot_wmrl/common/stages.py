@@ -18,6 +18,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
@@ -217,6 +218,17 @@ def entry_point(program: str) -> Callable[[], int | None]:
     if not found:
         raise not_installed(program)
     return next(iter(found)).load()
+
+
+def in_fork[**P, T](function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+    """Call a function in a fork of this process, and return or raise what it does; all of it is pickled.
+
+    What it leaves in libraries ends with the fork: once a process has rendered with OpenGL, as MuJoCo does,
+    stages that render wait for ever.
+    """
+    context = multiprocessing.get_context("fork")
+    with ProcessPoolExecutor(1, mp_context=context, initializer=own_progress_lock) as fork:
+        return fork.submit(function, *args, **kwargs).result()
 
 
 def run_measured(command: Sequence[str], log: Path, progress: Progress) -> int:

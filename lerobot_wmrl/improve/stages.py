@@ -24,7 +24,7 @@ from lerobot_wmrl.common.errors import STOPPED
 from lerobot_wmrl.common.lerobot_commands import edit_command, env_flags, merge_command, train_command
 from lerobot_wmrl.common.policies import check_units, load_processors
 from lerobot_wmrl.common.presets import Flags, format_flags
-from lerobot_wmrl.common.stages import FAILED, Stage, never, read_record
+from lerobot_wmrl.common.stages import FAILED, Stage, in_fork, never, read_record
 from lerobot_wmrl.data.embodiment import Embodiment, read_embodiment
 from lerobot_wmrl.data.episodes import SUCCESS, ChosenEpisodes, DatasetSource, EpisodeTable, read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
@@ -109,7 +109,7 @@ class Improvement:
             torch.tensor(robot.action_low), torch.tensor(robot.action_high), "the dataset",
         )  # fmt: skip
         if config.real_env is not None:
-            check_real_env(config.policy, config.real_env)
+            in_fork(check_real_env, config.policy, config.real_env)  # stages are forks that render too
         return cls(config, found)
 
     def stages(self) -> list[Stage]:

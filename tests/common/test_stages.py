@@ -14,11 +14,13 @@ import pytest
 
 from lerobot_wmrl.common import stages as runner
 from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.stages import (
     Stage,
     StageError,
     claimed,
     entry_point,
+    in_fork,
     read_record,
     run_measured,
     run_stages,
@@ -212,6 +214,19 @@ def test_with_cuda_a_stage_is_a_fresh_program(tmp_path: Path, monkeypatch: pytes
     code = "import os, sys; print('torch' in sys.modules, os.getsid(0) == os.getpid()); sys.exit(3)"
     assert run_measured(["python", "-c", code], log, lambda *_: None) == 3
     assert log.read_text().split() == ["False", "True"]
+
+
+def fork_or_fail(field: str | None) -> int:
+    if field is not None:
+        raise FieldError(field, 3, "is odd", "give 4")
+    return os.getpid()
+
+
+def test_what_a_fork_of_the_command_looks_at_is_returned_or_raised() -> None:
+    """Nothing of it stays in the process that stages are forked from."""
+    assert in_fork(fork_or_fail, None) != os.getpid()
+    with pytest.raises(FieldError, match=r"^seed=3: is odd; give 4$"):
+        in_fork(fork_or_fail, "seed")
 
 
 def test_a_command_that_is_not_installed_is_named() -> None:

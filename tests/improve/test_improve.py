@@ -1,6 +1,7 @@
 """The whole command on data that is not ours: PushT, at the size `tiny`."""
 
 import json
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -22,6 +23,7 @@ from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_wmrl.common.command_line import run_command
 from lerobot_wmrl.common.errors import STOPPED
 from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.common.presets import preset_settings
 from lerobot_wmrl.common.stages import claimed
 from lerobot_wmrl.common.tracking import read_metrics
@@ -30,7 +32,7 @@ from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.improve import stages
 from lerobot_wmrl.improve.configuration_improve import ImproveConfig
 from lerobot_wmrl.improve.findings import few_decisions
-from lerobot_wmrl.improve.stages import CLONED, DISTILLED, FITTED, PPO, SFT
+from lerobot_wmrl.improve.stages import CLONED, DISTILLED, FITTED, PPO, SFT, Improvement
 from lerobot_wmrl.scripts import train
 from lerobot_wmrl.scripts.improve import improve, settings
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
@@ -238,6 +240,28 @@ def test_no_start_is_imagined_twice_where_one_task_has_few(
     two = replace(table, columns={**table.columns, "start.task": np.array([0, 0, 0, 0, 1, 1])})
     monkeypatch.setattr(type(improvement), "learnt", lambda self: two)
     assert "--n_episodes=1" in improvement.compare(tmp_path, improvement.imagination(), 256)
+
+
+def note_process(policy: PreTrainedConfig, env: EnvConfig) -> None:
+    Path("process").write_text(str(os.getpid()))
+
+
+def test_nothing_is_rendered_in_the_process_that_stages_are_forked_from(
+    demonstrations: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With OpenGL, which MuJoCo renders with, a stage that renders would wait for ever."""
+    monkeypatch.setattr(stages, "check_real_env", note_process)
+    monkeypatch.chdir(tmp_path)
+    policy = save_untrained_policy(tmp_path / "policy", OBS_IMAGE, size=96, actions=2)
+    Improvement.of(
+        ImproveConfig(
+            policy=read_policy_config(str(policy), []),
+            dataset=ChosenEpisodes(str(demonstrations)),
+            real_env=PushtEnv(),
+            output_dir=tmp_path / "improve",
+        )
+    )
+    assert int(Path("process").read_text()) != os.getpid()
 
 
 def test_another_round_does_not_double_the_frames_of_a_rollout(tmp_path: Path) -> None:
