@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,10 +36,10 @@ from lerobot_wmrl.improve.stages import Improvement
 from lerobot_wmrl.rl.algorithm import frozen_copy
 from lerobot_wmrl.scripts.convert_openvla import ConvertOpenVLAConfig, convert
 from lerobot_wmrl.scripts.train import main
+from tests.commands import run_here
 from tests.lerobot_policy_openvla.small import observe, small_policy
 from tests.rl.point_env import PointEnv
 
-BIN = Path(sys.executable).parent
 ADAPTERS = "adapter_model.safetensors"
 SHORT = [
     "--algorithm.type=ppo", "--num_envs=2", "--iterations=3", "--save_freq=1",
@@ -62,11 +61,6 @@ class SevenPointsConfig(EnvConfig):
         env = PointEnv(n_envs, horizon=4, image_size=32)
         env.single_action_space = gym.spaces.Box(-0.1, 0.1, (7,), np.float32)
         return env
-
-
-def run(program: str, *flags: str) -> None:
-    result = subprocess.run([BIN / program, *flags], capture_output=True, text=True)
-    assert result.returncode == 0, result.stderr[-3000:]
 
 
 def improve(
@@ -106,7 +100,7 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def tuned(base: Path, small_dataset: LeRobotDataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The output folder of four steps of lerobot-train with LoRA."""
     output_dir = tmp_path_factory.mktemp("tuned") / "sft"
-    run(
+    run_here(
         "lerobot-train", f"--policy.path={base}", "--policy.push_to_hub=false", "--policy.device=cpu",
         "--peft.method_type=LORA", "--peft.r=4", "--peft.lora_alpha=8", "--dataset.repo_id=local/synthetic",
         f"--dataset.root={small_dataset.root}", "--steps=4", "--batch_size=4", "--num_workers=0",
@@ -142,7 +136,7 @@ def test_adapters_are_trained_further_as_the_command_improve_does_it(
     )  # fmt: skip
     found = look(read_episodes(small_dataset), config.policy, None)
     (command,) = (stage.command() for stage in Improvement(config, found).stages() if stage.name == "cloned")
-    run(*command, "--policy.device=cpu", "--steps=2", "--save_freq=2")
+    run_here(*command, "--policy.device=cpu", "--steps=2", "--save_freq=2")
     before, after = (load_file(folder / LAST / ADAPTERS) for folder in (tuned, tmp_path / "cloned"))
     assert after.keys() == before.keys()
     assert any(not torch.equal(after[name], value) for name, value in before.items() if "lora_B" in name)
@@ -168,7 +162,7 @@ def test_improve_reload_and_evaluate(tuned: Path, tmp_path: Path, monkeypatch: p
     assert torch.equal(lerobots.eval().select_action(observe()), improved.select_action(observe()))
     assert torch.equal(lerobots.value(observe()), improved.value(observe()))
     assert not torch.equal(improved.value(observe()), load(tuned).value(observe()))
-    run(
+    run_here(
         "lerobot-eval", f"--policy.path={tmp_path / 'rl' / LAST}", "--env.type=wmrl_maniskill",
         "--env.image_size=32", "--env.episode_length=4", "--eval.n_episodes=1", "--eval.batch_size=1",
         "--seed=1000000", f"--output_dir={tmp_path / 'eval'}",

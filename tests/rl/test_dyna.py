@@ -13,10 +13,12 @@ from safetensors.torch import load_file
 from lerobot_wmrl.data.episodes import DatasetSource
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
+from lerobot_wmrl.rl import dyna
 from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.callbacks import Callbacks
 from lerobot_wmrl.rl.configuration_callbacks import DynaConfig, NewRollouts
 from lerobot_wmrl.rl.dyna import DynaRounds, round_iterations
+from tests.commands import run_here
 
 WEIGHTS = "checkpoints/last/pretrained_model/model.safetensors"
 
@@ -91,9 +93,10 @@ class CopyingRecorder:
 
 
 def test_rounds_build_on_one_another(
-    rounds: DynaRounds, small_dataset: LeRobotDataset, tmp_path: Path
+    rounds: DynaRounds, small_dataset: LeRobotDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each trains the world model of the one before, and learns from what all have recorded."""
+    monkeypatch.setattr(dyna, "run_subcommand", lambda command: run_here(*command))
     recorder: Any = CopyingRecorder(Path(small_dataset.root))
     rounds.recorder, rounds.config.dataset.roots, rounds.config.n_episodes = recorder, None, 5
     for iteration in (3, 6):

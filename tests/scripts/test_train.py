@@ -19,6 +19,7 @@ from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelE
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 from lerobot_wmrl.scripts.train import TrainConfig, check_config, evaluation, main, rollout_length
+from tests.commands import run_here
 from tests.hub_server import Hub
 from tests.rl.checkpoints import save_untrained_policy
 from tests.scripts.point_config import PointConfig
@@ -35,11 +36,6 @@ SHORT = [
 POINT = ["--env.type=test_point"]
 
 
-def run(program: str, *flags: str) -> None:
-    result = subprocess.run([BIN / program, *flags], capture_output=True, text=True)
-    assert result.returncode == 0, result.stderr[-3000:]
-
-
 def improve(monkeypatch: pytest.MonkeyPatch, *flags: str) -> None:
     """The command lerobot-wmrl-train, in this process."""
     monkeypatch.setattr(sys, "argv", ["lerobot-wmrl-train", *flags])
@@ -50,7 +46,7 @@ def improve(monkeypatch: pytest.MonkeyPatch, *flags: str) -> None:
 def cloned(small_dataset: LeRobotDataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The output folder of four steps of lerobot-train."""
     output_dir = tmp_path_factory.mktemp("clone") / "sft"
-    run(
+    run_here(
         "lerobot-train", "--policy.type=cnn", "--policy.push_to_hub=false", "--policy.device=cpu",
         "--dataset.repo_id=local/synthetic", f"--dataset.root={small_dataset.root}", "--steps=4",
         "--batch_size=4", "--num_workers=0", "--env_eval_freq=0", f"--output_dir={output_dir}",
@@ -67,10 +63,10 @@ def test_clone_improve_and_evaluate(cloned: Path, tmp_path: Path, monkeypatch: p
     assert lines[0]["first_ratio_error"] < 1e-3
     assert all(line["episode_length"] <= 4 for line in lines)
     last = output_dir / "checkpoints" / "last" / "pretrained_model"
-    run(
-        "lerobot-eval", f"--policy.path={last}", *SIMULATOR, "--eval.n_episodes=1", "--eval.batch_size=1",
-        "--seed=1000000", f"--output_dir={tmp_path / 'eval'}",
-    )  # fmt: skip
+    flags = [f"--policy.path={last}", *SIMULATOR, "--eval.n_episodes=1", "--eval.batch_size=1"]
+    flags += ["--seed=1000000", f"--output_dir={tmp_path / 'eval'}"]
+    evaluated = subprocess.run([BIN / "lerobot-eval", *flags], capture_output=True, text=True)
+    assert evaluated.returncode == 0, evaluated.stderr[-3000:]
     assert "pc_success" in json.loads((tmp_path / "eval" / "eval_info.json").read_text())["overall"]
 
 
