@@ -4,18 +4,22 @@ import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from gymnasium.spaces import Box
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import PushtEnv
+from lerobot.scripts.lerobot_eval import rollout
 from lerobot.utils.constants import OBS_IMAGE
 
 from lerobot_wmrl.common.constants import KINDS, POLICY, START_KIND
 from lerobot_wmrl.data.embodiment import Embodiment, check_same_robot
 from lerobot_wmrl.data.episodes import EpisodeTable, open_dataset, read_episodes
 from lerobot_wmrl.evaluation.agreement import policy_outcomes
+from lerobot_wmrl.rl import recorders
 from lerobot_wmrl.rl.recorders import EnvRecorder, robot_of
 from tests.rl.checkpoints import save_untrained_policy
 
@@ -73,6 +77,24 @@ def test_what_the_policy_does_out_of_range_is_reported_and_noise_is_not(
     narrow = replace(ROBOT, action_high=[512.0, AIM - 1])
     EnvRecorder(PushtEnv(episode_length=STEPS), narrow, "cpu").record(checkpoint, 1, 7, tmp_path / "narrow")
     assert "50.0 % of the components of the policy's actions were out of range" in caplog.text
+
+
+def test_what_a_policy_does_after_its_episode_is_not_counted(
+    checkpoint: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """LeRobot's rollout goes on until the last environment has ended."""
+
+    def first_ends_early(*given: Any, **settings: Any) -> Any:
+        taken, seen = rollout(*given, **settings), given[4].__self__
+        taken["done"][0, 1] = True
+        seen.clipped = [torch.full((2,), float(step >= 2)) for step in range(STEPS)]
+        return taken
+
+    monkeypatch.setattr(recorders, "rollout", first_ends_early)
+    recorder = EnvRecorder(PushtEnv(episode_length=STEPS), ROBOT, "cpu", num_envs=2)
+    recorder.record(checkpoint, 2, 7, tmp_path / "rollouts")
+    assert read_episodes(open_dataset(tmp_path / "rollouts")).length.tolist() == [2, STEPS]
+    assert "42.9 % of the components" in caplog.text, "three of seven steps"
 
 
 def test_actions_may_go_as_far_as_those_of_the_same_robots_dataset(
