@@ -113,8 +113,8 @@ def test_the_readme_says_what_was_measured() -> None:
         ("value_four_tasks", "imagined_ppo", "PPO in imagination"),
         ("value_four_tasks_simulator", "simulated_ppo", "PPO in ManiSkill"),
     ):
-        (found,) = (results / study).glob("*.json")
-        tasks = json.loads(found.read_text())["tasks"].values()
+        cells = [json.loads(path.read_text()) for path in (results / study).glob("*.json")]
+        tasks = [task for cell in cells for task in cell["tasks"].values()]
         shares = ([task[domain][method]["share"] for task in tasks] for domain in ("ind", "ood"))
         assert f"{'/'.join(f'{100 * np.mean(each):.0f}' for each in shares)} after {words}" in text
     longer = [json.loads(path.read_text()) for path in (results / "value_longer").glob("*.json")]
