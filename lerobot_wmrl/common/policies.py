@@ -103,20 +103,6 @@ def require_trained(config: PreTrainedConfig) -> None:
         )
 
 
-def require_single_observations(config: PreTrainedConfig) -> None:
-    """Raise FieldError for a policy that learns from several observations at once.
-
-    The labels of a planner hold one.
-    """
-    steps = config.observation_delta_indices or [0]
-    if len(steps) > 1:
-        raise FieldError(
-            "policy.path", config.pretrained_path,
-            f"{config.type} learns from {len(steps)} observations at once, and distillation gives it one",
-            "take a policy of single observations, such as act, smolvla or pi0",
-        )  # fmt: skip
-
-
 def require_chunks(config: PreTrainedConfig) -> None:
     """Raise FieldError for an ACT policy whose actions are averages of several chunks."""
     if config.temporal_ensemble_coeff is not None:

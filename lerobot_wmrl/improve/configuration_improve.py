@@ -14,7 +14,6 @@ from lerobot_wmrl.common.errors import FieldError, require_at_least, require_cho
 from lerobot_wmrl.common.policies import (
     read_policy_config,
     require_chunks,
-    require_single_observations,
     require_trained,
 )
 from lerobot_wmrl.common.presets import Flags
@@ -106,8 +105,6 @@ class ImproveConfig(RunConfig):
         if self.policy is None:
             raise FieldError("policy.path", None, "is missing", "give the policy to improve")
         require_trained(self.policy)
-        if self.policy.type not in ALGORITHMS:
-            require_single_observations(self.policy)
         if self.policy.type == "act":
             require_chunks(self.policy)
         if not self.dataset.given:

@@ -38,7 +38,7 @@ class Sizes:
     Args:
         preset: the stages' preset.
         frame_side: the shorter side of the frames that the policy sees, in pixels.
-        pixels: pixels of all its cameras' frames.
+        pixels: pixels of all frames that it learns from at once.
         length: frames of an imagined episode.
     """
 

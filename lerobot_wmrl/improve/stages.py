@@ -300,7 +300,10 @@ class Improvement:
     @property
     def sizes(self) -> Sizes:
         """How large frames, batches and rollouts are."""
-        return Sizes(self.config.preset, self.found.frame_side, self.found.pixels, self.length)
+        assert self.config.policy is not None
+        observations = len(self.config.policy.observation_delta_indices or [0])
+        pixels = self.found.pixels * observations
+        return Sizes(self.config.preset, self.found.frame_side, pixels, self.length)
 
     def _done(self) -> Flags:
         return {"done_threshold": DONE_THRESHOLD, "done_frames": min(DONE_FRAMES, max(1, self.found.held))}

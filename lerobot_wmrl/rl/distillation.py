@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import torch
 from lerobot.rl.algorithms.base import RLAlgorithm
 from lerobot.rl.algorithms.configs import TrainingStats
-from lerobot.utils.constants import OBS_STR
 from torch import Tensor, nn
 from torch.optim import Optimizer
 from tqdm import tqdm
@@ -25,7 +24,14 @@ from lerobot_wmrl.common.policies import load_trained_weights
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
-from lerobot_wmrl.rl.labels import Labels, Part, action_chunks, recorded_successes
+from lerobot_wmrl.rl.labels import (
+    Labels,
+    Part,
+    Windows,
+    action_windows,
+    observation_windows,
+    recorded_successes,
+)
 from lerobot_wmrl.rl.observations import TASK, as_read_back
 from lerobot_wmrl.rl.protocol import Observation, Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer
@@ -72,8 +78,7 @@ class Distillation(RLAlgorithm):
             )
         self.parameters = [each for each in policy.parameters() if each.requires_grad]
         self.optimizer = self.make_optimizers_and_scheduler()[self.name]
-        indices = policy.config.action_delta_indices
-        self.chunk = len(indices) if indices else 0
+        self.windows = Windows.of(policy.config)
         self.labels = Labels(output_dir / LABELS_FOLDER, rank_and_size()[0])
 
     def make_optimizers_and_scheduler(self) -> dict[str, Optimizer]:
@@ -108,12 +113,12 @@ class Distillation(RLAlgorithm):
         if self.config.recorded and not self.labels.recorded:
             model = env.model.config
             self.labels.recorded = recorded_successes(
-                env.config.dataset, model.tokenizer.camera_keys, model.state_size, self.chunk
+                env.config.dataset, model.tokenizer.camera_keys, model.state_size, self.windows
             )
         shown = self.demonstrate(env, pipeline, rollout, seed)
-        rows = shown.labelled.nonzero()
-        part = rollout.observations.read_stored((rows[:, 0] * env.num_envs + rows[:, 1]).cpu())
-        part |= action_chunks(shown.actions, shown.labelled, self.chunk)
+        steps, envs = shown.labelled.nonzero(as_tuple=True)
+        part = observation_windows(rollout.observations, steps, envs, self.windows.observations)
+        part |= action_windows(shown.actions, shown.labelled, self.windows.actions)
         self.labels.add(self.iteration, Part(part, list(rollout.observations.instructions)))
         if not min(gather_counts(sum(map(len, self.labels.imagined)), env.device)):
             raise TrainingStopped(
@@ -193,10 +198,7 @@ class Distillation(RLAlgorithm):
     def batches(self, updates: int, pipeline: Pipeline) -> Iterator[dict[str, Any]]:
         """Draw that many batches of labels."""
         for _ in tqdm(range(updates), "update", leave=False, unit="step", disable=hidden_progress()):
-            drawn = self.labels.draw(self.config.batch_size)
-            if self.lerobot_policy.config.observation_delta_indices is not None:  # as a dataset gives it
-                drawn |= {name: drawn[name][:, None] for name in drawn if name.startswith(OBS_STR)}
-            yield pipeline.prepare(drawn)
+            yield pipeline.prepare(self.labels.draw(self.config.batch_size))
 
     def update(self, batch_iterator: Iterator[dict[str, Any]]) -> TrainingStats:
         """Take one optimizer step on each batch.

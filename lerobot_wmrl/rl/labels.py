@@ -1,4 +1,4 @@
-"""Observations labelled with actions to imitate, on the CPU and on disk. N labels, n steps of a chunk."""
+"""Observations labelled with actions to imitate, on the CPU and on disk. N labels, n steps of a window."""
 
 import json
 from collections.abc import Sequence
@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from lerobot.utils.constants import ACTION, OBS_STATE
+from lerobot.configs import PreTrainedConfig
+from lerobot.utils.constants import ACTION, OBS_STATE, OBS_STR
 from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor
@@ -17,8 +17,27 @@ from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.frame_cache import decode_episode
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.envs.start_frames import every_chosen_episode
-from lerobot_wmrl.rl.observations import TASK, decoded
+from lerobot_wmrl.rl.observations import TASK, ObservationBuffer, decoded
 from lerobot_wmrl.rl.policy_adapters import ACTION_IS_PAD
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Which observations and actions around a step a policy learns from, as it tells LeRobot's datasets.
+
+    Args:
+        observations: their distances from the step, none later than it (`observation_delta_indices`); None
+            for the step's own observation, without an axis of time.
+        actions: theirs (`action_delta_indices`), of a chunk for example; None for the step's own.
+    """
+
+    observations: list[int] | None = None
+    actions: list[int] | None = None
+
+    @classmethod
+    def of(cls, policy: PreTrainedConfig) -> "Windows":
+        """Return those of a policy."""
+        return cls(policy.observation_delta_indices, policy.action_delta_indices)
 
 
 @dataclass(frozen=True)
@@ -27,7 +46,7 @@ class Part:
 
     Args:
         tensors: observations with images as bytes, `task` as an index into the instructions, `action`, and
-            for chunks `action_is_pad`; (N, …) each.
+            for windows of actions `action_is_pad`; (N, …) each, windows (N, n, …).
         instructions: instructions of the tasks.
     """
 
@@ -103,7 +122,7 @@ class Labels:
 
 
 def recorded_successes(
-    source: StartFrames, cameras: Sequence[str], state_size: int, chunk: int
+    source: StartFrames, cameras: Sequence[str], state_size: int, windows: Windows
 ) -> list[Part]:
     """Return the actions of a dataset's successful episodes as labels; nothing without a dataset or success.
 
@@ -111,7 +130,7 @@ def recorded_successes(
         source: the episodes, those of its split, tasks and scenes.
         cameras: keys of the images.
         state_size: components of the state, 0 for observations without it.
-        chunk: actions of a chunk, n; 0 for policies without chunks.
+        windows: what the policy learns from.
     """
     if not source.given:
         return []
@@ -120,39 +139,64 @@ def recorded_successes(
     episodes = episodes[table.success[episodes]]
     if not len(episodes):
         return []
-    steps = np.arange(table.length[episodes].max())[:, None]  # (T, E) below
-    acting = torch.from_numpy(steps < table.length[episodes])
-    rows = np.minimum(table.start[episodes] + steps, table.start[episodes] + table.length[episodes] - 1)
-    labels = action_chunks(torch.from_numpy(table.action[rows]), acting, chunk)
+    start, length = (torch.from_numpy(of_all[episodes]) for of_all in (table.start, table.length))
+    steps = torch.arange(int(length.max()))[:, None]  # (T, E) below
+    acting = steps < length
+    rows = start + steps.minimum(length - 1)
+    labels = action_windows(torch.from_numpy(table.action[rows.numpy()]), acting, windows.actions)
     step, episode = acting.nonzero(as_tuple=True)
-    chosen = rows[step, episode]
-    place = (table.length[episodes].cumsum() - table.length[episodes])[episode] + step.numpy()
+    seen = observed_steps(step, windows.observations)  # (N,) or (N, n)
+    own = episode if seen.ndim == 1 else episode[:, None]
     for camera in cameras:
         frames = [decode_episode(table.dataset, int(each), camera) for each in episodes]
-        labels[camera] = torch.cat(frames)[place]
+        labels[camera] = torch.cat(frames)[(length.cumsum(0) - length)[own] + seen]
     if state_size:
-        labels[OBS_STATE] = torch.from_numpy(table.state[chosen])
+        labels[OBS_STATE] = torch.from_numpy(table.state[(start[own] + seen).numpy()])
     labels[TASK] = episode
     return [Part(labels, [table.instructions[each] for each in episodes])]
 
 
-def action_chunks(actions: Tensor, labelled: Tensor, length: int) -> dict[str, Tensor]:
-    """Return the labels of every labelled step: its action, or the chunk that begins with it.
+def observed_steps(step: Tensor, distances: Sequence[int] | None) -> Tensor:
+    """Return the steps whose observations belong to each of the steps (N,): (N, n), or (N,) without windows.
 
-    A chunk ends with its labelled run; beyond, the last action is repeated and marked as padding.
+    Before an episode begins its first observation is repeated, as LeRobot's datasets do.
+    """
+    if distances is None:
+        return step
+    return (step[:, None] + torch.tensor(distances, device=step.device)).clamp(min=0)
+
+
+def observation_windows(
+    observations: ObservationBuffer, step: Tensor, env: Tensor, distances: Sequence[int] | None
+) -> dict[str, Tensor]:
+    """Return the observations, as they are stored, that belong to steps (N,) of environments (N,)."""
+    steps = observed_steps(step, distances)
+    rows = steps * observations.num_envs + (env if steps.ndim == 1 else env[:, None])
+    stored = observations.read_stored(rows.flatten().cpu())
+    if distances is None:
+        return stored
+    windows = {name: value.unflatten(0, rows.shape) for name, value in stored.items()}
+    return {name: value if name.startswith(OBS_STR) else value[:, -1] for name, value in windows.items()}
+
+
+def action_windows(actions: Tensor, labelled: Tensor, distances: Sequence[int] | None) -> dict[str, Tensor]:
+    """Return the labels of every labelled step: its action, or those in the window around it.
+
+    A window ends with its labelled run, beyond which the last action is repeated and marked as padding, as is
+    the first before the episode.
 
     Args:
-        actions: (T, B, A).
+        actions: what was done, (T, B, A).
         labelled: (T, B) bool; a run of steps in each environment.
-        length: actions of a chunk, n; 0 for policies without chunks.
+        distances: distances of a window's actions from the step; None without windows.
 
     Returns:
         `action` (N, A) in the order of `labelled.nonzero()`, or (N, n, A) with `action_is_pad` (N, n).
     """
     step, env = labelled.nonzero(as_tuple=True)
-    if not length:
+    if distances is None:
         return {ACTION: actions[step, env]}
     last = len(labelled) - 1 - labelled.flip(0).long().argmax(0)  # (B,), of the environments with labels
-    wanted = step[:, None] + torch.arange(length, device=step.device)  # (N, n)
-    end = last[env][:, None]
-    return {ACTION: actions[wanted.minimum(end), env[:, None]], ACTION_IS_PAD: wanted > end}
+    wanted, end = step[:, None] + torch.tensor(distances, device=step.device), last[env][:, None]
+    there = wanted.clamp(min=0).minimum(end)
+    return {ACTION: actions[there, env[:, None]], ACTION_IS_PAD: wanted != there}

@@ -292,12 +292,15 @@ def test_frames_of_any_size_make_a_grid_that_the_transformer_divides(
 @pytest.mark.parametrize(("kind", "pixels", "flags"), [
     (CnnConfig, 2 * 64**2, set()),
     (CnnConfig, 480 * 640, {"--num_envs=23", "--algorithm.micro_batch_size=27"}),
-    (VQBeTConfig, 480 * 640, {"--num_envs=3", "--algorithm.recorded=false", "--algorithm.batch_size=27"}),
+    (VQBeTConfig, 480 * 640, {"--num_envs=1", "--algorithm.recorded=false", "--algorithm.batch_size=5"}),
 ])  # fmt: skip
 def test_large_frames_are_trained_on_in_smaller_numbers(
     kind: type[PreTrainedConfig], pixels: int, flags: set[str], tmp_path: Path
 ) -> None:
-    """A rollout holds at most 2 GiB of frames, all labels of a distillation too, and a pass 2²³ pixels."""
+    """A rollout holds at most 2 GiB of frames, all labels of a distillation too, and a pass 2²³ pixels.
+
+    VQ-BeT learns from five observations at once.
+    """
     policy = kind(device="cpu", pretrained_path=tmp_path)
     command = made_commands(
         tmp_path, policy=policy, pixels=pixels, longest=98, usual=98, success_frames=3000

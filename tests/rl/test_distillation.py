@@ -10,10 +10,10 @@ import pytest
 import torch
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 from lerobot.policies.factory import make_pre_post_processors
 from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
 from lerobot.policies.vqbet.modeling_vqbet import VQBeTPolicy
+from lerobot.utils.constants import ACTION
 from safetensors.torch import load_file
 from torch import Tensor
 
@@ -23,7 +23,15 @@ from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
-from lerobot_wmrl.rl.labels import Labels, Part, action_chunks, recorded_successes
+from lerobot_wmrl.rl.labels import (
+    Labels,
+    Part,
+    Windows,
+    action_windows,
+    observation_windows,
+    recorded_successes,
+)
+from lerobot_wmrl.rl.observations import ObservationBuffer
 from lerobot_wmrl.scripts.train import main
 from lerobot_wmrl.world_models.configuration_planner import PlannerSettings
 from lerobot_wmrl.world_models.planning import Planner
@@ -126,23 +134,47 @@ def test_nothing_is_labelled_after_an_episode_has_ended(
     assert read_metrics(output_dir)[-1]["labels"] == 2 + 4 + 4
 
 
-@pytest.mark.parametrize("chunk", [0, 3])
-def test_recorded_successes_are_labels_as_they_were_recorded(small_dataset: LeRobotDataset, chunk: int):
+@pytest.mark.parametrize("windows", [Windows(), Windows(None, [0, 1, 2]), Windows([-1, 0], [-1, 0, 1])])
+def test_recorded_successes_are_labels_as_lerobots_datasets_give_them(
+    small_dataset: LeRobotDataset, windows: Windows
+) -> None:
     camera = "observation.images.third_view"
     source = StartFrames(root=str(small_dataset.root), max_starts=1, branches=2)
-    (part,) = recorded_successes(source, [camera], state_size=8, chunk=chunk)
+    (part,) = recorded_successes(source, [camera], state_size=8, windows=windows)
     table = read_episodes(small_dataset)
     episodes = table.success.nonzero()[0]
     assert len(part) == table.length[episodes].sum()
-    last = [small_dataset[int(table.start[each] + table.length[each] - 1)] for each in episodes]
-    for episode, row in zip(range(len(episodes)), last, strict=True):
-        end = int((part.tensors["task"] == episode).nonzero()[-1])  # labels are in the order of their steps
-        image = part.tensors[camera][end].float() / 255
-        assert (image - row[camera]).abs().max() < 0.01
-        assert torch.equal(part.tensors["observation.state"][end], row["observation.state"])
-        actions = part.tensors["action"][end].reshape(-1, 7)
-        assert torch.equal(actions, row["action"].expand(max(1, chunk), 7))
-        assert part.instructions[episode] == row["task"]
+    wanted = {ACTION: windows.actions, STATE: windows.observations, camera: windows.observations}
+    seconds = {name: [step / small_dataset.fps for step in steps] for name, steps in wanted.items() if steps}
+    given = LeRobotDataset(small_dataset.repo_id, small_dataset.root, delta_timestamps=seconds)
+    for number, episode in enumerate(episodes):
+        rows = (part.tensors["task"] == number).nonzero()[:, 0]  # in the order of their steps
+        assert part.instructions[number] == given[int(table.start[episode])]["task"]
+        for step in (0, len(rows) - 1):
+            label = {name: value[rows[step]] for name, value in part.tensors.items()}
+            item = given[int(table.start[episode]) + step]
+            assert (label[camera].float() / 255 - item[camera]).abs().max() < 0.01
+            assert torch.equal(label[STATE], item[STATE])
+            assert torch.equal(label[ACTION], item[ACTION])
+            if windows.actions:
+                assert torch.equal(label["action_is_pad"], item["action_is_pad"])
+
+
+def test_windows_of_imagined_observations_end_with_the_step_itself() -> None:
+    """Before the episode, the first is repeated."""
+    buffer = ObservationBuffer(steps=3, num_envs=2)
+    for step in range(3):
+        state = torch.tensor([[10.0 * step], [10.0 * step + 1]])
+        buffer.write(step, {STATE: state, "task": [f"first {step}", f"second {step}"]})
+    step, env = torch.tensor([0, 1, 2]), torch.tensor([1, 0, 1])
+    found = observation_windows(buffer, step, env, [-2, -1, 0])
+    assert found[STATE][..., 0].tolist() == [[1, 1, 1], [0, 0, 10], [1, 11, 21]]
+    assert [list(buffer.instructions)[index] for index in found["task"]] == [
+        "second 0",
+        "first 1",
+        "second 2",
+    ]
+    assert observation_windows(buffer, step, env, None)[STATE][:, 0].tolist() == [1, 10, 21]
 
 
 def test_recorded_successes_are_learnt_too_and_a_resumed_training_reads_them_again(
@@ -170,13 +202,14 @@ def test_policies_of_chunks_learn_chunks(
     assert len(weights(output_dir))
 
 
-def test_policies_whose_observations_have_a_time_axis_get_one(
-    imagined: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("observations", [1, 3])
+def test_policies_of_several_observations_learn_from_as_many(
+    observations: int, imagined: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """LeRobot's VQ-BeT learns from observations (B, 1, …), even of one frame."""
+    """LeRobot's VQ-BeT learns from observations (B, n, …), also where n is 1."""
     features = {IMAGE: (FeatureType.VISUAL, (3, 32, 32)), STATE: (FeatureType.STATE, (8,))}
     config = VQBeTConfig(
-        device="cpu", n_obs_steps=1, pretrained_backbone_weights=None, crop_shape=None,
+        device="cpu", n_obs_steps=observations, pretrained_backbone_weights=None, crop_shape=None,
         use_group_norm=True, spatial_softmax_num_keypoints=4, n_vqvae_training_steps=1,
         vqvae_embedding_dim=8, vqvae_enc_hidden_dim=8, gpt_input_dim=16, gpt_output_dim=16,
         gpt_hidden_dim=16, gpt_n_layer=1, gpt_n_head=2,
@@ -231,20 +264,6 @@ def test_what_cannot_be_is_refused_by_its_flag(
     assert not (tmp_path / "rl").exists()
 
 
-def test_policies_of_several_observations_are_refused_before_anything_is_made(
-    imagined: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """A diffusion policy learns from two."""
-    DiffusionConfig(device="cpu").save_pretrained(tmp_path / "diffusion")
-    flags = [f"--policy.path={tmp_path / 'diffusion'}", *FAST, *imagined, f"--output_dir={tmp_path / 'rl'}"]
-    with pytest.raises(SystemExit):
-        train(monkeypatch, *flags)
-    assert "diffusion learns from 2 observations at once, and distillation gives it one" in (
-        capsys.readouterr().err
-    )
-    assert not (tmp_path / "rl").exists()
-
-
 def test_settings_of_the_planner_are_checked_where_they_are():
     with pytest.raises(FieldError, match=r"^planner.knots=1"):
         DistillationConfig(planner=PlannerSettings(knots=1))
@@ -253,12 +272,12 @@ def test_settings_of_the_planner_are_checked_where_they_are():
 def test_a_chunk_ends_with_its_run_and_repeats_the_last_action():
     actions = torch.arange(4.0)[:, None, None] + torch.tensor([0.0, 10.0])[:, None]  # (T, B, 1)
     labelled = torch.tensor([[True, False], [True, True], [True, True], [False, True]])
-    found = action_chunks(actions, labelled, 2)
+    found = action_windows(actions, labelled, [0, 1])
     assert found["action"][..., 0].tolist() == [[0, 1], [1, 2], [11, 12], [2, 2], [12, 13], [13, 13]]
     assert found["action_is_pad"].tolist() == [
         [False, False], [False, False], [False, False], [False, True], [False, False], [False, True],
     ]  # fmt: skip
-    assert action_chunks(actions, labelled, 0)["action"][:, 0].tolist() == [0, 1, 11, 2, 12, 13]
+    assert action_windows(actions, labelled, None)["action"][:, 0].tolist() == [0, 1, 11, 2, 12, 13]
 
 
 def test_labels_are_the_same_when_they_are_read_again(tmp_path: Path):
