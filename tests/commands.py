@@ -9,4 +9,6 @@ from lerobot_wmrl.common.stages import entry_point
 def run_here(program: str, *flags: str) -> None:
     """Run a console command, as its entry point does. SystemExit if it fails."""
     with patch.object(sys, "argv", [program, *flags]):
-        entry_point(program)()
+        status = entry_point(program)()
+    if status:
+        raise SystemExit(status)

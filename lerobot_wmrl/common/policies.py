@@ -103,6 +103,20 @@ def require_trained(config: PreTrainedConfig) -> None:
         )
 
 
+def require_past_observations(config: PreTrainedConfig) -> None:
+    """Raise FieldError for a policy that learns from what follows a step: later observations, or rewards.
+
+    The labels of a planner have neither.
+    """
+    ahead = max(config.observation_delta_indices or [0]) > 0
+    if ahead or config.reward_delta_indices is not None:
+        raise FieldError(
+            "policy.path", config.pretrained_path,
+            f"{config.type} learns from {'later observations' if ahead else 'rewards'}, and a planner's "
+            "labels have none", "take one that is cloned from observations and actions, such as act",
+        )  # fmt: skip
+
+
 def require_chunks(config: PreTrainedConfig) -> None:
     """Raise FieldError for an ACT policy whose actions are averages of several chunks."""
     if config.temporal_ensemble_coeff is not None:

@@ -224,11 +224,18 @@ def in_fork[**P, T](function: Callable[P, T], *args: P.args, **kwargs: P.kwargs)
     """Call a function in a fork of this process, and return or raise what it does; all of it is pickled.
 
     What it leaves in libraries ends with the fork: once a process has rendered with OpenGL, as MuJoCo does,
-    stages that render wait for ever.
+    stages that render wait for ever. With CUDA, where stages are no forks, it is called in this process.
     """
+    if torch.cuda.is_available():
+        return function(*args, **kwargs)
     context = multiprocessing.get_context("fork")
-    with ProcessPoolExecutor(1, mp_context=context, initializer=own_progress_lock) as fork:
+    with ProcessPoolExecutor(1, context, _begin_fork, (os.getpid(),)) as fork:
         return fork.submit(function, *args, **kwargs).result()
+
+
+def _begin_fork(parent: int) -> None:
+    die_with(parent)
+    own_progress_lock()
 
 
 def run_measured(command: Sequence[str], log: Path, progress: Progress) -> int:

@@ -183,15 +183,20 @@ class MeanChange:
 
 
 @lru_cache(maxsize=4)
-def resampled(runs: int, starts: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def drawn_counts(runs: int, starts: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Return how often each resample draws each run and each start. (B, R) and (B, E) float64
 
     The same for every table of one shape, and drawn once, which takes most of an interval's time. They are
-    whole numbers: sums of outcomes are exact, and no machine rounds an interval's end otherwise than another.
+    whole numbers: sums of outcomes (0 and 1) are exact, and every machine rounds an interval's ends alike.
     """
     rng = np.random.default_rng(seed)
-    drawn_runs = rng.multinomial(runs, np.full(runs, 1 / runs), RESAMPLES).astype(np.float64)
-    return drawn_runs, rng.multinomial(starts, np.full(starts, 1 / starts), RESAMPLES).astype(np.float64)
+    drawn = [
+        rng.multinomial(count, np.full(count, 1 / count), RESAMPLES).astype(np.float64)
+        for count in (runs, starts)
+    ]
+    for counts in drawn:
+        counts.setflags(write=False)
+    return drawn[0], drawn[1]
 
 
 @dataclass(frozen=True)
@@ -211,7 +216,7 @@ class RunsMean:
         """
         table = np.asarray(values, np.float64)
         runs, starts = table.shape
-        drawn_runs, drawn_starts = resampled(runs, starts, seed)
+        drawn_runs, drawn_starts = drawn_counts(runs, starts, seed)
         means = np.einsum("be,be->b", drawn_runs @ table, drawn_starts) / table.size
         low, high = np.percentile(means, (2.5, 97.5))
         return cls(float(table.mean()), float(low), float(high))

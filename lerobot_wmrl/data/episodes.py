@@ -257,14 +257,17 @@ def missing_files(root: Path) -> list[Path]:
     The table is read without LeRobot's metadata, which takes as long to open as the whole dataset, and looks
     each path up by itself. Where there is no table, LeRobot says why: the dataset's version is older.
     """
-    if not (root / EPISODES_DIR).is_dir():
+    tables = sorted((root / EPISODES_DIR).glob("*/*.parquet"))
+    if not tables:
         return []
     info, named = load_info(root), set[Path]()
+    table = pyarrow.dataset.dataset([str(each) for each in tables], format="parquet")
+    if (rows := table.count_rows()) != info.total_episodes:
+        raise ValueError(f"{EPISODES_DIR} has {rows} of {info.total_episodes} episodes")
     files = [("data", info.data_path)]
     for key, feature in info.features.items():
         if feature["dtype"] == "video":
             files.append((f"videos/{key}", str(info.video_path)))
-    table = pyarrow.dataset.dataset(root / EPISODES_DIR, format="parquet")
     for kind, pattern in files:
         places = table.to_table([f"{kind}/chunk_index", f"{kind}/file_index"]).to_pydict().values()
         for chunk, file in set(zip(*places, strict=True)):

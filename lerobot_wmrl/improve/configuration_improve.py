@@ -14,6 +14,7 @@ from lerobot_wmrl.common.errors import FieldError, require_at_least, require_cho
 from lerobot_wmrl.common.policies import (
     read_policy_config,
     require_chunks,
+    require_past_observations,
     require_trained,
 )
 from lerobot_wmrl.common.presets import Flags
@@ -105,6 +106,8 @@ class ImproveConfig(RunConfig):
         if self.policy is None:
             raise FieldError("policy.path", None, "is missing", "give the policy to improve")
         require_trained(self.policy)
+        if self.policy.type not in ALGORITHMS:
+            require_past_observations(self.policy)
         if self.policy.type == "act":
             require_chunks(self.policy)
         if not self.dataset.given:

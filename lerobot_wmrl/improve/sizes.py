@@ -38,14 +38,16 @@ class Sizes:
     Args:
         preset: the stages' preset.
         frame_side: the shorter side of the frames that the policy sees, in pixels.
-        pixels: pixels of all frames that it learns from at once.
+        pixels: pixels of all its cameras' frames.
         length: frames of an imagined episode.
+        observations: how many observations it learns from at once.
     """
 
     preset: str
     frame_side: int
     pixels: int
     length: int
+    observations: int
 
     @property
     def could_be_larger(self) -> bool:
@@ -62,8 +64,8 @@ class Sizes:
 
     @property
     def pass_observations(self) -> int:
-        """Observations in one pass at most."""
-        return max(1, PASS_PIXELS // self.pixels)
+        """Steps of which a policy learns in one pass at most."""
+        return max(1, PASS_PIXELS // (self.pixels * self.observations))
 
     def cloning_settings(self) -> dict[str, Any]:
         """Return the preset of cloning, with smaller batches where frames are large."""

@@ -302,8 +302,9 @@ class Improvement:
         """How large frames, batches and rollouts are."""
         assert self.config.policy is not None
         observations = len(self.config.policy.observation_delta_indices or [0])
-        pixels = self.found.pixels * observations
-        return Sizes(self.config.preset, self.found.frame_side, pixels, self.length)
+        return Sizes(
+            self.config.preset, self.found.frame_side, self.found.pixels, self.length, observations
+        )  # fmt: skip
 
     def _done(self) -> Flags:
         return {"done_threshold": DONE_THRESHOLD, "done_frames": min(DONE_FRAMES, max(1, self.found.held))}

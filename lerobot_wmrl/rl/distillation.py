@@ -24,14 +24,7 @@ from lerobot_wmrl.common.policies import load_trained_weights
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
-from lerobot_wmrl.rl.labels import (
-    Labels,
-    Part,
-    Windows,
-    action_windows,
-    observation_windows,
-    recorded_successes,
-)
+from lerobot_wmrl.rl.labels import Labels, Windows, imagined_labels, recorded_successes
 from lerobot_wmrl.rl.observations import TASK, as_read_back
 from lerobot_wmrl.rl.protocol import Observation, Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer
@@ -116,10 +109,8 @@ class Distillation(RLAlgorithm):
                 env.config.dataset, model.tokenizer.camera_keys, model.state_size, self.windows
             )
         shown = self.demonstrate(env, pipeline, rollout, seed)
-        steps, envs = shown.labelled.nonzero(as_tuple=True)
-        part = observation_windows(rollout.observations, steps, envs, self.windows.observations)
-        part |= action_windows(shown.actions, shown.labelled, self.windows.actions)
-        self.labels.add(self.iteration, Part(part, list(rollout.observations.instructions)))
+        part = imagined_labels(rollout.observations, shown.actions, shown.labelled, self.windows)
+        self.labels.add(self.iteration, part)
         if not min(gather_counts(sum(map(len, self.labels.imagined)), env.device)):
             raise TrainingStopped(
                 f"iteration {self.iteration + 1}: the planner has not succeeded in any imagined episode, so "
@@ -143,7 +134,7 @@ class Distillation(RLAlgorithm):
     ) -> Demonstrated:
         """Let the policy act for some steps, and then the planner, until every first episode has ended.
 
-        The planner changes what the policy would do.
+        The planner changes what the policy would do, of which a policy of several observations has seen one.
         """
         policy, steps, count = self.lerobot_policy.eval(), rollout.steps, env.num_envs
         horizon = self.config.planner.horizon

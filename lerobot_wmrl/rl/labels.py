@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 from lerobot.configs import PreTrainedConfig
-from lerobot.utils.constants import ACTION, OBS_STATE, OBS_STR
+from lerobot.utils.constants import ACTION, OBS_STATE
 from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor
@@ -20,15 +20,19 @@ from lerobot_wmrl.envs.start_frames import every_chosen_episode
 from lerobot_wmrl.rl.observations import TASK, ObservationBuffer, decoded
 from lerobot_wmrl.rl.policy_adapters import ACTION_IS_PAD
 
+ROWS = "rows"
+"""Name of `Part.rows` in a file of labels."""
+
 
 @dataclass(frozen=True)
 class Windows:
     """Which observations and actions around a step a policy learns from, as it tells LeRobot's datasets.
 
     Args:
-        observations: their distances from the step, none later than it (`observation_delta_indices`); None
-            for the step's own observation, without an axis of time.
-        actions: theirs (`action_delta_indices`), of a chunk for example; None for the step's own.
+        observations: their distances from the step (`observation_delta_indices`), none above 0 and the last
+            one 0; None for the step's own observation, without an axis of time.
+        actions: those of the actions (`action_delta_indices`), of a chunk for example; None for the step's
+            own.
     """
 
     observations: list[int] | None = None
@@ -42,19 +46,30 @@ class Windows:
 
 @dataclass(frozen=True)
 class Part:
-    """N labels from one place.
+    """N labels from one place, whose windows share F observations.
 
     Args:
-        tensors: observations with images as bytes, `task` as an index into the instructions, `action`, and
-            for windows of actions `action_is_pad`; (N, …) each, windows (N, n, …).
+        observations: images as bytes and `task` as an index into the instructions; (F, …) each.
+        actions: `action`, (N, A) or windows (N, n, A), and for windows `action_is_pad` (N, n).
+        rows: which observations belong to each label, (N,) or windows (N, n).
         instructions: instructions of the tasks.
     """
 
-    tensors: dict[str, Tensor]
+    observations: dict[str, Tensor]
+    actions: dict[str, Tensor]
+    rows: Tensor
     instructions: list[str]
 
     def __len__(self) -> int:
-        return len(self.tensors[ACTION])
+        return len(self.rows)
+
+    def batch(self, labels: Tensor) -> dict[str, Any]:
+        """Return some of the labels, as LeRobot's datasets would give them: images in [0, 1]."""
+        rows = self.rows[labels]
+        own = rows if rows.ndim == 1 else rows[:, -1]
+        seen = {name: value[own if name == TASK else rows] for name, value in self.observations.items()}
+        actions = {name: value[labels] for name, value in self.actions.items()}
+        return decoded(seen | actions, self.instructions)
 
 
 class Labels:
@@ -81,10 +96,11 @@ class Labels:
         """Add an iteration's labels, on disk first."""
         self.folder.mkdir(parents=True, exist_ok=True)
         partial = self.path(iteration).with_suffix(".partial")
-        tensors = {name: value.cpu().contiguous() for name, value in part.tensors.items()}
-        save_file(tensors, partial, {"instructions": json.dumps(part.instructions)})
+        tensors = {**part.observations, **part.actions, ROWS: part.rows}
+        kept = {name: value.cpu().contiguous() for name, value in tensors.items()}
+        save_file(kept, partial, {"instructions": json.dumps(part.instructions)})
         partial.replace(self.path(iteration))
-        self._append(Part(tensors, part.instructions))
+        self._append(kept, part.instructions)
 
     def load(self, iterations: int) -> None:
         """Read the labels of the iterations before `iterations`, in place of those in memory.
@@ -96,7 +112,7 @@ class Labels:
         for iteration in range(iterations):
             with safe_open(self.path(iteration), framework="pt") as file:
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-                self._append(Part(tensors, json.loads(file.metadata()["instructions"])))
+                self._append(tensors, json.loads(file.metadata()["instructions"]))
 
     def draw(self, count: int) -> dict[str, Any]:
         """Draw a batch of labels at random, as LeRobot's datasets would give them: images in [0, 1]."""
@@ -107,18 +123,18 @@ class Labels:
         taken: list[dict[str, Any]] = []
         for index in part_of.unique().tolist():
             part, begin = parts[index], int(ends[index - 1]) if index else 0
-            rows = drawn[part_of == index] - begin
-            chosen = {name: value[rows] for name, value in part.tensors.items()}
-            taken.append(decoded(chosen, part.instructions))
+            taken.append(part.batch(drawn[part_of == index] - begin))
         return {
             name: [text for batch in taken for text in batch[name]] if name == TASK
             else torch.cat([batch[name] for batch in taken])
             for name in taken[0]
         }  # fmt: skip
 
-    def _append(self, part: Part) -> None:
-        if len(part):
-            self.imagined.append(part)
+    def _append(self, tensors: dict[str, Tensor], instructions: list[str]) -> None:
+        rows = tensors.pop(ROWS)
+        actions = {name: tensors.pop(name) for name in (ACTION, ACTION_IS_PAD) if name in tensors}
+        if len(rows):
+            self.imagined.append(Part(tensors, actions, rows, instructions))
 
 
 def recorded_successes(
@@ -142,48 +158,67 @@ def recorded_successes(
     start, length = (torch.from_numpy(of_all[episodes]) for of_all in (table.start, table.length))
     steps = torch.arange(int(length.max()))[:, None]  # (T, E) below
     acting = steps < length
-    rows = start + steps.minimum(length - 1)
-    labels = action_windows(torch.from_numpy(table.action[rows.numpy()]), acting, windows.actions)
-    step, episode = acting.nonzero(as_tuple=True)
-    seen = observed_steps(step, windows.observations)  # (N,) or (N, n)
-    own = episode if seen.ndim == 1 else episode[:, None]
-    for camera in cameras:
-        frames = [decode_episode(table.dataset, int(each), camera) for each in episodes]
-        labels[camera] = torch.cat(frames)[(length.cumsum(0) - length)[own] + seen]
+    taken = torch.from_numpy(table.action[(start + steps.minimum(length - 1)).numpy()])
+    actions = action_windows(taken, acting, windows.actions)
+    begin = length.cumsum(0) - length  # where the frames of each episode begin below
+    episode = torch.arange(len(episodes)).repeat_interleave(length)  # (F,), of each frame
+    observations = {
+        camera: torch.cat([decode_episode(table.dataset, int(each), camera) for each in episodes])
+        for camera in cameras
+    }
     if state_size:
-        labels[OBS_STATE] = torch.from_numpy(table.state[(start[own] + seen).numpy()])
-    labels[TASK] = episode
-    return [Part(labels, [table.instructions[each] for each in episodes])]
+        rows = (start - begin)[episode] + torch.arange(len(episode))
+        observations[OBS_STATE] = torch.from_numpy(table.state[rows.numpy()])
+    step, labelled = acting.nonzero(as_tuple=True)
+    return [Part(
+        observations | {TASK: episode}, actions, observed_rows(begin[labelled], step, windows.observations),
+        [table.instructions[each] for each in episodes],
+    )]  # fmt: skip
 
 
-def observed_steps(step: Tensor, distances: Sequence[int] | None) -> Tensor:
-    """Return the steps whose observations belong to each of the steps (N,): (N, n), or (N,) without windows.
+def imagined_labels(
+    observations: ObservationBuffer, actions: Tensor, labelled: Tensor, windows: Windows
+) -> Part:
+    """Return the labelled steps of a rollout.
+
+    Args:
+        observations: those of the rollout.
+        actions: what was done, (T, B, A).
+        labelled: (T, B) bool; a run of steps in each environment.
+        windows: what the policy learns from.
+    """
+    step, env = labelled.nonzero(as_tuple=True)
+    wanted = observed_rows(env, step, windows.observations, observations.num_envs)
+    kept, rows = wanted.unique(return_inverse=True)
+    return Part(
+        observations.read_stored(kept.cpu()), action_windows(actions, labelled, windows.actions), rows,
+        list(observations.instructions),
+    )  # fmt: skip
+
+
+def observed_rows(first: Tensor, step: Tensor, distances: Sequence[int] | None, stride: int = 1) -> Tensor:
+    """Return the rows of the observations that belong to each of the steps (N,): (N, n), or (N,) without
+    windows.
 
     Before an episode begins its first observation is repeated, as LeRobot's datasets do.
+
+    Args:
+        first: row of the first observation of each step's episode, (N,).
+        step: number of the step in its episode, (N,).
+        distances: distances of a window's observations from the step, none above 0; None without windows.
+        stride: rows from one step to the next.
     """
     if distances is None:
-        return step
-    return (step[:, None] + torch.tensor(distances, device=step.device)).clamp(min=0)
-
-
-def observation_windows(
-    observations: ObservationBuffer, step: Tensor, env: Tensor, distances: Sequence[int] | None
-) -> dict[str, Tensor]:
-    """Return the observations, as they are stored, that belong to steps (N,) of environments (N,)."""
-    steps = observed_steps(step, distances)
-    rows = steps * observations.num_envs + (env if steps.ndim == 1 else env[:, None])
-    stored = observations.read_stored(rows.flatten().cpu())
-    if distances is None:
-        return stored
-    windows = {name: value.unflatten(0, rows.shape) for name, value in stored.items()}
-    return {name: value if name.startswith(OBS_STR) else value[:, -1] for name, value in windows.items()}
+        return first + step * stride
+    steps = (step[:, None] + torch.tensor(distances, device=step.device)).clamp(min=0)
+    return first[:, None] + steps * stride
 
 
 def action_windows(actions: Tensor, labelled: Tensor, distances: Sequence[int] | None) -> dict[str, Tensor]:
     """Return the labels of every labelled step: its action, or those in the window around it.
 
-    A window ends with its labelled run, beyond which the last action is repeated and marked as padding, as is
-    the first before the episode.
+    What lies before or after the labelled run is marked as padding: the actions that were done before it, the
+    first one before the episode began, and the run's last action after its end.
 
     Args:
         actions: what was done, (T, B, A).
@@ -196,7 +231,8 @@ def action_windows(actions: Tensor, labelled: Tensor, distances: Sequence[int] |
     step, env = labelled.nonzero(as_tuple=True)
     if distances is None:
         return {ACTION: actions[step, env]}
-    last = len(labelled) - 1 - labelled.flip(0).long().argmax(0)  # (B,), of the environments with labels
-    wanted, end = step[:, None] + torch.tensor(distances, device=step.device), last[env][:, None]
-    there = wanted.clamp(min=0).minimum(end)
-    return {ACTION: actions[there, env[:, None]], ACTION_IS_PAD: wanted != there}
+    first = labelled.long().argmax(0)[env][:, None]
+    last = (len(labelled) - 1 - labelled.flip(0).long().argmax(0))[env][:, None]
+    wanted = step[:, None] + torch.tensor(distances, device=step.device)  # (N, n)
+    outside = (wanted < first) | (wanted > last)
+    return {ACTION: actions[wanted.clamp(min=0).minimum(last), env[:, None]], ACTION_IS_PAD: outside}

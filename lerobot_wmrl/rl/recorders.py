@@ -20,7 +20,7 @@ from tqdm import trange
 
 from lerobot_wmrl.common.actions import clip_actions, warn_of_clipped
 from lerobot_wmrl.common.constants import KINDS, POLICY, START_KIND, START_SEED, Observation
-from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.errors import FieldError, renamed
 from lerobot_wmrl.common.exploration import ExplorationNoise
 from lerobot_wmrl.common.files import whole_folder
 from lerobot_wmrl.common.lerobot_commands import env_flags
@@ -28,7 +28,13 @@ from lerobot_wmrl.common.policies import load_policy, load_processors, read_poli
 from lerobot_wmrl.common.presets import Flags, format_flags
 from lerobot_wmrl.common.processes import run_subcommand
 from lerobot_wmrl.data.budget import Ledger, budget_flags, spending
-from lerobot_wmrl.data.embodiment import Embodiment, observed_range, read_embodiment, recorded_range
+from lerobot_wmrl.data.embodiment import (
+    Embodiment,
+    component_names,
+    observed_range,
+    read_embodiment,
+    recorded_range,
+)
 from lerobot_wmrl.data.episodes import open_dataset, read_episodes
 from lerobot_wmrl.data.features import encoder_of, episode_features, matched, observation_row
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
@@ -266,9 +272,9 @@ def robot_of(config: EnvConfig, env: Any, like: Any | None) -> Embodiment:
         config: the environment's.
         env: the environment.
         like: metadata of a dataset of the same robot, whose names are taken, and whose range if it states
-            one. Else the range is that of the environment's action space, widened to the actions in `like`:
-            an environment may take more than its space says, as LeRobot's Aloha does (joint angles, "from -1
-            to 1"). Without `like`, numbers are the names.
+            one. Else the range is that of the environment's action space, widened to that of the actions in
+            `like`: an environment may take more than its space says, as LeRobot's Aloha does (joint angles,
+            "from -1 to 1"). Without `like`, numbers are the names.
 
     Raises:
         FieldError: the actions of both have other numbers of components, or neither says how large they are.
@@ -285,22 +291,36 @@ def robot_of(config: EnvConfig, env: Any, like: Any | None) -> Embodiment:
                 "like.root", like.root, f"its actions have {count} components, the environment's {len(low)}",
                 "give a dataset of the same robot",
             )  # fmt: skip
-        if recorded_range(like.features[ACTION]) is not None or not bounded:
-            return read_embodiment(like, Embodiment())
-        shown = observed_range(like)
-        widest = np.minimum(low, shown[0]).tolist(), np.maximum(high, shown[1]).tolist()
-        if widest != (low, high):
-            logging.warning(
-                "%s says that its actions are from %s to %s; those of the dataset go beyond, and so may the "
-                "policy's", config.type, low, high,
-            )  # fmt: skip
-        return read_embodiment(like, Embodiment(action_low=widest[0], action_high=widest[1]))
+        given = Embodiment()
+        with renamed("dataset.root", "like.root"):
+            if recorded_range(like.features[ACTION]) is None and bounded:
+                given = widened(config, low, high, like)
+            return read_embodiment(like, given)
     if not bounded:
         raise FieldError(
             "env.type", config.type, "does not say between which values its actions are",
             "give a dataset of the same robot, `like.root` or `like.repo_id`",
         )  # fmt: skip
     return Embodiment(config.fps, [str(index) for index in range(len(low))], low, high)
+
+
+def widened(config: EnvConfig, low: list[float], high: list[float], like: Any) -> Embodiment:
+    """Return the range of an environment's actions, widened to that of a dataset's; warns where it was."""
+    least, most = observed_range(like)
+    beyond = [
+        f"{name} {seen[0]:.4g} to {seen[1]:.4g} (in {config.type} {own[0]:.4g} to {own[1]:.4g})"
+        for name, own, seen in zip(
+            component_names(like.features[ACTION]), zip(low, high, strict=True),
+            zip(least, most, strict=True), strict=True,
+        )
+        if seen[0] < own[0] or seen[1] > own[1]
+    ]  # fmt: skip
+    if beyond:
+        logging.warning(
+            "like.root: actions go beyond the environment's action space, and so may the policy's: %s. Are "
+            "they in the same units?", ", ".join(beyond),
+        )  # fmt: skip
+    return Embodiment(action_low=np.minimum(low, least).tolist(), action_high=np.maximum(high, most).tolist())
 
 
 @dataclass

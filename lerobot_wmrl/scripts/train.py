@@ -261,13 +261,15 @@ def train_policy(cfg: TrainConfig) -> None:
     from accelerate import PartialState
     from lerobot.utils.random_utils import set_seed
 
-    from lerobot_wmrl.common.policies import load_policy, load_processors
+    from lerobot_wmrl.common.policies import load_policy, load_processors, require_past_observations
     from lerobot_wmrl.envs.lerobot_env import make_tensor_env
     from lerobot_wmrl.rl.budget import check_data
 
     check_config(cfg)
     check_data(cfg, cfg.env)
     config = load_config(cfg)
+    if isinstance(cfg.algorithm, DistillationConfig):
+        require_past_observations(config)
     PartialState(cpu=config.device == "cpu", timeout=LONGEST_WAIT)
     done = finished(cfg)
     wait_for_all()  # no process has written anything before all have looked

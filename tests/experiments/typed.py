@@ -41,9 +41,11 @@ LEROBOT: dict[str, type[Any]] = {
 }
 SHELL = {"cp", "ln", "source", "pip", "make", "hf", "apt", ".uv/bin/uv"}
 
-PATH = re.compile(r"[^=,\[]*/[^,\]]*")
+PATH = re.compile(r"[^,\[\]]*/[^,\[\]]*")
+NUMBER = re.compile(r"(?<![\w.])-?\d+(\.\d+)?(e-?\d+)?(?![\w.])")
+
 PARSED: set[tuple[str, ...]] = set()
-"""Commands that programs take, without their numbers and paths."""
+"""Commands that programs take, as `without_numbers` makes them."""
 
 registered = cache(register_third_party_plugins)
 
@@ -67,10 +69,16 @@ def check(command: str) -> None:
     that differ in numbers and paths alone, one is parsed.
     """
     words = words_of(command)
-    without_numbers = tuple(re.sub(r"\d+(\.\d+)?(e-?\d+)?", "0", PATH.sub("/", word)) for word in words)
-    if without_numbers not in PARSED:
+    if (kind := tuple(map(without_numbers, words))) not in PARSED:
         parse(words)
-        PARSED.add(without_numbers)
+        PARSED.add(kind)
+
+
+def without_numbers(word: str) -> str:
+    """Return a word with all paths in a flag's value, all its whole numbers and all others made the same."""
+    name, equals, value = word.partition("=")
+    numbers = NUMBER.sub(lambda found: "0.5" if found[1] or found[2] else "0", PATH.sub("/", value))
+    return name + equals + numbers
 
 
 def parse(words: list[str]) -> None:

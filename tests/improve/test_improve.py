@@ -292,7 +292,7 @@ def test_frames_of_any_size_make_a_grid_that_the_transformer_divides(
 @pytest.mark.parametrize(("kind", "pixels", "flags"), [
     (CnnConfig, 2 * 64**2, set()),
     (CnnConfig, 480 * 640, {"--num_envs=23", "--algorithm.micro_batch_size=27"}),
-    (VQBeTConfig, 480 * 640, {"--num_envs=1", "--algorithm.recorded=false", "--algorithm.batch_size=5"}),
+    (VQBeTConfig, 480 * 640, {"--num_envs=3", "--algorithm.recorded=false", "--algorithm.batch_size=5"}),
 ])  # fmt: skip
 def test_large_frames_are_trained_on_in_smaller_numbers(
     kind: type[PreTrainedConfig], pixels: int, flags: set[str], tmp_path: Path

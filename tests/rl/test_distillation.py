@@ -11,6 +11,7 @@ import torch
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.factory import make_pre_post_processors
+from lerobot.policies.tdmpc.configuration_tdmpc import TDMPCConfig
 from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
 from lerobot.policies.vqbet.modeling_vqbet import VQBeTPolicy
 from lerobot.utils.constants import ACTION
@@ -28,7 +29,7 @@ from lerobot_wmrl.rl.labels import (
     Part,
     Windows,
     action_windows,
-    observation_windows,
+    imagined_labels,
     recorded_successes,
 )
 from lerobot_wmrl.rl.observations import ObservationBuffer
@@ -148,12 +149,14 @@ def test_recorded_successes_are_labels_as_lerobots_datasets_give_them(
     seconds = {name: [step / small_dataset.fps for step in steps] for name, steps in wanted.items() if steps}
     given = LeRobotDataset(small_dataset.repo_id, small_dataset.root, delta_timestamps=seconds)
     for number, episode in enumerate(episodes):
-        rows = (part.tensors["task"] == number).nonzero()[:, 0]  # in the order of their steps
-        assert part.instructions[number] == given[int(table.start[episode])]["task"]
-        for step in (0, len(rows) - 1):
-            label = {name: value[rows[step]] for name, value in part.tensors.items()}
+        frames = part.observations["task"][part.rows.reshape(len(part), -1)[:, -1]]
+        labels = (frames == number).nonzero()[:, 0]  # in the order of their steps
+        assert len(labels) == table.length[episode]
+        for step in (0, len(labels) - 1):
+            label = {name: value[0] for name, value in part.batch(labels[step : step + 1]).items()}
             item = given[int(table.start[episode]) + step]
-            assert (label[camera].float() / 255 - item[camera]).abs().max() < 0.01
+            assert label["task"] == item["task"]
+            assert (label[camera] - item[camera]).abs().max() < 0.01
             assert torch.equal(label[STATE], item[STATE])
             assert torch.equal(label[ACTION], item[ACTION])
             if windows.actions:
@@ -161,20 +164,26 @@ def test_recorded_successes_are_labels_as_lerobots_datasets_give_them(
 
 
 def test_windows_of_imagined_observations_end_with_the_step_itself() -> None:
-    """Before the episode, the first is repeated."""
+    """Before the episode, the first is repeated. What was done before the planner took over is no label."""
     buffer = ObservationBuffer(steps=3, num_envs=2)
     for step in range(3):
         state = torch.tensor([[10.0 * step], [10.0 * step + 1]])
         buffer.write(step, {STATE: state, "task": [f"first {step}", f"second {step}"]})
-    step, env = torch.tensor([0, 1, 2]), torch.tensor([1, 0, 1])
-    found = observation_windows(buffer, step, env, [-2, -1, 0])
-    assert found[STATE][..., 0].tolist() == [[1, 1, 1], [0, 0, 10], [1, 11, 21]]
-    assert [list(buffer.instructions)[index] for index in found["task"]] == [
-        "second 0",
-        "first 1",
-        "second 2",
+    labelled = torch.tensor([[False, True], [True, False], [True, False]])
+    actions = torch.tensor([[0.0, 1], [10, 11], [20, 21]])[..., None]
+    part = imagined_labels(buffer, actions, labelled, Windows([-2, -1, 0], [-1, 0, 1]))
+    batch = part.batch(torch.arange(3))
+    assert batch[STATE][..., 0].tolist() == [[1, 1, 1], [0, 0, 10], [0, 10, 20]]
+    assert batch["task"] == ["second 0", "first 1", "first 2"]
+    assert batch[ACTION][..., 0].tolist() == [[1, 1, 1], [0, 10, 20], [10, 20, 20]]
+    assert batch["action_is_pad"].tolist() == [
+        [True, False, True],
+        [True, False, False],
+        [False, False, True],
     ]
-    assert observation_windows(buffer, step, env, None)[STATE][:, 0].tolist() == [1, 10, 21]
+    assert len(part.observations[STATE]) == 4, "each observation is kept once"
+    part = imagined_labels(buffer, actions, labelled, Windows())
+    assert part.batch(torch.arange(3))[STATE][:, 0].tolist() == [1, 10, 20]
 
 
 def test_recorded_successes_are_learnt_too_and_a_resumed_training_reads_them_again(
@@ -264,6 +273,17 @@ def test_what_cannot_be_is_refused_by_its_flag(
     assert not (tmp_path / "rl").exists()
 
 
+def test_policies_that_learn_from_what_follows_are_refused_before_anything_is_made(
+    imagined: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    TDMPCConfig(device="cpu").save_pretrained(tmp_path / "tdmpc")
+    flags = [f"--policy.path={tmp_path / 'tdmpc'}", *FAST, *imagined, f"--output_dir={tmp_path / 'rl'}"]
+    with pytest.raises(SystemExit):
+        train(monkeypatch, *flags)
+    assert "tdmpc learns from later observations, and a planner's labels have none" in capsys.readouterr().err
+    assert not (tmp_path / "rl").exists()
+
+
 def test_settings_of_the_planner_are_checked_where_they_are():
     with pytest.raises(FieldError, match=r"^planner.knots=1"):
         DistillationConfig(planner=PlannerSettings(knots=1))
@@ -286,10 +306,10 @@ def test_labels_are_the_same_when_they_are_read_again(tmp_path: Path):
         count = 2 * iteration  # the first iteration has none
         part = {
             "observation.images.top": torch.full((count, 3, 2, 2), 51 * iteration, dtype=torch.uint8),
-            "action": iteration + torch.arange(float(count))[:, None] / 10,
             "task": torch.zeros(count, dtype=torch.long),
         }
-        labels.add(iteration, Part(part, [f"task {iteration}"]))
+        actions = {"action": iteration + torch.arange(float(count))[:, None] / 10}
+        labels.add(iteration, Part(part, actions, torch.arange(count), [f"task {iteration}"]))
     again = Labels(tmp_path, 0)
     again.load(3)
     assert len(again) == len(labels) == 6

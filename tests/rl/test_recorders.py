@@ -111,7 +111,7 @@ def test_actions_may_go_as_far_as_those_of_the_same_robots_dataset(
     robot = robot_of(PushtEnv(), env, dataset.meta)
     assert robot.action_names == ["elbow", "gripper"]
     assert (robot.action_low, robot.action_high) == ([-1, -1], [pytest.approx(1.16), 1])
-    assert "those of the dataset go beyond" in caplog.text
+    assert "elbow -0.5 to 1.16 (in pusht -1 to 1). Are they in the same units?" in caplog.text
     dataset.meta.features["action"]["info"] = {"low": [-2.0, 0.0], "high": [2.0, 1.0]}
     assert robot_of(PushtEnv(), env, dataset.meta).action_high == [2, 1], "what it states goes before both"
 

@@ -122,6 +122,15 @@ def test_a_missing_file_is_named_and_not_downloaded(pattern, message, small_data
     assert not (tmp_path / "run").exists()
 
 
+def test_a_table_that_lacks_episodes_is_named_and_nothing_is_downloaded(small_dataset, tmp_path):
+    root = tmp_path / "dataset"
+    shutil.copytree(small_dataset.root, root)
+    table = next((root / "meta" / "episodes").rglob("*.parquet"))
+    pq.write_table(pq.read_table(table).slice(1), table)
+    with pytest.raises(ValueError, match=r"cannot be opened \(meta/episodes has 5 of 6 episodes\)"):
+        train_tokenizer(root, tmp_path / "run", steps=1)
+
+
 def test_truncated_numbers_are_named(small_dataset, tmp_path):
     root = tmp_path / "dataset"
     shutil.copytree(small_dataset.root, root)
