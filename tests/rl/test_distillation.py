@@ -2,6 +2,7 @@
 
 import shutil
 import sys
+from collections.abc import Callable
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,8 @@ import pytest
 import torch
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
+from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
 from lerobot.policies.factory import make_pre_post_processors
 from lerobot.policies.tdmpc.configuration_tdmpc import TDMPCConfig
 from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
@@ -211,30 +214,50 @@ def test_policies_of_chunks_learn_chunks(
     assert len(weights(output_dir))
 
 
-@pytest.mark.parametrize("observations", [1, 3])
+FEATURES: dict[str, Any] = {
+    "device": "cpu", "pretrained_backbone_weights": None, "crop_shape": None, "use_group_norm": True,
+    "spatial_softmax_num_keypoints": 4,
+    "input_features": {
+        IMAGE: PolicyFeature(FeatureType.VISUAL, (3, 32, 32)), STATE: PolicyFeature(FeatureType.STATE, (8,)),
+    },
+    "output_features": {ACTION: PolicyFeature(FeatureType.ACTION, (7,))},
+}  # fmt: skip
+
+
+def small_vqbet(observations: int) -> VQBeTPolicy:
+    return VQBeTPolicy(VQBeTConfig(
+        **FEATURES, n_obs_steps=observations, n_vqvae_training_steps=1, vqvae_embedding_dim=8,
+        vqvae_enc_hidden_dim=8, gpt_input_dim=16, gpt_output_dim=16, gpt_hidden_dim=16, gpt_n_layer=1,
+        gpt_n_head=2,
+    ))  # fmt: skip
+
+
+def small_diffusion(observations: int) -> DiffusionPolicy:
+    return DiffusionPolicy(DiffusionConfig(
+        **FEATURES, n_obs_steps=observations, horizon=8, n_action_steps=4, down_dims=(16, 32), n_groups=4,
+        diffusion_step_embed_dim=16, num_train_timesteps=4,
+    ))  # fmt: skip
+
+
+@pytest.mark.parametrize(("make", "observations"), [(small_vqbet, 1), (small_vqbet, 3), (small_diffusion, 2)])
 def test_policies_of_several_observations_learn_from_as_many(
-    observations: int, imagined: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """LeRobot's VQ-BeT learns from observations (B, n, …), also where n is 1."""
-    features = {IMAGE: (FeatureType.VISUAL, (3, 32, 32)), STATE: (FeatureType.STATE, (8,))}
-    config = VQBeTConfig(
-        device="cpu", n_obs_steps=observations, pretrained_backbone_weights=None, crop_shape=None,
-        use_group_norm=True, spatial_softmax_num_keypoints=4, n_vqvae_training_steps=1,
-        vqvae_embedding_dim=8, vqvae_enc_hidden_dim=8, gpt_input_dim=16, gpt_output_dim=16,
-        gpt_hidden_dim=16, gpt_n_layer=1, gpt_n_head=2,
-        input_features={key: PolicyFeature(*each) for key, each in features.items()},
-        output_features={"action": PolicyFeature(FeatureType.ACTION, (7,))},
-    )  # fmt: skip
-    policy, output_dir = tmp_path / "vqbet", tmp_path / "rl"
-    VQBeTPolicy(config).save_pretrained(policy)
+    make: Callable[[int], Any], observations: int, imagined: list[str], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """VQ-BeT learns from observations (B, n, …), also where n is 1."""
+    made, policy, output_dir = make(observations), tmp_path / "policy", tmp_path / "rl"
+    made.save_pretrained(policy)
     stats = {key: {"min": torch.full(size, -1.0), "max": torch.ones(size)} for key, size in (
-        (STATE, (8,)), ("action", (7,))
+        (STATE, (8,)), (ACTION, (7,))
     )}  # fmt: skip
     stats[IMAGE] = {"mean": torch.zeros(3, 1, 1), "std": torch.ones(3, 1, 1)}
-    for processor in make_pre_post_processors(config, dataset_stats=stats):
+    for processor in make_pre_post_processors(made.config, dataset_stats=stats):
         processor.save_pretrained(policy)
-    train(monkeypatch, f"--policy.path={policy}", *FAST, *imagined, f"--output_dir={output_dir}")
+    flags = [*FAST, "--algorithm.recorded=true", *imagined, f"--output_dir={output_dir}"]
+    train(monkeypatch, f"--policy.path={policy}", *flags)
     assert read_metrics(output_dir)[-1]["labels"] >= 3 * 4
+    before = load_file(policy / "model.safetensors")
+    assert any(not torch.equal(before[name], value) for name, value in weights(output_dir).items())
 
 
 def test_without_a_success_there_is_nothing_to_learn_from(
