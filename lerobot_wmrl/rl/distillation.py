@@ -51,7 +51,7 @@ class Distillation(RLAlgorithm):
     the labels of all iterations and the successful episodes of the dataset.
 
     Args:
-        policy: any policy of LeRobot that lerobot-train can train, trained in place.
+        policy: any policy of LeRobot that is cloned from observations and actions, trained in place.
         config: the algorithm's configuration.
         output_dir: the training's folder, where the labels are kept.
     """
