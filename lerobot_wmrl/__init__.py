@@ -20,6 +20,7 @@ CONFIGURATIONS = (
     "lerobot_wmrl.world_models.configuration_world_model",
     "lerobot_wmrl.world_models.autoregressive.configuration",
     "lerobot_wmrl.rewards.configuration_rewards",
+    "lerobot_wmrl.envs.configuration_hub",
     "lerobot_wmrl.envs.configuration_world_model",
     "lerobot_wmrl.envs.configuration_wmrl_maniskill",
     "lerobot_wmrl.rl.configuration_algorithms",

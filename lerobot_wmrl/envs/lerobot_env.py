@@ -8,15 +8,16 @@ import torch
 from gymnasium.vector import AutoresetMode
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.envs import make_env, make_env_pre_post_processors
-from lerobot.envs.configs import EnvConfig
+from lerobot.envs.configs import EnvConfig, HubEnvConfig
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION, preprocess_observation
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
 from lerobot_wmrl.common.actions import clip_actions
 from lerobot_wmrl.common.constants import Observation
-from lerobot_wmrl.common.errors import within
+from lerobot_wmrl.common.errors import FieldError, within
 from lerobot_wmrl.common.policies import check_fit
+from lerobot_wmrl.envs.configuration_hub import HubEnv
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 
 SAME_START: Final = 0.01
@@ -28,6 +29,11 @@ def make_tensor_env(config: EnvConfig, n_envs: int, device: str) -> gym.vector.V
     if is_own(config):
         own: gym.vector.VectorEnv = config.create_tensor_env(n_envs, device)
         return own
+    if isinstance(config, HubEnvConfig):
+        raise FieldError(
+            "type", config.type, "its code lies on the hub, and this command does not run that of this type",
+            f"set `type` to hub and `hub_path` to {config.hub_path}; lerobot-wmrl-compare takes it as it is",
+        )  # fmt: skip
     return LeRobotTensorEnv(config, n_envs, device)
 
 
@@ -43,7 +49,8 @@ def runs_in_processes(config: EnvConfig) -> bool:
     takes from Gymnasium's registry, such as PushT, or from the hub may lack `task_description`. LeRobot's
     rollout asks for it, and an asynchronous environment without it does not survive the question.
     """
-    return is_own(config) or type(config).create_envs is not EnvConfig.create_envs
+    own_way = type(config).create_envs is not EnvConfig.create_envs
+    return is_own(config) or (own_way and not isinstance(config, HubEnv))
 
 
 def shapes_of(observation: Observation) -> dict[str, tuple[int, ...]]:
