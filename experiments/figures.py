@@ -11,23 +11,7 @@ from matplotlib.figure import Figure
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.improve.report.figures import COLOURS, tidy
 
-PALETTE: Final = (
-    *COLOURS,
-    "#b83280",
-    "#333333",
-    "#d69e2e",
-    "#319795",
-    "#718096",
-    "#9c4221",
-    "#63b3ed",
-    "#553c9a",
-    "#b7791f",
-    "#22543d",
-    "#f687b3",
-    "#a0aec0",
-    "#276749",
-    "#c05621",
-)
+PALETTE: Final = (*COLOURS, "#b83280", "#333333", "#d69e2e", "#319795")
 """Colours of methods, in their order."""
 
 PLACES: Final = {"imagined": "PPO in imagination", "simulated": "PPO in ManiSkill"}

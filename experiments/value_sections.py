@@ -7,11 +7,10 @@ from typing import Any, Final
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from scipy.stats import ttest_1samp
 
-from experiments import figures
 from experiments.cells import DOMAINS, Load, paired, points
 from experiments.study import ROOT, read_cells
 from lerobot_wmrl.common.files import markdown_table as table
@@ -45,6 +44,17 @@ IMAGINED: Final = (
     "ppo_distilled", "longer_imagined_ppo", "longer_ppo_distilled",
 )  # fmt: skip
 """Methods that use a world model."""
+
+DRAWN: Final = {
+    "cloning": "#90a4ae",
+    "filtered": "#607d8b",
+    "longer_filtered": "#37474f",
+    "simulated_ppo": "#2f855a",
+    "imagined_ppo": "#f6ad55",
+    "planned": "#dd6b20",
+    "ppo_distilled": "#9b2c2c",
+}
+"""Methods of the figure, the main ones of the table, and their colours."""
 
 CONTROLLED: Final = ("imagined_ppo", "planned")
 """Those that controls are made for."""
@@ -548,37 +558,40 @@ def shares(cells: Sequence[Cell], method: str, domain: str) -> str:
 
 
 def draw_value(load: Load, path: Path) -> None:
-    """Draw success against real episodes: a panel a domain, a line a method with its band.
+    """Draw success for every budget: a panel a domain, a point a method with its interval.
 
     Nothing is drawn before a cell has been published.
     """
     found = groups(load)
     if not found:
         return
-    figure = Figure(figsize=(9, 4.8), layout="constrained")
+    figure = Figure(figsize=(9, 4.2), layout="constrained")
     panels = figure.subplots(1, 2, sharey=True)
-    methods = measured([cell for cells in found.values() for cell in cells], TITLES)
-    colours = dict(zip(TITLES, figures.PALETTE, strict=True))
+    methods = measured([cell for cells in found.values() for cell in cells], DRAWN)
     for axes, domain in zip(panels, SCENES, strict=True):
-        lines = [_draw_line(axes, found, method, domain, colours[method]) for method in methods]
+        points = [
+            _draw_points(axes, found, method, domain, 0.11 * (number - (len(methods) - 1) / 2))
+            for number, method in enumerate(methods)
+        ]
         axes.set_title(f"{DOMAINS[domain]} scenes")
         axes.set_xlabel("real episodes: demonstrations + rollouts")
-        axes.set_xticks(range(len(found)), [f"{d} + {r}" for d, r in sorted(found, key=sum)])
+        axes.set_xticks(range(len(found)), [f"{d} + {r}" for d, r in sorted(found)])
     panels[0].set_ylabel("success in ManiSkill")
     titles = [TITLES[method] for method in methods]
-    figure.legend(lines, titles, loc="outside lower center", ncols=2, frameon=False, fontsize=9)
+    figure.legend(points, titles, loc="outside lower center", ncols=2, frameon=False, fontsize=9)
     path.parent.mkdir(parents=True, exist_ok=True)
     tidy(figure).savefig(path, dpi=130)
 
 
-def _draw_line(axes: Axes, found: Groups, method: str, domain: str, color: str) -> Line2D:
-    """Draw a method's mean and band over the budgets, the smallest first, and return the line."""
+def _draw_points(axes: Axes, found: Groups, method: str, domain: str, shift: float) -> ErrorbarContainer:
+    """Draw a method's mean and interval beside those of others: hollow if it uses no world model."""
     places, means = [], []
-    for place, budget in enumerate(sorted(found, key=sum)):
+    for place, budget in enumerate(sorted(found)):
         if runs := outcomes(found[budget], method, domain):
-            places.append(place)
+            places.append(place + shift)
             means.append(RunsMean.over(runs))
-    low, high = [mean.low for mean in means], [mean.high for mean in means]
-    axes.fill_between(places, low, high, color=color, alpha=0.15)
-    (line,) = axes.plot(places, [mean.mean for mean in means], marker="o", color=color)
-    return line
+    whiskers = [[mean.mean - mean.low for mean in means], [mean.high - mean.mean for mean in means]]
+    return axes.errorbar(
+        places, [mean.mean for mean in means], whiskers, fmt="o", color=DRAWN[method],
+        markerfacecolor=DRAWN[method] if method in IMAGINED else "white",
+    )  # fmt: skip

@@ -154,7 +154,7 @@ def test_a_control_differs_from_the_study_in_nothing_but_the_world_model() -> No
             assert own or flag in MAY_DIFFER, (step.name, word)
 
 
-def test_the_figure_has_a_line_for_every_method(docs: Path) -> None:
+def test_a_figure_is_drawn(docs: Path) -> None:
     path = docs / "images" / "value.png"
     draw_value(loader(docs), path)
     assert path.stat().st_size > 10_000
