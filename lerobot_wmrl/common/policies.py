@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from huggingface_hub import snapshot_download
 from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.default import PeftConfig as AdapterSettings
@@ -16,6 +17,7 @@ from torch import Tensor
 
 from lerobot_wmrl.common.checkpoints import ADAPTERS_FILE, resolve_checkpoint
 from lerobot_wmrl.common.errors import FieldError, first_line
+from lerobot_wmrl.common.files import whole_folder
 
 
 def read_policy_config(path: str, overrides: list[str]) -> PreTrainedConfig:
@@ -35,6 +37,23 @@ def read_policy_config(path: str, overrides: list[str]) -> PreTrainedConfig:
         ) from error  # fmt: skip
     config.pretrained_path = folder
     return config
+
+
+def copy_checkpoint(config: PreTrainedConfig, folder: Path) -> None:
+    """Make a checkpoint that acts as `config` says, with links to its policy's weights and processors.
+
+    A checkpoint that is there already stays. That of a name on the hub is downloaded into its cache.
+    """
+    if folder.exists():
+        return
+    source = Path(str(config.pretrained_path))
+    if not source.is_dir():
+        source = Path(snapshot_download(str(source)))
+    with whole_folder(folder) as partial:
+        config.save_pretrained(partial)
+        for file in source.iterdir():
+            if file.name != "config.json":
+                (partial / file.name).symlink_to(file.resolve())
 
 
 def check_weights(config: PreTrainedConfig) -> None:

@@ -55,6 +55,7 @@ class ImproveConfig(RunConfig):
 
     Args:
         policy: `--policy.path=FOLDER` or a name on the hub: the policy to improve, cloned from such data.
+            Settings of its own hold for all stages, such as `--policy.n_action_steps=8` for ACT.
         dataset: `--dataset.repo_id=USER/NAME` or `--dataset.root=FOLDER`: episodes with actions, the cameras
             that the policy sees, and next.success. Failures belong into it.
         real_env: `--real_env.type=…` and its settings: one of LeRobot's environments or wmrl_maniskill, to
@@ -92,17 +93,16 @@ class ImproveConfig(RunConfig):
     seed: int = 0
     output_dir: Path = Path("outputs/improve")
 
+    @property
+    def policy_flags(self) -> list[str]:
+        """The settings of the policy that the command line changes: `--n_action_steps=8`."""
+        return parser.get_cli_overrides("policy") or []
+
     def check(self) -> None:
         """Read the policy's configuration. FieldError for a setting that cannot be."""
         path = parser.get_path_arg("policy")
         if path:
-            for flag in parser.get_cli_overrides("policy") or []:
-                name, _, value = flag.removeprefix("--").partition("=")
-                raise FieldError(
-                    f"policy.{name}", value, "would hold for some of the commands only",
-                    "set it in the policy's config.json",
-                )  # fmt: skip
-            self.policy = read_policy_config(path, [])
+            self.policy = read_policy_config(path, self.policy_flags)
         if self.policy is None:
             raise FieldError("policy.path", None, "is missing", "give the policy to improve")
         require_trained(self.policy)

@@ -167,5 +167,5 @@ def few_decisions(policy: PreTrainedConfig, table: EpisodeTable) -> list[str]:
         return []
     return [
         f"decisions: {policy.type} takes {steps} actions at a time, and an imagined episode has about "
-        f"{usual} frames. RL has little to choose: set `n_action_steps` lower in the policy's config.json"
+        f"{usual} frames. RL has little to choose: set --policy.n_action_steps lower"
     ]

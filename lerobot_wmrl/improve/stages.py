@@ -22,7 +22,7 @@ from lerobot_wmrl.common.constants import (
 )
 from lerobot_wmrl.common.errors import STOPPED
 from lerobot_wmrl.common.lerobot_commands import edit_command, env_flags, merge_command, train_command
-from lerobot_wmrl.common.policies import check_units, load_processors
+from lerobot_wmrl.common.policies import check_units, copy_checkpoint, load_processors
 from lerobot_wmrl.common.presets import Flags, format_flags
 from lerobot_wmrl.common.stages import FAILED, Stage, in_fork, never, read_record
 from lerobot_wmrl.data.embodiment import Embodiment, read_embodiment
@@ -178,9 +178,15 @@ class Improvement:
 
     @property
     def policy(self) -> str:
-        """Path or name of the policy that is improved."""
+        """Path or name of the policy that is improved: with settings of the command line, that of a copy."""
         assert self.config.policy is not None
-        return str(self.config.policy.pretrained_path)
+        return str(self.out / "policy" if self.config.policy_flags else self.config.policy.pretrained_path)
+
+    def copy_policy(self) -> None:
+        """Make the copy of the policy that every stage reads, if the command line changes its settings."""
+        assert self.config.policy is not None
+        if self.config.policy_flags:
+            copy_checkpoint(self.config.policy, self.out / "policy")
 
     @property
     def rl_checkpoint(self) -> Path:

@@ -37,6 +37,7 @@ def improve(cfg: ImproveConfig) -> None:
     print(f"{cfg.dataset.name}:\n{improvement.found}\n  {improvement.duration}")
     stages = improvement.stages()
     with claimed(cfg.output_dir, settings(cfg, stages)):
+        improvement.copy_policy()
         run_stages(stages, cfg.output_dir)
         page = Page.of(improvement)
         path = page.write(cfg.output_dir)
@@ -49,6 +50,8 @@ def settings(cfg: ImproveConfig, stages: "list[Stage]") -> dict[str, object]:
     """Return what decides the result, as JSON."""
     assert cfg.policy is not None
     given = {name: value for name, value in draccus.encode(cfg).items() if name != "policy"}
+    if cfg.policy_flags:
+        given["policy_flags"] = cfg.policy_flags
     return given | {
         "policy": str(cfg.policy.pretrained_path), "size": cfg.preset, "output_dir": str(cfg.output_dir),
         "selection_episodes": cfg.selection_episodes if cfg.selects else 0,

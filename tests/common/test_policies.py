@@ -13,6 +13,7 @@ from lerobot_wmrl.common.policies import (
     check_fit,
     check_units,
     check_weights,
+    copy_checkpoint,
     load_policy,
     read_policy_config,
 )
@@ -91,3 +92,14 @@ def test_the_rounded_mean_of_a_constant_component_is_in_its_range(tmp_path: Path
     step.stats = {"action": {"mean": held + 0.01}}
     with pytest.raises(ValueError, match=r"gripper is 0\.31 on average"):
         check_units(config, SimpleNamespace(steps=[step]), ["gripper"], held, held)
+
+
+def test_a_copy_acts_as_it_is_told_and_its_original_stays(tmp_path: Path) -> None:
+    original, copy = save_untrained_policy(tmp_path / "original", size=32), tmp_path / "copies" / "one"
+    copy_checkpoint(read_policy_config(str(original), ["--max_shift=0"]), copy)
+    assert [read_policy_config(str(path), []).max_shift for path in (original, copy)] == [2, 0]
+    weights = (load_policy(read_policy_config(str(path), [])).state_dict() for path in (original, copy))
+    assert all(torch.equal(*pair) for pair in zip(*(each.values() for each in weights), strict=True))
+    assert {path.name for path in copy.iterdir()} == {path.name for path in original.iterdir()}
+    copy_checkpoint(read_policy_config(str(original), ["--max_shift=1"]), copy)
+    assert read_policy_config(str(copy), []).max_shift == 0, "it is there already"

@@ -144,8 +144,13 @@ def test_a_dyna_round_records_in_pusht(
 
 
 def test_without_one_the_report_says_that_it_is_a_belief(demonstrations: Path, tmp_path: Path) -> None:
-    done = run(tmp_path, demonstrations, "--dataset.episodes=[0,2]")
+    done = run(tmp_path, demonstrations, "--dataset.episodes=[0,2]", "--policy.max_shift=1")
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    shifts = {
+        folder: read_policy_config(str(tmp_path / folder), []).max_shift
+        for folder in ("policy", "improve/policy", "improve/rl", "improve/distilled")
+    }
+    assert shifts == {"policy": 2, "improve/policy": 1, "improve/rl": 1, "improve/distilled": 1}
     report = (tmp_path / "improve" / "report.html").read_text()
     assert "Changes in imagination" in report
     assert "shows nothing about the real world" in report
@@ -165,7 +170,6 @@ def test_without_one_the_report_says_that_it_is_a_belief(demonstrations: Path, t
     (["--max_frames=0"], "--max_frames=0: must be at least 1"),
     (["--seed=1000000"], "--seed=1000000: must be from 0 to 999999"),
     (["--size=huge"], "--size=huge: choose one of auto, tiny, demo, cpu"),
-    (["--policy.n_action_steps=8"], "--policy.n_action_steps=8: would hold for some of the commands only"),
     (["--dataset.root=nowhere"], "no LeRobotDataset there"),
     (["--real_env.type=wmrl_maniskill"],
      "the policy needs observation.image, which real_env does not have"),
