@@ -1,5 +1,6 @@
 """Any environment of LeRobot's for reinforcement learning: tensors in, tensors out."""
 
+from math import ceil
 from typing import Any, Final
 
 import gymnasium as gym
@@ -84,7 +85,8 @@ class LeRobotTensorEnv(gym.vector.VectorEnv):
     """B environments of LeRobot's, stepped one after the other, with SAME_STEP autoreset.
 
     Observations have LeRobot's names, as its rollout makes them: images (B, 3, H, W) in [0, 1], `task`
-    (B instructions). If the environment has several tasks, they are shared out among the B.
+    (B instructions). If the environment has several tasks, they are shared out among the B. An episode is
+    truncated after `_max_episode_steps` frames, which LIBERO leaves to LeRobot's rollout.
 
     Actions (B, A) that are out of the environment's range are clipped to it and counted:
     `info["reward_parts"]["clipped"]`, the share of components. NaN is refused. When an episode ends in a
@@ -93,19 +95,22 @@ class LeRobotTensorEnv(gym.vector.VectorEnv):
     """
 
     def __init__(self, config: EnvConfig, n_envs: int, device: str) -> None:
-        self.envs: list[gym.vector.VectorEnv] = []
-        for row in range(n_envs):
-            made = make_env(config, 1, use_async_envs=False)
-            every = [env for tasks in made.values() for env in tasks.values()]
-            self.tasks = len(every)
-            self.envs.append(every.pop(row % self.tasks))
-            for spare in every:
-                spare.close()
+        tasks = _members(config, 1)
+        self.tasks = len(tasks)
+        if n_envs > self.tasks:
+            for (env,) in tasks:
+                env.close()
+            tasks = _members(config, ceil(n_envs / self.tasks))
+        in_turn = [env for members in zip(*tasks, strict=True) for env in members]
+        self.envs, spare = in_turn[:n_envs], in_turn[n_envs:]
+        for env in spare:
+            env.close()
         self.before, self.after = make_env_pre_post_processors(config, None)
         self.num_envs, self.device = n_envs, torch.device(device)
-        self.single_action_space = self.envs[0].single_action_space
+        self.single_action_space = self.envs[0].action_space
         self.action_space = gym.vector.utils.batch_space(self.single_action_space, n_envs)
-        self.max_episode_steps = max(int(env.call("_max_episode_steps")[0]) for env in self.envs)
+        self._limits = [_frame_limit(config, env) for env in self.envs]
+        self.max_episode_steps = max(self._limits)
         self.metadata = {"render_fps": config.fps, "autoreset_mode": AutoresetMode.SAME_STEP}
         self._length = np.zeros(n_envs, np.int64)
 
@@ -137,10 +142,11 @@ class LeRobotTensorEnv(gym.vector.VectorEnv):
         taken = clipped.numpy()
         reward, flags = np.zeros(self.num_envs, np.float32), np.zeros((3, self.num_envs), bool)
         for row, env in enumerate(self.envs):
-            observation, gained, terminated, truncated, info = env.step(taken[row : row + 1])
+            observation, gained, terminated, truncated, info = env.step(taken[row])
             self._length[row] += 1
-            reward[row], flags[:, row] = gained[0], (terminated[0], truncated[0], succeeded(info))
-            self._seen[row] = self._observe(row, final_observation(observation, info))
+            truncated |= not terminated and self._length[row] >= self._limits[row]
+            reward[row], flags[:, row] = gained, (terminated, truncated, info.get("is_success", False))
+            self._seen[row] = self._observe(row, observation)
         ended = flags[0] | flags[1]
         result = self._stacked(self._seen)
         info = {"reward_parts": {"clipped": share.to(self.device)}}
@@ -169,12 +175,11 @@ class LeRobotTensorEnv(gym.vector.VectorEnv):
 
     def _begin(self, row: int, seed: int | None) -> Observation:
         self._length[row] = 0
-        seeds = None if seed is None else [seed]
-        return self._observe(row, self.envs[row].reset(seed=seeds, options={NEW_ROLLOUT_OPTION: True})[0])
+        return self._observe(row, self.envs[row].reset(seed=seed, options={NEW_ROLLOUT_OPTION: True})[0])
 
     def _observe(self, row: int, raw: Any) -> Observation:
         """Return an observation as LeRobot's rollout shows it to a policy's processors, batch of one."""
-        observation = preprocess_observation(raw)
+        observation = preprocess_observation(_batch_of_one(raw))
         observation["task"] = self._instruction(row)
         seen: Observation = self.before(observation)
         return seen
@@ -182,7 +187,7 @@ class LeRobotTensorEnv(gym.vector.VectorEnv):
     def _instruction(self, row: int) -> list[str]:
         for name in ("task_description", "task"):
             try:
-                return [str(text) for text in self.envs[row].call(name)]
+                return [str(self.envs[row].get_wrapper_attr(name))]
             except (AttributeError, NotImplementedError):
                 continue
         return [""]
@@ -199,23 +204,31 @@ class LeRobotTensorEnv(gym.vector.VectorEnv):
         return torch.from_numpy(values).to(self.device)
 
 
-def succeeded(info: dict[str, Any]) -> bool:
-    """Return whether the step of a single environment was a success, as LeRobot's rollout reads it."""
-    found = info.get("final_info", info)
-    found = found if isinstance(found, dict) else (found[0] or {})
-    return bool(np.asarray(found.get("is_success", False)).reshape(-1)[0])
+def _members(config: EnvConfig, each: int) -> list[list[gym.Env]]:
+    """Make `each` environments of every task. → by task. FieldError if they are not to be had one by one."""
+    made = make_env(config, each, use_async_envs=False)
+    tasks = [env for suite in made.values() for env in suite.values()]
+    for env in tasks:
+        if not isinstance(env, gym.vector.SyncVectorEnv):
+            raise FieldError(
+                "type", config.type, f"makes a {type(env).__name__}, whose episodes cannot begin one by one",
+                "it must make a gymnasium.vector.SyncVectorEnv where `use_async_envs` is false",
+            )  # fmt: skip
+    return [list(env.envs) for env in tasks]
 
 
-def final_observation(observation: Any, info: dict[str, Any]) -> Any:
-    """Return what a single environment showed last, before it was reset in the same step."""
-    final = info.get("final_obs")
-    if final is None or final[0] is None:
-        return observation
-    return batch_of_one(final[0])
+def _frame_limit(config: EnvConfig, env: gym.Env) -> int:
+    """Return the most frames of an episode. FieldError if the environment does not say it."""
+    if not env.has_wrapper_attr("_max_episode_steps"):
+        raise FieldError(
+            "type", config.type, "does not say after how many frames an episode ends (`_max_episode_steps`)",
+            "make the environment by gymnasium.make, with `max_episode_steps`",
+        )  # fmt: skip
+    return int(env.get_wrapper_attr("_max_episode_steps"))
 
 
-def batch_of_one(observation: Any) -> Any:
+def _batch_of_one(observation: Any) -> Any:
     """Add a batch dimension to the arrays of an observation."""
     if isinstance(observation, dict):
-        return {name: batch_of_one(value) for name, value in observation.items()}
-    return np.asarray(observation)[None]
+        return {name: _batch_of_one(value) for name, value in observation.items()}
+    return np.array(observation)[None]

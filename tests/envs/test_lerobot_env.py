@@ -4,8 +4,9 @@ import itertools
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
+import gymnasium as gym
 import pytest
 import torch
 from lerobot.envs.configs import EnvConfig, PushtEnv
@@ -72,17 +73,80 @@ class TwoTasks(PushtEnv):
         return {"pusht": dict(enumerate(made))}
 
 
+class Counted(gym.Wrapper):
+    """PushT whose starts depend on the number of resets, as LIBERO's do."""
+
+    def __init__(self, env: gym.Env, first: int, stride: int) -> None:
+        super().__init__(env)
+        self.starts = itertools.count(first, stride)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        return self.env.reset(seed=next(self.starts), options=options)
+
+
 @EnvConfig.register_subclass("unseeded")
 @dataclass
 class Unseeded(PushtEnv):
-    """PushT whose starts depend on the number of resets, as LIBERO's do."""
+    """Of such environments."""
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, Any]]:
         made = PushtEnv(episode_length=self.episode_length).create_envs(n_envs)
-        (env,) = made["pusht"].values()
-        reset, count = env.reset, itertools.count()
-        env.reset = lambda seed, options: reset(seed=[next(count)], options=options)
+        vector = made["pusht"][0]
+        vector.envs = [Counted(env, number, n_envs) for number, env in enumerate(vector.envs)]
         return made
+
+
+def test_environments_begin_in_starts_of_their_own_where_resets_are_counted() -> None:
+    states = LeRobotTensorEnv(Unseeded(episode_length=STEPS), B, "cpu").reset(seed=5)[0][OBS_STATE]
+    known = LeRobotTensorEnv(PushtEnv(episode_length=STEPS), B, "cpu").reset(seed=[0, 1])[0][OBS_STATE]
+    assert torch.equal(states, known)
+
+
+class Endless(gym.Wrapper):
+    """PushT that leaves it to LeRobot's rollout to end an episode, as LIBERO does."""
+
+    def step(self, action: Any) -> Any:
+        observation, reward, terminated, _, info = self.env.step(action)
+        return observation, reward, terminated, False, info
+
+
+@EnvConfig.register_subclass("endless")
+@dataclass
+class EndlessPusht(PushtEnv):
+    """Of such environments."""
+
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, Any]]:
+        made = PushtEnv(episode_length=self.episode_length).create_envs(n_envs)
+        made["pusht"][0].envs = [Endless(env) for env in made["pusht"][0].envs]
+        return made
+
+
+def test_an_episode_ends_at_the_limit_though_the_environment_goes_on() -> None:
+    env = LeRobotTensorEnv(EndlessPusht(episode_length=STEPS), B, "cpu")
+    env.reset(seed=5)
+    *_, truncated, info = [env.step(torch.full((B, 2), 250.0)) for _ in range(STEPS)][-1]
+    assert truncated.all()
+    assert info["final_info"]["episode_length"].tolist() == [STEPS] * B
+
+
+@EnvConfig.register_subclass("ten_tasks")
+@dataclass
+class TenTasks(PushtEnv):
+    """PushT ten times; counts the environments that it has made."""
+
+    made: ClassVar[int] = 0
+
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, Any]]:
+        TenTasks.made += 10 * n_envs
+        config = PushtEnv(episode_length=self.episode_length)
+        return {"pusht": {task: config.create_envs(n_envs)["pusht"][0] for task in range(10)}}
+
+
+def test_hardly_more_environments_are_made_than_asked_for() -> None:
+    env = LeRobotTensorEnv(TenTasks(episode_length=STEPS), 12, "cpu")
+    assert (len(env.envs), env.tasks, TenTasks.made) == (12, 10, 10 + 20)
+    assert len(set(map(id, env.envs))) == 12
+    env.close()
 
 
 def test_grpo_needs_starts_that_seeds_decide(env: LeRobotTensorEnv) -> None:
@@ -96,7 +160,8 @@ def test_grpo_needs_starts_that_seeds_decide(env: LeRobotTensorEnv) -> None:
 
 def test_several_tasks_are_shared_out_and_the_longest_episode_counts() -> None:
     env = LeRobotTensorEnv(TwoTasks(episode_length=STEPS), 3, "cpu")
-    assert [int(each.call("_max_episode_steps")[0]) for each in env.envs] == [STEPS, 2 * STEPS, STEPS]
+    limits = [each.get_wrapper_attr("_max_episode_steps") for each in env.envs]
+    assert limits == [STEPS, 2 * STEPS, STEPS]
     assert env.max_episode_steps == 2 * STEPS
     check_tasks(TrainConfig(), env)
     with pytest.raises(ValueError, match=r"^algorithm\.type=grpo: .*the environment has 2 tasks; choose one"):
