@@ -23,6 +23,11 @@ def to_bytes(images: Tensor) -> Tensor:
     return (images * 255).round().byte()
 
 
+def as_bytes(images: Tensor) -> Tensor:
+    """Convert images to uint8, from [0, 1] if they are not in uint8."""
+    return images if images.dtype == torch.uint8 else to_bytes(images)
+
+
 def jpeg(image: np.ndarray) -> bytes:
     """Encode an image (H, W, 3) uint8."""
     return cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()

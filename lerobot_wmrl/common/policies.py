@@ -215,7 +215,7 @@ def check_units(
         known = (getattr(step, "stats", None) or {}).get(ACTION, {}).get("mean")
         if known is None:
             continue
-        mean, least, most = (torch.as_tensor(each).flatten().double().cpu() for each in (known, low, high))
+        mean, least, most = (torch.as_tensor(each).flatten().cpu().double() for each in (known, low, high))
         width = (most - least).clamp_min(1e-3 * most.abs())  # a constant component's mean was rounded
         strange = (mean < least - width) | (mean > most + width)
         for component in strange.nonzero().flatten().tolist()[:1]:
@@ -286,11 +286,17 @@ def has_adapters(policy: Any) -> bool:
 
 
 def load_trained_weights(policy: Any, weights: dict[str, Any]) -> None:
-    """Load all weights of a checkpoint, or its adapters' alone. Raises RuntimeError if they do not fit."""
+    """Load all weights of a checkpoint, or its adapters' alone. Raises RuntimeError if they do not fit.
+
+    Of weights that a policy uses under several names a checkpoint holds one.
+    """
     from peft import set_peft_model_state_dict
 
     if not has_adapters(policy):
-        policy.load_state_dict(weights)
+        own = policy.state_dict()
+        held = {own[name].data_ptr() for name in weights if name in own}
+        tied = {name: own[name] for name in own.keys() - weights.keys() if own[name].data_ptr() in held}
+        policy.load_state_dict({**tied, **weights})
         return
     unexpected = set_peft_model_state_dict(policy, weights).unexpected_keys
     if unexpected:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.images import to_bytes
+from lerobot_wmrl.common.images import as_bytes
 from lerobot_wmrl.data.embodiment import HIGH, LOW, Embodiment
 
 
@@ -33,9 +33,12 @@ def episode_features(observation: Observation, robot: Embodiment, camera: str) -
 
 
 def observation_row(observation: Observation, row: int) -> dict[str, np.ndarray]:
-    """Return one row of a batch of observations as a dataset holds it: images (H, W, 3) uint8."""
+    """Return one row of a batch of observations as a dataset holds it: images (H, W, 3) uint8.
+
+    Images of the batch are in [0, 1], or uint8 already.
+    """
     return {
-        key: to_bytes(value[row]).permute(1, 2, 0).cpu().numpy()
+        key: as_bytes(value[row]).permute(1, 2, 0).cpu().numpy()
         if key.startswith(OBS_IMAGE)
         else value[row].cpu().numpy().astype(np.float32)
         for key, value in observation.items()

@@ -33,10 +33,10 @@ class HubEnv(EnvConfig):
     trust_remote_code: bool = False
 
     def __post_init__(self) -> None:
-        """Raise FieldError unless there is a path and its code may run."""
-        if not self.hub_path:
-            raise FieldError("hub_path", "", "no environment is named", "give user/name, as on the hub")
-        if not self.trust_remote_code:
+        """Raise FieldError if there is a path whose code may not run. Its actions are not known yet."""
+        self.features.clear()
+        self.features_map.clear()
+        if self.hub_path and not self.trust_remote_code:
             raise FieldError(
                 "trust_remote_code", False, f"the code of {self.hub_path} would run on this machine",
                 "read it, then set this to true",
@@ -52,8 +52,10 @@ class HubEnv(EnvConfig):
     ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """Make the environments, as {suite: {task: vector of `n_envs`}}.
 
-        FieldError if the file cannot be had, or makes another number of environments.
+        FieldError if there is no path, the file cannot be had, or makes another number of environments.
         """
+        if not self.hub_path:
+            raise FieldError("hub_path", "", "no environment is named", "give user/name, as on the hub")
         try:
             made: dict[str, dict[int, gym.vector.VectorEnv]] = make_env(
                 self.hub_path, n_envs, use_async_envs, trust_remote_code=self.trust_remote_code

@@ -3,15 +3,17 @@
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from math import ceil
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 import torch
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs import close_envs, make_env, make_env_pre_post_processors
-from lerobot.envs.configs import EnvConfig
-from lerobot.envs.utils import env_to_policy_features
+from lerobot.envs.configs import EnvConfig, LiberoEnv
+from lerobot.envs.utils import NEW_ROLLOUT_OPTION, FreezeAfterEpisodeEnd, env_to_policy_features
 from lerobot.scripts.lerobot_eval import eval_policy
 from lerobot.utils.constants import ACTION, PRETRAINED_MODEL_DIR
 from lerobot.utils.random_utils import set_seed
@@ -108,13 +110,17 @@ def load_policies(configs: Mapping[str, PreTrainedConfig]) -> list[LoadedPolicy]
 def opened(config: EnvConfig, n_envs: int, trust_remote_code: bool, policies: int) -> Iterator[list[Envs]]:
     """Make the environments of that many policies, for `n_envs` episodes at once; close them in the end.
 
-    This project's own are shared. LeRobot's are not: in LIBERO the number of resets so far, and not the seed,
-    chooses the start. Those of several tasks stay in this process: all of them are open at the same time.
+    This project's own are shared. LeRobot's are not: see `counts_resets`. Those of several tasks stay in this
+    process: all of them are open at the same time.
     """
     own, parallel = is_own(config), runs_in_processes(config)
 
     def make() -> Envs:
-        return make_env(config, n_envs, parallel, trust_remote_code=trust_remote_code)
+        envs: Envs = make_env(config, n_envs, parallel, trust_remote_code=trust_remote_code)
+        for env in _flat(envs):
+            if isinstance(env, SyncVectorEnv) and env.autoreset_mode is AutoresetMode.NEXT_STEP:
+                env.envs = [FreezeAfterEpisodeEnd(each) for each in env.envs]
+        return envs
 
     made = [make()]
     if parallel and not own and len(_flat(made[0])) > 1:
@@ -136,16 +142,30 @@ def _flat(envs: Envs) -> list[Any]:
     return [env for tasks in envs.values() for env in tasks.values()]
 
 
+def counts_resets(config: EnvConfig) -> bool:
+    """Return whether not the seed but the number of resets so far chooses an episode's start, as in LIBERO.
+
+    Policies meet the same starts there if each has environments of its own that are reset once an episode:
+    LeRobot's `FreezeAfterEpisodeEnd` keeps those away that a vector environment would make by itself.
+    """
+    return isinstance(config, LiberoEnv) and config.init_states
+
+
 def require_new_starts(envs: Envs, config: EnvConfig, n_episodes: int) -> None:
-    """Raise FieldError if a world model has too few start frames: episodes would repeat and count twice."""
-    if not isinstance(config, WorldModelEnv):
+    """Raise FieldError if a world model or LIBERO has too few starts: some would count twice."""
+    if isinstance(config, WorldModelEnv):
+        fewest = min(len(env.env.starts) for env in _flat(envs))
+        said, more = "the world model has {} start frames", ", or give more with `env.dataset.max_starts`"
+    elif counts_resets(config):
+        fewest = min(len(states) for env in _flat(envs) for states in env.call("_init_states"))
+        said, more = f"{config.type} has {{}} starts", ", or set `env.init_states` to false"
+    else:
         return
-    fewest = min(len(env.env.starts) for env in _flat(envs))
     if n_episodes > fewest:
         raise FieldError(
             "n_episodes", n_episodes,
-            f"the world model has {fewest} start frames for a task, and an episode that is repeated says "
-            f"nothing new", f"set it to at most {fewest}, or give more with `env.dataset.max_starts`",
+            f"{said.format(fewest)} for a task, and an episode that is repeated says nothing new",
+            f"set it to at most {fewest}{more}",
         )  # fmt: skip
 
 
@@ -160,6 +180,10 @@ def run_comparison(
         seed: seed of the first start of each task; each further one adds one.
         save: called after every block.
     """
+    if counts_resets(config):
+        for env in (each for own in envs for each in _flat(own)):
+            for _ in range(ceil(comparison.starts_per_task / batch_size)):
+                env.reset(options={NEW_ROLLOUT_OPTION: True})
     while not comparison.finished:
         done = comparison.starts_per_task
         count = min(batch_size, comparison.n_episodes - done)

@@ -6,7 +6,13 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 
-from lerobot_wmrl.common.constants import EVALUATION_SEED, START_COLUMNS, START_SCENE, START_SEED
+from lerobot_wmrl.common.constants import (
+    EVALUATION_SEED,
+    SELECTION_SEED,
+    START_COLUMNS,
+    START_SCENE,
+    START_SEED,
+)
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.episodes import EpisodeTable, parquet_files
 from lerobot_wmrl.maniskill.scenes import scenes_of
@@ -61,6 +67,23 @@ def scene_splits(
         )  # fmt: skip
     held_out = np.isin(scene, [each.index for each in scenes_of("ood")] if unseen is None else list(unseen))
     return {"ind": (scene >= 0) & ~held_out, "ood": (scene >= 0) & held_out}
+
+
+def require_unmeasured(table: EpisodeTable) -> None:
+    """Raise FieldError if results are reported on starts of the dataset: no policy may be chosen there.
+
+    These have evaluation seeds, from `EVALUATION_SEED` on and below `SELECTION_SEED`. A dataset without seeds
+    passes.
+    """
+    seeds = table.column(START_SEED)
+    measured = (seeds >= EVALUATION_SEED) & (seeds < SELECTION_SEED)
+    if measured.any():
+        raise FieldError(
+            "dataset.root", table.dataset.root,
+            f"{measured.sum()} of {len(seeds)} episodes have evaluation seeds, on which results are "
+            f"reported; the first is episode {np.argmax(measured)} (seed {seeds[measured][0]})",
+            f"choose the policy on others, recorded with seeds from {SELECTION_SEED} on",
+        )  # fmt: skip
 
 
 def require_unreported(table: EpisodeTable, episodes: np.ndarray, remedy: str) -> None:

@@ -10,19 +10,24 @@ from lerobot_wmrl.data.budget import Ledger
 from lerobot_wmrl.data.episodes import DatasetSource, read_episodes
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.envs.start_frames import check_starts
+from lerobot_wmrl.maniskill.recordings import require_unmeasured
 from lerobot_wmrl.rl.configuration_callbacks import CallbackSettings
 
 
 def check_data(settings: CallbackSettings, env: EnvConfig) -> None:
     """Raise FieldError for a dataset that a training in `env` must not learn from.
 
-    Starts must not be among those that results are reported on. With a budget its ledger must know the
-    episodes of every dataset that decides something: starts, gate, selection and Dyna rounds.
+    Starts must not be among those that results are reported on, whether policies are trained or chosen on
+    them. With a budget its ledger must know the episodes of every dataset that decides something: starts,
+    gate, selection and Dyna rounds.
     """
     ledger = None if settings.budget is None else Ledger(settings.budget)
     if isinstance(env, WorldModelEnv):
         with within("env"):
             check_starts(env.dataset, ledger)
+    if settings.selection.dataset.given:
+        with within("selection"):
+            require_unmeasured(read_episodes(settings.selection.dataset.open()))
     if ledger is None:
         return
     datasets = {

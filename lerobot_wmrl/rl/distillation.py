@@ -1,5 +1,6 @@
 """Distillation of a planner into a policy, in imagination. T time, B environments, A action components."""
 
+import math
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -111,11 +112,17 @@ class Distillation(RLAlgorithm):
         shown = self.demonstrate(env, pipeline, rollout, seed)
         part = imagined_labels(rollout.observations, shown.actions, shown.labelled, self.windows)
         self.labels.add(self.iteration, part)
-        if not min(gather_counts(sum(map(len, self.labels.imagined)), env.device)):
+        imagined = gather_counts(sum(map(len, self.labels.imagined)), env.device)
+        if not sum(imagined):
             raise TrainingStopped(
                 f"iteration {self.iteration + 1}: the planner has not succeeded in any imagined episode, so "
                 "there is nothing to learn from: raise `algorithm.planner.samples` or "
                 "`algorithm.planner.iterations`, lower `env.done_threshold`, or train the world model longer"
+            )
+        if not min(gather_counts(len(self.labels), env.device)):
+            raise TrainingStopped(
+                f"iteration {self.iteration + 1}: in {imagined.count(0)} of {len(imagined)} processes the "
+                "planner has not succeeded in any imagined episode: raise `num_envs`, or use fewer processes"
             )
         collected = time.perf_counter()
         updates = self.config.last_updates if last else self.config.updates
@@ -204,7 +211,7 @@ class Distillation(RLAlgorithm):
             self.optimizer.zero_grad()
             loss.backward()
             average_gradients(self.parameters)
-            norm = nn.utils.clip_grad_norm_(self.parameters, self.preset.grad_clip_norm)
+            norm = nn.utils.clip_grad_norm_(self.parameters, self.preset.grad_clip_norm or math.inf)
             if not (torch.isfinite(loss) and torch.isfinite(norm)):
                 raise TrainingStopped(
                     f"iteration {self.iteration + 1}: the loss or its gradient is not finite; the last "

@@ -67,7 +67,7 @@ class PPO(PolicyGradient):
 
     def __init__(self, policy: Any, config: PPOConfig) -> None:
         super().__init__(policy, config)
-        self.return_scale = ReturnScale(self.value_parameters[0].device)
+        self.return_scale = ReturnScale()
 
     def parameter_groups(self) -> dict[str, tuple[list[nn.Parameter], float]]:
         """Return two groups: the value function has a learning rate and a gradient norm of its own."""

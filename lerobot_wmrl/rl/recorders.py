@@ -14,7 +14,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs import make_env, make_env_pre_post_processors
 from lerobot.envs.configs import EnvConfig
 from lerobot.scripts.lerobot_eval import rollout
-from lerobot.utils.constants import ACTION, PRETRAINED_MODEL_DIR
+from lerobot.utils.constants import ACTION, OBS_IMAGE, PRETRAINED_MODEL_DIR
 from torch import Tensor
 from tqdm import trange
 
@@ -23,6 +23,7 @@ from lerobot_wmrl.common.constants import KINDS, POLICY, START_KIND, START_SEED,
 from lerobot_wmrl.common.errors import FieldError, renamed
 from lerobot_wmrl.common.exploration import ExplorationNoise
 from lerobot_wmrl.common.files import whole_folder
+from lerobot_wmrl.common.images import to_bytes
 from lerobot_wmrl.common.lerobot_commands import env_flags
 from lerobot_wmrl.common.policies import load_policy, load_processors, read_policy_config
 from lerobot_wmrl.common.presets import Flags, format_flags
@@ -343,8 +344,13 @@ class RecordingProcessors:
     """Of each step, the share of the components of the policy's actions that were out of range. (B,)"""
 
     def preprocess(self, observation: Observation) -> Observation:
-        """Keep a batch of observations in LeRobot's names, and prepare it for the policy."""
-        self.observations.append(dict(observation))
+        """Keep a batch of observations in LeRobot's names, images in uint8, and prepare it for the policy."""
+        self.observations.append(
+            {
+                name: to_bytes(value) if name.startswith(OBS_IMAGE) else value
+                for name, value in observation.items()
+            }
+        )
         prepared: Observation = self.before(observation)
         return prepared
 

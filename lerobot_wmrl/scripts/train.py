@@ -279,9 +279,10 @@ def train_policy(cfg: TrainConfig) -> None:
     else:
         set_seed(cfg.seed)
         policy, processors = load_policy(config), load_processors(config)
+        settings = draccus.encode(cfg)  # an environment of the hub tells its configuration of its actions
         env: Any = make_tensor_env(cfg.env, cfg.num_envs, config.device or "cpu")
         try:
-            train_in(env, cfg, policy, processors)
+            train_in(env, cfg, settings, policy, processors)
         finally:
             env.close()
     if rank_and_size()[0] == 0:
@@ -309,10 +310,11 @@ def finished(cfg: TrainConfig) -> bool:
 def train_in(
     env: Any,
     cfg: TrainConfig,
+    settings: dict[str, Any],
     policy: Any,
     processors: tuple[Any, Any],
 ) -> None:
-    """Check that policy and environment fit, then train."""
+    """Check that policy and environment fit, then train. `settings` are the configuration's, as JSON."""
     from lerobot_wmrl.common.policies import adopt_features, check_fit, check_units, with_new_adapters
     from lerobot_wmrl.envs.lerobot_env import check_real_env, shapes_of
     from lerobot_wmrl.rl.budget import charge_steps
@@ -322,7 +324,7 @@ def train_in(
     from lerobot_wmrl.rl.trainer import Schedule, make_algorithm, train
 
     check_tasks(cfg, env)
-    config, settings = policy.config, draccus.encode(cfg)
+    config = policy.config
     observation = env.reset(seed=cfg.seed)[0]
     shown = shapes_of(observation)
     adopt_features(config, shown)

@@ -137,5 +137,5 @@ def make_codebook(quantizer: str, levels: Sequence[int]) -> CodeBook:
 
 def perplexity(tokens: Tensor) -> float:
     """Return the exponential of the entropy of tokens (…): how many are in use, were all equally frequent."""
-    counts = tokens.unique(return_counts=True)[1].double()
+    counts = tokens.unique(return_counts=True)[1].cpu().double()
     return torch.special.entr(counts / counts.sum()).sum().exp().item()

@@ -7,6 +7,7 @@ import pytest
 import torch
 from lerobot.configs.types import FeatureType, NormalizationMode, PolicyFeature
 from lerobot.processor import PolicyProcessorPipeline, UnnormalizerProcessorStep
+from safetensors.torch import load_file, save_model
 
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_wmrl.common.policies import (
@@ -15,6 +16,7 @@ from lerobot_wmrl.common.policies import (
     check_weights,
     copy_checkpoint,
     load_policy,
+    load_trained_weights,
     read_policy_config,
 )
 from tests.rl.checkpoints import save_untrained_policy
@@ -103,3 +105,20 @@ def test_a_copy_acts_as_it_is_told_and_its_original_stays(tmp_path: Path) -> Non
     assert {path.name for path in copy.iterdir()} == {path.name for path in original.iterdir()}
     copy_checkpoint(read_policy_config(str(original), ["--max_shift=1"]), copy)
     assert read_policy_config(str(copy), []).max_shift == 0, "it is there already"
+
+
+def test_weights_with_two_names_are_loaded_where_a_checkpoint_holds_one(tmp_path: Path) -> None:
+    def tied() -> torch.nn.ModuleDict:
+        layers = torch.nn.ModuleDict({name: torch.nn.Linear(2, 2) for name in ("words", "scores", "other")})
+        layers["scores"].weight = layers["words"].weight
+        return layers
+
+    saved, loaded = tied(), tied()
+    save_model(saved, str(tmp_path / "model.safetensors"))
+    weights = load_file(tmp_path / "model.safetensors")
+    assert len(weights) == 5
+    load_trained_weights(loaded, weights)
+    assert all(torch.equal(value, loaded.state_dict()[name]) for name, value in saved.state_dict().items())
+    del weights["other.weight"]
+    with pytest.raises(RuntimeError, match=r"Missing key.*other\.weight"):
+        load_trained_weights(loaded, weights)

@@ -14,9 +14,11 @@ from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.episodes import open_dataset
 from lerobot_wmrl.envs.configuration_hub import HubEnv
 from lerobot_wmrl.envs.lerobot_env import make_tensor_env, runs_in_processes
+from lerobot_wmrl.improve.stages import Improvement
 from tests.commands import run_here
 from tests.hub_client import hub as hub
 from tests.hub_server import Hub, Repo
+from tests.improve.made_up import improvement_of
 from tests.rl.checkpoints import save_untrained_policy
 
 STEPS = 3
@@ -63,13 +65,11 @@ def test_any_file_of_any_revision_makes_it(hub: Hub) -> None:
     assert not runs_in_processes(config), "it may lack what LeRobot asks of those in processes"
 
 
-@pytest.mark.parametrize(("settings", "message"), [
-    ({}, "no environment is named"),
-    ({"hub_path": PATH}, "the code of someone/pusht would run on this machine"),
-])  # fmt: skip
-def test_no_code_runs_unasked(settings: dict[str, str], message: str) -> None:
-    with pytest.raises(FieldError, match=message):
-        HubEnv(**settings)
+def test_no_code_runs_unasked() -> None:
+    with pytest.raises(FieldError, match="the code of someone/pusht would run on this machine"):
+        HubEnv(hub_path=PATH)
+    with pytest.raises(FieldError, match="no environment is named"):
+        make_tensor_env(HubEnv(trust_remote_code=True), 1, "cpu")
 
 
 def test_lerobots_own_type_of_them_is_refused_where_it_cannot_be_trusted() -> None:
@@ -109,3 +109,28 @@ def test_commands_take_it_lerobots_too(
     monkeypatch.setattr(sys, "argv", ["lerobot-eval", *flags, *counts])
     lerobot_eval()
     assert json.loads((folder / "eval_info.json").read_text())["overall"]["n_episodes"] == 2
+
+
+def test_rl_trains_in_it_and_says_how_to_evaluate_there(
+    hub: Hub, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    publish(hub, env=FILE)
+    policy = save_untrained_policy(tmp_path / "policy", OBS_IMAGE, size=96, actions=2, constant=250.0)
+    flags = [
+        f"--policy.path={policy}", "--env.type=hub", f"--env.hub_path={PATH}", "--env.trust_remote_code=true",
+        "--num_envs=2", "--iterations=1", f"--output_dir={tmp_path / 'rl'}",
+    ]  # fmt: skip
+    for _ in range(2):
+        run_here("lerobot-wmrl-train", *flags)
+    again = capfd.readouterr().out.partition("already trained for 1 iterations")[2]
+    assert f"--env.type=hub --env.hub_path={PATH} --env.trust_remote_code=true" in again
+
+
+def test_improving_a_policy_there_is_planned_before_it_is_done(hub: Hub, tmp_path: Path) -> None:
+    """The commands of the stages name the environment as the user did."""
+    publish(hub, env=FILE)
+    config = improvement_of(tmp_path).config
+    config.real_env, config.rollouts = HubEnv(hub_path=PATH, trust_remote_code=True, fps=10), 2
+    recording = Improvement(config, improvement_of(tmp_path).found).stages()[0].command()
+    named = f"--env.type=hub --env.fps=10 --env.hub_path={PATH} --env.trust_remote_code=true"
+    assert named in " ".join(recording)

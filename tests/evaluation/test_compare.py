@@ -4,6 +4,7 @@ import json
 import sys
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar
@@ -15,9 +16,10 @@ import pytest
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from lerobot.configs.types import FeatureType, PolicyFeature
-from lerobot.envs.configs import EnvConfig, PushtEnv
+from lerobot.envs.configs import EnvConfig, LiberoEnv, PushtEnv
 from lerobot.envs.utils import _LazyAsyncVectorEnv
 from lerobot.policies.factory import make_pre_post_processors
+from lerobot.processor import PolicyProcessorPipeline
 
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
@@ -89,6 +91,55 @@ class ThresholdConfig(EnvConfig):
             return SyncVectorEnv(copies, autoreset_mode=AutoresetMode.SAME_STEP)
 
         return {suite: {task: make(suite, task) for task in TASKS[suite]} for suite in self.suites}
+
+
+class CountingEnv(ThresholdEnv):
+    """Takes its starts in turn, whatever the seed, and ends in the second step unless it succeeds before."""
+
+    _max_episode_steps = 2
+    _init_states = (*range(12),)
+
+    def __init__(self, first: int, stride: int) -> None:
+        super().__init__("push", 0, 0.0)
+        self.starts = count(first, stride)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
+        self.steps = 0
+        return super().reset(seed=next(self.starts))
+
+    def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        self.steps += 1
+        success = bool(action[0] > self.threshold)
+        seen = {"pixels": {"third_view": np.zeros((32, 32, 3), np.uint8)}}
+        return seen, 0.0, success, self.steps == 2, {"is_success": success}
+
+
+@EnvConfig.register_subclass("test_counting")
+@dataclass
+class CountingConfig(LiberoEnv):
+    """A task whose starts are chosen as LIBERO's are."""
+
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, Any]]:
+        return {"push": {0: SyncVectorEnv([partial(CountingEnv, row, n_envs) for row in range(n_envs)])}}
+
+
+@pytest.mark.parametrize("killed", [False, True])
+def test_policies_meet_the_same_starts_where_resets_choose_them(config, killed, monkeypatch):
+    """One policy's episodes end sooner, the comparison is interrupted, and no start comes twice."""
+    monkeypatch.setattr(
+        running, "make_env_pre_post_processors", lambda *_: [PolicyProcessorPipeline(steps=[])] * 2
+    )
+    config.policies, config.env, config.n_episodes = config.policies[:2], CountingConfig(), 12
+    config.stop_early = False
+    if killed:
+        kill_in_third_block(config, monkeypatch)
+    episodes = results_of(config)["episodes"]
+    expected = [[rate > difficulty("push", 0, start) for rate in (0.6, 0.9)] for start in range(12)]
+    assert [episode["successes"] for episode in episodes] == expected
+    with pytest.raises(
+        ValueError, match=r"n_episodes=13: test_counting has 12 starts for a task, .* at most 12"
+    ):
+        compare(replace(config, n_episodes=13, output_dir=config.output_dir / "more"))
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.budget import Ledger, Limits
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.maniskill.scenes import scenes_of
@@ -209,5 +210,9 @@ def test_the_others_of_such_a_dataset_are_learnt_from_and_all_are_measured(
 ) -> None:
     run(train_world_model, *TOKENIZER, "--dataset.root={reported}", "--dataset.episodes=[0,1,3,5]")
     measured = TrainConfig()
-    measured.gate.dataset.root = measured.selection.dataset.root = str(reported)
+    measured.gate.dataset.root = str(reported)
     check_data(measured, PointConfig())
+    measured.selection.dataset.root = str(reported)
+    said = r"selection\.dataset\.root=.*: 1 of 6 episodes have evaluation seeds.* \(seed 1000007\)"
+    with pytest.raises(FieldError, match=said):
+        check_data(measured, PointConfig())
