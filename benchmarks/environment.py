@@ -74,7 +74,7 @@ def stepping(env: WorldModelVectorEnv) -> Work:
 
 
 def tensor_bytes() -> int:
-    """Of all tensors that Python holds."""
+    """Return the bytes of all tensors that Python holds."""
     gc.collect()
     found = {
         each.untyped_storage().data_ptr(): each.untyped_storage().nbytes()

@@ -14,7 +14,7 @@ def add_world_models(parser: argparse.ArgumentParser) -> None:
 
 
 def world_model_env(given: argparse.Namespace, **settings: Any) -> WorldModelEnv:
-    """Of the flags, and further settings of the environment."""
+    """Make the environment of the flags, with further settings."""
     return WorldModelEnv(
         world_model_path=given.world_model, text_world_model_path=given.text_world_model,
         dataset=StartFrames(root=given.root), **settings,

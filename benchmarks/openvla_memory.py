@@ -42,7 +42,7 @@ PROMPT = 25
 """Tokens of a usual instruction's prompt."""
 
 TRAINED_COPIES = 4
-"""Of a trained float32 weight: itself, its gradient, two moments."""
+"""Bytes of a trained float32 weight: itself, its gradient, two moments."""
 
 VALUE_SIZES = (512, 128)
 
@@ -77,7 +77,7 @@ class Policy(nn.Module):
 
 
 def adapted(rank: int) -> nn.Module:
-    """Without memory (on the meta device): adapters as the policy has them by default, all else frozen."""
+    """Make the policy on the meta device, without memory: its default adapters, all else frozen."""
     config = LoraConfig(r=rank, lora_alpha=rank // 2, **adapter_targets(RELEASED))
     with init_empty_weights():
         return get_peft_model(Policy(), config)

@@ -91,7 +91,7 @@ def untrained_policy(env: gym.vector.VectorEnv, device: str) -> tuple[CnnPolicy,
 
 
 def buffer_bytes(buffer: RolloutBuffer) -> int:
-    """Of everything that is kept of an iteration."""
+    """Return the bytes of everything that is kept of an iteration."""
     kept = [*vars(buffer).values(), *buffer.observations.tensors.values(), *buffer.columns.values()]
     return sum(value.numel() * value.element_size() for value in kept if isinstance(value, torch.Tensor))
 

@@ -44,7 +44,7 @@ class Imagination:
 
     @property
     def frames(self) -> int:
-        """That are remembered in the long run: the window, or half of what an anchor is kept for."""
+        """Frames that are remembered in the long run: the window, or half of what an anchor is kept for."""
         config = self.model.config
         return config.clip_length // 2 if config.dynamics.type == "anchored" else config.dynamics.window
 
@@ -53,12 +53,12 @@ class Imagination:
         return self.model.step(self.state, self.action).tokens
 
     def step_and_decode(self) -> Tensor:
-        """Its pictures, (B, N, 3, H, W)."""
+        """Imagine a frame and return its pictures. (B, N, 3, H, W)"""
         return self.model.decode(self.step(), self.state.context).images
 
     @torch.no_grad()
     def step_without_memory(self) -> Tensor:
-        """The same frame from all digits and actions that are remembered, all layers computed anew."""
+        """The same frame from all tokens and actions that are remembered, all layers computed anew."""
         model, state, frames = self.model, self.state, self.frames
         condition = model.encode_actions(self.action[:, None].expand(-1, frames, -1))
         with compute_in(self.dtype, self.device):
@@ -115,7 +115,7 @@ def start_frames(model: ActionWorldModelRewardModel, batch: int, device: torch.d
 
 
 def black_context(model: ActionWorldModelRewardModel, batch: int, device: torch.device) -> Context:
-    """Of black first frames."""
+    """Imaginations that begin in black frames."""
     size, cameras = model.tokenizer.image_size, model.tokenizer.num_cameras
     return model.tokenizer.context(torch.zeros(batch, cameras, 3, size, size, device=device))
 

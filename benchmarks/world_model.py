@@ -40,7 +40,7 @@ from workloads import STEPS, Imagination, Work, random_clip, repeated, training_
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
 BATCHES = (1, 16, 64, 256)
 MOST_TRAINING_FRAMES = 4096
-"""In one training batch: the activations of more do not fit into the memory of a small machine."""
+"""Clips in one training batch: the activations of more do not fit into the memory of a small machine."""
 
 
 def flop(work: Work) -> float:

@@ -89,7 +89,7 @@ def frames_of(views: list[str], episodes: int, size: int, folder: Path) -> Frame
 
 
 def record_part(views: list[str], first: int, image_size: int, path: Path) -> None:
-    """In a process of its own: `PART` episodes, at one size."""
+    """Render `PART` episodes at one size, in a process of its own."""
     scenes, tasks = scenes_of("ind"), list(TASKS.values())
     VIEWS.update(CANDIDATES)
     simulation = Simulation(tasks[0], scenes, Rendering(tuple(views), image_size))

@@ -34,7 +34,7 @@ COMPARED: Final = (
     ("ppo_distilled", ("imagined_ppo",), "over PPO in imagination"),
     ("simulated_ppo", CLONED, "PPO in ManiSkill over the best BC"),
 )
-"""Of what is compared: the method, what with, and the title."""
+"""Comparisons: the method, what it is compared with, and the title."""
 
 LIMITS: Final = """\
 The world model is not told the task: it knows it if the first frame shows it. The done threshold was chosen

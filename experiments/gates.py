@@ -19,7 +19,7 @@ Results = dict[str, dict[str, Any]]
 
 GATE: Final = ("done_threshold", "done_frames", "false_positive_rate", "recall", "auc", "passed")
 KEPT: Final = (*GATE, "headline", "operating_point", "gate_by_task", "extreme_actions", "tokenizer")
-"""Of metrics.json; curves and sweeps are large and can be made again."""
+"""Parts of metrics.json that are kept; curves and sweeps are large and can be made again."""
 
 HEADLINE: Final = ("delta_psnr_0_6s", "moving_psnr", "abs_rel", "done_f1")
 PSNR_STEPS: Final = (1, 10, 30)

@@ -6,14 +6,17 @@ a start and in the order of the seeds, so that policies can be compared on the s
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+from scipy.stats import bootstrap
+
 from experiments import figures
 from experiments.study import Study
-from lerobot_wmrl.common.statistics import MeanChange, PairedChange, Proportion
+from lerobot_wmrl.common.statistics import PairedChange, Proportion
 from lerobot_wmrl.common.tracking import read_metrics
 
 Outcomes = list[bool]
@@ -32,6 +35,37 @@ def outcomes(folder: Path) -> Outcomes:
 def rate(found: Sequence[bool]) -> dict[str, Any]:
     """Return successes, episodes, share, Wilson's interval, and the outcomes themselves."""
     return {**Proportion(sum(found), len(found)).as_json(), "outcomes": [int(success) for success in found]}
+
+
+@dataclass(frozen=True)
+class MeanChange:
+    """The mean change of a success rate over several runs on the same starts, with a 95 % interval."""
+
+    mean: float
+    low: float
+    high: float
+    runs: int
+    starts: int
+
+    @classmethod
+    def over_runs(cls, before: Sequence[Sequence[bool]], after: Sequence[Sequence[bool]]) -> "MeanChange":
+        """Compare the outcomes of R runs on the same E starts, in the same order.
+
+        The runs share their starts, so R·E outcomes are not independent: the bootstrap draws starts (Efron
+        1979). The interval does not say how much another seed of the training would differ.
+        """
+        if len({len(run) for run in (*before, *after)}) != 1:
+            raise ValueError("the runs were evaluated on different numbers of starts: they cannot be pooled")
+        change = (np.asarray(after, float) - np.asarray(before, float)).mean(0)
+        low, high = (float(change.mean()),) * 2
+        if change.std() > 0:
+            interval = bootstrap((change,), np.mean, method="percentile", rng=0).confidence_interval
+            low, high = float(interval.low), float(interval.high)
+        return cls(float(change.mean()), low, high, len(before), len(change))
+
+    def __str__(self) -> str:
+        points = f"{100 * self.mean:+.1f} points (95 %: {100 * self.low:+.1f} to {100 * self.high:+.1f}"
+        return f"{points}; {self.runs} runs on the same {self.starts} starts)"
 
 
 def mean_change(before: Sequence[Outcomes], after: Sequence[Outcomes]) -> dict[str, Any]:

@@ -1,4 +1,6 @@
-"""Write docs/results.md from the JSON in docs/results. Nothing on that page is typed by hand.
+"""Write docs/results.md from the JSON in docs/results, its tables and their numbers.
+
+Numbers of runs without a file are typed into the text of the sections.
 
 python -m experiments.tables
 python -m experiments.tables --check

@@ -77,7 +77,7 @@ def draw(gripper: np.ndarray, object_xy: np.ndarray, size: int) -> np.ndarray:
 
 
 def measure_depth(image: np.ndarray) -> np.ndarray:
-    """Of such a picture: the table 1 m away, what stands on it nearer. → (H, W, 1) uint16 millimetres"""
+    """Return its depth: the table 1 m away, what stands on it nearer. → (H, W, 1) uint16 millimetres"""
     return np.where(image[..., :1] == 220, 800, np.where(image[..., 2:] == 230, 600, 1000)).astype(np.uint16)
 
 

@@ -20,7 +20,7 @@ def rank_and_size() -> tuple[int, int]:
 
 def hidden_progress() -> bool | None:
     """Return tqdm's `disable`: in the first process None, which shows a bar in a terminal only; else True."""
-    return True if rank_and_size()[0] else None
+    return None if is_first_process() else True
 
 
 def mean_over_processes(metrics: Mapping[str, float], device: torch.device | str) -> dict[str, float]:
@@ -45,6 +45,11 @@ def largest_over_processes(values: Tensor) -> Tensor:
     if rank_and_size()[1] > 1:
         dist.all_reduce(values, dist.ReduceOp.MAX)
     return values
+
+
+def is_first_process() -> bool:
+    """Return whether this process is the one that writes and shows progress."""
+    return rank_and_size()[0] == 0
 
 
 def gather_counts(count: int, device: torch.device | str) -> list[int]:

@@ -8,21 +8,17 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from scipy.stats import binomtest, bootstrap
+from scipy.stats import binomtest
 
-Z_95 = 1.959963984540054
 RESAMPLES = 2000
 
 
 def wilson_interval(successes: int, n: int) -> tuple[float, float]:
-    """Return Wilson's 95 % score interval of a proportion, which lies in it whatever is rounded; (0, 1) for
-    n = 0 (Wilson 1927)."""
+    """Return Wilson's 95 % score interval of a proportion (Wilson 1927); (0, 1) for n = 0."""
     if n == 0:
         return 0.0, 1.0
-    share, z2 = successes / n, Z_95**2
-    centre = (share + z2 / (2 * n)) / (1 + z2 / n)
-    half = Z_95 / (1 + z2 / n) * math.sqrt(share * (1 - share) / n + z2 / (4 * n * n))
-    return max(0.0, min(share, centre - half)), min(1.0, max(share, centre + half))
+    found = binomtest(successes, n).proportion_ci(0.95, "wilson")
+    return float(found.low), float(found.high)
 
 
 @dataclass(frozen=True)
@@ -149,37 +145,6 @@ class PairedChange:
 
     def as_json(self) -> dict[str, float | int]:
         return {"gained": self.gained, "lost": self.lost, "p_value": self.p_value}
-
-
-@dataclass(frozen=True)
-class MeanChange:
-    """The mean change of a success rate over several runs on the same starts, with a 95 % interval."""
-
-    mean: float
-    low: float
-    high: float
-    runs: int
-    starts: int
-
-    @classmethod
-    def over_runs(cls, before: Sequence[Sequence[bool]], after: Sequence[Sequence[bool]]) -> "MeanChange":
-        """Compare the outcomes of R runs on the same E starts, in the same order.
-
-        The runs share their starts, so R·E outcomes are not independent: the bootstrap draws starts (Efron
-        1979). The interval does not say how much another seed of the training would differ.
-        """
-        if len({len(run) for run in (*before, *after)}) != 1:
-            raise ValueError("the runs were evaluated on different numbers of starts: they cannot be pooled")
-        change = (np.asarray(after, float) - np.asarray(before, float)).mean(0)
-        low, high = (float(change.mean()),) * 2
-        if change.std() > 0:
-            interval = bootstrap((change,), np.mean, method="percentile", rng=0).confidence_interval
-            low, high = float(interval.low), float(interval.high)
-        return cls(float(change.mean()), low, high, len(before), len(change))
-
-    def __str__(self) -> str:
-        points = f"{100 * self.mean:+.1f} points (95 %: {100 * self.low:+.1f} to {100 * self.high:+.1f}"
-        return f"{points}; {self.runs} runs on the same {self.starts} starts)"
 
 
 @lru_cache(maxsize=4)

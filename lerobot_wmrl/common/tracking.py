@@ -10,7 +10,7 @@ from typing import Any
 
 from lerobot.utils.logging_utils import MetricsTracker
 
-from lerobot_wmrl.common.distributed import rank_and_size
+from lerobot_wmrl.common.distributed import is_first_process
 
 METRICS_FILE = "metrics.jsonl"
 
@@ -50,7 +50,7 @@ def make_wandb(cfg: Any) -> Any:
         cfg: a command's dataclass, with what LeRobot's logger reads: wandb, output_dir, job_name, resume,
             seed, env, dataset, policy or reward_model, is_reward_model_training, to_dict.
     """
-    if not cfg.wandb.enable or rank_and_size()[0] > 0:
+    if not cfg.wandb.enable or not is_first_process():
         return None
     from lerobot.common.wandb_utils import WandBLogger
 
@@ -76,7 +76,7 @@ class Tracker:
 
     def log(self, step: int, metrics: Mapping[str, float], mode: str = "train") -> None:
         """Write metrics to the file and to wandb, as `train/…` or `eval/…`, from the first process."""
-        if rank_and_size()[0] > 0:
+        if not is_first_process():
             return
         append_metrics(self.output_dir, step, metrics)
         if self.wandb is not None:
@@ -87,11 +87,11 @@ class Tracker:
         self.log(step, metrics)
         self.meters.step()
         self.meters.update_metrics({name: metrics[name] for name in self.shown if name in metrics})
-        if step % self.log_freq == 0 and rank_and_size()[0] == 0:
+        if step % self.log_freq == 0 and is_first_process():
             logging.info(self.meters)
             self.meters.reset_averages()
 
     def log_policy(self, checkpoint: Path) -> None:
         """Upload the policy of a checkpoint as wandb's artifact."""
-        if self.wandb is not None and rank_and_size()[0] == 0:
+        if self.wandb is not None and is_first_process():
             self.wandb.log_policy(checkpoint)

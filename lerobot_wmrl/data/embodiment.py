@@ -15,6 +15,9 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.episodes import read_actions
 
+POSITION_NAMES: Final = ("tcp_x", "tcp_y", "tcp_z")
+"""First components of a state that begins with the position of the tool centre point (TCP, m)."""
+
 LOW, HIGH = "low", "high"
 """Keys of the recorded range of a feature, lists of one number a component, in the feature's `info`."""
 

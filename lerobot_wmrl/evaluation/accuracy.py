@@ -10,6 +10,7 @@ from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
 from lerobot_wmrl.common.statistics import Estimate, Proportion, bootstrap_ratio
+from lerobot_wmrl.data.embodiment import POSITION_NAMES
 from lerobot_wmrl.data.episodes import EpisodeTable
 from lerobot_wmrl.data.frames import Context
 from lerobot_wmrl.evaluation.gate import first_run
@@ -29,7 +30,6 @@ from lerobot_wmrl.evaluation.replay import (
     Recording,
     imagine_frames,
 )
-from lerobot_wmrl.maniskill.embodiment import STATE_NAMES
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer, feature_distance
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 
@@ -122,7 +122,7 @@ def compare_frames(
 def predicts_tcp(recording: Recording, replay: EpisodeReplay) -> bool:
     """Whether the model predicts a state that begins with the TCP's position in metres."""
     names = recording.table.dataset.features.get(OBS_STATE, {}).get("names") or []
-    return bool(replay.state.shape[-1]) and list(names[:3]) == list(STATE_NAMES[:3])
+    return bool(replay.state.shape[-1]) and tuple(names[:3]) == POSITION_NAMES
 
 
 def tcp_error_mm(recording: Recording, replay: EpisodeReplay) -> Tensor:

@@ -4,10 +4,12 @@ from typing import Final
 
 import numpy as np
 
+from lerobot_wmrl.data.embodiment import POSITION_NAMES
+
 FPS: Final = 25
 """Control and recording rate in Hz."""
 
-STATE_NAMES: Final = ("tcp_x", "tcp_y", "tcp_z", "tcp_qw", "tcp_qx", "tcp_qy", "tcp_qz", "gripper_opening")
+STATE_NAMES: Final = (*POSITION_NAMES, "tcp_qw", "tcp_qx", "tcp_qy", "tcp_qz", "gripper_opening")
 """`observation.state`: TCP position (m), TCP quaternion wxyz, gripper opening in [0, 1]."""
 
 ACTION_NAMES: Final = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")

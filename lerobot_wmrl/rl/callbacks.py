@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 from lerobot.utils.utils import flatten_dict
 
-from lerobot_wmrl.common.distributed import rank_and_size, wait_for_all
+from lerobot_wmrl.common.distributed import is_first_process, wait_for_all
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.lerobot_compat import checkpoint_name
 from lerobot_wmrl.common.tracking import Tracker
@@ -91,7 +91,7 @@ class Callbacks:
         for callback in self.callbacks:
             if self._pending(callback, iteration):
                 folder = record_folder(self.output_dir, callback.name, iteration, self.total)
-                if rank_and_size()[0] == 0:
+                if is_first_process():
                     with preserved_randomness():
                         write_json(folder / RECORD_FILE, callback.run(iteration, checkpoint, folder))
                 wait_for_all()

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from lerobot_wmrl.common.checkpoints import BEST_CHECKPOINT_LINK, link_checkpoint
-from lerobot_wmrl.common.distributed import rank_and_size
+from lerobot_wmrl.common.distributed import is_first_process
 from lerobot_wmrl.common.lerobot_compat import checkpoint_dir
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.evaluation.agreement import Evaluated
@@ -58,7 +58,7 @@ class Selection:
         """
         best = best_iteration(records, self.judge)
         checkpoint = checkpoint_dir(self.output_dir, best, self.total)
-        if rank_and_size()[0] == 0:
+        if is_first_process():
             link_checkpoint(checkpoint, BEST_CHECKPOINT_LINK)
         latest = max(records)
         if diverged(records[best], records[latest]):

@@ -12,7 +12,7 @@ from lerobot.utils.logging_utils import MetricsTracker
 from tqdm import tqdm
 
 from lerobot_wmrl.common.checkpoints import latest_checkpoint, read_weights, write_checkpoint
-from lerobot_wmrl.common.distributed import rank_and_size, wait_for_all
+from lerobot_wmrl.common.distributed import is_first_process, rank_and_size, wait_for_all
 from lerobot_wmrl.common.lerobot_compat import (
     checkpoint_dir,
     gather_random_states,
@@ -95,7 +95,7 @@ def train(
     runner = Callbacks(callbacks, output_dir, total, tracker)
     with tqdm(
         total=total, initial=algorithm.iteration, desc=algorithm.name.upper(), unit="iteration",
-        disable=rank_and_size()[0] > 0,
+        disable=not is_first_process(),
     ) as progress:  # fmt: skip
         runner.resume(algorithm.iteration)
         wait_for_all()  # else a slow process would read records that the first one writes below
@@ -149,7 +149,7 @@ def save(
         algorithm.save_pretrained(folder / ALGORITHM_DIR)
         save_training_state(folder, algorithm.iteration, random_states, algorithm.optimizer)
 
-    if rank_and_size()[0] == 0:
+    if is_first_process():
         write_checkpoint(output_dir, total, algorithm.iteration, write)
     wait_for_all()
     return checkpoint_dir(output_dir, algorithm.iteration, total)

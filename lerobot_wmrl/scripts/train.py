@@ -36,7 +36,7 @@ from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from lerobot_wmrl.common.checkpoints import best_checkpoint, last_checkpoint
 from lerobot_wmrl.common.command_line import RunConfig, claim_output_dir, run_command
 from lerobot_wmrl.common.constants import EVALUATION_SEED
-from lerobot_wmrl.common.distributed import LONGEST_WAIT, rank_and_size, wait_for_all
+from lerobot_wmrl.common.distributed import LONGEST_WAIT, is_first_process, rank_and_size, wait_for_all
 from lerobot_wmrl.common.errors import FieldError, require_at_least
 from lerobot_wmrl.common.precision import keep_freed_memory
 from lerobot_wmrl.common.presets import expand_preset, format_flags
@@ -285,7 +285,7 @@ def train_policy(cfg: TrainConfig) -> None:
             train_in(env, cfg, settings, policy, processors)
         finally:
             env.close()
-    if rank_and_size()[0] == 0:
+    if is_first_process():
         lines = summary(cfg)
         print("\n".join(lines))
         publish(cfg, lines)
@@ -341,7 +341,7 @@ def train_in(
     buffer = RolloutBuffer(rollout_length(cfg, longest), cfg.num_envs, config.device, longest)
     trained = Trained(policy, processors, env, cfg.env)
     callbacks = make_callbacks(cfg, trained, cfg.output_dir, cfg.iterations)
-    if rank_and_size()[0] == 0:
+    if is_first_process():
         claim_output_dir(cfg.output_dir, settings, MAY_DIFFER)
         if cfg.budget is not None and not isinstance(cfg.env, WorldModelEnv):
             steps = cfg.iterations * cfg.num_envs * rank_and_size()[1] * buffer.steps

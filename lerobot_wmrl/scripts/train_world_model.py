@@ -23,7 +23,7 @@ from lerobot.configs.default import WandBConfig
 from lerobot.configs.rewards import RewardModelConfig
 
 from lerobot_wmrl.common.command_line import RunConfig, claim_output_dir, require_free, run_command
-from lerobot_wmrl.common.distributed import LONGEST_WAIT
+from lerobot_wmrl.common.distributed import LONGEST_WAIT, is_first_process
 from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least, require_choice
 from lerobot_wmrl.common.precision import PRECISIONS, keep_freed_memory, training_dtype
 from lerobot_wmrl.common.presets import expand_preset, format_flags
@@ -160,7 +160,7 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
         print(f"{cfg.output_dir}: already trained for {cfg.steps} steps")
     else:
         run_training(cfg, model, table, given, processes)
-    if processes.is_main_process:
+    if is_first_process():
         print(f"\n{conclusion(cfg, model, table)}")
         if cfg.model.push_to_hub:
             model.push_model_to_hub(cfg)
@@ -177,7 +177,7 @@ def run_training(
     with processes.main_process_first():
         seed = cfg.seed + processes.process_index
         sampler = make_joint_sampler(model, table, cfg.dataset, cfg.batch_size, seed)
-        if processes.is_main_process:
+        if is_first_process():
             claim_output_dir(cfg.output_dir, given, MAY_DIFFER)
     dtype = training_dtype(cfg.precision, cfg.model.device)
     used = replace(cfg, precision=str(dtype).removeprefix("torch."))

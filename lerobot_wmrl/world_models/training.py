@@ -27,7 +27,7 @@ from tqdm import tqdm
 from lerobot_wmrl.common.checkpoints import latest_checkpoint, write_checkpoint
 from lerobot_wmrl.common.constants import HUMAN_LIKE, KINDS, START_KIND
 from lerobot_wmrl.common.cuda_graphs import cuda_graphs
-from lerobot_wmrl.common.distributed import mean_over_processes
+from lerobot_wmrl.common.distributed import is_first_process, mean_over_processes
 from lerobot_wmrl.common.errors import FieldError, renamed
 from lerobot_wmrl.common.lerobot_compat import (
     gather_random_states,
@@ -269,7 +269,7 @@ def train(
             log(settings.output_dir, step, metrics, progress, wandb)
         if should_save_checkpoint(step, settings.save_freq, settings.steps):
             random_states = gather_random_states()
-            if processes.is_main_process:
+            if is_first_process():
                 write_checkpoint(settings.output_dir, settings.steps, step, save)
         progress.update()
     progress.close()
@@ -277,14 +277,14 @@ def train(
 
 def progress_bar(name: str, first: int, steps: int) -> tqdm:
     """Show steps done and the time left, in the first process."""
-    quiet = not PartialState().is_main_process
+    quiet = not is_first_process()
     return tqdm(total=steps, initial=first, desc=f"Training {name}", unit="step", disable=quiet)
 
 
 def log(output_dir: Path, step: int, metrics: dict[str, float], progress: tqdm, wandb: Any) -> None:
     """Show the loss beside the bar, and let the first process write a line of metrics."""
     progress.set_postfix(loss=f"{metrics['loss']:.3f}")
-    if PartialState().is_main_process:
+    if is_first_process():
         append_metrics(output_dir, step, metrics)
         if wandb is not None:
             wandb.log_dict(metrics, step)

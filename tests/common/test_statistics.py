@@ -1,17 +1,18 @@
 import math
+from statistics import NormalDist
 
 import numpy as np
 import pytest
 
 from lerobot_wmrl.common.statistics import (
-    Z_95,
     Estimate,
-    MeanChange,
     PairedChange,
     Proportion,
     bootstrap_ratio,
     wilson_interval,
 )
+
+Z_95 = NormalDist().inv_cdf(0.975)
 
 
 @pytest.mark.parametrize(("k", "n"), [(0, 20), (0, 64), (7, 20), (53, 100), (80, 80), (100, 100)])
@@ -52,27 +53,6 @@ def test_paired_p_value_is_that_of_a_fair_coin() -> None:
     assert PairedChange(6, 0).p_value == pytest.approx(2 / 2**6)
     assert PairedChange(6, 1).p_value == pytest.approx(2 * (1 + 7) / 2**7)
     assert PairedChange(1, 6).p_value == PairedChange(6, 1).p_value
-
-
-def test_the_interval_of_several_runs_counts_a_start_once() -> None:
-    """Three copies of a run say no more than one: its interval is that of the mean over its starts."""
-    rng = np.random.default_rng(0)
-    before, after = rng.random(200) < 0.5, rng.random(200) < 0.7
-    change = after.astype(float) - before
-    once = MeanChange.over_runs([before], [after])
-    thrice = MeanChange.over_runs([before] * 3, [after] * 3)
-    assert (thrice.low, thrice.high) == (once.low, once.high)
-    assert once.mean == pytest.approx(change.mean())
-    assert once.high - once.low == pytest.approx(2 * Z_95 * change.std() / math.sqrt(200), rel=0.1)
-
-
-def test_runs_on_different_starts_are_not_pooled() -> None:
-    with pytest.raises(ValueError, match="different numbers of starts"):
-        MeanChange.over_runs([[True], [True, False]], [[True], [True, False]])
-
-
-def test_runs_that_change_nothing_change_nothing() -> None:
-    assert MeanChange.over_runs([[True, False]], [[True, False]]) == MeanChange(0.0, 0.0, 0.0, 1, 2)
 
 
 def test_the_bootstrap_of_a_mean_is_its_normal_interval() -> None:
