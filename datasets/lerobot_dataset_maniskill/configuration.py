@@ -187,6 +187,11 @@ class RecordConfig(RunConfig):
                 "env.dataset.branches", self.env.dataset.branches,
                 "recorded episodes begin with first frames", "leave it out",
             )  # fmt: skip
+        if isinstance(self.env, WorldModelEnv) and not self.elsewhere and not self.env.dataset.given:
+            raise FieldError(
+                "env.dataset.root", "", "the episodes that imagined ones begin in are recorded with them",
+                "give a dataset in place of `env.dataset.frames` and `env.dataset.resets`",
+            )  # fmt: skip
         if self.elsewhere and self.shard_of[1] > 1:
             raise FieldError("shard", self.shard, "divides recordings in ManiSkill alone", "leave it out")
 
@@ -330,7 +335,7 @@ def imagined_content(env: WorldModelEnv) -> dict[str, Any]:
     general = {each.name for each in fields(RewardModelConfig)} - {"pretrained_path"}  # device, hub
     return {
         "world_model": env.world_model_path,
-        "starts": asdict(env.dataset),
+        "starts": draccus.encode(env.dataset),
         "cameras": list(model.tokenizer.cameras),
         "image_size": model.tokenizer.square_side,
         "done_threshold": env.done_threshold,

@@ -155,6 +155,16 @@ def fit_to_environment(
     check_fit(config, shown, action_size)
 
 
+def seen_shape(feature: PolicyFeature) -> tuple[int, ...]:
+    """Return the shape of what a policy sees, images (C, H, W).
+
+    LeRobot's feature says (H, W, 3) where the dataset calls the channels by another name, such as `rgb`.
+    """
+    shape = tuple(feature.shape)
+    channels_last = feature.type is FeatureType.VISUAL and shape[-1] == 3 and shape[0] != 3
+    return (3, *shape[:2]) if channels_last else shape
+
+
 def check_fit(
     config: PreTrainedConfig, shown: Mapping[str, tuple[int, ...]], action_size: int,
     where: str = "the environment",
@@ -176,8 +186,8 @@ def check_fit(
                 f"the policy needs {name}, which {where} does not have (its cameras: {cameras})",
                 "use one with the policy's cameras and state, or train the policy on what this one shows",
             )  # fmt: skip
-        if shown[name] != tuple(feature.shape):
-            needed = f"the policy needs {name} of shape {tuple(feature.shape)}"
+        if shown[name] != seen_shape(feature):
+            needed = f"the policy needs {name} of shape {seen_shape(feature)}"
             raise FieldError(
                 "policy.path", path, f"{needed}, {where} has {shown[name]}",
                 "use the image size that the policy was trained on",

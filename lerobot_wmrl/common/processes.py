@@ -78,7 +78,8 @@ def die_with(parent: int) -> None:
     Otherwise the next call would meet a second writer. The signal outlives exec. The parent may have died
     before the signal was asked for.
     """
-    ctypes.CDLL(None).prctl(SET_PARENT_DEATH_SIGNAL, signal.SIGKILL)
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(SET_PARENT_DEATH_SIGNAL, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)
 

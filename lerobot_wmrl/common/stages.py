@@ -220,13 +220,19 @@ def entry_point(program: str) -> Callable[[], int | None]:
     return next(iter(found)).load()
 
 
+def may_fork() -> bool:
+    """Return whether a fork can do what this process can: not if this process has asked for CUDA, and not on
+    macOS."""
+    return sys.platform == "linux" and not torch.cuda.is_available()
+
+
 def in_fork[**P, T](function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
     """Call a function in a fork of this process, and return or raise what it does; all of it is pickled.
 
     What it leaves in libraries ends with the fork: once a process has rendered with OpenGL, as MuJoCo does,
-    stages that render wait for ever. With CUDA, where stages are no forks, it is called in this process.
+    stages that render wait for ever. Where stages are no forks, it is called in this process.
     """
-    if torch.cuda.is_available():
+    if not may_fork():
         return function(*args, **kwargs)
     context = multiprocessing.get_context("fork")
     with ProcessPoolExecutor(1, context, _begin_fork, (os.getpid(),)) as fork:
@@ -242,7 +248,7 @@ def run_measured(command: Sequence[str], log: Path, progress: Progress) -> int:
     """Run `command` to its end and return its exit status; an exception ends its process group first."""
     reader, writer = os.pipe()
     process = multiprocessing.get_context("fork").Process(
-        target=_run_command, args=(list(command), writer, os.getpid(), torch.cuda.is_available())
+        target=_run_command, args=(list(command), writer, os.getpid(), not may_fork())
     )
     sys.stdout.flush()
     try:
@@ -270,7 +276,7 @@ def _run_command(command: list[str], output: int, parent: int, anew: bool) -> No
     sys.stdout, sys.stderr = (os.fdopen(stream, "w", buffering=1, closefd=False) for stream in (1, 2))
     os.environ.setdefault("COLUMNS", str(shutil.get_terminal_size().columns))
     keep_freed_memory()
-    if anew:  # a fork of a process that has asked for CUDA cannot use it
+    if anew:
         os.environ["PYTHONUNBUFFERED"] = "1"
         os.execv(find_program(command[0]), command)
     sys.argv = command

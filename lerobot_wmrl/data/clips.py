@@ -172,8 +172,7 @@ class FrameSampler:
 
     def __post_init__(self) -> None:
         """Find the frames that show success, and the share of draws that must fall on them besides."""
-        self.shown = np.append(False, self.table.success_target[:-1])  # a frame follows the action before it,
-        self.shown[self.table.start] = False  # and an episode's first frame none
+        self.shown = self.table.shown
         offsets = [np.flatnonzero(self.shown[rows]) for rows in self.table.rows(self.episodes)]
         counts, length = np.array([len(each) for each in offsets]), self.table.length[self.episodes]
         self.solved_episodes = np.repeat(self.episodes, counts)

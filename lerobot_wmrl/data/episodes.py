@@ -1,5 +1,6 @@
 """Episodes of a LeRobotDataset: all columns but the pictures, and checks of a dataset against a model."""
 
+import hashlib
 import logging
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -48,14 +49,18 @@ class DatasetSource:
 
     Args:
         root: folder of the dataset on disk.
-        repo_id: name of the dataset on the hub. It is downloaded, into LeRobot's cache, if there is no
-            `root`.
+        repo_id: name of the dataset on the hub. It is downloaded if it is not in `root`: there, or without
+            `root` into LeRobot's cache.
         revision: branch, tag or commit to download; by default the one of LeRobot's dataset version.
     """
 
     root: str = ""
     repo_id: str | None = None
     revision: str | None = None
+
+    def __post_init__(self) -> None:
+        """Write the folder's path in one way, without a slash at its end."""
+        self.root = str(Path(self.root)) if self.root else ""
 
     @property
     def given(self) -> bool:
@@ -73,14 +78,19 @@ class DatasetSource:
         return {f"dataset.{name}": value for name, value in named.items() if value}
 
     def open(self) -> LeRobotDataset:
-        """Open the dataset; download it first if it is named by `repo_id` alone.
+        """Open the dataset; download it first if it has a name on the hub and is not in `root`.
 
         Raises:
             FieldError: there is none, it is not whole, or it cannot be downloaded.
         """
-        if self.root or not self.repo_id:
-            return open_dataset(self.root, self.repo_id)
-        return download_dataset(self.repo_id, self.revision)
+        if self.repo_id and not (self.root and Path(self.root).exists()):
+            return download_dataset(self.repo_id, self.revision, self.root or None)
+        if self.revision:
+            raise FieldError(
+                "dataset.revision", self.revision, f"chooses what is downloaded, and {self.root} is there",
+                "leave it out, or give another `dataset.root`",
+            )  # fmt: skip
+        return open_dataset(self.root, self.repo_id)
 
 
 @dataclass
@@ -156,6 +166,18 @@ class EpisodeTable:
         return self.columns.get(name, np.full(len(self.start), -1))
 
     @property
+    def shown(self) -> np.ndarray:
+        """Whether a row's frame shows success, which holds after the action before it. (N,)"""
+        shown = np.append(False, self.success_target[:-1])
+        shown[self.start] = False  # an episode's first frame follows no action
+        return shown
+
+    def shows_success(self, episodes: Iterable[int]) -> bool:
+        """Return whether any frame of the episodes shows success."""
+        shown = self.shown
+        return any(shown[rows].any() for rows in self.rows(episodes))
+
+    @property
     def done_known(self) -> bool:
         """Whether the dataset says where success holds; else done is False everywhere."""
         return success_column(self.dataset.features) is not None
@@ -223,10 +245,10 @@ def open_dataset(root: str | Path, repo_id: str | None = None) -> LeRobotDataset
     )  # fmt: skip
 
 
-def download_dataset(repo_id: str, revision: str | None = None) -> LeRobotDataset:
-    """Download a dataset of the hub into LeRobot's cache and open it. FieldError if that fails."""
+def download_dataset(repo_id: str, revision: str | None = None, root: str | None = None) -> LeRobotDataset:
+    """Download a dataset of the hub, to `root` or LeRobot's cache, and open it. FieldError if that fails."""
     try:
-        return LeRobotDataset(repo_id, revision=revision, video_backend=VIDEO_BACKEND)
+        return LeRobotDataset(repo_id, root=root, revision=revision, video_backend=VIDEO_BACKEND)
     except Exception as error:  # the hub's client, parquet and JSON each raise their own
         if isinstance(error, OLDER_FORMAT) and revision is None:
             copy = Path("data") / repo_id.rpartition("/")[2]
@@ -248,6 +270,12 @@ def older_format(field: str, value: object, repo_id: str, root: str | Path) -> F
         f"`{script} --repo-id={repo_id} --root={root} --push-to-hub=false`, and give `dataset.root` {root}. "
         "The old files are kept beside it",
     )  # fmt: skip
+
+
+def fingerprint(root: Path) -> str:
+    """Return a short hash of a dataset's folder `meta`, which changes with episodes, columns and values."""
+    files = sorted(path for suffix in ("json", "parquet") for path in (root / "meta").rglob(f"*.{suffix}"))
+    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:12]
 
 
 def missing_files(root: Path) -> list[Path]:
@@ -436,9 +464,14 @@ def choose_episodes(
 
 
 def frame_size(feature: Mapping[str, Any]) -> tuple[int, int]:
-    """Return (H, W) of a camera's feature, whose shape is (H, W, 3) or, by its names, (3, H, W)."""
-    names = feature.get("names") or ("height", "width", "channels")
-    height, width = feature["shape"][:2] if names[2].startswith("channel") else feature["shape"][1:]
+    """Return (H, W) of a camera's feature, whose shape is (H, W, 3) or (3, H, W).
+
+    Its names say which, if one of them is that of the channels; else the shape does.
+    """
+    shape, names = tuple(feature["shape"]), feature.get("names") or ()
+    channels = [axis for axis, name in enumerate(names) if str(name).startswith("channel")]
+    first = channels[0] == 0 if channels else shape[0] in (1, 3) and shape[-1] not in (1, 3)
+    height, width = shape[1:] if first else shape[:2]
     return height, width
 
 
@@ -472,6 +505,17 @@ def check_depth(features: Mapping[str, Any], camera_keys: Sequence[str]) -> None
                 "depth", True, f"the world model looks at {key}, which the dataset lacks",
                 "record it with lerobot-wmrl-record --depth=true",
             )  # fmt: skip
+
+
+def require_shown(table: EpisodeTable, episodes: Iterable[int]) -> None:
+    """Raise FieldError if episodes succeed and none of their frames shows it."""
+    if not table.shows_success(episodes):
+        raise FieldError(
+            "dataset.root", table.dataset.root,
+            f"{success_column(table.dataset.features)} is true in the last rows of episodes alone, and the "
+            "frame after the last action is not recorded: no frame shows success",
+            "label it anew: lerobot-wmrl-label with --success.type=ends takes the last frames for solved",
+        )  # fmt: skip
 
 
 def check_widths(features: Mapping[str, Any], wanted: Mapping[str, int]) -> None:

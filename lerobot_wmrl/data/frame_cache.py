@@ -32,6 +32,9 @@ from lerobot_wmrl.data.frames import NO_CONTEXT, Context
 
 ENCODE_BATCH = 128
 
+DECODED = 256
+"""Frames of a camera that are decoded at a time: those of a long episode would not fit into the memory."""
+
 
 class FrameEncoder(Protocol):
     """Interface of a frame tokenizer, as the caches use it."""
@@ -60,7 +63,8 @@ class FrameEncoder(Protocol):
 
 def cache_dir(dataset: LeRobotDataset) -> Path:
     """Return the folder of a dataset's caches: beside it, or, in the hub's cache, in LeRobot's folder."""
-    root = Path(dataset.root)
+    root = Path(dataset.root).absolute()
+    root = root.resolve() if ".." in root.parts else root
     if root.parent.name == "snapshots":  # the hub's cache has nothing else there
         return HF_LEROBOT_HOME / "frames" / f"{root.parents[1].name}-{root.name}.cache"
     return root.with_name(root.name + ".cache")
@@ -76,11 +80,12 @@ def cached_frames(dataset: LeRobotDataset, camera_keys: Sequence[str], side: int
 
     def fill(target: np.ndarray) -> None:
         for episode in tqdm(range(dataset.num_episodes), desc="Decoding frames", unit="episode"):
-            rows = dataset.meta.episodes[episode]
-            begin, end = rows["dataset_from_index"], rows["dataset_to_index"]
+            begin, end = rows_of(dataset, episode)
             for camera, name in enumerate(camera_keys):
-                frames = stretch(decode_episode(dataset, episode, name), side, side)
-                target[begin:end, camera] = frames.permute(0, 2, 3, 1).numpy()
+                for first in range(begin, end, DECODED):
+                    rows = slice(first, min(first + DECODED, end))
+                    frames = stretch(decode(dataset, episode, name, rows), side, side)
+                    target[rows, camera] = frames.permute(0, 2, 3, 1).numpy()
 
     return memory_map(cache_dir(dataset) / f"frames-{key}.npy", shape, np.uint8, fill)
 
@@ -176,26 +181,35 @@ def frames_to_tensor(frames: np.ndarray) -> Tensor:
     return torch.from_numpy(np.array(frames)).permute(0, 1, 4, 2, 3).float() / 255
 
 
+def rows_of(dataset: LeRobotDataset, episode: int) -> tuple[int, int]:
+    """Return the first row of an episode and the one after its last."""
+    rows = dataset.meta.episodes[episode]
+    return rows["dataset_from_index"], rows["dataset_to_index"]
+
+
 def decode_episode(dataset: LeRobotDataset, episode: int, key: str) -> Tensor:
     """Decode one episode and camera, uint8 (T, 3, H, W), from video or from stored images."""
-    rows = dataset.meta.episodes[episode]
-    indices = range(rows["dataset_from_index"], rows["dataset_to_index"])
+    return decode(dataset, episode, key, slice(*rows_of(dataset, episode)))
+
+
+def decode(dataset: LeRobotDataset, episode: int, key: str, rows: slice) -> Tensor:
+    """Decode some rows of an episode, which are the dataset's, in one camera: uint8 (T, 3, H, W)."""
     if key not in dataset.meta.video_keys:
-        images = dataset.hf_dataset.with_format(None, columns=[key])[indices][key]
+        images = dataset.hf_dataset.with_format(None, columns=[key])[rows][key]
         frames = np.stack([np.asarray(image.convert("RGB")) for image in images])
         return torch.from_numpy(frames).permute(0, 3, 1, 2)
-    return decode_video(dataset, episode, key)
+    return decode_video(dataset, episode, key, rows)
 
 
-def decode_video(dataset: LeRobotDataset, episode: int, key: str) -> Tensor:
-    """Decode the video of one episode and camera: uint8 (T, 3, H, W), or codes of depth (T, 1, H, W).
+def decode_video(dataset: LeRobotDataset, episode: int, key: str, rows: slice) -> Tensor:
+    """Decode rows of an episode from a camera's video: uint8 (T, 3, H, W), or codes of depth (T, 1, H, W).
 
     Raises:
         ValueError: the video is corrupted.
     """
-    rows = dataset.meta.episodes[episode]
-    first, length = rows[f"videos/{key}/from_timestamp"], rows["length"]
-    times = [first + index / dataset.fps for index in range(length)]
+    begin = rows_of(dataset, episode)[0]
+    first = dataset.meta.episodes[episode][f"videos/{key}/from_timestamp"]
+    times = [first + index / dataset.fps for index in range(rows.start - begin, rows.stop - begin)]
     path = Path(dataset.root) / dataset.meta.get_video_file_path(episode, key)
     try:
         return decode_video_frames(
@@ -215,14 +229,24 @@ def memory_map(
 ) -> np.ndarray:
     """Return the array at `path`, written by `fill` if missing; the file appears only once it is whole."""
     if not path.is_file():
-        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except PermissionError as error:
+            raise FieldError(
+                "dataset.root", path.parent.with_suffix(""),
+                f"its decoded frames are kept beside it, where nothing can be written ({path.parent})",
+                "copy the dataset, or make a symbolic link to it, where you may write",
+            ) from error  # fmt: skip
         host = socket.gethostname()  # others may share the folder, and their processes are not seen here
         for torn in path.parent.glob(f"*.{host}+*.partial"):
             if not psutil.pid_exists(int(torn.stem.rpartition("+")[2])):
                 torn.unlink(missing_ok=True)
         partial = path.with_suffix(f".{host}+{os.getpid()}.partial")
-        target = np.lib.format.open_memmap(partial, mode="w+", dtype=dtype, shape=shape)
         try:
+            target = np.lib.format.open_memmap(partial, mode="w+", dtype=dtype, shape=shape)
+            with partial.open("r+b") as file:  # a disk that is full says so now, and not by a bus error later
+                if hasattr(os, "posix_fallocate"):
+                    os.posix_fallocate(file.fileno(), 0, partial.stat().st_size)
             fill(target)
             target.flush()
             partial.replace(path)
@@ -272,7 +296,8 @@ def decode_depth(dataset: LeRobotDataset, episode: int, key: str) -> Tensor:
     """Decode the depth of one episode and camera, (T, 1, H, W) metres, from video or from stored images."""
     info = dataset.features[key].get("info") or {}
     if key in dataset.meta.video_keys:
-        codes, encoder = decode_video(dataset, episode, key), DepthEncoderConfig.from_video_info(info)
+        codes = decode_video(dataset, episode, key, slice(*rows_of(dataset, episode)))
+        encoder = DepthEncoderConfig.from_video_info(info)
         metres = dequantize_depth(
             codes, encoder.depth_min, encoder.depth_max, encoder.shift, encoder.use_log,
             output_unit=DEPTH_METER_UNIT,

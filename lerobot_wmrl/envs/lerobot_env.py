@@ -17,7 +17,7 @@ from torch import Tensor
 from lerobot_wmrl.common.actions import clip_actions
 from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.errors import FieldError, within
-from lerobot_wmrl.common.policies import check_fit
+from lerobot_wmrl.common.policies import check_fit, seen_shape
 from lerobot_wmrl.envs.configuration_hub import HubEnv
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 
@@ -76,7 +76,7 @@ def check_real_env(policy: PreTrainedConfig, config: EnvConfig) -> None:
         shown = shapes_of(env.reset()[0])
     finally:
         env.close()
-    wanted = {name: tuple(feature.shape) for name, feature in policy.image_features.items()}
+    wanted = {name: seen_shape(feature) for name, feature in policy.image_features.items()}
     sized = {name: wanted.get(name, shape) for name, shape in shown.items()}
     check_fit(policy, sized, env.single_action_space.shape[0], "real_env")
 

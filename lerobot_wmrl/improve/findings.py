@@ -12,7 +12,13 @@ from lerobot_wmrl.common.constants import START_TASK
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.policies import check_fit
 from lerobot_wmrl.data.embodiment import component_names
-from lerobot_wmrl.data.episodes import EpisodeTable, camera_names, frame_size, success_column
+from lerobot_wmrl.data.episodes import (
+    EpisodeTable,
+    camera_names,
+    frame_size,
+    require_shown,
+    success_column,
+)
 
 LONGEST_IMAGINATION = 98
 """Frames of an imagined episode at most. Where recorded episodes are longer, imagination also begins in their
@@ -99,6 +105,7 @@ def look(
             "dataset.root", root, f"{has}, so there is nothing to reward",
             "add next.success with lerobot-wmrl-label, or record successes",
         )  # fmt: skip
+    require_shown(table, range(len(success)))
     seconds, fps = table.length / table.dataset.fps, table.dataset.fps
     cameras = [f"{name} {h}x{w}" for name, (h, w) in zip(camera_names(keys), sizes.values(), strict=True)]
     lines = [

@@ -148,7 +148,8 @@ class Drive:
         for action in self.actions:
             before = self.observation
             self._advance(action)
-            yield Step(before, action[0].numpy(), self.measured["reward"])
+            box = self.env.single_action_space
+            yield Step(before, np.clip(action[0].numpy(), box.low, box.high), self.measured["reward"])
         self.synchronized = True  # and the real environment has stayed where it was
 
     def succeeds(self, threshold: float, frames: int) -> bool:

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 def improve(cfg: ImproveConfig) -> None:
     """Run every stage, write the report, and say what came of it."""
     from lerobot_wmrl.common.stages import claimed, run_stages
+    from lerobot_wmrl.data.episodes import fingerprint
     from lerobot_wmrl.improve.report.page import Page
     from lerobot_wmrl.improve.report.words import verdict
 
@@ -36,7 +37,8 @@ def improve(cfg: ImproveConfig) -> None:
     improvement = Improvement.of(cfg)
     print(f"{cfg.dataset.name}:\n{improvement.found}\n  {improvement.duration}")
     stages = improvement.stages()
-    with claimed(cfg.output_dir, settings(cfg, stages)):
+    given = {**settings(cfg, stages), "the dataset's content": fingerprint(improvement.found.root)}
+    with claimed(cfg.output_dir, given):
         improvement.copy_policy()
         run_stages(stages, cfg.output_dir)
         page = Page.of(improvement)

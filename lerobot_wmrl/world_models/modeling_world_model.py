@@ -49,8 +49,11 @@ CONDITION_TOKENS: Final = 4
 """Tokens that an action is embedded into."""
 
 MIN_SPREAD: Final = 1e-3
-"""Standard deviation below which a component is a constant, and not scaled: in the dataset's units, or for
-actions that are all small, in halves of the largest range."""
+"""Standard deviation below which a component is a constant, and not scaled: in the dataset's units, for small
+actions in halves of their component's range."""
+
+ROUNDING: Final = 1e-6
+"""Standard deviation that rounding may give a constant component, as a share of its mean, or of 1."""
 
 STATE_SPREAD: Final = 0.02
 """Least standard deviation by which the state is scaled, in the dataset's units. The opening of a closed
@@ -142,18 +145,19 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
             self.config.state_size = features[OBS_STATE]["shape"][0] if OBS_STATE in features else 0
 
     def _register_statistics(
-        self, name: str, key: str, size: int, stats: Any, least: float = 0.0, unit: float = 1.0
+        self, name: str, key: str, size: int, stats: Any, least: float = 0.0, unit: Tensor | float = 1.0
     ) -> None:
         """Register mean and standard deviation of the feature `key`, the latter at least `least`.
 
-        unit: unit in which `MIN_SPREAD` is measured.
+        unit: unit in which `MIN_SPREAD` is measured, one for each component or for all.
         """
         mean, std = torch.zeros(size), torch.ones(size)
         if stats is not None and size:
             mean = torch.as_tensor(stats[key]["mean"], dtype=torch.float32)
             std = torch.as_tensor(stats[key]["std"], dtype=torch.float32)
             std = std.where(std != 1, 1 + torch.finfo(std.dtype).eps)  # 1 says that it never varies
-            std = torch.where(std <= MIN_SPREAD * unit, 1.0, std).clamp_min(least)
+            constant = torch.maximum(torch.as_tensor(MIN_SPREAD * unit), ROUNDING * mean.abs().clamp_min(1))
+            std = torch.where(std <= constant, 1.0, std).clamp_min(least)
         self.register_buffer(f"{name}_mean", mean)
         self.register_buffer(f"{name}_std", std)
 
@@ -226,8 +230,8 @@ class ActionWorldModelRewardModel(WorldModelRewardModel):
 
     def __init__(self, config: ActionWorldModelConfig, dataset_stats: Any = None, **kwargs: Any) -> None:
         super().__init__(config, dataset_stats, **kwargs)
-        ends = zip(config.embodiment.action_low, config.embodiment.action_high, strict=True)
-        unit = min(1.0, max(((high - low) / 2 for low, high in ends), default=1.0))
+        low, high = map(torch.tensor, (config.embodiment.action_low, config.embodiment.action_high))
+        unit = ((high - low) / 2).clamp_max(1.0) if len(low) else 1.0
         self._register_statistics("action", ACTION, config.action_size, dataset_stats, unit=unit)
         width = config.dynamics.width
         self.embed_action = nn.Sequential(

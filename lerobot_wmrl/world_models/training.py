@@ -41,6 +41,7 @@ from lerobot_wmrl.data.clips import ClipSampler, FrameSampler, InTurn
 from lerobot_wmrl.data.episodes import (
     EpisodeTable,
     TrainingData,
+    require_shown,
 )
 from lerobot_wmrl.data.frame_cache import (
     cached_context,
@@ -122,6 +123,8 @@ def make_sampler(
                 f"{table.dataset.root} has neither next.success nor next.done, so its frames cannot be told "
                 "apart", "label its episodes, or leave `tokenizer.success` out",
             )  # fmt: skip
+        if config.tokenizer.success and table.success[episodes].any():
+            require_shown(table, episodes.nonzero()[0])
         sizes = config.tokenizer
         frames, cameras = cached_frames(table.dataset, sizes.camera_keys, sizes.image_size), sizes.cameras
         return FrameSampler(table, frames, episodes.nonzero()[0], cameras, batch_size, seed, config.device)

@@ -54,6 +54,16 @@ def test_truncated_weights_are_refused(tmp_path: Path) -> None:
             read(config)
 
 
+def test_images_may_be_described_with_their_channels_last(tmp_path: Path) -> None:
+    """As LeRobot does it where a dataset calls them `rgb`."""
+    config = read_policy_config(str(save_untrained_policy(tmp_path, size=(48, 64))), [])
+    assert config.input_features
+    config.input_features[IMAGE] = PolicyFeature(FeatureType.VISUAL, (48, 64, 3))
+    check_fit(config, {IMAGE: (3, 48, 64)}, action_size=3)
+    with pytest.raises(ValueError, match=r"shape \(3, 48, 64\), the environment has \(3, 64, 48\)"):
+        check_fit(config, {IMAGE: (3, 64, 48)}, action_size=3)
+
+
 @pytest.mark.parametrize(("camera", "size", "actions", "message"), [
     ("wrist", 32, 3, r"needs observation\.images\.wrist.*cameras: observation\.images\.third_view"),
     ("third_view", 64, 3, r"\(3, 64, 64\), the environment has \(3, 32, 32\)"),

@@ -1,12 +1,22 @@
 """What is read from a dataset beside its pictures."""
 
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_wmrl.data.episodes import open_dataset, read_episodes
+from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.data.episodes import (
+    DatasetSource,
+    fingerprint,
+    frame_size,
+    open_dataset,
+    read_episodes,
+    require_shown,
+)
 
 FEATURES = {"action": {"dtype": "float32", "shape": (1,), "names": ["x"]}}
 
@@ -43,7 +53,46 @@ def test_where_episodes_merely_end_nothing_is_added(tmp_path: Path) -> None:
         })  # fmt: skip
     dataset.save_episode()
     dataset.finalize()
-    assert read_episodes(open_dataset(tmp_path / "d")).success_target.tolist() == [False] * 4 + [True]
+    table = read_episodes(open_dataset(tmp_path / "d"))
+    assert table.success_target.tolist() == [False] * 4 + [True]
+    with pytest.raises(FieldError, match=r"next.done is true in the last rows .* no frame shows success"):
+        require_shown(table, [0])
+
+
+def test_a_frame_shows_success_after_the_action_that_leads_to_it(tmp_path: Path) -> None:
+    table = read_episodes(open_dataset(record(tmp_path / "one", [["open"] * 4, ["open"] * 3])))
+    table.done[[1, 3, 4]] = True
+    assert table.shown.astype(int).tolist() == [0, 0, 1, 0, 0, 1, 0]
+    assert [table.shows_success([episode]) for episode in (0, 1)] == [True, True]
+    require_shown(table, [0, 1])
+
+
+@pytest.mark.parametrize(("shape", "names"), [
+    ((48, 64, 3), ["height", "width", "channels"]), ((48, 64, 3), ["height", "width", "channel"]),
+    ((3, 48, 64), ["channels", "height", "width"]), ((48, 64, 3), ["height", "width", "rgb"]),
+    ((3, 48, 64), ["c", "h", "w"]), ((48, 64, 3), None), ((48, 64, 1), ["height", "width", "depth"]),
+])  # fmt: skip
+def test_the_size_of_frames_is_read_whatever_their_channels_are_called(
+    shape: tuple[int, ...], names: list[str] | None
+) -> None:
+    assert frame_size({"shape": shape, "names": names}) == (48, 64)
+
+
+def test_a_folder_is_the_same_with_and_without_a_slash() -> None:
+    assert DatasetSource("data/x/") == DatasetSource("data/x")
+    assert not DatasetSource().given
+
+
+def test_the_fingerprint_changes_with_labels_and_not_with_a_copy(
+    make_synthetic_dataset: Callable[..., LeRobotDataset], tmp_path: Path
+) -> None:
+    root = Path(make_synthetic_dataset(tmp_path / "one").root)
+    shutil.copytree(root, tmp_path / "copy")
+    before = fingerprint(root)
+    assert fingerprint(tmp_path / "copy") == before
+    stats = root / "meta" / "stats.json"
+    stats.write_text(stats.read_text().replace("next.success", "next.failure"))
+    assert fingerprint(root) != before
 
 
 @pytest.mark.parametrize(

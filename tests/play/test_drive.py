@@ -73,6 +73,13 @@ def test_replaying_yields_what_was_seen_and_moves_nothing(drive):
     assert drive.step(some_actions(5)[4], "you") == following
 
 
+def test_what_is_saved_is_the_action_that_was_imagined(drive):
+    """Out of range it is clipped, as the environment does."""
+    drive.step(torch.full((1, 7), 2.0), "you")
+    (step,) = drive.replay()
+    assert step.action.tolist() == drive.env.single_action_space.high.tolist()
+
+
 def test_recorded_frames_are_beside_as_long_as_the_recorded_actions_are_taken(drive):
     assert drive.views[0]["beside"]["name"] == "recorded"
     taken = drive.step(torch.from_numpy(drive.recorded.actions[0])[None], "recorded")
