@@ -33,7 +33,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.precision import keep_freed_memory
-from lerobot_wmrl.data.episodes import DatasetSource
+from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import DrivenEnv
 from lerobot_wmrl.play.saving import SavedEpisodes

@@ -108,7 +108,8 @@ def check_datasets(study: Study, step: Step, checked: frozenset[Source] = frozen
         return checked
     from lerobot_wmrl.common.errors import FieldError, renamed
     from lerobot_wmrl.data.budget import Ledger
-    from lerobot_wmrl.data.episodes import open_dataset, read_episodes
+    from lerobot_wmrl.data.dataset import open_dataset
+    from lerobot_wmrl.data.episodes import read_episodes
 
     found = {each for each in sources(step) if each.recorded} - checked
     for source in sorted(found, key=lambda each: each[:2]):

@@ -13,7 +13,8 @@ import numpy as np
 
 from lerobot_wmrl.common.constants import KINDS
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.episodes import SUCCESS, open_dataset, read_episodes
+from lerobot_wmrl.data.dataset import open_dataset
+from lerobot_wmrl.data.episodes import SUCCESS, read_episodes
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
 

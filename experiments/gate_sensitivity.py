@@ -22,7 +22,8 @@ from tqdm import tqdm
 from lerobot_wmrl.common.constants import TASKS
 from lerobot_wmrl.common.files import markdown_table, write_json
 from lerobot_wmrl.common.statistics import Proportion
-from lerobot_wmrl.data.episodes import EpisodeTable, open_dataset, read_episodes
+from lerobot_wmrl.data.dataset import open_dataset
+from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
 from lerobot_wmrl.maniskill.cameras import Rendering
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 from lerobot_wmrl.maniskill.scenes import SCENES

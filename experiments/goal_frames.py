@@ -24,7 +24,8 @@ from experiments.gates import training_minutes
 from lerobot_wmrl.common.constants import START_SCENE
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.statistics import RESAMPLES
-from lerobot_wmrl.data.episodes import choose_episodes, open_dataset, read_episodes
+from lerobot_wmrl.data.dataset import open_dataset
+from lerobot_wmrl.data.episodes import choose_episodes, read_episodes
 from lerobot_wmrl.data.frame_cache import frames_to_tensor
 from lerobot_wmrl.evaluation.goals import TrainedProbe, goal_quality, imagine_goals, train_probe
 from lerobot_wmrl.evaluation.replay import Recording

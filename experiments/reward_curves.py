@@ -32,7 +32,8 @@ from torch import Tensor
 from experiments.figures import COLOURS, tidy
 from lerobot_wmrl.common.files import markdown_table, write_json
 from lerobot_wmrl.common.statistics import Estimate
-from lerobot_wmrl.data.episodes import EpisodeTable, open_dataset, read_episodes
+from lerobot_wmrl.data.dataset import open_dataset
+from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.start_frames import chosen_episodes
 from lerobot_wmrl.envs.uncertainty import SIGNALS

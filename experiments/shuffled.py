@@ -22,7 +22,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import ACTION, DONE, REWARD
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.episodes import EpisodeTable, open_dataset, parquet_files, read_episodes
+from lerobot_wmrl.data.dataset import open_dataset
+from lerobot_wmrl.data.episodes import EpisodeTable, parquet_files, read_episodes
 
 COLUMNS: Final = {"labels": ("next.success", DONE, REWARD), "actions": (ACTION,)}
 

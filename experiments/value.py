@@ -10,7 +10,8 @@ from experiments.run import read_record
 from experiments.study import Study
 from experiments.success import Results, outcomes, rate
 from lerobot_wmrl.data.budget import Ledger
-from lerobot_wmrl.data.episodes import open_dataset, read_episodes
+from lerobot_wmrl.data.dataset import open_dataset
+from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.evaluation.comparison import RESULTS
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 

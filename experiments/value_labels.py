@@ -39,7 +39,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from experiments.value_model import auc, cross_fitted_values, log_loss
 from lerobot_wmrl.common.constants import KINDS, START_KIND
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.episodes import EpisodeTable, open_dataset, parquet_files, read_episodes
+from lerobot_wmrl.data.dataset import open_dataset
+from lerobot_wmrl.data.episodes import EpisodeTable, parquet_files, read_episodes
 
 STEPS: Final = 10
 QUANTILE: Final = 0.6

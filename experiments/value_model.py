@@ -21,7 +21,8 @@ from lerobot_policy_cnn.networks import ObservationEncoder, Readout
 from lerobot_policy_cnn.processor_cnn import MIN_DATASET_STD
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.images import random_shift
-from lerobot_wmrl.data.episodes import EpisodeTable, frame_size
+from lerobot_wmrl.data.checks import frame_size
+from lerobot_wmrl.data.episodes import EpisodeTable
 from lerobot_wmrl.data.frame_cache import cached_frames, frames_to_tensor
 
 FOLDS: Final = 3

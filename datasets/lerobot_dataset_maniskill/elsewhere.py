@@ -21,7 +21,8 @@ from lerobot_wmrl.common.errors import FieldError, within
 from lerobot_wmrl.common.files import write_json, writing
 from lerobot_wmrl.common.policies import check_weights
 from lerobot_wmrl.data.budget import Ledger, spending
-from lerobot_wmrl.data.episodes import open_dataset, read_episodes
+from lerobot_wmrl.data.dataset import open_dataset
+from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.features import describe_alike
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.envs.start_frames import check_starts

@@ -81,7 +81,7 @@ def run(config: RecordConfig) -> None:
     from lerobot_dataset_maniskill.publishing import publish
     from lerobot_dataset_maniskill.recorder import record
     from lerobot_dataset_maniskill.worker import silence_libraries
-    from lerobot_wmrl.data.episodes import open_dataset
+    from lerobot_wmrl.data.dataset import open_dataset
 
     silence_libraries()
     if config.merge_shards:
@@ -102,7 +102,8 @@ def run(config: RecordConfig) -> None:
 def check_shards(config: RecordConfig) -> None:
     """Raise FieldError unless the shards are in the ledger, if one is given: then it knows the whole too."""
     from lerobot_wmrl.data.budget import Ledger
-    from lerobot_wmrl.data.episodes import open_dataset, read_episodes
+    from lerobot_wmrl.data.dataset import open_dataset
+    from lerobot_wmrl.data.episodes import read_episodes
 
     if config.budget is not None:
         with renamed("dataset.root", "merge_shards"):

@@ -25,7 +25,8 @@ from lerobot_wmrl.common.errors import FieldError, within
 from lerobot_wmrl.common.files import foreign_files, write_json, writing
 from lerobot_wmrl.common.policies import check_weights, fit_to_environment
 from lerobot_wmrl.data.budget import Ledger, spending
-from lerobot_wmrl.data.episodes import open_dataset, read_episodes
+from lerobot_wmrl.data.dataset import open_dataset
+from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.maniskill.backend import render_backend, simulating_context
 from lerobot_wmrl.maniskill.embodiment import ACTION_NAMES
 

@@ -12,7 +12,7 @@ from tqdm import tqdm
 from experiments import person
 from lerobot_wmrl.common.files import write_json, write_text
 from lerobot_wmrl.common.policies import read_policy_config
-from lerobot_wmrl.data.episodes import DatasetSource
+from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.envs.configuration_world_model import DrivenEnv
 from lerobot_wmrl.play.drive import Drive
 from lerobot_wmrl.play.drivers import PlannerDriver

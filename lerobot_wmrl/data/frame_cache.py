@@ -27,7 +27,8 @@ from tqdm import tqdm
 
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.images import stretch
-from lerobot_wmrl.data.episodes import VIDEO_BACKEND, depth_key
+from lerobot_wmrl.data.checks import depth_key
+from lerobot_wmrl.data.dataset import VIDEO_BACKEND
 from lerobot_wmrl.data.frames import NO_CONTEXT, Context
 
 ENCODE_BATCH = 128

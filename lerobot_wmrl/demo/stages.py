@@ -14,7 +14,8 @@ from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.common.presets import Flags, format_flags, preset_flags, presets_of
 from lerobot_wmrl.common.stages import Stage
 from lerobot_wmrl.common.tracking import read_metrics
-from lerobot_wmrl.data.episodes import VALIDATION_EVERY, ChosenEpisodes
+from lerobot_wmrl.data.dataset import ChosenEpisodes
+from lerobot_wmrl.data.episodes import VALIDATION_EVERY
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.improve.configuration_improve import ROLLOUT_SEED_OFFSET, ImproveConfig
 from lerobot_wmrl.improve.report.page import Page, stage_records

@@ -13,7 +13,7 @@ from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 from lerobot_wmrl.common.constants import TASKS
 from lerobot_wmrl.common.errors import FieldError, require_at_least
 from lerobot_wmrl.common.images import camera_key
-from lerobot_wmrl.data.episodes import ChosenEpisodes
+from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.envs.uncertainty import Uncertainty
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 

@@ -21,11 +21,7 @@ from lerobot_wmrl.common.errors import FieldError, within
 from lerobot_wmrl.common.images import stretch, to_bytes
 from lerobot_wmrl.common.statistics import evenly_spaced
 from lerobot_wmrl.data.budget import Ledger
-from lerobot_wmrl.data.episodes import (
-    EpisodeTable,
-    choose_episodes,
-    read_episodes,
-)
+from lerobot_wmrl.data.episodes import EpisodeTable, choose_episodes, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames, frames_to_tensor
 from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv

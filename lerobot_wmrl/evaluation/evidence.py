@@ -12,7 +12,8 @@ from lerobot_wmrl.common.command_line import CONFIG_FILE
 from lerobot_wmrl.common.constants import DYNA, START_SCENE
 from lerobot_wmrl.common.errors import FieldError, first_line
 from lerobot_wmrl.common.statistics import Proportion
-from lerobot_wmrl.data.episodes import ChosenEpisodes, choose_episodes
+from lerobot_wmrl.data.dataset import ChosenEpisodes
+from lerobot_wmrl.data.episodes import choose_episodes
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.evaluation.calibration import Confusion
 from lerobot_wmrl.evaluation.gate import Outcomes, gate_at, labelled_recording, predict_outcomes

@@ -19,7 +19,8 @@ from torch import Tensor
 from lerobot_wmrl.common.constants import KINDS, PLAY, START_KIND, START_TASK, TASKS
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.statistics import Estimate, Proportion
-from lerobot_wmrl.data.episodes import EpisodeTable, open_dataset, read_episodes
+from lerobot_wmrl.data.dataset import open_dataset
+from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_features
 from lerobot_wmrl.evaluation.replay import EpisodeReplay, Recording, in_batches
 from lerobot_wmrl.world_models.checkpoint import check_dataset

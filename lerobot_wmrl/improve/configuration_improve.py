@@ -18,7 +18,7 @@ from lerobot_wmrl.common.policies import (
     require_trained,
 )
 from lerobot_wmrl.common.presets import Flags
-from lerobot_wmrl.data.episodes import ChosenEpisodes
+from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 
 SIZES: Final = ("auto", "tiny", "demo", "cpu")

@@ -11,14 +11,9 @@ from lerobot.utils.constants import ACTION, DONE, OBS_IMAGE, OBS_STATE
 from lerobot_wmrl.common.constants import START_TASK
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.policies import check_fit
+from lerobot_wmrl.data.checks import camera_names, frame_size, require_shown
 from lerobot_wmrl.data.embodiment import component_names
-from lerobot_wmrl.data.episodes import (
-    EpisodeTable,
-    camera_names,
-    frame_size,
-    require_shown,
-    success_column,
-)
+from lerobot_wmrl.data.episodes import EpisodeTable, success_column
 
 LONGEST_IMAGINATION = 98
 """Frames of an imagined episode at most. Where recorded episodes are longer, imagination also begins in their

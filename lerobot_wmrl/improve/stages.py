@@ -25,8 +25,9 @@ from lerobot_wmrl.common.lerobot_commands import edit_command, env_flags, merge_
 from lerobot_wmrl.common.policies import check_units, copy_checkpoint, load_processors
 from lerobot_wmrl.common.presets import Flags, format_flags
 from lerobot_wmrl.common.stages import FAILED, Stage, in_fork, never, read_record
+from lerobot_wmrl.data.dataset import ChosenEpisodes, DatasetSource
 from lerobot_wmrl.data.embodiment import Embodiment, read_embodiment
-from lerobot_wmrl.data.episodes import SUCCESS, ChosenEpisodes, DatasetSource, EpisodeTable, read_episodes
+from lerobot_wmrl.data.episodes import SUCCESS, EpisodeTable, read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.envs.lerobot_env import check_real_env

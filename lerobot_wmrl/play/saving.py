@@ -13,8 +13,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import ACTION, DEFAULT_FEATURES
 
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.embodiment import Embodiment, check_same_robot
-from lerobot_wmrl.data.episodes import open_dataset
 from lerobot_wmrl.data.features import episode_features, observation_row
 from lerobot_wmrl.play.drive import Step
 

@@ -12,7 +12,8 @@ from lerobot.utils.constants import OBS_STATE
 from PIL import Image, ImageOps
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.episodes import DatasetSource, EpisodeTable, read_episodes
+from lerobot_wmrl.data.dataset import DatasetSource
+from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv

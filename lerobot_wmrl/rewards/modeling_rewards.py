@@ -9,8 +9,8 @@ from lerobot.utils.constants import REWARD
 from torch import Tensor, nn
 
 from lerobot_wmrl.common.errors import FieldError, require_at_least
+from lerobot_wmrl.data.checks import check_cameras, frame_size
 from lerobot_wmrl.data.clips import take_steps, unpadded_rows
-from lerobot_wmrl.data.episodes import check_cameras, frame_size
 from lerobot_wmrl.rewards.configuration_rewards import EmbeddingConfig, GeneralConfig, ProxyConfig
 from lerobot_wmrl.rewards.general import general_reward
 from lerobot_wmrl.world_models.checkpoint import load_model

@@ -195,7 +195,7 @@ def rewards_of(rule: RewardModelRule, dataset: "LeRobotDataset") -> np.ndarray:
     from tqdm import tqdm
 
     from lerobot_wmrl.common.checkpoints import resolve_checkpoint
-    from lerobot_wmrl.data.episodes import VIDEO_BACKEND
+    from lerobot_wmrl.data.dataset import VIDEO_BACKEND
     from lerobot_wmrl.rewards.loading import load_preprocessor
 
     try:

@@ -7,7 +7,7 @@ from typing import Final
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice, require_share, within
-from lerobot_wmrl.data.episodes import DatasetSource
+from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 
 GATE_ACTIONS: Final = ("stop", "warn", "off")

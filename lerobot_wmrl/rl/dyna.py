@@ -16,7 +16,7 @@ from lerobot_wmrl.common.constants import DYNA, EVALUATION_SEED
 from lerobot_wmrl.common.presets import Flags, format_flags
 from lerobot_wmrl.common.processes import run_subcommand
 from lerobot_wmrl.data.budget import budget_flags
-from lerobot_wmrl.data.episodes import DatasetSource, open_dataset
+from lerobot_wmrl.data.dataset import DatasetSource, open_dataset
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.callbacks import REAL_STEPS, Record, record_folder

@@ -15,7 +15,7 @@ import numpy as np
 from termcolor import colored
 
 from lerobot_wmrl.common.constants import GATE_SEED
-from lerobot_wmrl.data.episodes import open_dataset
+from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.evaluation.gate import Gate, Outcomes, gate_at, labelled_recording, predict_outcomes
 from lerobot_wmrl.evaluation.pictures import save_strip, side_by_side

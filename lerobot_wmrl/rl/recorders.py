@@ -29,6 +29,7 @@ from lerobot_wmrl.common.policies import load_policy, load_processors, read_poli
 from lerobot_wmrl.common.presets import Flags, format_flags
 from lerobot_wmrl.common.processes import run_subcommand
 from lerobot_wmrl.data.budget import Ledger, budget_flags, spending
+from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.embodiment import (
     Embodiment,
     component_names,
@@ -36,7 +37,7 @@ from lerobot_wmrl.data.embodiment import (
     read_embodiment,
     recorded_range,
 )
-from lerobot_wmrl.data.episodes import open_dataset, read_episodes
+from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.features import encoder_of, episode_features, matched, observation_row
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv

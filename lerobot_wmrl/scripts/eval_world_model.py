@@ -27,7 +27,7 @@ from lerobot_wmrl.common.command_line import RunConfig, claim_output_dir, run_co
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import FieldError, require_at_least
 from lerobot_wmrl.common.presets import expand_preset
-from lerobot_wmrl.data.episodes import ChosenEpisodes
+from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 
 if TYPE_CHECKING:

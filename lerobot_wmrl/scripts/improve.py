@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 def improve(cfg: ImproveConfig) -> None:
     """Run every stage, write the report, and say what came of it."""
     from lerobot_wmrl.common.stages import claimed, run_stages
-    from lerobot_wmrl.data.episodes import fingerprint
+    from lerobot_wmrl.data.dataset import fingerprint
     from lerobot_wmrl.improve.report.page import Page
     from lerobot_wmrl.improve.report.words import verdict
 

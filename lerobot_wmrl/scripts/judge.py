@@ -36,7 +36,7 @@ from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.command_line import RunConfig, claim_output_dir, require_free, run_command
 from lerobot_wmrl.common.errors import FieldError, Stopped, regrouped, renamed, require_at_least
 from lerobot_wmrl.common.files import write_json, writing
-from lerobot_wmrl.data.episodes import ChosenEpisodes
+from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 

@@ -25,7 +25,8 @@ import numpy as np
 from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.files import whole_folder, writing
-from lerobot_wmrl.data.episodes import SUCCESS, DatasetSource
+from lerobot_wmrl.data.dataset import DatasetSource
+from lerobot_wmrl.data.episodes import SUCCESS
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.play import labels  # noqa: F401 (registers `by_hand`)
 from lerobot_wmrl.rewards.success_rules import EndsRule, SuccessRule, rows_of

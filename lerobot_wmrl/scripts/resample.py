@@ -19,7 +19,8 @@ import numpy as np
 
 from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.errors import FieldError, require_at_least
-from lerobot_wmrl.data.episodes import SUCCESS_COLUMNS, DatasetSource
+from lerobot_wmrl.data.dataset import DatasetSource
+from lerobot_wmrl.data.episodes import SUCCESS_COLUMNS
 
 if TYPE_CHECKING:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset

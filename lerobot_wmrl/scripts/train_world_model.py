@@ -28,7 +28,8 @@ from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least, re
 from lerobot_wmrl.common.precision import PRECISIONS, keep_freed_memory, training_dtype
 from lerobot_wmrl.common.presets import expand_preset, format_flags
 from lerobot_wmrl.common.tracking import make_wandb
-from lerobot_wmrl.data.episodes import EpisodeTable, TrainingData
+from lerobot_wmrl.data.dataset import TrainingData
+from lerobot_wmrl.data.episodes import EpisodeTable
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
 
 TRAINED = ("frame_tokenizer", "action_world_model", "text_world_model")

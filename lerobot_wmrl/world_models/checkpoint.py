@@ -14,8 +14,8 @@ from safetensors import SafetensorError
 
 from lerobot_wmrl.common.checkpoints import resolve_checkpoint
 from lerobot_wmrl.common.errors import FieldError, first_line
+from lerobot_wmrl.data.checks import check_cameras, check_depth, check_widths
 from lerobot_wmrl.data.embodiment import check_same_robot
-from lerobot_wmrl.data.episodes import check_cameras, check_depth, check_widths
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig, WorldModelConfig
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.images import stretch
-from lerobot_wmrl.data.episodes import check_cameras, frame_size
+from lerobot_wmrl.data.checks import check_cameras, frame_size
 from lerobot_wmrl.data.frames import NO_CONTEXT
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer, ImageLoss, motion_weight

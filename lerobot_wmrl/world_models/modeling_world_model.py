@@ -16,15 +16,10 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.data.checks import check_cameras, check_depth, check_episode_lengths, check_statistics
 from lerobot_wmrl.data.clips import Clip, clip_from_windows
 from lerobot_wmrl.data.embodiment import read_embodiment
-from lerobot_wmrl.data.episodes import (
-    check_cameras,
-    check_depth,
-    check_episode_lengths,
-    check_statistics,
-    success_column,
-)
+from lerobot_wmrl.data.episodes import success_column
 from lerobot_wmrl.data.frame_cache import depth_of_windows
 from lerobot_wmrl.world_models.anchored.dynamics import AnchoredDynamics
 from lerobot_wmrl.world_models.autoregressive.configuration import AutoregressiveConfig

@@ -37,12 +37,10 @@ from lerobot_wmrl.common.lerobot_compat import (
 )
 from lerobot_wmrl.common.precision import compute_in, training_dtype
 from lerobot_wmrl.common.tracking import append_metrics
+from lerobot_wmrl.data.checks import require_shown
 from lerobot_wmrl.data.clips import ClipSampler, FrameSampler, InTurn
-from lerobot_wmrl.data.episodes import (
-    EpisodeTable,
-    TrainingData,
-    require_shown,
-)
+from lerobot_wmrl.data.dataset import TrainingData
+from lerobot_wmrl.data.episodes import EpisodeTable
 from lerobot_wmrl.data.frame_cache import (
     cached_context,
     cached_depth,

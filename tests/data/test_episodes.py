@@ -9,14 +9,9 @@ import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.episodes import (
-    DatasetSource,
-    fingerprint,
-    frame_size,
-    open_dataset,
-    read_episodes,
-    require_shown,
-)
+from lerobot_wmrl.data.checks import frame_size, require_shown
+from lerobot_wmrl.data.dataset import DatasetSource, fingerprint, open_dataset
+from lerobot_wmrl.data.episodes import read_episodes
 
 FEATURES = {"action": {"dtype": "float32", "shape": (1,), "names": ["x"]}}
 

@@ -13,7 +13,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.tracking import read_metrics
-from lerobot_wmrl.data.episodes import ChosenEpisodes
+from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.data.frame_cache import cached_depth, token_depth
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.maniskill.embodiment import FPS

@@ -12,7 +12,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wmrl.common.images import stretch
 from lerobot_wmrl.data import frame_cache
-from lerobot_wmrl.data.episodes import open_dataset
+from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.frame_cache import cached_frames, frames_to_tensor
 
 

@@ -9,7 +9,8 @@ from lerobot.datasets import dataset_metadata, lerobot_dataset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wmrl.data import frame_cache
-from lerobot_wmrl.data.episodes import DatasetSource, TrainingData, open_dataset, read_episodes
+from lerobot_wmrl.data.dataset import DatasetSource, TrainingData, open_dataset
+from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig, train_world_model
 from tests.hub_server import Hub
 from tests.trained import tokenizer_config

@@ -11,7 +11,7 @@ from lerobot.scripts.lerobot_eval import main as lerobot_eval
 from lerobot.utils.constants import OBS_IMAGE, OBS_STATE
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.episodes import open_dataset
+from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.envs.configuration_hub import HubEnv
 from lerobot_wmrl.envs.lerobot_env import make_tensor_env, runs_in_processes
 from lerobot_wmrl.improve.stages import Improvement

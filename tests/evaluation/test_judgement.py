@@ -13,7 +13,7 @@ import pytest
 from lerobot_wmrl.common.checkpoints import Checkpoint, resolve_checkpoint
 from lerobot_wmrl.common.errors import Stopped
 from lerobot_wmrl.common.statistics import Proportion
-from lerobot_wmrl.data.episodes import ChosenEpisodes
+from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.evaluation import evidence
 from lerobot_wmrl.evaluation.calibration import Confusion

@@ -12,7 +12,8 @@ import torch
 from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.constants import KINDS
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.episodes import ChosenEpisodes, choose_episodes, open_dataset, read_episodes
+from lerobot_wmrl.data.dataset import ChosenEpisodes, open_dataset
+from lerobot_wmrl.data.episodes import choose_episodes, read_episodes
 from lerobot_wmrl.data.frames import NO_CONTEXT
 from lerobot_wmrl.evaluation import replay as replay_module
 from lerobot_wmrl.evaluation.accuracy import (

@@ -9,7 +9,8 @@ import pytest
 from lerobot.scripts.lerobot_record import record
 
 from experiments.person.script import SPEED, Hands, make_parser, write_script
-from lerobot_wmrl.data.episodes import open_dataset, read_episodes
+from lerobot_wmrl.data.dataset import open_dataset
+from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.maniskill.embodiment import ACTION_NAMES, FPS
 from tests.rl.checkpoints import save_untrained_policy
 

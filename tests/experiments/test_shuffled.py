@@ -8,7 +8,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from experiments.shuffled import donor_rows, shuffle
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.episodes import EpisodeTable, open_dataset, read_episodes
+from lerobot_wmrl.data.dataset import open_dataset
+from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames
 
 CAMERA = "observation.images.third_view"

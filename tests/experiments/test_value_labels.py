@@ -26,7 +26,8 @@ from experiments.value_labels import (
 from experiments.value_model import auc, cross_fitted_values, deal_folds, log_loss
 from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_wmrl.common.constants import KINDS
-from lerobot_wmrl.data.episodes import EpisodeTable, open_dataset, parquet_files, read_episodes
+from lerobot_wmrl.data.dataset import open_dataset
+from lerobot_wmrl.data.episodes import EpisodeTable, parquet_files, read_episodes
 from tests.relabelled import UNLABELLED, relabelled
 
 DEMONSTRATIONS = 2

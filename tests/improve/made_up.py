@@ -6,7 +6,7 @@ from typing import Any
 from lerobot.configs import PreTrainedConfig
 
 from lerobot_policy_cnn.configuration_cnn import CnnConfig
-from lerobot_wmrl.data.episodes import ChosenEpisodes
+from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.improve.configuration_improve import ImproveConfig
 from lerobot_wmrl.improve.findings import Findings
 from lerobot_wmrl.improve.stages import Improvement

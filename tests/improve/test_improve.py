@@ -27,7 +27,8 @@ from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.common.presets import preset_settings
 from lerobot_wmrl.common.stages import claimed
 from lerobot_wmrl.common.tracking import read_metrics
-from lerobot_wmrl.data.episodes import ChosenEpisodes, open_dataset, read_episodes
+from lerobot_wmrl.data.dataset import ChosenEpisodes, open_dataset
+from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.improve import stages
 from lerobot_wmrl.improve.configuration_improve import ImproveConfig

@@ -21,7 +21,8 @@ from lerobot_dataset_maniskill.merging import merge_folders
 from lerobot_wmrl.common.constants import START_SEED
 from lerobot_wmrl.common.images import to_bytes
 from lerobot_wmrl.common.policies import read_policy_config
-from lerobot_wmrl.data.episodes import DatasetSource, open_dataset, read_episodes
+from lerobot_wmrl.data.dataset import DatasetSource, open_dataset
+from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.features import matched
 from lerobot_wmrl.rl.recorders import RolloutRecorder
 from tests.pusht import record_pusht

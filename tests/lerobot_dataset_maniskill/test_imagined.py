@@ -15,7 +15,7 @@ from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
 from lerobot_wmrl.common.constants import KINDS
 from lerobot_wmrl.common.policies import read_policy_config
-from lerobot_wmrl.data.episodes import open_dataset
+from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig

@@ -21,7 +21,7 @@ from lerobot_dataset_maniskill.merging import require_same
 from lerobot_dataset_maniskill.recorder import follow_workers, missing_parts, record
 from lerobot_dataset_maniskill.writer import HOLD_FRAMES, find_damage
 from lerobot_wmrl.common.constants import KINDS
-from lerobot_wmrl.data.episodes import open_dataset
+from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.frame_cache import cached_frames
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.maniskill.embodiment import STATE_NAMES

@@ -29,7 +29,8 @@ from lerobot_wmrl.common.policies import (
     unwrapped,
 )
 from lerobot_wmrl.common.tracking import read_metrics
-from lerobot_wmrl.data.episodes import ChosenEpisodes, read_episodes
+from lerobot_wmrl.data.dataset import ChosenEpisodes
+from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.improve.configuration_improve import ImproveConfig
 from lerobot_wmrl.improve.findings import look
 from lerobot_wmrl.improve.stages import Improvement

@@ -24,7 +24,8 @@ from lerobot.utils import keyboard_input
 from lerobot_robot_imagined.config_imagined import ImaginedRobotConfig
 from lerobot_robot_imagined.imagined import ImaginedRobot
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.episodes import open_dataset, read_episodes
+from lerobot_wmrl.data.dataset import open_dataset
+from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_world_model import DrivenEnv, StartFrames
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW, ACTION_NAMES, FPS, STATE_NAMES
 from tests.rl.checkpoints import save_untrained_policy

@@ -10,7 +10,8 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.episodes import DatasetSource, read_episodes
+from lerobot_wmrl.data.dataset import DatasetSource
+from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.play.drive import Drive
 from lerobot_wmrl.play.visit import Visit

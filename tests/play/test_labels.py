@@ -22,7 +22,8 @@ from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.remote.webdriver import WebDriver
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.episodes import DatasetSource, open_dataset, read_episodes
+from lerobot_wmrl.data.dataset import DatasetSource, open_dataset
+from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.play.labels import ByHandRule, LabelPage
 from lerobot_wmrl.scripts.label import LabelConfig, label
 

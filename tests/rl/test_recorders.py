@@ -16,8 +16,9 @@ from lerobot.scripts.lerobot_eval import rollout
 from lerobot.utils.constants import OBS_IMAGE
 
 from lerobot_wmrl.common.constants import KINDS, POLICY, START_KIND
+from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.embodiment import Embodiment, check_same_robot
-from lerobot_wmrl.data.episodes import EpisodeTable, open_dataset, read_episodes
+from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
 from lerobot_wmrl.evaluation.agreement import policy_outcomes
 from lerobot_wmrl.rl import recorders
 from lerobot_wmrl.rl.recorders import EnvRecorder, robot_of

@@ -11,7 +11,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.rewards.factory import make_reward_pre_post_processors
 from lerobot.rewards.sarm.configuration_sarm import SARMConfig
 
-from lerobot_wmrl.data.episodes import open_dataset, read_episodes
+from lerobot_wmrl.data.dataset import open_dataset
+from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.rewards.configuration_rewards import ProxyConfig
 from lerobot_wmrl.rewards.modeling_rewards import ProxyRewardModel
 from lerobot_wmrl.scripts.label import longest_run, main

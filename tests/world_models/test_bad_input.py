@@ -12,7 +12,8 @@ import torch
 
 from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.episodes import ChosenEpisodes, choose_episodes, read_episodes
+from lerobot_wmrl.data.dataset import ChosenEpisodes
+from lerobot_wmrl.data.episodes import choose_episodes, read_episodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.scripts.eval_world_model import EvalWorldModelConfig, eval_world_model

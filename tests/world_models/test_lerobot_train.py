@@ -12,7 +12,8 @@ from lerobot.scripts import lerobot_train
 from safetensors.torch import load_file
 
 from lerobot_wmrl.data.clips import clip_from_windows
-from lerobot_wmrl.data.episodes import open_dataset, read_episodes
+from lerobot_wmrl.data.dataset import open_dataset
+from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.world_models import losses
 from lerobot_wmrl.world_models.checkpoint import load_model

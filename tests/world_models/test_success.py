@@ -11,7 +11,8 @@ from torch import Tensor
 
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.clips import MOST_WEIGHT, SUCCESS_SHARE, ClipSampler, FrameSampler
-from lerobot_wmrl.data.episodes import EpisodeTable, TrainingData, read_episodes
+from lerobot_wmrl.data.dataset import TrainingData
+from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_features, cached_frames, frames_to_tensor
 from lerobot_wmrl.evaluation.gate import seen_outcomes
 from lerobot_wmrl.evaluation.replay import Recording

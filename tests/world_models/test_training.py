@@ -15,13 +15,8 @@ from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.presets import PRESETS, preset_flags
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data.clips import ClipSampler, InTurn
-from lerobot_wmrl.data.episodes import (
-    ChosenEpisodes,
-    EpisodeTable,
-    TrainingData,
-    open_dataset,
-    read_episodes,
-)
+from lerobot_wmrl.data.dataset import ChosenEpisodes, TrainingData, open_dataset
+from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames, cached_tokens
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.scripts.eval_world_model import EvalWorldModelConfig, eval_world_model

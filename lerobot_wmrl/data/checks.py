@@ -1,0 +1,99 @@
+"""What a dataset must have for a model: cameras, depth, widths, statistics, success that is shown."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from lerobot.utils.constants import OBS_IMAGE, OBS_IMAGES
+
+from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.data.episodes import EpisodeTable, success_column
+
+
+def frame_size(feature: Mapping[str, Any]) -> tuple[int, int]:
+    """Return (H, W) of a camera's feature, whose shape is (H, W, 3) or (3, H, W).
+
+    Its names say which, if one of them is that of the channels; else the shape does.
+    """
+    shape, names = tuple(feature["shape"]), feature.get("names") or ()
+    channels = [axis for axis, name in enumerate(names) if str(name).startswith("channel")]
+    first = channels[0] == 0 if channels else shape[0] in (1, 3) and shape[-1] not in (1, 3)
+    height, width = shape[1:] if first else shape[:2]
+    return height, width
+
+
+def check_cameras(features: Mapping[str, Any], camera_keys: Sequence[str]) -> None:
+    """Raise FieldError unless the dataset has these cameras."""
+    for key in camera_keys:
+        if key not in features:
+            cameras = ", ".join(name for name in features if name.startswith(OBS_IMAGE)) or "none"
+            raise FieldError(
+                "tokenizer.cameras", camera_names(camera_keys),
+                f"the dataset has no {key} (its cameras: {cameras})",
+                "set `tokenizer.cameras` to match, or use a dataset with this camera",
+            )  # fmt: skip
+
+
+def camera_names(camera_keys: Sequence[str]) -> list[str]:
+    """Return the cameras' names without the prefix of their keys."""
+    return [key.removeprefix(f"{OBS_IMAGES}.") for key in camera_keys]
+
+
+def depth_key(camera_key: str) -> str:
+    """Return the dataset's key of a camera's depth."""
+    return f"{camera_key}_depth"
+
+
+def check_depth(features: Mapping[str, Any], camera_keys: Sequence[str]) -> None:
+    """Raise FieldError unless the dataset has the depth of these cameras."""
+    for key in map(depth_key, camera_keys):
+        if key not in features:
+            raise FieldError(
+                "depth", True, f"the world model looks at {key}, which the dataset lacks",
+                "record it with lerobot-wmrl-record --depth=true",
+            )  # fmt: skip
+
+
+def require_shown(table: EpisodeTable, episodes: Iterable[int]) -> None:
+    """Raise FieldError if episodes succeed and none of their frames shows it."""
+    if not table.shows_success(episodes):
+        raise FieldError(
+            "dataset.root", table.dataset.root,
+            f"{success_column(table.dataset.features)} is true in the last rows of episodes alone, and the "
+            "frame after the last action is not recorded: no frame shows success",
+            "label it anew: lerobot-wmrl-label with --success.type=ends takes the last frames for solved",
+        )  # fmt: skip
+
+
+def check_widths(features: Mapping[str, Any], wanted: Mapping[str, int]) -> None:
+    """Raise ValueError unless the features have as many components as a model was trained with, 0 for any."""
+    for name, width in wanted.items():
+        found = features[name]["shape"][0] if name in features else 0
+        if width and found != width:
+            raise ValueError(
+                f"{name}: the world model was trained with {width} components, the dataset has "
+                f"{found or 'none'}; use a dataset like the one it was trained on"
+            )
+
+
+def check_statistics(meta: Any, key: str) -> None:
+    """Raise FieldError unless a dataset's statistics of a feature are a finite number for each component."""
+    size = int(np.prod(meta.features[key]["shape"]))
+    for name in ("mean", "std"):
+        found = np.asarray((meta.stats or {}).get(key, {}).get(name, ()), np.float64).reshape(-1)
+        if len(found) != size or not np.isfinite(found).all():
+            raise FieldError(
+                "dataset.root", meta.root,
+                f"its statistics (meta/stats.json) say that the {name} of {key} is {found.tolist()}, where "
+                f"{size} finite numbers should be",
+                "compute them again with lerobot-edit-dataset --operation.type=recompute_stats",
+            )  # fmt: skip
+
+
+def check_episode_lengths(meta: Any) -> None:
+    """Raise FieldError if no episode has a second frame to predict."""
+    if meta.total_frames <= meta.total_episodes:
+        raise FieldError(
+            "dataset.root", meta.root, f"{meta.total_episodes} episodes of {meta.total_frames} frames in all",
+            "a world model learns from episodes of two frames or more: record longer ones",
+        )  # fmt: skip
