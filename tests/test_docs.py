@@ -131,6 +131,14 @@ def test_the_readme_says_what_was_measured() -> None:
     )
     assert best_success(pick_place, BASELINES, "ind") == worse
     assert f"PPO beat filtered BC by {better - worse} points, in known scenes alone" in text
+    stem = "demonstrations50_rollouts300_seed0.json"
+    shares = (
+        json.loads((results / study / stem).read_text())["methods"][method]["ind"]["share"]
+        for study, method in (
+            ("value_pick_place", "imagined_ppo"), ("value_pick_place_longer", "longer_filtered"),
+        )
+    )  # fmt: skip
+    assert f"longer BC by {100 * (next(shares) - next(shares)):.0f} (one)" in text
     unseen = (best_success(pick_place, methods, "ood") for methods in (("imagined_ppo",), BASELINES))
     assert abs(next(unseen) - next(unseen)) <= 1
     driven = [json.loads(path.read_text()) for path in (results / "driven").glob("*.json")]
