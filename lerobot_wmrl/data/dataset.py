@@ -60,13 +60,8 @@ class DatasetSource:
         Raises:
             FieldError: there is none, it is not whole, or it cannot be downloaded.
         """
-        if self.repo_id and not (self.root and Path(self.root).exists()):
+        if self.repo_id and not (self.root and (Path(self.root) / "meta" / "info.json").is_file()):
             return download_dataset(self.repo_id, self.revision, self.root or None)
-        if self.revision:
-            raise FieldError(
-                "dataset.revision", self.revision, f"chooses what is downloaded, and {self.root} is there",
-                "leave it out, or give another `dataset.root`",
-            )  # fmt: skip
         return open_dataset(self.root, self.repo_id)
 
 

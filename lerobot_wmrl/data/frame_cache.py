@@ -10,6 +10,7 @@ import json
 import os
 import socket
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -26,6 +27,7 @@ from torch.nn import functional as F
 from tqdm import tqdm
 
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.files import NOT_WRITABLE
 from lerobot_wmrl.common.images import stretch
 from lerobot_wmrl.data.checks import depth_key
 from lerobot_wmrl.data.dataset import VIDEO_BACKEND
@@ -230,30 +232,40 @@ def memory_map(
 ) -> np.ndarray:
     """Return the array at `path`, written by `fill` if missing; the file appears only once it is whole."""
     if not path.is_file():
-        try:
+        with room_in(path.parent):
             path.parent.mkdir(parents=True, exist_ok=True)
-        except PermissionError as error:
-            raise FieldError(
-                "dataset.root", path.parent.with_suffix(""),
-                f"its decoded frames are kept beside it, where nothing can be written ({path.parent})",
-                "copy the dataset, or make a symbolic link to it, where you may write",
-            ) from error  # fmt: skip
         host = socket.gethostname()  # others may share the folder, and their processes are not seen here
         for torn in path.parent.glob(f"*.{host}+*.partial"):
             if not psutil.pid_exists(int(torn.stem.rpartition("+")[2])):
                 torn.unlink(missing_ok=True)
         partial = path.with_suffix(f".{host}+{os.getpid()}.partial")
         try:
-            target = np.lib.format.open_memmap(partial, mode="w+", dtype=dtype, shape=shape)
-            with partial.open("r+b") as file:  # a disk that is full says so now, and not by a bus error later
-                if hasattr(os, "posix_fallocate"):
-                    os.posix_fallocate(file.fileno(), 0, partial.stat().st_size)
+            with room_in(path.parent):
+                target = np.lib.format.open_memmap(partial, mode="w+", dtype=dtype, shape=shape)
+                with partial.open("r+b") as file:  # a full disk says so now, and not by a bus error later
+                    if hasattr(os, "posix_fallocate"):
+                        os.posix_fallocate(file.fileno(), 0, partial.stat().st_size)
             fill(target)
             target.flush()
             partial.replace(path)
         finally:
             partial.unlink(missing_ok=True)
     return np.load(path, mmap_mode="r")
+
+
+@contextmanager
+def room_in(folder: Path) -> Iterator[None]:
+    """Turn the error of a disk that is full or must not be written into one with a remedy."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in NOT_WRITABLE:
+            raise
+        raise FieldError(
+            "dataset.root", folder.with_suffix(""),
+            f"its decoded frames are kept in {folder}, which cannot be written ({error})",
+            "make room, or copy the dataset, or make a symbolic link to it, where you may write",
+        ) from error  # fmt: skip
 
 
 def file_stamps(dataset: LeRobotDataset) -> list[object]:

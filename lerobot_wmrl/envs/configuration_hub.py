@@ -70,7 +70,15 @@ class HubEnv(EnvConfig):
                 f"asked for {n_envs} environments at once, its make_env made {sorted(counts) or 'none'}",
                 "it must heed `n_envs`; or ask for one at a time",
             )  # fmt: skip
-        shape = every[0].single_action_space.shape or ()
+        space = every[0].single_action_space
+        if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
+            raise FieldError(
+                "hub_path",
+                self.hub_path,
+                f"its actions are {space}",
+                "policies act by a vector (Box)",
+            )
+        shape = space.shape
         self.features = {
             ACTION: PolicyFeature(FeatureType.ACTION, shape)
         }  # lerobot-eval asks once it is made

@@ -9,7 +9,7 @@ import torch
 from gymnasium.vector import AutoresetMode
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.envs import make_env, make_env_pre_post_processors
-from lerobot.envs.configs import EnvConfig, HubEnvConfig
+from lerobot.envs.configs import EnvConfig, HubEnvConfig, LiberoEnv
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION, preprocess_observation
 from lerobot.utils.constants import ACTION
 from torch import Tensor
@@ -33,7 +33,7 @@ def make_tensor_env(config: EnvConfig, n_envs: int, device: str) -> gym.vector.V
     if isinstance(config, HubEnvConfig):
         raise FieldError(
             "type", config.type, "its code lies on the hub, and this command does not run that of this type",
-            f"set `type` to hub and `hub_path` to {config.hub_path}; lerobot-wmrl-compare takes it as it is",
+            "choose another; lerobot-wmrl-compare takes it, with --trust_remote_code=true",
         )  # fmt: skip
     return LeRobotTensorEnv(config, n_envs, device)
 
@@ -54,16 +54,25 @@ def runs_in_processes(config: EnvConfig) -> bool:
     return is_own(config) or (own_way and not isinstance(config, HubEnv))
 
 
+def counts_resets(config: EnvConfig) -> bool:
+    """Return whether not the seed but the number of resets so far chooses an episode's start, as in LIBERO.
+
+    Policies meet the same starts there if each has environments of its own that are reset once an episode:
+    LeRobot's `FreezeAfterEpisodeEnd` keeps those away that a vector environment would make by itself.
+    """
+    return isinstance(config, LiberoEnv) and config.init_states
+
+
 def shapes_of(observation: Observation) -> dict[str, tuple[int, ...]]:
     """Return the shapes of a batch's tensors, without the batch's dimension, as `check_fit` takes them."""
     return {name: tuple(value.shape[1:]) for name, value in observation.items() if isinstance(value, Tensor)}
 
 
-def check_real_env(policy: PreTrainedConfig, config: EnvConfig) -> None:
+def check_real_env(policy: PreTrainedConfig, config: EnvConfig, starts: int = 0) -> None:
     """Raise FieldError unless a policy can act in `real_env`, of which one is made to look at it.
 
     ManiSkill says what it shows without its simulator. The pictures of other environments may have any size:
-    LeRobot leaves it to policies to make them fit.
+    LeRobot leaves it to policies to make them fit. LIBERO must have at least `starts` starts for a task.
     """
     if isinstance(config, WmrlManiSkillEnv):
         with within("real_env"):
@@ -71,8 +80,14 @@ def check_real_env(policy: PreTrainedConfig, config: EnvConfig) -> None:
             config.runs_batched("cuda")
         check_fit(policy, config.observation_shapes(), config.features[ACTION].shape[0], "real_env")
         return
-    env = make_tensor_env(config, 1, "cpu")
+    with within("real_env"):
+        env = make_tensor_env(config, 1, "cpu")
     try:
+        if counts_resets(config) and (known := len(env.envs[0].get_wrapper_attr("_init_states"))) < starts:
+            raise FieldError(
+                "real_env.init_states", True, f"{config.type} has {known} starts for a task, policies are "
+                f"measured on {starts}", "set it to false, or lower `eval_episodes` and `selection_episodes`",
+            )  # fmt: skip
         shown = shapes_of(env.reset()[0])
     finally:
         env.close()

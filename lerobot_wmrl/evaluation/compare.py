@@ -12,7 +12,7 @@ import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs import close_envs, make_env, make_env_pre_post_processors
-from lerobot.envs.configs import EnvConfig, LiberoEnv
+from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION, FreezeAfterEpisodeEnd, env_to_policy_features
 from lerobot.scripts.lerobot_eval import eval_policy
 from lerobot.utils.constants import ACTION, PRETRAINED_MODEL_DIR
@@ -28,7 +28,7 @@ from lerobot_wmrl.common.policies import (
     read_policy_config,
 )
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
-from lerobot_wmrl.envs.lerobot_env import is_own, runs_in_processes
+from lerobot_wmrl.envs.lerobot_env import counts_resets, is_own, runs_in_processes
 from lerobot_wmrl.evaluation.comparison import Comparison, Episode
 
 type Envs = dict[str, dict[int, gym.vector.VectorEnv]]
@@ -140,15 +140,6 @@ def opened(config: EnvConfig, n_envs: int, trust_remote_code: bool, policies: in
 
 def _flat(envs: Envs) -> list[Any]:
     return [env for tasks in envs.values() for env in tasks.values()]
-
-
-def counts_resets(config: EnvConfig) -> bool:
-    """Return whether not the seed but the number of resets so far chooses an episode's start, as in LIBERO.
-
-    Policies meet the same starts there if each has environments of its own that are reset once an episode:
-    LeRobot's `FreezeAfterEpisodeEnd` keeps those away that a vector environment would make by itself.
-    """
-    return isinstance(config, LiberoEnv) and config.init_states
 
 
 def require_new_starts(envs: Envs, config: EnvConfig, n_episodes: int) -> None:

@@ -110,7 +110,9 @@ class Improvement:
             torch.tensor(robot.action_low), torch.tensor(robot.action_high), "the dataset",
         )  # fmt: skip
         if config.real_env is not None:
-            in_fork(check_real_env, config.policy, config.real_env)  # stages are forks that render too
+            starts = max(config.eval_episodes, config.selection_episodes)
+            # not in this process: stages are forks of it that render too
+            in_fork(check_real_env, config.policy, config.real_env, starts)
         return cls(config, found)
 
     def stages(self) -> list[Stage]:

@@ -11,7 +11,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import OBS_STATE
 from PIL import Image, ImageOps
 
-from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.errors import FieldError, within
 from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames
@@ -137,7 +137,8 @@ class World:
         """Return a visitor's own real environment, None if there is none."""
         if self.real_env is None:
             return None
-        env = make_tensor_env(self.real_env, 1, "cpu")
+        with within("real_env"):
+            env = make_tensor_env(self.real_env, 1, "cpu")
         count, wanted = env.single_action_space.shape[0], len(self.model.embodiment.action_names)
         if count != wanted:
             env.close()

@@ -37,7 +37,7 @@ from lerobot_wmrl.common.checkpoints import best_checkpoint, last_checkpoint
 from lerobot_wmrl.common.command_line import RunConfig, claim_output_dir, run_command
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.distributed import LONGEST_WAIT, is_first_process, rank_and_size, wait_for_all
-from lerobot_wmrl.common.errors import FieldError, require_at_least
+from lerobot_wmrl.common.errors import FieldError, require_at_least, within
 from lerobot_wmrl.common.precision import keep_freed_memory
 from lerobot_wmrl.common.presets import expand_preset, format_flags
 from lerobot_wmrl.common.tracking import make_wandb
@@ -280,7 +280,8 @@ def train_policy(cfg: TrainConfig) -> None:
         set_seed(cfg.seed)
         policy, processors = load_policy(config), load_processors(config)
         settings = draccus.encode(cfg)  # an environment of the hub tells its configuration of its actions
-        env: Any = make_tensor_env(cfg.env, cfg.num_envs, config.device or "cpu")
+        with within("env"):
+            env: Any = make_tensor_env(cfg.env, cfg.num_envs, config.device or "cpu")
         try:
             train_in(env, cfg, settings, policy, processors)
         finally:

@@ -10,6 +10,7 @@ import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.images import stretch
 from lerobot_wmrl.data import frame_cache
 from lerobot_wmrl.data.dataset import open_dataset
@@ -36,7 +37,7 @@ def test_a_disk_that_is_full_says_so_and_leaves_nothing(
 
     monkeypatch.setattr(os, "posix_fallocate", full)
     monkeypatch.setattr(frame_cache, "cache_dir", lambda _: tmp_path / "cache")
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(FieldError, match=r"which cannot be written .*No space left"):
         cached_frames(small_dataset, ["observation.images.third_view"], 32)
     assert not list((tmp_path / "cache").iterdir())
 

@@ -42,14 +42,13 @@ def test_it_is_downloaded_once(published: LeRobotDataset, hub: Hub) -> None:
     assert table.success.tolist() == own.success.tolist()
 
 
-def test_it_is_downloaded_to_a_folder_that_is_not_there_yet(
-    published: LeRobotDataset, tmp_path: Path
-) -> None:
-    source = DatasetSource(str(tmp_path / "mine"), NAME)
+def test_it_is_downloaded_to_a_new_folder(published: LeRobotDataset, hub: Hub, tmp_path: Path) -> None:
+    source = DatasetSource(str(tmp_path / "mine"), NAME, "main")
     assert read_episodes(source.open()).action.shape == read_episodes(published).action.shape
     assert (tmp_path / "mine" / "meta" / "info.json").is_file()
-    with pytest.raises(ValueError, match=r"revision=main: chooses what is downloaded, and .*mine is there"):
-        DatasetSource(str(tmp_path / "mine"), NAME, "main").open()
+    hub.requests.clear()
+    source.open()
+    assert not hub.requests, "it is there"
 
 
 def test_a_tokenizer_trains_on_it(published: LeRobotDataset, tmp_path: Path) -> None:

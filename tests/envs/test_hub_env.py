@@ -73,7 +73,7 @@ def test_no_code_runs_unasked() -> None:
 
 
 def test_lerobots_own_type_of_them_is_refused_where_it_cannot_be_trusted() -> None:
-    with pytest.raises(FieldError, match=r"type=isaaclab_arena: its code lies on the hub.*`hub_path`"):
+    with pytest.raises(FieldError, match=r"type=isaaclab_arena: its code lies on the hub.*choose another"):
         make_tensor_env(IsaaclabArenaEnv(), 1, "cpu")
 
 

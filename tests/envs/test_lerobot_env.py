@@ -9,11 +9,13 @@ from typing import Any, ClassVar
 import gymnasium as gym
 import pytest
 import torch
-from lerobot.envs.configs import EnvConfig, PushtEnv
+from lerobot.envs.configs import EnvConfig, LiberoEnv, PushtEnv
 from lerobot.utils.constants import OBS_IMAGE, OBS_STATE
 
+from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.common.tracking import read_metrics
-from lerobot_wmrl.envs.lerobot_env import LeRobotTensorEnv, make_tensor_env
+from lerobot_wmrl.envs.lerobot_env import LeRobotTensorEnv, check_real_env, make_tensor_env
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 from lerobot_wmrl.scripts.train import TrainConfig, check_tasks, main
 from tests.rl.checkpoints import save_untrained_policy
@@ -100,6 +102,25 @@ def test_environments_begin_in_starts_of_their_own_where_resets_are_counted() ->
     states = LeRobotTensorEnv(Unseeded(episode_length=STEPS), B, "cpu").reset(seed=5)[0][OBS_STATE]
     known = LeRobotTensorEnv(PushtEnv(episode_length=STEPS), B, "cpu").reset(seed=[0, 1])[0][OBS_STATE]
     assert torch.equal(states, known)
+
+
+@EnvConfig.register_subclass("counted_libero")
+@dataclass
+class CountedLibero(LiberoEnv):
+    """PushT that says, as LIBERO's environments do, which starts it has."""
+
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, Any]]:
+        made = PushtEnv().create_envs(n_envs)
+        for env in made["pusht"][0].envs:
+            env._init_states = (0, 1, 2)
+        return made
+
+
+def test_more_starts_than_there_are_are_refused_before_anything_is_trained(tmp_path: Path) -> None:
+    path = save_untrained_policy(tmp_path, OBS_IMAGE, size=96, actions=2)
+    said = r"^real_env.init_states=True: counted_libero has 3 starts for a task, policies are measured on 4"
+    with pytest.raises(FieldError, match=said):
+        check_real_env(read_policy_config(str(path), []), CountedLibero(), 4)
 
 
 class Endless(gym.Wrapper):

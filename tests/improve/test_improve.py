@@ -247,7 +247,7 @@ def test_no_start_is_imagined_twice_where_one_task_has_few(
     assert "--n_episodes=1" in improvement.compare(tmp_path, improvement.imagination(), 256)
 
 
-def note_process(policy: PreTrainedConfig, env: EnvConfig) -> None:
+def note_process(policy: PreTrainedConfig, env: EnvConfig, starts: int) -> None:
     Path("process").write_text(str(os.getpid()))
 
 
