@@ -33,7 +33,7 @@ TASKS_ROWS: Final = partial(value.rows_above, study=value.TASKS_STUDY, parts=val
 SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     "value_push": ("Policies", value.value_push),
     "value_pick_place": ("Policies", value.value_pick_place),
-    "value_pick_place_longer": ("Policies", partial(SECOND_ROWS, ["longer", "longer_filtered"])),
+    "value_pick_place_longer": ("Policies", partial(SECOND_ROWS, ["longer_filtered"])),
     "value_pick_place_simulator": ("Policies", partial(SECOND_ROWS, ["simulated_ppo"])),
     "value_pick_place_dyna": ("Policies", partial(SECOND_ROWS, ["dyna"])),
     "value_pick_place_iterated": ("Policies", partial(SECOND_ROWS, ["iterated", "iterated_ppo"])),

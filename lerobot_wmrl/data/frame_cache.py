@@ -83,10 +83,10 @@ def cached_frames(dataset: LeRobotDataset, camera_keys: Sequence[str], side: int
 
     def fill(target: np.ndarray) -> None:
         for episode in tqdm(range(dataset.num_episodes), desc="Decoding frames", unit="episode"):
-            begin, end = rows_of(dataset, episode)
+            whole = rows_of(dataset, episode)
             for camera, name in enumerate(camera_keys):
-                for first in range(begin, end, DECODED):
-                    rows = slice(first, min(first + DECODED, end))
+                for first in range(whole.start, whole.stop, DECODED):
+                    rows = slice(first, min(first + DECODED, whole.stop))
                     frames = stretch(decode(dataset, episode, name, rows), side, side)
                     target[rows, camera] = frames.permute(0, 2, 3, 1).numpy()
 
@@ -184,15 +184,15 @@ def frames_to_tensor(frames: np.ndarray) -> Tensor:
     return torch.from_numpy(np.array(frames)).permute(0, 1, 4, 2, 3).float() / 255
 
 
-def rows_of(dataset: LeRobotDataset, episode: int) -> tuple[int, int]:
-    """Return the first row of an episode and the one after its last."""
+def rows_of(dataset: LeRobotDataset, episode: int) -> slice:
+    """Return where an episode has its frames."""
     rows = dataset.meta.episodes[episode]
-    return rows["dataset_from_index"], rows["dataset_to_index"]
+    return slice(rows["dataset_from_index"], rows["dataset_to_index"])
 
 
 def decode_episode(dataset: LeRobotDataset, episode: int, key: str) -> Tensor:
     """Decode one episode and camera, uint8 (T, 3, H, W), from video or from stored images."""
-    return decode(dataset, episode, key, slice(*rows_of(dataset, episode)))
+    return decode(dataset, episode, key, rows_of(dataset, episode))
 
 
 def decode(dataset: LeRobotDataset, episode: int, key: str, rows: slice) -> Tensor:
@@ -210,7 +210,7 @@ def decode_video(dataset: LeRobotDataset, episode: int, key: str, rows: slice) -
     Raises:
         ValueError: the video is corrupted.
     """
-    begin = rows_of(dataset, episode)[0]
+    begin = rows_of(dataset, episode).start
     first = dataset.meta.episodes[episode][f"videos/{key}/from_timestamp"]
     times = [first + index / dataset.fps for index in range(rows.start - begin, rows.stop - begin)]
     path = Path(dataset.root) / dataset.meta.get_video_file_path(episode, key)
@@ -297,9 +297,8 @@ def cached_depth(dataset: LeRobotDataset, camera_keys: Sequence[str], grid: int)
 
     def fill(target: np.ndarray) -> None:
         for episode in tqdm(range(dataset.num_episodes), desc="Decoding depth", unit="episode"):
-            rows = dataset.meta.episodes[episode]
             maps = torch.cat([decode_depth(dataset, episode, name) for name in keys], 1)
-            target[rows["dataset_from_index"] : rows["dataset_to_index"]] = token_depth(maps, grid).numpy()
+            target[rows_of(dataset, episode)] = token_depth(maps, grid).numpy()
 
     shape = (dataset.num_frames, len(keys) * grid**2)
     return memory_map(cache_dir(dataset) / f"depth-{key}.npy", shape, np.float32, fill)
@@ -309,7 +308,7 @@ def decode_depth(dataset: LeRobotDataset, episode: int, key: str) -> Tensor:
     """Decode the depth of one episode and camera, (T, 1, H, W) metres, from video or from stored images."""
     info = dataset.features[key].get("info") or {}
     if key in dataset.meta.video_keys:
-        codes = decode_video(dataset, episode, key, slice(*rows_of(dataset, episode)))
+        codes = decode_video(dataset, episode, key, rows_of(dataset, episode))
         encoder = DepthEncoderConfig.from_video_info(info)
         metres = dequantize_depth(
             codes, encoder.depth_min, encoder.depth_max, encoder.shift, encoder.use_log,

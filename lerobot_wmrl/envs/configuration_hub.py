@@ -78,9 +78,7 @@ class HubEnv(EnvConfig):
                 f"its actions are {space}",
                 "policies act by a vector (Box)",
             )
-        shape = space.shape
-        self.features = {
-            ACTION: PolicyFeature(FeatureType.ACTION, shape)
-        }  # lerobot-eval asks once it is made
+        # lerobot-eval asks for them once the environment is made
+        self.features = {ACTION: PolicyFeature(FeatureType.ACTION, space.shape)}
         self.features_map = {ACTION: ACTION}
         return made

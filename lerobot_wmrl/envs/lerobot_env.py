@@ -21,6 +21,9 @@ from lerobot_wmrl.common.policies import check_fit, seen_shape
 from lerobot_wmrl.envs.configuration_hub import HubEnv
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 
+FRAME_LIMIT: Final = "_max_episode_steps"
+"""Attribute of an environment that ends LeRobot's rollouts."""
+
 SAME_START: Final = 0.01
 """Difference between two starts that rendering may make: of pixels in [0, 1], or in the state's units."""
 
@@ -234,12 +237,12 @@ def _members(config: EnvConfig, each: int) -> list[list[gym.Env]]:
 
 def _frame_limit(config: EnvConfig, env: gym.Env) -> int:
     """Return the most frames of an episode. FieldError if the environment does not say it."""
-    if not env.has_wrapper_attr("_max_episode_steps"):
+    if not env.has_wrapper_attr(FRAME_LIMIT):
         raise FieldError(
-            "type", config.type, "does not say after how many frames an episode ends (`_max_episode_steps`)",
+            "type", config.type, f"does not say after how many frames an episode ends (`{FRAME_LIMIT}`)",
             "make the environment by gymnasium.make, with `max_episode_steps`",
         )  # fmt: skip
-    return int(env.get_wrapper_attr("_max_episode_steps"))
+    return int(env.get_wrapper_attr(FRAME_LIMIT))
 
 
 def _batch_of_one(observation: Any) -> Any:

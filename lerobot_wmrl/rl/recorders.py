@@ -41,12 +41,10 @@ from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.features import encoder_of, episode_features, matched, observation_row
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
+from lerobot_wmrl.envs.lerobot_env import FRAME_LIMIT
 
 IMAGE_WRITERS = 4
 """Threads that compress the frames of rollouts in a LeRobot environment."""
-
-FRAME_LIMIT = "_max_episode_steps"
-"""Attribute of an environment that ends LeRobot's rollouts."""
 
 
 class Recorder(Protocol):

@@ -277,41 +277,34 @@ def test_noise_of_what_hardly_varies_does_not_weigh_as_much_as_motion():
     torch.testing.assert_close(model.action_std, torch.full((7,), 0.01))
 
 
-def test_small_actions_are_scaled_if_their_range_is_small():
-    """Displacements in metres, one of them idle but for its noise, and one constant."""
-    robot = Embodiment(action_low=[-0.002] * 5 + [-1e-7, 0.3], action_high=[0.002] * 5 + [1e-7, 0.3])
-    spread = torch.tensor([7e-4] * 5 + [1e-7, 0.0])
-    model = ActionWorldModelRewardModel(
+def model_of_spread(robot: Embodiment, spread: torch.Tensor) -> ActionWorldModelRewardModel:
+    """A model of data whose actions vary by so much. (7,)"""
+    return ActionWorldModelRewardModel(
         ActionWorldModelConfig(**nested(SIZES), embodiment=robot),
         dataset_stats={
             "observation.state": {"mean": torch.zeros(8), "std": torch.ones(8)},
             "action": {"mean": torch.zeros(7), "std": spread},
         },
     )
+
+
+def test_small_actions_are_scaled_if_their_range_is_small():
+    """Displacements in metres, one of them idle but for its noise, and one constant."""
+    robot = Embodiment(action_low=[-0.002] * 5 + [-1e-7, 0.3], action_high=[0.002] * 5 + [1e-7, 0.3])
+    spread = torch.tensor([7e-4] * 5 + [1e-7, 0.0])
+    model = model_of_spread(robot, spread)
     torch.testing.assert_close(model.action_std, torch.tensor([7e-4] * 5 + [1.0, 1.0]))
 
 
 def test_small_displacements_are_scaled_beside_a_gripper_of_a_large_range():
     robot = Embodiment(action_low=[-0.002] * 6 + [0.0], action_high=[0.002] * 6 + [100.0])
     spread = torch.tensor([7e-4] * 5 + [1e-7, 40.0])
-    model = ActionWorldModelRewardModel(
-        ActionWorldModelConfig(**nested(SIZES), embodiment=robot),
-        dataset_stats={
-            "observation.state": {"mean": torch.zeros(8), "std": torch.ones(8)},
-            "action": {"mean": torch.zeros(7), "std": spread},
-        },
-    )
+    model = model_of_spread(robot, spread)
     torch.testing.assert_close(model.action_std, torch.tensor([7e-4] * 5 + [1.0, 40.0]))
 
 
 def test_a_component_that_varies_by_one_is_not_taken_for_a_constant_one():
     """A planner leaves components alone whose standard deviation is 1."""
     robot = Embodiment(action_low=[-1.0] * 7, action_high=[1.0] * 7)
-    model = ActionWorldModelRewardModel(
-        ActionWorldModelConfig(**nested(SIZES), embodiment=robot),
-        dataset_stats={
-            "observation.state": {"mean": torch.zeros(8), "std": torch.ones(8)},
-            "action": {"mean": torch.zeros(7), "std": torch.tensor([1.0, 0.0, *[0.5] * 5])},
-        },
-    )
+    model = model_of_spread(robot, torch.tensor([1.0, 0.0, *[0.5] * 5]))
     assert (model.action_std == 1).tolist() == [False, True, *[False] * 5]
