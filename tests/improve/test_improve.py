@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -245,6 +246,30 @@ def test_no_start_is_imagined_twice_where_one_task_has_few(
     two = replace(table, columns={**table.columns, "start.task": np.array([0, 0, 0, 0, 1, 1])})
     monkeypatch.setattr(type(improvement), "learnt", lambda self: two)
     assert "--n_episodes=1" in improvement.compare(tmp_path, improvement.imagination(), 256)
+
+
+def test_a_dataset_that_has_changed_is_not_taken_for_the_one_before(
+    demonstrations: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = tmp_path / "data"
+    shutil.copytree(demonstrations, root)
+    policy = save_untrained_policy(tmp_path / "policy", OBS_IMAGE, size=96, actions=2, constant=250.0)
+    config = ImproveConfig(
+        policy=read_policy_config(str(policy), []), dataset=ChosenEpisodes(str(root)), size="tiny",
+        output_dir=tmp_path / "improve",
+    )  # fmt: skip
+
+    def stop(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("lerobot_wmrl.common.stages.run_stages", stop)
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            improve(config)
+    stats = root / "meta" / "stats.json"
+    stats.write_text(json.dumps(json.loads(stats.read_text()), indent=1))
+    with pytest.raises(ValueError, match=r"was started with other settings \(the dataset's content"):
+        improve(config)
 
 
 def note_process(policy: PreTrainedConfig, env: EnvConfig, starts: int) -> None:

@@ -95,6 +95,19 @@ def test_it_trains_on_the_planners_successes_and_resumes_as_if_nothing_had_happe
     assert all(torch.equal(value, after[name]) for name, value in weights(output_dir).items())
 
 
+def test_a_limit_of_zero_limits_no_gradient(
+    imagined: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in lerobot-train: it leaves the same weights as a limit that is never reached."""
+    policy, found = save_untrained_policy(tmp_path / "policy", actions=7), []
+    for limit in ("0", "1e9"):
+        folder = tmp_path / limit
+        flags = [f"--policy.path={policy}", f"--policy.optimizer_grad_clip_norm={limit}", *FAST, *imagined]
+        train(monkeypatch, *flags, "--iterations=1", f"--output_dir={folder}")
+        found.append(weights(folder))
+    assert all(torch.equal(value, found[1][name]) for name, value in found[0].items())
+
+
 def test_the_planners_search_begins_at_what_the_policy_would_do(
     imagined: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
