@@ -5,7 +5,7 @@ from typing import Any
 
 from experiments.cells import DOMAINS, Load, counted, paired, percents, points, share
 from lerobot_wmrl.common.files import markdown_table as table
-from lerobot_wmrl.improve.stages import CLONED, DISTILLED
+from lerobot_wmrl.improve.improvement import CLONED, DISTILLED
 
 
 def demo(load: Load) -> str:

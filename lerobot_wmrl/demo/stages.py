@@ -17,11 +17,12 @@ from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.data.episodes import VALIDATION_EVERY
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.improve import commands
 from lerobot_wmrl.improve.configuration_improve import ROLLOUT_SEED_OFFSET, ImproveConfig
+from lerobot_wmrl.improve.improvement import Improvement
 from lerobot_wmrl.improve.report.page import Page, stage_records
 from lerobot_wmrl.improve.report.results import curve, lerobot_train_curve, read_place
 from lerobot_wmrl.improve.report.words import verdict
-from lerobot_wmrl.improve.stages import Improvement
 
 SEED_STRIDE: Final = 100_000
 """Demo seed s records and trains with seeds from s·SEED_STRIDE on, below EVALUATION_SEED."""
@@ -200,12 +201,12 @@ class Demo:
 
     def _unseen(self) -> list[str]:
         env = env_flags(WmrlManiSkillEnv(**UNSEEN))
-        return self.improvement().compare(self.out / "unseen", env, self.config.eval_episodes)
+        return commands.compare(self.improvement(), self.out / "unseen", env, self.config.eval_episodes)
 
     def _imagined(self) -> list[str]:
         improvement = self.improvement()
-        env = improvement.imagination()
-        return improvement.compare(self.out / "imagined", env, self.config.eval_episodes)
+        env = commands.imagination(improvement)
+        return commands.compare(improvement, self.out / "imagined", env, self.config.eval_episodes)
 
     def _command(self, program: str, flags: Flags) -> list[str]:
         """Return a command of this package, at the demo's size."""
@@ -217,5 +218,5 @@ def conclusion(page: Page, path: Path) -> str:
     return "\n".join([
         verdict(page.improvement, page.places), "", f"The report: {path}",
         "Next: open it; it ends with every command, to change and run by hand. Drive the world model:",
-        shlex.join(page.improvement.drive()),
+        shlex.join(commands.drive(page.improvement)),
     ])  # fmt: skip

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import draccus
 
 from lerobot_wmrl.improve.configuration_improve import ImproveConfig
-from lerobot_wmrl.improve.stages import Improvement
+from lerobot_wmrl.improve.improvement import Improvement
 
 if TYPE_CHECKING:
     from lerobot_wmrl.common.stages import Stage
@@ -30,13 +30,14 @@ def improve(cfg: ImproveConfig) -> None:
     """Run every stage, write the report, and say what came of it."""
     from lerobot_wmrl.common.stages import claimed, run_stages
     from lerobot_wmrl.data.dataset import fingerprint
+    from lerobot_wmrl.improve import commands
     from lerobot_wmrl.improve.report.page import Page
     from lerobot_wmrl.improve.report.words import verdict
 
     cfg.check()
     improvement = Improvement.of(cfg)
     print(f"{cfg.dataset.name}:\n{improvement.found}\n  {improvement.duration}")
-    stages = improvement.stages()
+    stages = commands.stages(improvement)
     given = {**settings(cfg, stages), "the dataset's content": fingerprint(improvement.found.root)}
     with claimed(cfg.output_dir, given):
         improvement.copy_policy()
@@ -44,7 +45,7 @@ def improve(cfg: ImproveConfig) -> None:
         page = Page.of(improvement)
         path = page.write(cfg.output_dir)
     print(f"\n{verdict(improvement, page.places)}\n\nThe report: {path}")
-    if again := improvement.another_round():
+    if again := commands.another_round(improvement):
         print(f"Another round, with as many rollouts of this policy:\n{shlex.join(again)}")
 
 

@@ -7,9 +7,10 @@ from lerobot.configs import PreTrainedConfig
 
 from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_wmrl.data.dataset import ChosenEpisodes
+from lerobot_wmrl.improve import commands
 from lerobot_wmrl.improve.configuration_improve import ImproveConfig
 from lerobot_wmrl.improve.findings import Findings
-from lerobot_wmrl.improve.stages import Improvement
+from lerobot_wmrl.improve.improvement import Improvement
 
 
 def improvement_of(
@@ -27,6 +28,15 @@ def improvement_of(
     )
 
 
+def commands_of(improvement: Improvement, *names: str) -> dict[str, list[str]]:
+    """Return the commands of an improvement's stages by name, by default of all."""
+    return {
+        stage.name: stage.command()
+        for stage in commands.stages(improvement)
+        if not names or stage.name in names
+    }
+
+
 def made_commands(folder: Path, *given: Any, **found: Any) -> dict[str, list[str]]:
     """Return the commands of such stages by name."""
-    return {stage.name: stage.command() for stage in improvement_of(folder, *given, **found).stages()}
+    return commands_of(improvement_of(folder, *given, **found))

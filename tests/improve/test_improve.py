@@ -31,15 +31,16 @@ from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data.dataset import ChosenEpisodes, open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
-from lerobot_wmrl.improve import stages
+from lerobot_wmrl.improve import commands
+from lerobot_wmrl.improve import improvement as decisions
 from lerobot_wmrl.improve.configuration_improve import ImproveConfig
 from lerobot_wmrl.improve.findings import few_decisions
-from lerobot_wmrl.improve.stages import CLONED, DISTILLED, FITTED, PPO, SFT, Improvement
+from lerobot_wmrl.improve.improvement import CLONED, DISTILLED, FITTED, PPO, SFT, Improvement
 from lerobot_wmrl.scripts import train
 from lerobot_wmrl.scripts.improve import improve, settings
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 from lerobot_wmrl.world_models.configuration_world_model import AnchoredConfig
-from tests.improve.made_up import improvement_of, made_commands
+from tests.improve.made_up import commands_of, improvement_of, made_commands
 from tests.pusht import record_pusht
 from tests.rl.checkpoints import save_untrained_policy
 
@@ -207,12 +208,12 @@ def test_long_episodes_are_imagined_in_parts(
     longest: int, clip: int, length: int, branches: int, tmp_path: Path
 ) -> None:
     """From frames all over them, as many as it takes to cover them; so successes at their ends count."""
-    commands = made_commands(tmp_path, longest=longest, usual=longest)
-    assert f"--model.clip_length={clip}" in commands["world_model"]
-    judged = [flag for flag in commands["check"] if flag.startswith("--episode_length")]
+    made = made_commands(tmp_path, longest=longest, usual=longest)
+    assert f"--model.clip_length={clip}" in made["world_model"]
+    judged = [flag for flag in made["check"] if flag.startswith("--episode_length")]
     assert judged == ([] if branches else [f"--episode_length={length}"])
     for stage in ("rl", "comparison"):
-        assert {f"--env.episode_length={length}", f"--env.dataset.branches={branches}"} <= {*commands[stage]}
+        assert {f"--env.episode_length={length}", f"--env.dataset.branches={branches}"} <= {*made[stage]}
 
 
 def test_one_long_recording_does_not_divide_all_the_others(tmp_path: Path) -> None:
@@ -238,14 +239,14 @@ def test_no_start_is_imagined_twice_where_one_task_has_few(
     root = make_synthetic_dataset(tmp_path / "merged", episodes=6).root
     tasks = read_episodes(open_dataset(root)).column("start.task")
     assert len(np.unique(tasks)) == 1
-    monkeypatch.setattr(stages, "MAX_STARTS", 4)
+    monkeypatch.setattr(decisions, "MAX_STARTS", 4)
     improvement = improvement_of(tmp_path, total=6, fewest=6)
     improvement.config.dataset = ChosenEpisodes(str(root))
-    assert "--n_episodes=4" in improvement.compare(tmp_path, improvement.imagination(), 256)
+    assert "--n_episodes=4" in commands.compare(improvement, tmp_path, commands.imagination(improvement), 256)
     table = read_episodes(open_dataset(root))
     two = replace(table, columns={**table.columns, "start.task": np.array([0, 0, 0, 0, 1, 1])})
     monkeypatch.setattr(type(improvement), "learnt", lambda self: two)
-    assert "--n_episodes=1" in improvement.compare(tmp_path, improvement.imagination(), 256)
+    assert "--n_episodes=1" in commands.compare(improvement, tmp_path, commands.imagination(improvement), 256)
 
 
 def test_a_dataset_that_has_changed_is_not_taken_for_the_one_before(
@@ -280,7 +281,7 @@ def test_nothing_is_rendered_in_the_process_that_stages_are_forked_from(
     demonstrations: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With OpenGL, which MuJoCo renders with, a stage that renders would wait for ever."""
-    monkeypatch.setattr(stages, "check_real_env", note_process)
+    monkeypatch.setattr(decisions, "check_real_env", note_process)
     monkeypatch.chdir(tmp_path)
     policy = save_untrained_policy(tmp_path / "policy", OBS_IMAGE, size=96, actions=2)
     Improvement.of(
@@ -301,7 +302,7 @@ def test_another_round_does_not_double_the_frames_of_a_rollout(tmp_path: Path) -
     assert improvement.frame_limit == 160
     improvement.config.max_frames = 80
     assert improvement.frame_limit == 80
-    assert "--max_frames=80" in (improvement.another_round() or [])
+    assert "--max_frames=80" in (commands.another_round(improvement) or [])
 
 
 @pytest.mark.parametrize("size", ["tiny", "demo", "cpu"])
@@ -372,7 +373,7 @@ def test_rollouts_are_checked_on_if_they_tell_more_than_the_dataset(
         success=np.append(np.ones(40, bool), success),
         validation=np.append(np.ones(40, bool), number % 20 == 19),
     )
-    monkeypatch.setattr(stages, "read_episodes", lambda dataset: table)
+    monkeypatch.setattr(decisions, "read_episodes", lambda dataset: table)
     monkeypatch.setattr(ChosenEpisodes, "open", lambda self: self.root)
     improvement = improvement_of(tmp_path, held_out=held_out)
     improvement.config.rollouts, improvement.config.real_env = rollouts, PushtEnv()
@@ -400,35 +401,33 @@ def test_rollouts_are_merged_and_successes_cloned_before_rl(
         "pairs": [{"before": "a", "after": "b", "better": better and "b"}],
     }  # fmt: skip
     write_json(folder / "start" / "comparison.json", results)
-    stages = iter(improvement.stages())
-    commands = {stage.name: stage.command() for stage in islice(stages, 3)}
+    stages = iter(commands.stages(improvement))
+    made = {stage.name: stage.command() for stage in islice(stages, 3)}
     success = read_episodes(make_synthetic_dataset(folder / "merged", episodes=6)).success
-    commands |= {stage.name: stage.command() for stage in stages}
+    made |= {stage.name: stage.command() for stage in stages}
     assert {"--root=data", f"--new_root={folder / 'columns'}", "--operation.feature_names=['effort']"} <= {
-        *commands["columns"]
+        *made["columns"]
     }
     assert {f"--like.root={folder / 'columns'}", "--max_frames=80", "--video=true", "--seed=50000"} <= {
-        *commands["rollouts"]
+        *made["rollouts"]
     }
-    assert f"--operation.roots=['{folder / 'columns'}', '{folder / 'rollouts'}']" in commands["merged"]
+    assert f"--operation.roots=['{folder / 'columns'}', '{folder / 'rollouts'}']" in made["merged"]
     episodes = [episode for episode in (0, 3, 4, 5) if success[episode]]
     assert 0 < len(episodes) < 4
-    assert {f"--policy.path={before}", f"--dataset.episodes={episodes}".replace(" ", "")} <= {
-        *commands["cloned"]
-    }
+    assert {f"--policy.path={before}", f"--dataset.episodes={episodes}".replace(" ", "")} <= {*made["cloned"]}
     learnt = {f"--dataset.root={folder / 'merged'}", "--dataset.episodes=[0,3,4,5]"}
-    assert learnt <= {*commands["tokenizer"]}
-    assert learnt <= {*commands["world_model"]}
+    assert learnt <= {*made["tokenizer"]}
+    assert learnt <= {*made["world_model"]}
     starts = {flag.replace("--", "--env.", 1) for flag in learnt}
-    assert {*starts, f"--policies=[{cloned},{before}]", "--n_episodes=4"} <= {*commands["start"]}
-    assert {*starts, f"--policy.path={before if better else cloned}"} <= {*commands["rl"]}
+    assert {*starts, f"--policies=[{cloned},{before}]", "--n_episodes=4"} <= {*made["start"]}
+    assert {*starts, f"--policy.path={before if better else cloned}"} <= {*made["rl"]}
     planner = {"--algorithm.type=distillation", "--algorithm.recorded=false", "--gate.action=off"}
-    assert {*starts, *planner, f"--policy.path={ppo}"} <= {*commands["distilled"]}
+    assert {*starts, *planner, f"--policy.path={ppo}"} <= {*made["distilled"]}
     everything = {f"--policies=[{before},{cloned},{ppo},{distilled}]", "--against=all", "--env.type=pusht"}
-    assert {*everything, "--n_episodes=100", "--seed=1000000"} <= {*commands["comparison"]}
-    assert {*everything, "--n_episodes=50", "--seed=2000025"} <= {*commands["choice"]}
+    assert {*everything, "--n_episodes=100", "--seed=1000000"} <= {*made["comparison"]}
+    assert {*everything, "--n_episodes=50", "--seed=2000025"} <= {*made["choice"]}
     measured = {"--selection.freq=10", "--selection.n_episodes=25", "--real_env.type=pusht"}
-    assert measured <= {*commands["rl"]}
+    assert measured <= {*made["rl"]}
     assert "checkpoints/best/" in ppo
     assert "checkpoints/last/" in distilled
 
@@ -447,18 +446,16 @@ def test_the_discount_leaves_a_late_success_its_worth(
     improvement.config.real_env, improvement.config.rollouts = real, rollouts
     assert improvement.discount == discount
     if not rollouts:
-        (rl,) = (stage.command() for stage in improvement.stages() if stage.name == "rl")
+        rl = commands_of(improvement, "rl")["rl"]
         assert f"--algorithm.gamma={discount}" in rl
 
 
 def test_without_starts_to_select_on_the_last_checkpoint_and_policy_are_taken(tmp_path: Path) -> None:
     improvement = improvement_of(tmp_path)
     improvement.config.real_env, improvement.config.selection_episodes = PushtEnv(), 0
-    commands = {
-        stage.name: stage.command() for stage in improvement.stages() if stage.name in ("rl", "choice")
-    }
-    assert [*commands] == ["rl"]
-    assert not [flag for flag in commands["rl"] if "selection" in flag]
+    made = commands_of(improvement, "rl", "choice")
+    assert [*made] == ["rl"]
+    assert not [flag for flag in made["rl"] if "selection" in flag]
     assert "checkpoints/last/" in improvement.policies[PPO]
     assert improvement.chosen() == DISTILLED
 
@@ -470,7 +467,7 @@ def test_rl_may_stop_by_its_own_rules_if_it_leaves_a_checkpoint(
     """After any other error it is tried again."""
     improvement = improvement_of(tmp_path)
     improvement.config.real_env = real
-    (rl,) = (stage for stage in improvement.stages() if stage.name == "rl")
+    (rl,) = (stage for stage in commands.stages(improvement) if stage.name == "rl")
     for other in {"last", "best"} - {link}:
         (tmp_path / "rl" / "checkpoints" / other / "pretrained_model").mkdir(parents=True)
     assert not rl.optional(STOPPED)
@@ -489,11 +486,9 @@ def test_rl_is_measured_four_times_at_most(
     improvement = improvement_of(tmp_path, policy=kind(device="cpu", pretrained_path=tmp_path))
     config = improvement.config
     config.real_env, config.iterations, config.selection_episodes = PushtEnv(), iterations, 1
-    commands = {
-        stage.name: stage.command() for stage in improvement.stages() if stage.name in ("rl", "choice")
-    }
-    assert {f"--selection.freq={freq}", "--selection.n_episodes=1"} <= {*commands["rl"]}
-    assert {"--n_episodes=1", "--seed=2000001"} <= {*commands["choice"]}
+    made = commands_of(improvement, "rl", "choice")
+    assert {f"--selection.freq={freq}", "--selection.n_episodes=1"} <= {*made["rl"]}
+    assert {"--n_episodes=1", "--seed=2000001"} <= {*made["choice"]}
     assert all(
         "checkpoints/best/" in improvement.policies[name] for name in {PPO, FITTED} & {*improvement.policies}
     )
@@ -509,7 +504,7 @@ def test_only_policies_for_which_it_was_measured_are_fitted_to_a_planner_after_p
 ) -> None:
     improvement = improvement_of(tmp_path, policy=kind(device="cpu", pretrained_path=tmp_path))
     assert [*improvement.policies] == names
-    optional = [stage.name for stage in improvement.stages() if stage.optional(1)]
+    optional = [stage.name for stage in commands.stages(improvement) if stage.optional(1)]
     assert optional == (["distilled"] if DISTILLED in names else [])
     assert improvement.chosen() == names[-1]
 
@@ -525,7 +520,7 @@ def test_cloning_suits_the_policy_and_its_frames(
     policy = CnnConfig(device="cpu", pretrained_path=tmp_path, use_peft=adapters)
     improvement = improvement_of(tmp_path, policy=policy, pixels=pixels, failures=2)
     improvement.config.dataset.root = str(small_dataset.root)
-    (command,) = (stage.command() for stage in improvement.stages() if stage.name == "cloned")
+    command = commands_of(improvement, "cloned")["cloned"]
     given = [flag for flag in command if flag.startswith(("--batch_size=", "--peft"))]
     assert given == flags
     assert "--dataset.episodes=[0,1,3,4]" in command
@@ -533,7 +528,7 @@ def test_cloning_suits_the_policy_and_its_frames(
 
 def test_a_run_that_selects_nothing_goes_on_where_there_was_no_selection(tmp_path: Path) -> None:
     improvement = improvement_of(tmp_path, failures=2)
-    given = settings(improvement.config, improvement.stages())
+    given = settings(improvement.config, commands.stages(improvement))
     older = {name: value for name, value in given.items() if name != "selection_episodes"}
     write_json(tmp_path / "settings.json", older)
     with claimed(tmp_path, given):
@@ -543,7 +538,7 @@ def test_a_run_that_selects_nothing_goes_on_where_there_was_no_selection(tmp_pat
 def test_a_folder_that_was_begun_with_other_stages_is_refused(tmp_path: Path) -> None:
     """As by a version that did not clone."""
     improvement = improvement_of(tmp_path, failures=2)
-    given = settings(improvement.config, improvement.stages())
+    given = settings(improvement.config, commands.stages(improvement))
     write_json(tmp_path / "settings.json", {**given, "stages": ["tokenizer", "world_model", "check", "rl"]})
     with pytest.raises(ValueError, match="stages"), claimed(tmp_path, given):
         pass

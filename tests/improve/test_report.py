@@ -18,11 +18,12 @@ from PIL import Image
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.tracking import append_metrics
 from lerobot_wmrl.evaluation.comparison import Comparison, Episode
+from lerobot_wmrl.improve import commands
+from lerobot_wmrl.improve.improvement import CLONED, DISTILLED, PPO, SFT, Improvement
 from lerobot_wmrl.improve.report import figures
 from lerobot_wmrl.improve.report.page import Page
 from lerobot_wmrl.improve.report.results import curve, lerobot_train_curve, training_curves
 from lerobot_wmrl.improve.report.words import compared, trust, verdict
-from lerobot_wmrl.improve.stages import CLONED, DISTILLED, PPO, SFT, Improvement
 from tests.experiments.typed import check
 from tests.improve.made_up import improvement_of
 
@@ -57,7 +58,7 @@ def finished(tmp_path: Path) -> Improvement:
 
 def write_records(improvement: Improvement) -> None:
     """Write those of finished stages."""
-    for stage in improvement.stages():
+    for stage in commands.stages(improvement):
         write_json(improvement.out / "stages" / f"{stage.name}.json", {
             "name": stage.name, "title": stage.title, "command": f"run-{stage.name}", "seconds": 3.0,
             "peak_memory_bytes": 2e9,
@@ -97,7 +98,7 @@ def test_the_page_is_self_contained_and_says_the_numbers(finished: Improvement) 
     )
     assert "RL&#39;s checkpoint is that of iteration 10: none succeeded more often in the real" in page
     assert "on starts set aside for this: 0: 50 % (5 of 10; 24–76 %), 10: 80 % (8 of 10; " in page
-    for stage in finished.stages():
+    for stage in commands.stages(finished):
         assert f"<pre>run-{stage.name}</pre>" in page
     assert page.count("data:image/png;base64,") == 8, "bars, the replayed episode, and six curves"
 
@@ -166,7 +167,7 @@ def test_a_success_in_imagination_is_said_to_be_a_belief(finished: Improvement) 
 @pytest.mark.usefixtures("without_drawing")
 def test_the_command_that_drives_the_world_model_takes_its_flags(finished: Improvement) -> None:
     finished.config.dataset.episodes = [0, 2]
-    command = shlex.join(finished.drive())
+    command = shlex.join(commands.drive(finished))
     check(command)
     assert "--dataset.root=data " in command
     assert "--done_threshold=0.95" in command
@@ -180,10 +181,10 @@ def test_another_round_begins_from_the_policy_to_use_on_all_episodes(
     finished: Improvement, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """From starts of its own."""
-    assert finished.another_round() is None
+    assert commands.another_round(finished) is None
     assert "Another round" not in text_of(finished)
     finished.config.rollouts, finished.config.seed = 20, 7
-    command = shlex.join(finished.another_round() or [])
+    command = shlex.join(commands.another_round(finished) or [])
     check(command)
     merged = f"--dataset.root={finished.out}/merged --real_env.type=pusht --rollouts=20"
     assert f"--policy.path={finished.out}/distilled/checkpoints/last/pretrained_model {merged}" in command
@@ -231,7 +232,7 @@ def test_the_summary_holds_every_headline_number(finished: Improvement) -> None:
     }
     assert summary["gate"] is None
     assert summary["chosen"] == DISTILLED
-    assert summary["seconds"] == 3.0 * len(finished.stages())
+    assert summary["seconds"] == 3.0 * len(commands.stages(finished))
 
 
 @pytest.mark.usefixtures("without_drawing")
@@ -249,7 +250,7 @@ def test_the_policy_to_use_is_the_best_one_on_other_starts(
     assert f"Policy to use: {chosen}, {path}. None succeeded more often in pusht, on starts set aside" in said
     assert said.count(": better") + said.count(": worse") + said.count(": not decided") == 3
     assert said.count(f"{chosen}, against ") + said.count(f", against {chosen}:") == 3
-    assert f"--policy.path={path}" in finished.drive()
+    assert f"--policy.path={path}" in commands.drive(finished)
     assert f'<tr class="chosen"><td>{chosen}</td>' in text_of(finished)
     assert json.loads((finished.out / "summary.json").read_text())["chosen"] == chosen
 

@@ -33,11 +33,12 @@ from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.improve.configuration_improve import ImproveConfig
 from lerobot_wmrl.improve.findings import look
-from lerobot_wmrl.improve.stages import Improvement
+from lerobot_wmrl.improve.improvement import Improvement
 from lerobot_wmrl.rl.algorithm import frozen_copy
 from lerobot_wmrl.scripts.convert_openvla import ConvertOpenVLAConfig, convert
 from lerobot_wmrl.scripts.train import main
 from tests.commands import run_here
+from tests.improve.made_up import commands_of
 from tests.lerobot_policy_openvla.small import observe, small_policy
 from tests.rl.point_env import PointEnv
 
@@ -136,7 +137,7 @@ def test_adapters_are_trained_further_as_the_command_improve_does_it(
         size="tiny", output_dir=tmp_path,
     )  # fmt: skip
     found = look(read_episodes(small_dataset), config.policy, None)
-    (command,) = (stage.command() for stage in Improvement(config, found).stages() if stage.name == "cloned")
+    command = commands_of(Improvement(config, found), "cloned")["cloned"]
     run_here(*command, "--policy.device=cpu", "--steps=2", "--save_freq=2")
     before, after = (load_file(folder / LAST / ADAPTERS) for folder in (tuned, tmp_path / "cloned"))
     assert after.keys() == before.keys()

@@ -10,6 +10,8 @@ import jinja2
 
 from lerobot_wmrl.common.files import write_json, write_text
 from lerobot_wmrl.common.stages import Stage, read_record
+from lerobot_wmrl.improve import commands
+from lerobot_wmrl.improve.improvement import Improvement
 from lerobot_wmrl.improve.report import figures
 from lerobot_wmrl.improve.report.results import (
     Curve,
@@ -34,7 +36,6 @@ from lerobot_wmrl.improve.report.words import (
     start_line,
     trust,
 )
-from lerobot_wmrl.improve.stages import Improvement
 
 PAGE = "report.html"
 
@@ -94,7 +95,7 @@ class Page:
         """Return the page of an improvement by itself."""
         return cls(
             improvement, f"{improvement.policy}, improved in imagination", improvement.config.seed,
-            stage_records(improvement.out, improvement.stages()), [compared(improvement)],
+            stage_records(improvement.out, commands.stages(improvement)), [compared(improvement)],
             {"recorded": improvement.out / "check"},
         )  # fmt: skip
 
@@ -128,7 +129,7 @@ class Page:
         for record in self.records:
             found.append(record)
             if shlex.split(record["command"])[0] == "lerobot-wmrl-improve":
-                own = stage_records(self.improvement.out, self.improvement.stages())
+                own = stage_records(self.improvement.out, commands.stages(self.improvement))
                 found += [{**each, "title": f"– {each['title']}"} for each in own]
         return found
 
@@ -162,8 +163,8 @@ class Page:
             warnings=gate_warnings(improvement),
             pictures=picture_sections(self.replays),
             curves=[figures.line(curve, title) for title, curve in curves.items()],
-            drive=shlex.join(improvement.drive()),
-            another_round=shlex.join(improvement.another_round() or []),
+            drive=shlex.join(commands.drive(improvement)),
+            another_round=shlex.join(commands.another_round(improvement) or []),
             stages=self._all_records(),
         )
 

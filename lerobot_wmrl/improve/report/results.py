@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.evaluation.comparison import RESULTS, Comparison, read_episodes
-from lerobot_wmrl.improve.stages import Improvement
+from lerobot_wmrl.improve.improvement import Improvement
 from lerobot_wmrl.rl.callbacks import RECORD_FILE, Record
 from lerobot_wmrl.rl.gate import SuccessGate
 from lerobot_wmrl.rl.selection import Selection

@@ -10,6 +10,7 @@ from lerobot_wmrl.evaluation.comparison import Pair
 from lerobot_wmrl.evaluation.gate import DOUBTFUL_AUC
 from lerobot_wmrl.evaluation.report import seen_line
 from lerobot_wmrl.improve.findings import few_failures
+from lerobot_wmrl.improve.improvement import CLONED, DONE_THRESHOLD, SFT, Improvement
 from lerobot_wmrl.improve.report.results import (
     Place,
     read_check,
@@ -18,7 +19,6 @@ from lerobot_wmrl.improve.report.results import (
     read_place,
     read_selection,
 )
-from lerobot_wmrl.improve.stages import CLONED, DONE_THRESHOLD, SFT, Improvement
 from lerobot_wmrl.rl.selection import REAL, best_iteration, success
 
 
