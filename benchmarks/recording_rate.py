@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from lerobot_dataset_maniskill import recorder
+from lerobot_dataset_maniskill import maniskill
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.manifest import planned_parts
 from lerobot_dataset_maniskill.worker import PartRecorder, silence_libraries
@@ -58,7 +58,7 @@ def worker_rate(workers: int, episodes: int) -> float:
     times: list[float] = []
     with recording(num_episodes=episodes, part_episodes=1, num_workers=workers) as (config, folder):
         parts = planned_parts(config)
-        recorder.record_in_parallel(
+        maniskill.record_in_parallel(
             config, folder, parts, workers, lambda result: times.append(time.perf_counter())
         )
     paced = times[WARM_UP * workers :]

@@ -36,7 +36,6 @@ from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.start_frames import chosen_episodes
-from lerobot_wmrl.envs.uncertainty import SIGNALS
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv, make_world_model_env
 from lerobot_wmrl.evaluation.gate import Outcomes
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW
@@ -56,6 +55,9 @@ NEVER = 10**6
 """No episode ends while it is judged."""
 
 HANDS: Final = ("random", "frozen", "saturated")
+
+SIGNALS: Final = ("token_entropy", "done_entropy")
+"""How uncertain the world model says that it is."""
 
 
 class RewardProbe:

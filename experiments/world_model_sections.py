@@ -229,7 +229,7 @@ needs recorded rewards.
 {found["unseen"]["successes"]} and {found["unseen"]["failures"]} in unseen ones, of a policy that the world
 model was not trained on. Uncertainty indicates false positives: of {unsure["predicted_successes"]} predicted
 successes {unsure["false"]} are failures, and the largest token entropy is higher in a false than in a true
-one in {100 * unsure["auc"]["token_entropy"]:.0f} % of all pairs. Its effect on PPO has not been measured.
+one in {100 * unsure["auc"]["token_entropy"]:.0f} % of all pairs.
 
 ![Mean reward along successes and failures](results/reward_curves.png)"""
 

@@ -319,8 +319,6 @@ class RecordConfig(RunConfig):
             "scenes": [scene.index for scene in env.selected_scenes()],
             "cameras": list(env.cameras),
             "image_size": env.image_size,
-            "light_jitter": env.light_jitter,
-            "camera_jitter": env.camera_jitter,
             "assets": env.describe_assets(),
             "robot_mesh_detail": env.robot_mesh_detail,
         }
@@ -343,5 +341,4 @@ def imagined_content(env: WorldModelEnv) -> dict[str, Any]:
         "reward": env.reward.type,
         "reward_settings": {name: value for name, value in reward.items() if name not in general},
         "text_world_model": env.text_world_model_path,
-        "uncertainty": asdict(env.uncertainty),
     }

@@ -6,13 +6,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
 from lerobot.datasets.aggregate import aggregate_datasets
 
 from lerobot_dataset_maniskill.card import CARD_FILE, success_by_kind, write_card
 from lerobot_dataset_maniskill.writer import VOCABULARY_FILE, find_damage, write_vocabulary
-from lerobot_wmrl.common.command_line import different_settings
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.output_folders import require_same
 from lerobot_wmrl.maniskill.embodiment import FPS
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
@@ -31,27 +30,21 @@ def merge_folders(folders: Sequence[Path], target: Path, repo_id: str) -> None:
     )  # fmt: skip
 
 
-def finish(merged: Path, output_dir: Path, repo_id: str, content: Mapping[str, Any]) -> None:
-    """Add vocabulary, pictures and card, move the whole into place at once, and report it.
+def describe(merged: Path, repo_id: str, content: Mapping[str, Any]) -> None:
+    """Add vocabulary, pictures and card to a dataset that is not in its place yet.
 
     Args:
-        merged: the dataset, in a temporary folder.
-        output_dir: where it is to be.
+        merged: the dataset.
         repo_id: its name.
         content: the settings that decide its episodes, written into its vocabulary.
     """
     write_vocabulary(merged, content)
-    table = recorded_episodes(merged)
-    write_card(merged, repo_id, table)
-    merged.replace(output_dir)
-    print(report(output_dir, table))
+    write_card(merged, repo_id, recorded_episodes(merged))
 
 
-def report(output_dir: Path, table: Mapping[str, np.ndarray]) -> str:
-    """Return what was recorded, how often each kind succeeded, and the next command.
-
-    `table` is `lerobot_wmrl.maniskill.recordings.recorded_episodes`.
-    """
+def report(output_dir: Path) -> str:
+    """Return what was recorded, how often each kind succeeded, and the next command."""
+    table = recorded_episodes(output_dir)
     frames = int(table["length"].sum())
     rates = (f"{kind} {wins}/{total}" for kind, (wins, total) in success_by_kind(table).items())
     command = "lerobot-wmrl-train-world-model --model.type=frame_tokenizer"
@@ -63,32 +56,32 @@ def report(output_dir: Path, table: Mapping[str, np.ndarray]) -> str:
     )
 
 
-def already_recorded(output_dir: Path, content: Mapping[str, Any], episodes: int) -> bool:
-    """Whether `output_dir` holds exactly this recording. Raises FieldError if it holds anything else."""
+def already_recorded(
+    output_dir: Path, settings: Mapping[str, Any] | None, content: Mapping[str, Any], episodes: int
+) -> bool:
+    """Whether `output_dir` holds exactly this recording. Raises FieldError if it holds anything else.
+
+    Args:
+        output_dir: where the dataset is to be.
+        settings: those that the dataset which is there says it was recorded with; None if it does not.
+        content: those that it is to be recorded with.
+        episodes: how many it is to have.
+    """
     if not output_dir.exists() or (output_dir.is_dir() and not any(output_dir.iterdir())):
         return False
-    vocabulary = output_dir / VOCABULARY_FILE
-    if not vocabulary.is_file():
+    if settings is None:
         raise FieldError("output_dir", output_dir, "holds something else", "choose a new folder")
-    require_same(json.loads(vocabulary.read_text())["recording"], content, output_dir)
-    problem = find_damage(output_dir, episodes)
-    if problem:
+    require_same_recording(settings, content, output_dir)
+    if problem := find_damage(output_dir, episodes):
         raise FieldError("output_dir", output_dir, problem, "remove the folder and record again")
     print(f"{output_dir} is already recorded: {episodes} episodes")
     return True
 
 
-def require_same(stored: Mapping[str, Any], content: Mapping[str, Any], folder: Path) -> None:
+def require_same_recording(stored: Mapping[str, Any], content: Mapping[str, Any], folder: Path) -> None:
     """Raise FieldError unless both settings describe the same episodes."""
     before = {**BY_DEFAULT, **stored}
-    differing = different_settings({key: before[key] for key in content if key in before}, content, ())
-    if differing:
-        raise FieldError(
-            "output_dir",
-            folder,
-            f"holds a recording with other settings ({'; '.join(differing)})",
-            "choose another folder, or repeat the first settings to continue it",
-        )
+    require_same(folder, {key: before[key] for key in content if key in before}, content)
 
 
 def merge_shards(shards: Sequence[Path], output_dir: Path, repo_id: str) -> None:
@@ -105,7 +98,7 @@ def merge_shards(shards: Sequence[Path], output_dir: Path, repo_id: str) -> None
     contents = [read_content(shard) for shard in shards]
     check_set(shards, contents)
     content = {**contents[0], "shard": WHOLE}
-    if already_recorded(output_dir, content, content["num_episodes"]):
+    if already_recorded(output_dir, recorded_settings(output_dir), content, content["num_episodes"]):
         return
     order = sorted(range(len(shards)), key=lambda index: contents[index]["shard"][0])
     merged = output_dir.with_name(f".{output_dir.name}.merging")
@@ -114,16 +107,24 @@ def merge_shards(shards: Sequence[Path], output_dir: Path, repo_id: str) -> None
     problem = find_damage(merged, content["num_episodes"])
     if problem:
         raise FieldError("merge_shards", _listed(shards), problem, "record the incomplete shards again")
-    finish(merged, output_dir, repo_id, content)
+    describe(merged, repo_id, content)
+    merged.replace(output_dir)
+    print(report(output_dir))
+
+
+def recorded_settings(root: Path) -> dict[str, Any] | None:
+    """Return the settings that a dataset was recorded with; None if the recorder did not make it."""
+    vocabulary = root / VOCABULARY_FILE
+    return json.loads(vocabulary.read_text())["recording"] if vocabulary.is_file() else None
 
 
 def read_content(shard: Path) -> dict[str, Any]:
     """Return the settings that a shard was recorded with. Raises FieldError if it is no recording."""
-    vocabulary = shard / VOCABULARY_FILE
-    if not vocabulary.is_file():
+    settings = recorded_settings(shard)
+    if settings is None:
         problem = f"is no finished recording ({VOCABULARY_FILE} is missing)"
         raise FieldError("merge_shards", shard, problem, "give the folders of finished shards")
-    return json.loads(vocabulary.read_text())["recording"]
+    return settings
 
 
 def check_set(shards: Sequence[Path], contents: Sequence[Mapping[str, Any]]) -> None:

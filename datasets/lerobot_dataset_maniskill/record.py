@@ -76,7 +76,6 @@ def run(config: RecordConfig) -> None:
         return
     from huggingface_hub import HfApi
 
-    from lerobot_dataset_maniskill.elsewhere import record_elsewhere
     from lerobot_dataset_maniskill.merging import merge_shards
     from lerobot_dataset_maniskill.publishing import publish
     from lerobot_dataset_maniskill.recorder import record
@@ -89,8 +88,6 @@ def run(config: RecordConfig) -> None:
         check_shards(config)
         with writing("output_dir", config.root):
             merge_shards(config.merge_shards, config.root, config.dataset_id)
-    elif config.elsewhere:
-        record_elsewhere(config)
     else:
         record(config)
     if config.push_to_hub and config.elsewhere:

@@ -1,95 +1,113 @@
-"""Runs the workers, resumes after an interruption, and merges the sub-datasets into one dataset."""
+"""Records what a configuration asks for in parts, resumes after an interruption, and merges the parts."""
 
-import fcntl
 import json
 import logging
-import queue
 import shutil
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final
-
-from tqdm import tqdm
+from typing import Any, Final, Protocol
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
-from lerobot_dataset_maniskill.imagined import ImaginedPartRecorder
-from lerobot_dataset_maniskill.manifest import Part, planned_parts
-from lerobot_dataset_maniskill.merging import already_recorded, finish, merge_folders, require_same
-from lerobot_dataset_maniskill.worker import EpisodeResult, PartRecorder, Report, serve_parts
+from lerobot_dataset_maniskill.elsewhere import Rollouts
+from lerobot_dataset_maniskill.maniskill import ManiSkillEpisodes
+from lerobot_dataset_maniskill.merging import already_recorded, merge_folders, require_same_recording
 from lerobot_dataset_maniskill.writer import find_damage
-from lerobot_wmrl.common.actions import warn_of_clipped
-from lerobot_wmrl.common.constants import EVALUATION_SEED, GATE_SEED, KINDS
+from lerobot_wmrl.common.constants import EVALUATION_SEED, GATE_SEED
 from lerobot_wmrl.common.errors import FieldError, within
-from lerobot_wmrl.common.files import foreign_files, write_json, writing
-from lerobot_wmrl.common.policies import check_weights, fit_to_environment
-from lerobot_wmrl.data.budget import Ledger, spending
+from lerobot_wmrl.common.files import write_json, writing
+from lerobot_wmrl.common.output_folders import locked, require_empty
+from lerobot_wmrl.common.policies import check_weights
+from lerobot_wmrl.data.budget import Ledger
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
-from lerobot_wmrl.maniskill.backend import render_backend, simulating_context
-from lerobot_wmrl.maniskill.embodiment import ACTION_NAMES
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 
 CONTENT_FILE: Final = "recording.json"
-POLL_SECONDS: Final = 1.0
-GRACE_SECONDS: Final = 10.0
-"""Time that a worker may take to exit when its work is done."""
+LOCK: Final = "lock"
+
+
+class Source(Protocol):
+    """Where the episodes of a recording come from."""
+
+    @property
+    def parts(self) -> Mapping[str, int]:
+        """The sub-datasets that are recorded at a time, in order: the name of each folder, its episodes."""
+
+    @property
+    def spent(self) -> Counter[str]:
+        """What the episodes cost of a budget (`data.budget.spending`), if they are real."""
+
+    def check(self) -> None:
+        """Raise ValueError where nothing can be recorded."""
+
+    def record(self, work: Path, missing: Sequence[str]) -> None:
+        """Record these parts into folders in `work`, with a progress bar."""
+
+    def describe(self, merged: Path) -> None:
+        """Add to the merged dataset what is said of it beside its episodes; its settings among it."""
+
+    def settings(self, root: Path) -> dict[str, Any] | None:
+        """Return the settings that a dataset says it was recorded with; None if it does not."""
+
+    def report(self, root: Path) -> str:
+        """Return what was recorded, how often it succeeds, and the next command."""
 
 
 def record(config: RecordConfig) -> None:
     """Record everything that is missing, then merge; or report that the recording is complete."""
     config.validate()
-    root, content = config.root, config.recorded_content()
-    work, parts = root.parent / f".{root.name}.recording", planned_parts(config)
+    root = config.root
+    work = root.parent / f".{root.name}.recording"
+    # as typed: an environment of the hub tells its configuration of its actions when it is made
+    content = config.recorded_content()
+    source: Source = (Rollouts if config.elsewhere else ManiSkillEpisodes)(config, content)
+    imagined = isinstance(config.env, WorldModelEnv)
     ledger = None if config.budget is None else Ledger(config.budget)
     if ledger is not None:
-        check_sources(config, ledger, parts)
-    if already_recorded(root, content, count_episodes(parts)):
+        check_budget(config, ledger)
+    if already_recorded(root, source.settings(root), content, sum(source.parts.values())):
         discard(work, content)
     else:
-        if ledger is not None and config.imagination is None:
-            ledger.require_left(Counter(spending(plan.kind) for part in parts for plan in part.episodes))
+        if ledger is not None and not imagined:
+            ledger.require_left(source.spent)
         if config.policy is not None:
             check_weights(config.policy)
-        if config.imagination is None:
-            check_simulation(config)
+        source.check()
         with writing("output_dir", root), claimed(work, content):
-            record_parts(config, work, parts)
-            merge(config, work, parts)
+            if missing := missing_parts(work, source.parts):
+                source.record(work, missing)
+            merge(source, work, root, config.dataset_id)
+        print(source.report(root))
         shutil.rmtree(work, ignore_errors=True)
     if ledger is not None:
-        ledger.charge(read_episodes(open_dataset(root)), imagined=config.imagination is not None)
+        ledger.charge(read_episodes(open_dataset(root)), imagined=imagined)
 
 
-def check_sources(config: RecordConfig, ledger: Ledger, parts: list[Part]) -> None:
+def check_budget(config: RecordConfig, ledger: Ledger) -> None:
     """Raise FieldError for episodes from which a method under a budget must not learn.
 
     The gate's rollouts have seeds of their own, on which nothing is reported.
     """
-    if config.imagination is not None:
+    if isinstance(config.env, WorldModelEnv):
         from lerobot_wmrl.envs.start_frames import check_starts
 
         with within("env"):
-            check_starts(config.imagination.dataset, ledger)
+            check_starts(config.env.dataset, ledger)
         return
-    if config.maniskill.split == "ood":
+    if isinstance(config.env, WmrlManiSkillEnv) and config.env.split == "ood":
         raise FieldError(
             "env.split", "ood", "under a budget, nothing is recorded in unseen scenes", "choose ind"
         )
-    seeds = {plan.seed for part in parts for plan in part.episodes}
-    if any(EVALUATION_SEED <= seed < GATE_SEED for seed in seeds):
+    end = config.seed + config.num_episodes
+    if config.seed < GATE_SEED and end > EVALUATION_SEED:
         raise FieldError(
             "seed", config.seed,
-            f"under a budget, seeds from {EVALUATION_SEED} on are for evaluation; these reach {max(seeds)}",
+            f"under a budget, seeds from {EVALUATION_SEED} on are for evaluation; these reach {end - 1}",
             "choose a smaller one",
         )  # fmt: skip
-
-
-def check_simulation(config: RecordConfig) -> None:
-    """Raise ValueError unless there is a renderer, and the cameras show what the policy needs."""
-    render_backend()
-    if config.policy is not None:
-        fit_to_environment(config.policy, config.maniskill.observation_shapes(), len(ACTION_NAMES))
 
 
 def discard(work: Path, content: Mapping[str, Any]) -> None:
@@ -106,17 +124,13 @@ def claimed(work: Path, content: Mapping[str, Any]) -> Iterator[None]:
     A command that fails before a part is recorded leaves no folder behind.
     """
     work.mkdir(parents=True, exist_ok=True)
-    with (work / "lock").open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise ValueError(f"{work}: another command is recording into this folder; wait for it") from error
+    with locked(work, work / LOCK):
         stored = work / CONTENT_FILE
         if stored.is_file() and has_parts(work):
-            require_same(json.loads(stored.read_text()), content, work)
-        elif not stored.is_file() and foreign_files(work, "lock", CONTENT_FILE):
-            raise ValueError(f"{work} holds something else; move it away to record here")
+            require_same_recording(json.loads(stored.read_text()), content, work)
         else:
+            if not stored.is_file():
+                require_empty(work, LOCK, CONTENT_FILE)
             write_json(stored, dict(content))
         try:
             yield
@@ -131,120 +145,28 @@ def has_parts(work: Path) -> bool:
     return any(work.glob("part-*"))
 
 
-def missing_parts(work: Path, parts: list[Part]) -> list[Part]:
+def missing_parts(work: Path, parts: Mapping[str, int]) -> list[str]:
     """Return the parts without a whole sub-dataset, and remove damaged sub-datasets."""
     for torn in work.glob(".part-*.partial"):
         shutil.rmtree(torn, ignore_errors=True)
     missing = []
-    for part in parts:
-        folder = work / part.name
-        problem = find_damage(folder, len(part.episodes)) if folder.exists() else "not recorded yet"
+    for name, episodes in parts.items():
+        folder = work / name
+        problem = find_damage(folder, episodes) if folder.exists() else "not recorded yet"
         if problem and folder.exists():
-            logging.warning("%s is recorded again: %s", part.name, problem)
+            logging.warning("%s is recorded again: %s", name, problem)
             shutil.rmtree(folder)
         if problem:
-            missing.append(part)
+            missing.append(name)
     return missing
 
 
-def record_parts(config: RecordConfig, work: Path, parts: list[Part]) -> None:
-    """Record the missing parts, in this process or in several, with a progress bar."""
-    missing = missing_parts(work, parts)
-    if not missing:
-        return
-    count = min(config.num_workers, len(missing)) if config.imagination is None else 1
-    with progress_bar(count_episodes(parts), missing) as report:
-        if count == 1:
-            make = PartRecorder if config.imagination is None else ImaginedPartRecorder
-            recorder = make(config, work)
-            for part in missing:
-                recorder.record(part, report)
-        else:
-            record_in_parallel(config, work, missing, count, report)
-
-
-@contextmanager
-def progress_bar(episodes: int, missing: list[Part]) -> Iterator[Report]:
-    """Show the episodes that are reported to it, the time left, and each kind's success rate.
-
-    At the end it says how many components of a policy's actions were out of range.
-    """
-    done = episodes - count_episodes(missing)
-    seen: Counter[str] = Counter()
-    won: Counter[str] = Counter()
-    clipped: list[float] = []
-    with tqdm(total=episodes, initial=done, unit="episode", desc="record") as bar:
-
-        def report(result: EpisodeResult) -> None:
-            seen[result.kind] += 1
-            won[result.kind] += result.success
-            clipped.extend(result.clipped)
-            bar.set_postfix({kind: f"{won[kind] / seen[kind]:.0%}" for kind in KINDS if seen[kind]}, False)
-            bar.update()
-
-        yield report
-    warn_of_clipped(clipped)
-
-
-def record_in_parallel(
-    config: RecordConfig, work: Path, missing: list[Part], count: int, report: Report
-) -> None:
-    """Record the parts in `count` processes."""
-    context = simulating_context()
-    jobs, results = context.Queue(), context.Queue()
-    for item in [*missing, *[None] * count]:
-        jobs.put(item)
-    arguments = (config, work, jobs, results)
-    workers = [context.Process(target=serve_parts, args=arguments, daemon=True) for _ in range(count)]
-    for worker in workers:
-        worker.start()
-    try:
-        follow_workers({part.index for part in missing}, results, workers, report)
-        for worker in workers:
-            worker.join(GRACE_SECONDS)
-    finally:
-        jobs.cancel_join_thread()  # else a full pipe that nobody reads any more holds the command up
-        for worker in workers:
-            worker.terminate()
-            worker.join()
-
-
-def follow_workers(open_parts: set[int], results: Any, workers: list[Any], report: Report) -> None:
-    """Wait until every open part is whole. Raises a worker's error here.
-
-    A worker's death is raised too, as soon as the others are silent: it may have held a lock that they wait
-    for.
-    """
-    while open_parts:
-        try:
-            result = results.get(timeout=POLL_SECONDS)
-        except queue.Empty:
-            ends = [worker.exitcode for worker in workers]
-            if any(ends) or None not in ends:
-                raise ValueError(
-                    f"recording processes died (exit statuses {', '.join(map(str, ends))}; -9 is what a lack "
-                    "of memory looks like, None still runs); run the same command to continue"
-                ) from None
-            continue
-        if isinstance(result, Exception):
-            raise result
-        if isinstance(result, EpisodeResult):
-            report(result)
-        else:
-            open_parts.discard(result)
-
-
-def merge(config: RecordConfig, work: Path, parts: list[Part]) -> None:
+def merge(source: Source, work: Path, root: Path, repo_id: str) -> None:
     """Merge the parts and move the whole into place at once."""
     merged = work / "merged"
     shutil.rmtree(merged, ignore_errors=True)
-    merge_folders([work / part.name for part in parts], merged, config.dataset_id)
-    problem = find_damage(merged, count_episodes(parts))
-    if problem:
+    merge_folders([work / name for name in source.parts], merged, repo_id)
+    if problem := find_damage(merged, sum(source.parts.values())):
         raise ValueError(f"{work}: merging failed: {problem}; remove the folder and record again")
-    finish(merged, config.root, config.dataset_id, config.recorded_content())
-
-
-def count_episodes(parts: list[Part]) -> int:
-    """Return the number of episodes of all parts."""
-    return sum(len(part.episodes) for part in parts)
+    source.describe(merged)
+    merged.replace(root)

@@ -1,11 +1,10 @@
-"""What every console command shares: parsing, help, claimed output folders, errors without tracebacks."""
+"""What every console command shares: parsing, help, errors without tracebacks."""
 
 import inspect
-import json
 import logging
 import re
 import sys
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -20,10 +19,11 @@ from draccus.utils import ParsingError
 from draccus.wrappers import docstring, field_wrapper
 from lerobot.configs import parser
 from lerobot.utils.import_utils import register_third_party_plugins
-from lerobot.utils.utils import flatten_dict, init_logging
+from lerobot.utils.utils import init_logging
 
 from lerobot_wmrl.common.errors import STOPPED, FieldError, Stopped
-from lerobot_wmrl.common.files import foreign_files, write_json
+from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.common.output_folders import CONFIG_FILE
 from lerobot_wmrl.common.presets import TYPE, format_value, read_settings
 from lerobot_wmrl.common.settings import (
     Setting,
@@ -33,8 +33,6 @@ from lerobot_wmrl.common.settings import (
     type_hints,
     without_none,
 )
-
-CONFIG_FILE = "train_config.json"
 
 FIELD = re.compile(r"`([\w.]+)((?:=[^`]*)?)`")
 """A field in a message, alone or with a value: `dynamics.type=anchored`."""
@@ -263,47 +261,3 @@ def flag_of(field: str, value: object, flags: Mapping[str, Any]) -> str | None:
         key=lambda name: (format_value(flags[name]) != format_value(value), name.count(".")),
         default=None,
     )
-
-
-def claim_output_dir(output_dir: Path, config: dict[str, Any], free: Collection[str] = ()) -> None:
-    """Mark a new folder as this run's, or recognise it. Raises ValueError if it holds something else."""
-    require_free(output_dir, config, free)
-    if not (output_dir / CONFIG_FILE).is_file():
-        write_json(output_dir / CONFIG_FILE, config)
-
-
-def require_free(output_dir: Path, config: dict[str, Any], free: Collection[str] = ()) -> None:
-    """Raise ValueError unless the folder is new, empty or this run's; leave it as it is.
-
-    `output_dir` (a run may be moved) and the settings called `free` may differ between the first call and its
-    continuation.
-    """
-    marker = output_dir / CONFIG_FILE
-    if output_dir.exists() and not output_dir.is_dir():
-        raise ValueError(f"--output_dir={output_dir} is a file; choose a new folder")
-    if marker.is_file():
-        differing = different_settings(json.loads(marker.read_text()), config, {"output_dir", *free})
-        if differing:
-            raise ValueError(
-                f"--output_dir={output_dir} holds a run with other settings ({'; '.join(differing)}); "
-                "choose another folder, or repeat the settings of the first run to continue it"
-            )
-    elif foreign_files(output_dir, CONFIG_FILE):
-        raise ValueError(f"--output_dir={output_dir} holds something else; choose a new folder")
-
-
-def different_settings(
-    stored: Mapping[str, Any], given: Mapping[str, Any], free: Collection[str]
-) -> list[str]:
-    """Return `name 'stored' → 'given'` of every setting that differs, unless it or its group is `free`.
-
-    A setting that one of the two lacks, being of another version, is off there: None, 0 or empty.
-    """
-    before, now = (flatten_dict(dict(settings), sep=".") for settings in (stored, given))
-    shared = before.keys() & now.keys()
-    return [
-        f"{name} {before.get(name)!r} → {now.get(name)!r}"
-        for name in {**before, **now}
-        if (before[name] != now[name] if name in shared else before.get(name) or now.get(name))
-        and not any(name == each or name.startswith(f"{each}.") for each in free)
-    ]

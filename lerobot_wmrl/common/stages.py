@@ -5,7 +5,6 @@ measured. Forking from a process that has imported the libraries saves every sta
 With CUDA, which does not survive a fork, the process then starts the command anew.
 """
 
-import fcntl
 import importlib
 import importlib.metadata
 import json
@@ -29,9 +28,9 @@ import huggingface_hub.constants
 import psutil
 import torch
 
-from lerobot_wmrl.common.command_line import RunConfig, different_settings, run_command
-from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.files import foreign_files, write_json
+from lerobot_wmrl.common.command_line import RunConfig, run_command
+from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.common.output_folders import locked, require_empty, require_same
 from lerobot_wmrl.common.precision import keep_freed_memory
 from lerobot_wmrl.common.processes import die_with, find_program, not_installed, own_progress_lock
 
@@ -104,28 +103,12 @@ def claimed(output_dir: Path, settings: Mapping[str, Any]) -> Iterator[None]:
     """
     marker = output_dir / MARKER
     if marker.exists():
-        check_settings(output_dir, json.loads(marker.read_text()), settings)
-    elif foreign_files(output_dir, MARKER):
-        raise FieldError(
-            "output_dir", output_dir, "holds what this command did not make", "choose another folder"
-        )
+        require_same(output_dir, json.loads(marker.read_text()), settings)
     else:
+        require_empty(output_dir, MARKER)
         write_json(marker, dict(settings))
-    with marker.open() as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise FieldError("output_dir", output_dir, "another run of this command is there") from None
+    with locked(output_dir, marker):
         yield
-
-
-def check_settings(output_dir: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
-    """Raise FieldError for settings that differ from those that the folder was begun with."""
-    if differing := different_settings(found, wanted, ()):
-        raise FieldError(
-            "output_dir", output_dir, f"was started with other settings ({'; '.join(differing)})",
-            "repeat the first ones to continue, or choose another folder",
-        )  # fmt: skip
 
 
 def run_stages(

@@ -43,8 +43,6 @@ class WmrlManiSkillEnv(EnvConfig):
         assets: YAML file with meshes to use in place of objects (`lemon: {mesh: lemon.obj, scale: 0.001}`).
         robot_mesh_detail: share of the robot's triangles that are drawn; 1 draws all, three times slower.
         batched: let all episodes share one simulation on CUDA. By default each has a process of its own.
-        light_jitter: how much the light varies between episodes, as a share (0.2 is plenty).
-        camera_jitter: how far the fixed camera is displaced between episodes (m; 0.01 is plenty).
     """
 
     task: str | None = "push"
@@ -57,8 +55,6 @@ class WmrlManiSkillEnv(EnvConfig):
     assets: Path | None = None
     robot_mesh_detail: float = ROBOT_MESH_DETAIL
     batched: bool = False
-    light_jitter: float = 0.0
-    camera_jitter: float = 0.0
     fps: int = FPS
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(default_factory=dict)
@@ -85,9 +81,6 @@ class WmrlManiSkillEnv(EnvConfig):
             require_at_least(self, 1, "episode_length")
         if not 0.0 < self.robot_mesh_detail <= 1.0:
             raise FieldError("robot_mesh_detail", self.robot_mesh_detail, "must be above 0 and at most 1")
-        for name, most in (("light_jitter", 1.0), ("camera_jitter", 0.1)):
-            if not 0.0 <= getattr(self, name) <= most:
-                raise FieldError(name, getattr(self, name), f"must be from 0 (off) to {most}")
         if self.assets is not None:
             read_assets(self.assets)
 
@@ -131,17 +124,11 @@ class WmrlManiSkillEnv(EnvConfig):
         """Return a simulator of `n_envs` episodes of one task at once.
 
         Raises:
-            FieldError: light or cameras are to vary, or there are several tasks.
+            FieldError: there are several tasks.
         """
         require_simulator()
         from lerobot_wmrl.maniskill.batched import BatchedSimulation
 
-        for name in ("light_jitter", "camera_jitter"):
-            if getattr(self, name):
-                raise FieldError(
-                    name, getattr(self, name), "a batched simulation varies neither light nor camera",
-                    "set it to 0, or `batched` to false",
-                )  # fmt: skip
         task, *more = tasks_of(self.task)
         if more:
             raise FieldError(
@@ -162,10 +149,7 @@ class WmrlManiSkillEnv(EnvConfig):
         return with_meshes(self.selected_scenes(), meshes)
 
     def _rendering(self, depth: bool) -> Rendering:
-        return Rendering(
-            tuple(self.cameras), self.image_size, depth,
-            self.robot_mesh_detail, self.light_jitter, self.camera_jitter,
-        )  # fmt: skip
+        return Rendering(tuple(self.cameras), self.image_size, depth, self.robot_mesh_detail)
 
     def create_envs(
         self, n_envs: int, use_async_envs: bool = False

@@ -14,7 +14,6 @@ from lerobot_wmrl.common.constants import TASKS
 from lerobot_wmrl.common.errors import FieldError, require_at_least
 from lerobot_wmrl.common.images import camera_key
 from lerobot_wmrl.data.dataset import ChosenEpisodes
-from lerobot_wmrl.envs.uncertainty import Uncertainty
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 
 
@@ -102,7 +101,6 @@ class WorldModelEnv(EnvConfig):
             world model has learnt from have (`clip_length`).
         done_threshold: predicted success probability θ at which a frame counts as done (eq. 7).
         done_frames: consecutive done frames k that make a success.
-        uncertainty: what happens to episodes about which the world model is uncertain.
         fps: frames a second, those of the world model's dataset.
         device: device of the models; by default the best one of this machine.
     """
@@ -116,7 +114,6 @@ class WorldModelEnv(EnvConfig):
     episode_length: int | None = None
     done_threshold: float = 0.5
     done_frames: int = 3
-    uncertainty: Uncertainty = field(default_factory=Uncertainty)
     device: str | None = None
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(default_factory=lambda: {ACTION: ACTION, "agent_pos": OBS_STATE})
@@ -161,7 +158,6 @@ class WorldModelEnv(EnvConfig):
         unknown = sorted({*(self.dataset.tasks or ())} - {*TASKS})
         if unknown:
             raise FieldError("dataset.tasks", unknown, f"choose from {', '.join(TASKS)}")
-        self.uncertainty.check()
 
     def _check_rewarding(self, model: Any) -> None:
         """Raise FieldError if the world model would never reward."""

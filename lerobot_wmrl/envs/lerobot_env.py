@@ -6,11 +6,11 @@ from typing import Any, Final
 import gymnasium as gym
 import numpy as np
 import torch
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.envs import make_env, make_env_pre_post_processors
 from lerobot.envs.configs import EnvConfig, HubEnvConfig, LiberoEnv
-from lerobot.envs.utils import NEW_ROLLOUT_OPTION, preprocess_observation
+from lerobot.envs.utils import NEW_ROLLOUT_OPTION, FreezeAfterEpisodeEnd, preprocess_observation
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
@@ -64,6 +64,15 @@ def counts_resets(config: EnvConfig) -> bool:
     LeRobot's `FreezeAfterEpisodeEnd` keeps those away that a vector environment would make by itself.
     """
     return isinstance(config, LiberoEnv) and config.init_states
+
+
+def freeze_finished(env: Any) -> None:
+    """Keep finished episodes of a vector environment from being reset and stepped until the last one ends.
+
+    LeRobot's rollout takes no notice of what comes after an end, but it costs time, and in LIBERO starts.
+    """
+    if isinstance(env, SyncVectorEnv) and env.autoreset_mode is AutoresetMode.NEXT_STEP:
+        env.envs = [FreezeAfterEpisodeEnd(each) for each in env.envs]
 
 
 def shapes_of(observation: Observation) -> dict[str, tuple[int, ...]]:

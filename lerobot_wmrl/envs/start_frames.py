@@ -1,8 +1,8 @@
 """Where imagined episodes begin, and the goal frame of each.
 
 Frames are read from a dataset's episodes, from a file or from ManiSkill's resets (`StartImages`). A
-world model then tokenises them (`Starts`), and the text world model imagines their goal frames (`Goals`).
-K is the number of starts, N the number of cameras.
+world model then tokenises them (`Starts`), and the text world model imagines their goal frames
+(`GoalFeatures`). K is the number of starts, N the number of cameras.
 """
 
 from collections.abc import Callable, Mapping
@@ -98,7 +98,7 @@ class Starts(NamedTuple):
         return len(self.instructions)
 
 
-class Goals(NamedTuple):
+class GoalFeatures(NamedTuple):
     """Goal frames of K starts: their features [(K·N, …)] and the measure that compares them, the similarity
     of each start to its goal (K,), and reached (K,), False where the text model never reached θ."""
 
@@ -355,7 +355,7 @@ def without_depth(model: WorldModelRewardModel) -> None:
 def load_starts(
     frames: StartImages, model: ActionWorldModelRewardModel, text_model: TextWorldModelRewardModel | None,
     measure: Similarity,
-) -> tuple[Starts, Goals | None]:  # fmt: skip
+) -> tuple[Starts, GoalFeatures | None]:  # fmt: skip
     """Tokenise the starts and, with a text model, imagine each one's goal frame once (eq. 6)."""
     device = model.state_mean.device
     state = torch.from_numpy(frames.state).to(device)
@@ -375,7 +375,7 @@ def load_starts(
 def imagine_goals(
     model: TextWorldModelRewardModel, frames: Frames, instructions: list[str], features: Features,
     measure: Similarity,
-) -> Goals:  # fmt: skip
+) -> GoalFeatures:  # fmt: skip
     """Imagine the goal frame of every start, GOAL_BATCH at once.
 
     Args:
@@ -390,4 +390,4 @@ def imagine_goals(
     parts = zip(*(measure.features(goal.decoded) for goal in goals), strict=True)
     goal_features = [torch.cat(part) for part in parts]
     similarity = measure(features, goal_features, model.tokenizer.num_cameras)
-    return Goals(goal_features, measure, similarity, torch.cat([goal.reached for goal in goals]))
+    return GoalFeatures(goal_features, measure, similarity, torch.cat([goal.reached for goal in goals]))

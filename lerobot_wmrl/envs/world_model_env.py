@@ -11,14 +11,14 @@ from gymnasium.vector import AutoresetMode
 from lerobot.rewards.factory import make_reward_model
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
+from torch.distributions import Bernoulli
 
 from lerobot_wmrl.common.actions import clip_actions
 from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.statistics import evenly_spaced
 from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
-from lerobot_wmrl.envs.start_frames import Goals, StartImages, Starts, load_starts, read_start_images
-from lerobot_wmrl.envs.uncertainty import entropies
+from lerobot_wmrl.envs.start_frames import GoalFeatures, StartImages, Starts, load_starts, read_start_images
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rewards.general import consecutive_count, is_done
 from lerobot_wmrl.rewards.loading import Reward, load_reward
@@ -48,7 +48,7 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
     """
 
     def __init__(
-        self, model: ActionWorldModelRewardModel, starts: Starts, goals: Goals | None,
+        self, model: ActionWorldModelRewardModel, starts: Starts, goals: GoalFeatures | None,
         reward: Reward, config: WorldModelEnv, n_envs: int,
     ) -> None:  # fmt: skip
         self.model, self.starts, self.goals = model, starts, goals
@@ -105,14 +105,12 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         """
         clipped, share = clip_actions(self._checked(actions), self.action_low, self.action_high)
         imagined = self.model.step(self._imagination, clipped)
-        uncertainty = entropies(imagined)
-        terminated, truncated = self._advance(imagined, uncertainty)
+        terminated, truncated = self._advance(imagined)
         decoded = self.model.decode(imagined.tokens, self._imagination.context)
         observation = self._observe(decoded.images, imagined.state)
         parts = {"success": terminated.float(), **self._progress(decoded)}
         reward = self.reward.compute_reward({**observation, **parts, "hidden": imagined.hidden})
-        reward = self.config.uncertainty.weigh(reward, uncertainty)
-        parts |= {**uncertainty, "done_probability": imagined.done_logit.sigmoid()}
+        parts |= {**entropies(imagined), "done_probability": imagined.done_logit.sigmoid()}
         parts["clipped"] = share
         info: dict[str, Any] = {"reward_parts": parts}
         finished = terminated | truncated
@@ -156,15 +154,14 @@ class WorldModelVectorEnv(gym.vector.VectorEnv):
         check_same_tokenizer(self.model, model, "world_model_path", "the refreshed one")
         self.model = model
 
-    def _advance(self, imagined: Imagined, uncertainty: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """Count frames. Return terminated (k consecutive done frames) and truncated (at the horizon, or where
-        the model is uncertain). → (B,) bool, (B,) bool"""
+    def _advance(self, imagined: Imagined) -> tuple[Tensor, Tensor]:
+        """Count frames. Return terminated (k consecutive done frames) and truncated (at the horizon). → (B,)
+        bool, (B,) bool"""
         fired = is_done(imagined.done_logit, self.config.done_threshold)
         self._done_streak = consecutive_count(self._done_streak, fired)
         self._elapsed = self._elapsed + 1
-        uncertain = self.config.uncertainty.ends(uncertainty)
-        terminated = (self._done_streak >= self.config.done_frames) & ~uncertain
-        return terminated, ((self._elapsed >= self.max_episode_steps) | uncertain) & ~terminated
+        terminated = self._done_streak >= self.config.done_frames
+        return terminated, (self._elapsed >= self.max_episode_steps) & ~terminated
 
     def _restart(self, mask: Tensor, observation: Observation) -> Observation:
         """Begin new episodes where `mask` (B,) is True. Return the observation with these rows replaced."""
@@ -295,3 +292,9 @@ def make_success_env(env: WorldModelVectorEnv, source: StartFrames, at_most: int
     starts = read_start_images(source, env.model.config)
     starts = starts.chosen(evenly_spaced(len(starts.images), at_most))
     return make_env_at(starts, models, env.config, env.num_envs)
+
+
+def entropies(imagined: Imagined) -> dict[str, Tensor]:
+    """Return how uncertain the model is of each frame's appearance and of its success, in nats. (B,) each"""
+    done = Bernoulli(logits=imagined.done_logit, validate_args=False)
+    return {"token_entropy": imagined.entropy, "done_entropy": done.entropy()}

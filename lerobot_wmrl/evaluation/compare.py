@@ -9,11 +9,10 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import torch
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs import close_envs, make_env, make_env_pre_post_processors
 from lerobot.envs.configs import EnvConfig
-from lerobot.envs.utils import NEW_ROLLOUT_OPTION, FreezeAfterEpisodeEnd, env_to_policy_features
+from lerobot.envs.utils import NEW_ROLLOUT_OPTION, env_to_policy_features
 from lerobot.scripts.lerobot_eval import eval_policy
 from lerobot.utils.constants import ACTION, PRETRAINED_MODEL_DIR
 from lerobot.utils.random_utils import set_seed
@@ -28,7 +27,7 @@ from lerobot_wmrl.common.policies import (
     read_policy_config,
 )
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
-from lerobot_wmrl.envs.lerobot_env import counts_resets, is_own, runs_in_processes
+from lerobot_wmrl.envs.lerobot_env import counts_resets, freeze_finished, is_own, runs_in_processes
 from lerobot_wmrl.evaluation.comparison import Comparison, Episode
 
 type Envs = dict[str, dict[int, gym.vector.VectorEnv]]
@@ -43,7 +42,7 @@ class LoadedPolicy(NamedTuple):
     processors: tuple[Any, Any]
 
 
-def checkpoint_name(path: str) -> str:
+def resolved_name(path: str) -> str:
     """Return the checkpoint behind a training's output folder or its link `last`, which a longer training
     moves on. A path that is no folder is returned as it is: it may be a hub id."""
     folder = resolve_checkpoint(path)
@@ -62,7 +61,7 @@ def read_policies(paths: Sequence[str], env: EnvConfig) -> dict[str, PreTrainedC
     """
     configs: dict[str, PreTrainedConfig] = {}
     for path in paths:
-        name = checkpoint_name(path)
+        name = resolved_name(path)
         if name in configs:
             raise FieldError("policies", path, "is given twice", "give every checkpoint once")
         with about_policy(path):
@@ -118,8 +117,7 @@ def opened(config: EnvConfig, n_envs: int, trust_remote_code: bool, policies: in
     def make() -> Envs:
         envs: Envs = make_env(config, n_envs, parallel, trust_remote_code=trust_remote_code)
         for env in _flat(envs):
-            if isinstance(env, SyncVectorEnv) and env.autoreset_mode is AutoresetMode.NEXT_STEP:
-                env.envs = [FreezeAfterEpisodeEnd(each) for each in env.envs]
+            freeze_finished(env)
         return envs
 
     made = [make()]

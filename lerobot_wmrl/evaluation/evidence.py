@@ -8,9 +8,9 @@ from typing import Any
 from lerobot.utils.constants import CHECKPOINTS_DIR, PRETRAINED_MODEL_DIR
 
 from lerobot_wmrl.common.checkpoints import resolve_checkpoint
-from lerobot_wmrl.common.command_line import CONFIG_FILE
 from lerobot_wmrl.common.constants import DYNA, START_SCENE
 from lerobot_wmrl.common.errors import FieldError, first_line
+from lerobot_wmrl.common.output_folders import CONFIG_FILE
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.data.episodes import choose_episodes

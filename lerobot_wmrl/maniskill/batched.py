@@ -103,7 +103,7 @@ class BatchedSimulation:
     Args:
         task: defines starts, success and reward.
         scenes: the scenes that may be asked for, with a user's meshes if there are any.
-        rendering: which pictures are taken; light and cameras do not vary here.
+        rendering: which pictures are taken.
         num_envs: B; 1 on the CPU.
         device: "cpu", "cuda" or "cuda:1" and so on, of physics and pictures.
     """

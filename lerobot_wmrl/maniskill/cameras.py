@@ -47,15 +47,9 @@ class Rendering:
         image_size: pixels of each side.
         depth: whether each camera also measures depth.
         robot_mesh_detail: share of the robot's triangles that are drawn; 1 draws ManiSkill's own meshes.
-        light_jitter: standard deviation of the lights' brightness, as a share, and of the sun's direction;
-            drawn once an episode.
-        camera_jitter: standard deviation (m) of the fixed cameras' positions, drawn once an episode. Their
-            directions vary by as much at the distance of the table.
     """
 
     cameras: tuple[str, ...] = ("third_view",)
     image_size: int = IMAGE_SIZE
     depth: bool = False
     robot_mesh_detail: float = ROBOT_MESH_DETAIL
-    light_jitter: float = 0.0
-    camera_jitter: float = 0.0

@@ -17,11 +17,11 @@ from transforms3d.euler import euler2quat
 
 from lerobot_wmrl.maniskill.actors import build_carpet, build_container, build_object, build_table
 from lerobot_wmrl.maniskill.backend import render_backend
-from lerobot_wmrl.maniskill.cameras import VIEWS, Rendering
+from lerobot_wmrl.maniskill.cameras import Rendering
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW, FPS
 from lerobot_wmrl.maniskill.episode import WORKSPACE_FLOOR, Episode, Frame
 from lerobot_wmrl.maniskill.objects import CONTAINERS, ObjectSpec
-from lerobot_wmrl.maniskill.rendering import AMBIENT, SUN, SUN_DIRECTION, Variation, camera_config
+from lerobot_wmrl.maniskill.rendering import AMBIENT, SUN, SUN_DIRECTION, camera_config
 from lerobot_wmrl.maniskill.robot import (
     BASE_POSITION,
     CONTROL_MODE,
@@ -192,15 +192,12 @@ class Simulation:
         self.env = TabletopEnv(scenes, rendering, render_backend=render_backend())
         self.env.reset(seed=0)
         self.cameras = {name: self.env._sensors[name].camera._render_cameras[0] for name in rendering.cameras}
-        fixed = {name: camera for name, camera in self.cameras.items() if name in VIEWS}
-        self.variation = Variation(self.env.scene.sub_scenes[0], fixed, rendering)
         self._low, self._high = np.array(ACTION_LOW, np.float32), np.array(ACTION_HIGH, np.float32)
 
     def reset(self, scene: Scene, seed: int) -> Frame:
         """Set up the start of (task, scene, seed). The same arguments give the same frame."""
         self.episode = Episode(self.task, self.env.scenes[scene.index], seed)
         self.env.place(self.episode.scene, self.episode.start)
-        self.variation.draw(seed, self.task.index, scene.index)
         self.episode.begin(self.object_position)
         return self._frame()
 

@@ -21,10 +21,11 @@ from typing import TYPE_CHECKING, Any
 import draccus
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_wmrl.common.command_line import RunConfig, claim_output_dir, require_free, run_command
+from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
 from lerobot_wmrl.common.files import write_json, writing
+from lerobot_wmrl.common.output_folders import claim_output_dir, require_free
 
 if TYPE_CHECKING:
     from lerobot.configs import PreTrainedConfig

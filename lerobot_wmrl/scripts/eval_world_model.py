@@ -23,9 +23,10 @@ import draccus
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_wmrl.common.checkpoints import Checkpoint
-from lerobot_wmrl.common.command_line import RunConfig, claim_output_dir, run_command
+from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import FieldError, require_at_least
+from lerobot_wmrl.common.output_folders import claim_output_dir
 from lerobot_wmrl.common.presets import expand_preset
 from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig

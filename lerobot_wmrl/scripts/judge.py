@@ -33,9 +33,10 @@ import draccus
 from tqdm import tqdm
 
 from lerobot_wmrl.common.checkpoints import Checkpoint
-from lerobot_wmrl.common.command_line import RunConfig, claim_output_dir, require_free, run_command
+from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.errors import FieldError, Stopped, regrouped, renamed, require_at_least
 from lerobot_wmrl.common.files import write_json, writing
+from lerobot_wmrl.common.output_folders import claim_output_dir, require_free
 from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
@@ -149,7 +150,7 @@ MAY_DIFFER = ("policies", "references", "coverage", "batch_size", "device")
 
 def judge(cfg: JudgeConfig) -> None:
     """Replay the rollouts and imagine what is missing of the episodes; write the results."""
-    from lerobot_wmrl.evaluation.compare import checkpoint_name
+    from lerobot_wmrl.evaluation.compare import resolved_name
     from lerobot_wmrl.evaluation.evidence import (
         confusion_of,
         learnt_from,
@@ -159,7 +160,7 @@ def judge(cfg: JudgeConfig) -> None:
     from lerobot_wmrl.evaluation.judgement import LEAST_YOUDEN, Judgement, save_picture, told
 
     cfg.check()
-    cfg.world_model.path = checkpoint_name(cfg.world_model.path)
+    cfg.world_model.path = resolved_name(cfg.world_model.path)
     env = cfg.imagination()
     configs, references = read_both(cfg, env)
     require_free(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER)

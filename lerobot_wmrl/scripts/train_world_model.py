@@ -22,9 +22,10 @@ from lerobot.configs import parser
 from lerobot.configs.default import WandBConfig
 from lerobot.configs.rewards import RewardModelConfig
 
-from lerobot_wmrl.common.command_line import RunConfig, claim_output_dir, require_free, run_command
+from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.distributed import LONGEST_WAIT, is_first_process
 from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least, require_choice
+from lerobot_wmrl.common.output_folders import claim_output_dir, require_free
 from lerobot_wmrl.common.precision import PRECISIONS, keep_freed_memory, training_dtype
 from lerobot_wmrl.common.presets import expand_preset, format_flags
 from lerobot_wmrl.common.tracking import make_wandb

@@ -40,6 +40,14 @@ model = get_reward_model_class("{type}").from_pretrained("{repo_id}")
 """
 
 
+def card_metadata(config: Any, *tags: str, **more: Any) -> ModelCardData:
+    """Return the metadata of the card of a model with this configuration, as LeRobot's own cards have it."""
+    return ModelCardData(
+        license=config.license or "apache-2.0", library_name="lerobot", pipeline_tag="robotics",
+        tags=sorted({*(config.tags or []), "robotics", "lerobot", *tags, config.type}), **more,
+    )  # fmt: skip
+
+
 class HubCard:
     """Mixin of `PreTrainedRewardModel`: how a model is published; `summary` says on its card what it is."""
 
@@ -65,13 +73,7 @@ class HubCard:
     def generate_model_card(self, dataset_repo_id: str | None, *_: Any, **__: Any) -> ModelCard:
         """Write the model's card."""
         config: Any = self.config  # type: ignore[attr-defined]
-        metadata = ModelCardData(
-            license=config.license or "apache-2.0",
-            library_name="lerobot",
-            pipeline_tag="robotics",
-            tags=sorted({*(config.tags or []), "robotics", "lerobot", "reward-model", config.type}),
-            datasets=dataset_repo_id,
-        )
+        metadata = card_metadata(config, "reward-model", datasets=dataset_repo_id)
         return ModelCard(
             CARD.format(
                 metadata=metadata.to_yaml(), name=config.type, summary=self.summary, type=config.type,

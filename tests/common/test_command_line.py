@@ -6,14 +6,14 @@ import pytest
 
 from lerobot_wmrl.common.command_line import (
     RunConfig,
-    different_settings,
     near_flag,
     parse_flags,
     said_in_flags,
 )
 from lerobot_wmrl.common.errors import FieldError, Stopped
+from lerobot_wmrl.common.output_folders import different_settings
 from lerobot_wmrl.common.settings import settings_of
-from lerobot_wmrl.scripts.train import TrainConfig
+from lerobot_wmrl.rl.configuration_train import TrainConfig
 
 
 @dataclass
@@ -89,8 +89,8 @@ def test_a_flag_that_does_not_exist_leads_to_one_that_does(name: str, near: str 
             "--env.reward.form is a setting of a type: give --env.reward.type=…",
         ),
         (
-            ["--env.type=world_model", "--env.light_jitter=true"],
-            "there is no flag --env.light_jitter: see --help",
+            ["--env.type=world_model", "--env.robot_mesh_detail=1"],
+            "there is no flag --env.robot_mesh_detail: see --help",
         ),
         (
             ["--env.type=world_model", "--env.max_starts=3"],

@@ -11,8 +11,8 @@ import lerobot_env_wmrl  # noqa: F401
 from lerobot_wmrl.common import presets
 from lerobot_wmrl.common.presets import expand_preset, format_flags, presets_of, read_settings
 from lerobot_wmrl.demo.stages import DemoConfig
+from lerobot_wmrl.rl.configuration_train import TrainConfig
 from lerobot_wmrl.scripts.eval_world_model import EvalWorldModelConfig
-from lerobot_wmrl.scripts.train import TrainConfig
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig
 
 CONFIGS = {

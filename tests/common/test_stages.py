@@ -161,7 +161,7 @@ def wait_until(condition: Callable[[], bool], seconds: float = 20.0) -> None:
 
 def test_a_foreign_folder_is_refused_and_left_alone(tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").write_text("mine")
-    with pytest.raises(ValueError, match="holds what this command did not make"), claimed(tmp_path, {}):
+    with pytest.raises(ValueError, match="holds something else"), claimed(tmp_path, {}):
         pass
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
 
@@ -170,7 +170,7 @@ def test_other_settings_are_refused_by_name(tmp_path: Path) -> None:
     with claimed(tmp_path, {"seed": 1}):
         pass
     with (
-        pytest.raises(ValueError, match=r"^output_dir=.* was started with other settings \(seed 1 → 2\)"),
+        pytest.raises(ValueError, match=r"^output_dir=.* was begun with other settings \(seed 1 → 2\)"),
         claimed(tmp_path, {"seed": 2}),
     ):
         pass

@@ -79,11 +79,6 @@ def test_lerobot_eval_gets_arrays_and_the_success_by_scene(
     assert "(0 of 1;" in caplog.text
 
 
-def test_jitter_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"^light_jitter=0\.1: .*`batched` to false"):
-        WmrlManiSkillEnv(light_jitter=0.1).create_batched_simulation(1, "cpu")
-
-
 class MadeUpSimulation:
     """Three rows without physics: an episode succeeds when its actions have lifted by 10 cm."""
 

@@ -17,7 +17,8 @@ from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.envs.lerobot_env import LeRobotTensorEnv, check_real_env, make_tensor_env
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
-from lerobot_wmrl.scripts.train import TrainConfig, check_tasks, main
+from lerobot_wmrl.rl.configuration_train import TrainConfig
+from lerobot_wmrl.scripts.train import check_tasks, main
 from tests.rl.checkpoints import save_untrained_policy
 
 B, STEPS = 2, 3

@@ -15,7 +15,6 @@ from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
 from lerobot_wmrl.envs.start_frames import branch_frames
-from lerobot_wmrl.envs.uncertainty import Uncertainty
 from lerobot_wmrl.envs.world_model_env import make_success_env
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH
 from lerobot_wmrl.rewards.configuration_rewards import EmbeddingConfig, GeneralConfig, ProxyConfig
@@ -396,13 +395,10 @@ REWARDS = {
 }
 
 
-@pytest.mark.parametrize(
-    "uncertainty", [Uncertainty(), Uncertainty(limit=100.0), Uncertainty(limit=0.1, effect="weight")]
-)
 @pytest.mark.parametrize("reward", list(REWARDS))
-def test_a_step_asks_the_device_only_whether_an_episode_has_ended(config, reward, uncertainty):
+def test_a_step_asks_the_device_only_whether_an_episode_has_ended(config, reward):
     """Anchored dynamics ask once more in the first step, who begins."""
-    env = replace(config, reward=REWARDS[reward], uncertainty=uncertainty).create_tensor_env(B)
+    env = replace(config, reward=REWARDS[reward]).create_tensor_env(B)
     assert fetched_by_steps(env, 4) == [2, 1, 1, 1]
 
 
@@ -456,36 +452,16 @@ def test_instructions_are_those_of_the_starts(env):
     assert observation["task"] == expected() != before
 
 
-def uncertain(config, **uncertainty):
-    """One step of four environments, in which done is certain, as likely as not, unlikely and excluded."""
+def test_entropies_say_how_uncertain_the_world_model_is(config):
+    """Done is certain, as likely as not, unlikely and excluded."""
     logits = torch.tensor([20.0, 0.0, -2.0, -20.0])
-    env = replace(config, uncertainty=Uncertainty(**uncertainty)).create_tensor_env(B)
+    env = config.create_tensor_env(B)
     step = env.model.step
     env.model.step = lambda *args: step(*args)._replace(done_logit=logits, entropy=torch.arange(4.0))
     env.reset(seed=0)
-    _, reward, terminated, truncated, info = env.step(torch.zeros(B, 7))
-    return reward, terminated, truncated, info["reward_parts"]
-
-
-def test_what_the_world_model_is_uncertain_of_ends_or_pays_less(config):
-    surely = replace(config, done_frames=1, done_threshold=0.4)
-    paid, terminated, truncated, parts = uncertain(surely)
-    assert terminated.tolist() == [True, True, False, False]
-    assert not truncated.any()
+    parts = env.step(torch.zeros(B, 7))[-1]["reward_parts"]
     torch.testing.assert_close(parts["done_entropy"], torch.tensor([0, 0.6931, 0.3653, 0]), atol=1e-3, rtol=0)
-    _, terminated, truncated, _ = uncertain(surely, limit=0.5, signal="done_entropy")
-    assert terminated.tolist() == [True, False, False, False]
-    assert truncated.tolist() == [False, True, False, False]
-    less, terminated, truncated, parts = uncertain(surely, limit=0.5, signal="token_entropy", effect="weight")
-    assert terminated.tolist() == [True, True, False, False]
-    assert not truncated.any()
     assert parts["token_entropy"].tolist() == [0, 1, 2, 3]
-    assert (paid < 0).any(), "a loss becomes no smaller"
-    torch.testing.assert_close(less, paid.where(paid < 0, paid * torch.tensor([1, 1 / 2, 1 / 4, 1 / 6])))
-    for wrong in ({"limit": 0.0}, {"signal": "mood"}, {"effect": "scold"}):
-        name, value = next(iter(wrong.items()))
-        with pytest.raises(ValueError, match=rf"^uncertainty\.{name}={value}"):
-            uncertain(config, **wrong)
 
 
 def test_episodes_last_as_long_as_the_world_model_has_learnt(config, trained_models, caplog):

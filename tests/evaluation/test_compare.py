@@ -31,7 +31,7 @@ from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.lerobot_env import runs_in_processes
 from lerobot_wmrl.evaluation import compare as running
-from lerobot_wmrl.evaluation.compare import checkpoint_name, opened
+from lerobot_wmrl.evaluation.compare import opened, resolved_name
 from lerobot_wmrl.evaluation.comparison import Comparison, Episode
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.scripts.compare import CompareConfig, compare
@@ -306,8 +306,8 @@ def test_a_link_to_a_checkpoint_names_the_checkpoint(tmp_path, monkeypatch):
         save_untrained_policy(folder / "pretrained_model")
         link_checkpoint(folder, "last")
         for given in ("run", "run/checkpoints/last", "run/checkpoints/last/pretrained_model"):
-            assert checkpoint_name(given) == str(folder)
-    assert checkpoint_name("lerobot/pusht") == "lerobot/pusht"
+            assert resolved_name(given) == str(folder)
+    assert resolved_name("lerobot/pusht") == "lerobot/pusht"
 
 
 def test_a_world_model_compares_a_policy_with_a_planner(imagination, tmp_path):

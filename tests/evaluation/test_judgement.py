@@ -214,7 +214,7 @@ def test_policies_references_and_coverage_may_be_added_and_what_was_imagined_is_
     found = results_of(replace(config, references=known, coverage=0.5))
     assert found["outcomes"] == {first: [True, False, False], second: [True] * 3}
     assert found["policies"][second]["real"]["k"] == 1
-    with pytest.raises(ValueError, match="holds a run with other settings"):
+    with pytest.raises(ValueError, match="was begun with other settings"):
         judge(replace(config, done_threshold=0.9999))
 
 

@@ -7,7 +7,8 @@ import numpy as np
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
-from lerobot_dataset_maniskill.manifest import EpisodePlan, planned_parts
+from lerobot_dataset_maniskill.manifest import EpisodePlan
+from lerobot_dataset_maniskill.maniskill import ManiSkillEpisodes
 from lerobot_dataset_maniskill.recorder import merge, missing_parts
 from lerobot_dataset_maniskill.worker import PartRecorder, PlannerDriver
 from lerobot_dataset_maniskill.writer import Outcome, StartColumns, add_step
@@ -50,11 +51,17 @@ class MadeUpRecorder(PartRecorder):
         return Frame(images, {}, np.zeros(8, np.float32), 0.0, success)
 
 
+def source_of(config: RecordConfig) -> ManiSkillEpisodes:
+    return ManiSkillEpisodes(config, config.recorded_content())
+
+
 def write_missing(config: RecordConfig, work: Path) -> None:
     """What the command does between claiming its folder and merging."""
-    recorder = MadeUpRecorder(config, work)
-    for part in missing_parts(work, planned_parts(config)):
-        recorder.record(part, lambda result: None)
+    source, recorder = source_of(config), MadeUpRecorder(config, work)
+    missing = missing_parts(work, source.parts)
+    for part in source.planned:
+        if part.name in missing:
+            recorder.record(part, lambda result: None)
 
 
 def record_made_up(config: RecordConfig) -> None:
@@ -62,5 +69,5 @@ def record_made_up(config: RecordConfig) -> None:
     work = config.root.with_name("work")
     work.mkdir()
     write_missing(config, work)
-    merge(config, work, planned_parts(config))
+    merge(source_of(config), work, config.root, config.dataset_id)
     shutil.rmtree(work)

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from lerobot_dataset_maniskill import recorder
+from lerobot_dataset_maniskill import maniskill
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.record import run
 from lerobot_dataset_maniskill.recorder import record
@@ -27,8 +27,8 @@ from tests.rl.checkpoints import save_untrained_policy
 @pytest.fixture(autouse=True)
 def _made_up(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is simulated."""
-    monkeypatch.setattr(recorder, "PartRecorder", MadeUpRecorder)
-    monkeypatch.setattr(recorder, "check_simulation", lambda config: None)
+    monkeypatch.setattr(maniskill, "PartRecorder", MadeUpRecorder)
+    monkeypatch.setattr(maniskill.ManiSkillEpisodes, "check", lambda self: None)
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Depth and jitter, as they come out of the dataset: equal to what the rebuilt start shows."""
+"""Depth and colours, as they come out of the dataset: equal to what the rebuilt start shows."""
 
 from pathlib import Path
 
@@ -13,9 +13,7 @@ from lerobot_wmrl.maniskill.scenes import SCENES
 
 
 def test_a_stored_start_and_its_depth_are_rebuilt_from_scene_and_seed(tmp_path: Path) -> None:
-    env = WmrlManiSkillEnv(
-        cameras=["third_view", "wrist"], image_size=64, light_jitter=0.2, camera_jitter=0.01, scenes=[1]
-    )
+    env = WmrlManiSkillEnv(cameras=["third_view", "wrist"], image_size=64, scenes=[1])
     config = RecordConfig(tmp_path / "dataset", num_episodes=1, num_workers=1, env=env, depth=True)
     record(config)
     dataset = LeRobotDataset("local/dataset", root=tmp_path / "dataset")

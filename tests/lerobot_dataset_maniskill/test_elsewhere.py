@@ -16,15 +16,15 @@ from lerobot.envs.configs import PushtEnv
 from lerobot.utils.constants import DEFAULT_FEATURES, OBS_IMAGE
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
-from lerobot_dataset_maniskill.elsewhere import record_elsewhere
 from lerobot_dataset_maniskill.merging import merge_folders
+from lerobot_dataset_maniskill.recorder import record
 from lerobot_wmrl.common.constants import START_SEED
 from lerobot_wmrl.common.images import to_bytes
 from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.data.dataset import DatasetSource, open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.features import matched
-from lerobot_wmrl.rl.recorders import RolloutRecorder
+from lerobot_wmrl.rl.rollout_recorder import RolloutRecorder
 from tests.pusht import record_pusht
 from tests.rl.checkpoints import save_untrained_policy
 
@@ -50,7 +50,7 @@ def config(demonstrations: Path, tmp_path: Path) -> RecordConfig:
 def test_they_have_the_columns_of_the_demonstrations_and_can_be_merged(
     config: RecordConfig, demonstrations: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    record_elsewhere(config)
+    record(config)
     assert "3 episodes, 18 frames" in capsys.readouterr().out
     table, given = (read_episodes(open_dataset(root)) for root in (config.root, demonstrations))
     assert table.dataset.features == given.dataset.features
@@ -73,7 +73,7 @@ def test_they_can_be_merged_with_a_dataset_that_is_described_in_other_words(
         feature["fps"] = info["fps"]
     (older / "meta" / "info.json").write_text(json.dumps(info))
     config.like = DatasetSource(str(older))
-    record_elsewhere(config)
+    record(config)
     merge_folders([older, config.root], tmp_path / "merged", "local/merged")
     merged = read_episodes(open_dataset(tmp_path / "merged"))
     assert len(merged.length) == 4
@@ -102,7 +102,7 @@ def test_videos_are_encoded_as_those_of_the_dataset(
     info["features"][OBS_IMAGE][key] = info["features"][OBS_IMAGE].pop("info")
     file.write_text(json.dumps(info))
     config.like = DatasetSource(str(videos.root))
-    record_elsewhere(config)
+    record(config)
     merge_folders([videos.root, config.root], tmp_path / "merged", "local/merged")
     assert len(read_episodes(open_dataset(tmp_path / "merged")).length) == 4
 
@@ -115,13 +115,13 @@ def test_a_dataset_of_another_rate_is_refused(
     file.write_text(json.dumps(json.loads(file.read_text()) | {"fps": 20}))
     config.like = DatasetSource(str(tmp_path / "faster"))
     with pytest.raises(ValueError, match="has 20 frames a second, the environment 10"):
-        record_elsewhere(config)
+        record(config)
 
 
 @pytest.mark.parametrize(("limit", "frames"), [(4, 4), (STEPS + 1, STEPS)])
 def test_an_episode_ends_at_the_lower_limit(config: RecordConfig, limit: int, frames: int) -> None:
     config.max_frames = limit
-    record_elsewhere(config)
+    record(config)
     assert read_episodes(open_dataset(config.root)).length.tolist() == [frames] * 3
 
 
@@ -132,7 +132,7 @@ def test_where_next_done_is_taken_for_success_it_says_success(
     bare = tmp_path / "bare"
     remove_feature(open_dataset(demonstrations), "next.success", output_dir=bare)
     config.like = DatasetSource(str(bare))
-    record_elsewhere(config)
+    record(config)
     table = read_episodes(open_dataset(config.root))
     assert "next.success" not in table.dataset.features
     assert not table.success.any(), "none of these episodes succeeds"
@@ -140,7 +140,7 @@ def test_where_next_done_is_taken_for_success_it_says_success(
 
 def test_names_and_range_can_be_taken_without_the_columns(config: RecordConfig, tmp_path: Path) -> None:
     config.like_columns = False
-    record_elsewhere(config)
+    record(config)
     features = open_dataset(config.root).features
     given = config.like.open().features
     assert features["action"]["names"] == given["action"]["names"]
@@ -178,26 +178,26 @@ def test_tasks_share_out_fewer_episodes_than_environments() -> None:
 def test_an_interrupted_recording_continues_and_a_whole_one_is_left_alone(
     config: RecordConfig, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    record, parts = RolloutRecorder.record, []
+    record_part, parts = RolloutRecorder.record, []
 
     def interrupted(self: RolloutRecorder, folder: Path, *args: Any) -> None:
         if len(parts) == 1:
             raise KeyboardInterrupt
         parts.append(folder.name)
-        record(self, folder, *args)
+        record_part(self, folder, *args)
 
     monkeypatch.setattr(RolloutRecorder, "record", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        record_elsewhere(config)
+        record(config)
     assert not config.root.exists()
     parts.clear()
-    record_elsewhere(config)
+    record(config)
     assert parts == ["part-00001"]
-    record_elsewhere(config)
+    record(config)
     assert "already recorded: 3 episodes" in capsys.readouterr().out
     config.exploration = 0.5
     with pytest.raises(ValueError, match=r"other settings \(exploration 0\.0 → 0\.5\)"):
-        record_elsewhere(config)
+        record(config)
 
 
 def test_without_demonstrations_the_environment_says_what_the_actions_are(
@@ -206,7 +206,7 @@ def test_without_demonstrations_the_environment_says_what_the_actions_are(
     far = save_untrained_policy(tmp_path / "far", OBS_IMAGE, size=96, actions=2, constant=600.0)
     config.policy = read_policy_config(str(far), [])
     config.like, config.video = DatasetSource(), False
-    record_elsewhere(config)
+    record(config)
     assert "the range is that of the action space of pusht; if the environment takes more" in caplog.text
     features = open_dataset(config.root).features
     assert features["action"]["info"] == {"low": [0.0, 0.0], "high": [512.0, 512.0]}
@@ -225,7 +225,7 @@ def test_bad_settings_are_named_and_nothing_is_left(
 ) -> None:
     setattr(config, setting, value)
     with pytest.raises(ValueError, match=message):
-        record_elsewhere(config)
+        record(config)
     assert not list(config.root.parent.glob("*rollouts*"))
 
 
@@ -236,6 +236,6 @@ def test_columns_that_a_rollout_lacks_are_named(
     panda = make_synthetic_dataset(tmp_path / "panda", episodes=1)
     config.like = DatasetSource(str(panda.root))
     with pytest.raises(ValueError, match="its actions have 7 components, the environment's 2"):
-        record_elsewhere(config)
+        record(config)
     with pytest.raises(ValueError, match=r"third_view: the dataset has it with shape \(32, 32, 3\)"):
         matched({"action": {"shape": (7,)}}, panda.meta.features)

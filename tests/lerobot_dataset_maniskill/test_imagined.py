@@ -96,9 +96,6 @@ def test_the_same_command_again_finds_it_complete_and_other_settings_are_refused
     config.env.done_frames = 1
     with pytest.raises(ValueError, match=r"other settings \(done_frames 2 → 1\)"):
         record(config)
-    config.env.done_frames, config.env.uncertainty.limit = 2, 0.5
-    with pytest.raises(ValueError, match=r"other settings \(uncertainty\.limit None → 0\.5\)"):
-        record(config)
 
 
 def test_frames_have_the_size_of_the_dataset_not_of_the_tokenizer(config, make_synthetic_dataset, tmp_path):

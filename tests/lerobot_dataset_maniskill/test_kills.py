@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 
 from lerobot_dataset_maniskill.manifest import planned_parts
-from lerobot_dataset_maniskill.recorder import count_episodes, merge
+from lerobot_dataset_maniskill.recorder import merge
 from lerobot_dataset_maniskill.writer import find_damage
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 from tests.lerobot_dataset_maniskill.killed_writers import ADVISED, Order, Writers, running_writers
-from tests.lerobot_dataset_maniskill.made_up import ROWS, write_missing
+from tests.lerobot_dataset_maniskill.made_up import ROWS, source_of, write_missing
 
 KILLS = 20
 
@@ -64,8 +64,8 @@ def test_twenty_kills_cost_nothing_that_was_finished(tmp_path: Path, writers: Wr
         one_part = min(one_part, kill_after / max(1, len(now) - len(finished)))
         finished = now
     write_missing(order.config, work)
-    merge(order.config, work, parts)
-    assert find_damage(tmp_path / "dataset", count_episodes(parts)) is None
+    merge(source_of(order.config), work, order.config.root, order.config.dataset_id)
+    assert find_damage(tmp_path / "dataset", 90) is None
     table = recorded_episodes(tmp_path / "dataset")
     assert sorted(table["seed"]) == list(range(90))
     assert set(table["length"]) == {ROWS}

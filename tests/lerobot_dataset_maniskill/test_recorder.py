@@ -17,8 +17,9 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.manifest import planned_parts
-from lerobot_dataset_maniskill.merging import require_same
-from lerobot_dataset_maniskill.recorder import follow_workers, missing_parts, record
+from lerobot_dataset_maniskill.maniskill import follow_workers
+from lerobot_dataset_maniskill.merging import require_same_recording
+from lerobot_dataset_maniskill.recorder import missing_parts, record
 from lerobot_dataset_maniskill.writer import HOLD_FRAMES, find_damage
 from lerobot_wmrl.common.constants import KINDS
 from lerobot_wmrl.data.dataset import open_dataset
@@ -26,6 +27,7 @@ from lerobot_wmrl.data.frame_cache import cached_frames
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.maniskill.embodiment import STATE_NAMES
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
+from tests.lerobot_dataset_maniskill.made_up import source_of
 
 EPISODES, PART = 6, 2
 KIND_SHARES = {"optimal": 0.5, "near_miss": 0.5}
@@ -74,8 +76,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copytree(work / "part-00000", work / "part-00002", dirs_exist_ok=True)
     for video in (work / "part-00002").rglob("*.mp4"):
         os.truncate(video, video.stat().st_size // 2)
-    parts = planned_parts(config(root))
-    assert "part-00000" not in {part.name for part in missing_parts(work, parts)}
+    assert "part-00000" not in missing_parts(work, source_of(config(root)).parts)
     assert not torn.exists()
     assert not (work / "part-00002").exists()
     assert (work / "part-00000" / "meta" / "info.json").stat().st_mtime_ns == first
@@ -141,11 +142,11 @@ def test_other_settings_and_foreign_folders_are_refused(recorded: Path, tmp_path
         record(config(recorded, seed=5))
     stored, other = (config(recorded, video=video).recorded_content() for video in (True, False))
     with pytest.raises(ValueError, match=r"other settings \(video True → False\)"):
-        require_same(stored, other, tmp_path)
+        require_same_recording(stored, other, tmp_path)
     del stored["video"]  # as earlier versions wrote it
-    require_same(stored, config(recorded, video=True).recorded_content(), tmp_path)
+    require_same_recording(stored, config(recorded, video=True).recorded_content(), tmp_path)
     with pytest.raises(ValueError, match=r"other settings \(video True → False\)"):
-        require_same(stored, other, tmp_path)
+        require_same_recording(stored, other, tmp_path)
     (tmp_path / "dataset").mkdir()
     (tmp_path / "dataset" / "thesis.txt").write_text("do not lose")
     with pytest.raises(ValueError, match="holds something else"):

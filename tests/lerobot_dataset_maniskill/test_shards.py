@@ -68,5 +68,5 @@ def test_merged_shards_are_the_whole_and_merged_again_say_so(
     capsys.readouterr()
     merge_shards(shards, tmp_path / "whole", "local/whole")
     assert "is already recorded: 5 episodes" in capsys.readouterr().out
-    with pytest.raises(ValueError, match=r"shard-1: holds a recording with other settings"):
+    with pytest.raises(ValueError, match=r"shard-1: was begun with other settings"):
         merge_shards(shards, shards[1], "local/whole")

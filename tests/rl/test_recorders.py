@@ -1,7 +1,7 @@
 """A policy is recorded in an environment that nobody here has built: PushT, by LeRobot's own plugin."""
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from gym_pusht.envs.pusht import PushTEnv
 from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.envs.configs import PushtEnv
+from lerobot.envs.configs import EnvConfig, PushtEnv
 from lerobot.scripts.lerobot_eval import rollout
 from lerobot.utils.constants import OBS_IMAGE
 
@@ -20,8 +22,9 @@ from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.embodiment import Embodiment, check_same_robot
 from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
 from lerobot_wmrl.evaluation.agreement import policy_outcomes
-from lerobot_wmrl.rl import recorders
-from lerobot_wmrl.rl.recorders import EnvRecorder, robot_of
+from lerobot_wmrl.rl import rollout_recorder
+from lerobot_wmrl.rl.recorders import EnvRecorder
+from lerobot_wmrl.rl.rollout_recorder import robot_of
 from tests.rl.checkpoints import save_untrained_policy
 
 STEPS, AIM = 5, 250.0
@@ -91,11 +94,47 @@ def test_what_a_policy_does_after_its_episode_is_not_counted(
         seen.clipped = [torch.full((2,), float(step >= 2)) for step in range(STEPS)]
         return taken
 
-    monkeypatch.setattr(recorders, "rollout", first_ends_early)
+    monkeypatch.setattr(rollout_recorder, "rollout", first_ends_early)
     recorder = EnvRecorder(PushtEnv(episode_length=STEPS), ROBOT, "cpu", num_envs=2)
     recorder.record(checkpoint, 2, 7, tmp_path / "rollouts")
     assert read_episodes(open_dataset(tmp_path / "rollouts")).length.tolist() == [2, STEPS]
     assert "42.9 % of the components" in caplog.text, "three of seven steps"
+
+
+@EnvConfig.register_subclass("test_next_step")
+@dataclass
+class NextStepPusht(PushtEnv):
+    """PushT in a vector environment that resets in the step after an end, as LIBERO's."""
+
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, Any]]:
+        made = PushtEnv(episode_length=STEPS).create_envs(n_envs, use_async_envs)
+        for tasks in made.values():
+            tasks[0].autoreset_mode = AutoresetMode.NEXT_STEP
+        return made
+
+
+def test_a_finished_episode_is_not_reset_while_the_others_go_on(
+    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In LIBERO every reset takes another start."""
+    reset, step, resets = PushTEnv.reset, PushTEnv.step, []
+
+    def noted(self: PushTEnv, seed: int | None = None, options: Any = None) -> Any:
+        resets.append(seed)
+        self.ends = seed == 7
+        return reset(self, seed=seed, options=options)
+
+    def ended(self: PushTEnv, action: np.ndarray) -> Any:
+        seen, reward, terminated, truncated, info = step(self, action)
+        return seen, reward, terminated or self.ends, truncated, info
+
+    monkeypatch.setattr(PushTEnv, "reset", noted)
+    monkeypatch.setattr(PushTEnv, "step", ended)
+    recorder = EnvRecorder(NextStepPusht(episode_length=STEPS), ROBOT, "cpu", num_envs=2)
+    recorder.record(checkpoint, 2, 7, tmp_path / "rollouts")
+    assert read_episodes(open_dataset(tmp_path / "rollouts")).length.tolist() == [1, STEPS]
+    assert [seed for seed in resets if seed is not None] == [7, 8]
+    assert None not in resets[resets.index(7) :]
 
 
 def test_actions_may_go_as_far_as_those_of_the_same_robots_dataset(

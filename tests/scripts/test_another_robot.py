@@ -12,7 +12,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import OBS_IMAGE
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
-from lerobot_dataset_maniskill.elsewhere import record_elsewhere
+from lerobot_dataset_maniskill.recorder import record
 from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
 from lerobot_policy_wm_mpc.modeling_wm_mpc import WmMpcPolicy
 from lerobot_wmrl.common.policies import read_policy_config
@@ -126,7 +126,7 @@ def test_its_imagined_episodes_are_recorded(
         reward=GeneralConfig(alpha=1.0), done_threshold=threshold, done_frames=2,
     )  # fmt: skip
     policy = save_untrained_policy(tmp_path / "policy", OBS_IMAGE, size=(HEIGHT, WIDTH), constant=30.0)
-    record_elsewhere(RecordConfig(
+    record(RecordConfig(
         output_dir=tmp_path / "imagined", env=env, num_episodes=3, part_episodes=2, exploration=0.1,
         policy=read_policy_config(str(policy), []), video=False,
     ))  # fmt: skip

@@ -16,7 +16,7 @@ from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.maniskill.scenes import scenes_of
 from lerobot_wmrl.rl import dyna, recorders
 from lerobot_wmrl.rl.budget import check_data
-from lerobot_wmrl.scripts.train import TrainConfig
+from lerobot_wmrl.rl.configuration_train import TrainConfig
 from lerobot_wmrl.scripts.train import main as train
 from lerobot_wmrl.scripts.train_world_model import main as train_world_model
 from tests.rl.checkpoints import save_untrained_policy

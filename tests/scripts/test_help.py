@@ -106,7 +106,7 @@ def test_a_groups_explanation_stands_before_its_first_flag() -> None:
 def test_flags_of_a_chosen_type_are_listed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.argv", ["lerobot-wmrl-train", "--env.type=wmrl_maniskill", "--help"])
     text = help_of(train.train_policy, train.TrainConfig)
-    assert "--env.light_jitter" in text
+    assert "--env.robot_mesh_detail" in text
     assert "--env.world_model_path  " not in text
 
 

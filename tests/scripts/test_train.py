@@ -18,7 +18,9 @@ from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
-from lerobot_wmrl.scripts.train import TrainConfig, check_config, evaluation, main, rollout_length
+from lerobot_wmrl.rl.configuration_train import TrainConfig, check_config
+from lerobot_wmrl.rl.trained_policy import evaluation
+from lerobot_wmrl.scripts.train import main, rollout_length
 from tests.commands import run_here
 from tests.hub_server import Hub
 from tests.rl.checkpoints import save_untrained_policy

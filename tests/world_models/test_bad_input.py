@@ -193,7 +193,7 @@ def test_a_second_tokenizer_is_refused(small_dataset, trained_models, tmp_path):
     root, tokenizer = Path(small_dataset.root), trained_models["frame_tokenizer"]
     other = train_tokenizer(root, tmp_path / "other", steps=1, seed=1)
     run = run_training(action_config(tokenizer), root, tmp_path / "run", steps=2)
-    with pytest.raises(ValueError, match=r"holds a run with other settings \(model"):
+    with pytest.raises(ValueError, match=r"was begun with other settings \(model"):
         run_training(action_config(other), root, run, steps=3)
     trained = str(run / "checkpoints" / "last" / "pretrained_model")
     with pytest.raises(FieldError, match=r"^tokenizer_path=.*other: the world model at .* carries the tok"):

@@ -14,7 +14,7 @@ from safetensors.torch import load_file
 from transformers import BertConfig
 
 from lerobot_wmrl.common.checkpoints import resolve_checkpoint
-from lerobot_wmrl.common.command_line import CONFIG_FILE
+from lerobot_wmrl.common.output_folders import CONFIG_FILE
 from lerobot_wmrl.world_models import losses
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.goal import imagine_goal

@@ -1,0 +1,171 @@
+"""Configuration of lerobot-wmrl-train."""
+
+import logging
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar
+
+import draccus
+from lerobot.configs import PreTrainedConfig, parser
+from lerobot.configs.default import PeftConfig, WandBConfig
+from lerobot.envs.configs import EnvConfig
+from lerobot.rl.algorithms.configs import RLAlgorithmConfig
+
+from lerobot_wmrl.common.command_line import RunConfig
+from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.errors import FieldError, require_at_least
+from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
+from lerobot_wmrl.rl.configuration_algorithms import PolicyGradientConfig, PPOConfig
+from lerobot_wmrl.rl.configuration_callbacks import CallbackSettings
+from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
+from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
+
+PUBLISHING = ("push_to_hub", "repo_id", "private", "license", "tags")
+"""Settings of the policy that only matter when it is published."""
+
+MAY_DIFFER = (
+    "resume", "job_name", "log_freq", "wandb", "gate.action", "dyna.dataset",
+    *(f"policy.{name}" for name in PUBLISHING),
+)  # fmt: skip
+"""Settings that may change when a run is resumed."""
+
+
+@dataclass
+class TrainConfig(CallbackSettings, RunConfig):
+    """Train a policy further by reinforcement learning.
+
+    `--preset=tiny|demo|cpu` stands for the flags of that size; flags further right override it.
+
+    Args:
+        policy: the SFT policy to improve, `--policy.path=FOLDER`: a checkpoint, or the output folder of
+            lerobot-train. PPO and GRPO train `cnn`, `act` and `openvla`; distillation trains any policy that
+            lerobot-train can clone.
+        env: `--env.type=world_model`, `wmrl_maniskill` or one of LeRobot's, and its settings.
+        algorithm: `--algorithm.type=ppo`, `grpo` or `distillation`, and its settings.
+        peft: `--peft.method_type=LORA --peft.r=32`, as in lerobot-train, trains new adapters and the value
+            function alone. A policy that has adapters already needs none of these flags.
+        output_dir: folder of checkpoints and metrics. If it holds this run already, the run continues.
+        num_envs: environments stepped together, in each process of `torchrun`.
+        rollout_steps: steps of each environment in a rollout; by default the longest episode.
+        iterations: number of rollouts, each followed by an update.
+        save_freq: iterations between checkpoints.
+        log_freq: iterations between lines in the terminal.
+        seed: seed of sampling and of the episodes, below 1,000,000. Seeds from there on are for evaluation.
+        resume: require a checkpoint in `output_dir` and continue from it, as in lerobot-train. Works with
+            `--config_path=outputs/rl/train_config.json` in place of all other flags too. Without this flag
+            the same command begins or continues.
+        wandb: `--wandb.enable=true` sends the metrics to Weights & Biases too, as lerobot-train does.
+        job_name: name of the run in Weights & Biases.
+        budget: ledger of the real episodes that a method may learn from, a JSON file (docs/protocol.md). It
+            must know the episodes of all datasets. Recordings in `real_env` are entered, and so are the steps
+            of a training outside a world model, as rollouts. Selection in `real_env` is refused.
+        real_env: any environment of LeRobot's, for selection, gate and Dyna: `--real_env.type=…` and its
+            settings.
+        real_num_envs: environments that run at once in `real_env`.
+        selection: choice of the checkpoint that is kept as `checkpoints/best`; off by default.
+        gate: check of the world model's false positive rate.
+        dyna: rounds that train the world model further on new rollouts of the current policy; off by default.
+    """
+
+    path_fields: ClassVar[list[str]] = ["policy"]
+    other_names: ClassVar[dict[str, str]] = {"steps": "iterations", "batch_size": "num_envs"}
+    dataset: ClassVar[None] = None
+    is_reward_model_training: ClassVar[bool] = False
+
+    policy: PreTrainedConfig | None = None
+    env: EnvConfig | None = None
+    algorithm: RLAlgorithmConfig = field(default_factory=PPOConfig)
+    peft: PeftConfig | None = None
+    output_dir: Path = Path("outputs/rl")
+    num_envs: int = 64
+    rollout_steps: int | None = None
+    iterations: int = 40
+    save_freq: int = 5
+    log_freq: int = 1
+    seed: int = 0
+    resume: bool = False
+    wandb: WandBConfig = field(default_factory=WandBConfig)
+    job_name: str | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the configuration as the dictionary that LeRobot's WandBLogger asks for."""
+        return draccus.encode(self)
+
+
+def check_config(cfg: TrainConfig) -> None:
+    """Raise FieldError for the first setting that is impossible."""
+    if not isinstance(cfg.algorithm, PolicyGradientConfig | DistillationConfig):
+        raise FieldError(
+            "algorithm.type", cfg.algorithm.type, "this command trains with ppo, grpo or distillation"
+        )
+    if cfg.env is None:
+        raise FieldError("env.type", None, "is missing", "choose world_model, or another environment")
+    require_at_least(cfg, 1, "num_envs", "iterations", "save_freq", "log_freq")
+    if isinstance(cfg.algorithm, PPOConfig) and cfg.algorithm.value_iterations >= cfg.iterations:
+        logging.warning(
+            "iterations=%d: the policy stays as it is, because the value function alone learns in the first "
+            "%d (algorithm.value_iterations)", cfg.iterations, cfg.algorithm.value_iterations,
+        )  # fmt: skip
+    if isinstance(cfg.algorithm, GRPOConfig):
+        cfg.algorithm.check_num_envs(cfg.num_envs)
+    if isinstance(cfg.algorithm, DistillationConfig):
+        check_distillation(cfg.algorithm, cfg.env)
+    if not 0 <= cfg.seed < EVALUATION_SEED:
+        raise FieldError(
+            "seed", cfg.seed, f"must be from 0 to {EVALUATION_SEED - 1}; those above are for evaluation"
+        )
+    cfg.check_callbacks(cfg.env, cfg.iterations)
+
+
+def check_distillation(algorithm: DistillationConfig, env: EnvConfig) -> None:
+    """Raise FieldError unless the planner can look ahead in the environment."""
+    if not isinstance(env, WorldModelEnv):
+        raise FieldError(
+            "algorithm.type", "distillation",
+            f"its planner looks ahead in a world model, and `env.type` is {env.type}",
+            "set `env.type` to world_model, or choose ppo or grpo",
+        )  # fmt: skip
+    if env.done_frames > algorithm.planner.horizon:
+        raise FieldError(
+            "algorithm.planner.horizon", algorithm.planner.horizon,
+            f"must be at least `env.done_frames`, {env.done_frames}",
+        )  # fmt: skip
+
+
+def load_config(cfg: TrainConfig) -> PreTrainedConfig:
+    """Read the policy's configuration into `cfg` and return it.
+
+    Whether and where the policy is published comes from the command line or a resumed run's configuration.
+    The checkpoint's own settings are ignored, because they would overwrite the SFT policy on the hub.
+    """
+    from lerobot_wmrl.common.policies import read_policy_config
+
+    path = parser.get_path_arg("policy") or (cfg.policy and cfg.policy.pretrained_path)
+    if not path:
+        raise ValueError("--policy.path: give the checkpoint of the policy to train")
+    stored = cfg.policy
+    typed = parser.get_cli_overrides("policy") or []
+    cfg.policy = read_policy_config(str(path), ["--push_to_hub=false", "--repo_id=null", *typed])
+    if stored is not None:
+        for name in PUBLISHING:
+            setattr(cfg.policy, name, getattr(stored, name))
+    if cfg.policy.push_to_hub and not cfg.policy.repo_id:
+        raise FieldError("policy.push_to_hub", True, "give its name on the hub, --policy.repo_id=user/name")
+    if cfg.policy.push_to_hub:
+        require_published_base(cfg, cfg.policy)
+    return cfg.policy
+
+
+def require_published_base(cfg: TrainConfig, policy: PreTrainedConfig) -> None:
+    """Raise FieldError if adapters are to be published and what they adapt is a folder of this machine."""
+    from lerobot_wmrl.common.policies import adapter_config
+
+    base = policy.pretrained_path if cfg.peft is not None else None
+    if policy.use_peft:
+        base = adapter_config(policy).base_model_name_or_path
+    if base is not None and Path(base).exists():
+        raise FieldError(
+            "policy.push_to_hub", True, f"the adapters belong to the policy in {base}, which nobody else has",
+            "publish that one, and give its name on the hub: with new adapters as `policy.path`, else in "
+            "adapter_config.json, base_model_name_or_path",
+        )  # fmt: skip

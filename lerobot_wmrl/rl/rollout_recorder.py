@@ -1,0 +1,274 @@
+"""A policy's rollouts in any environment of LeRobot's, as LeRobotDatasets."""
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.envs import make_env, make_env_pre_post_processors
+from lerobot.envs.configs import EnvConfig
+from lerobot.scripts.lerobot_eval import rollout
+from lerobot.utils.constants import ACTION, OBS_IMAGE
+from torch import Tensor
+
+from lerobot_wmrl.common.actions import clip_actions, warn_of_clipped
+from lerobot_wmrl.common.constants import KINDS, POLICY, START_KIND, START_SEED, Observation
+from lerobot_wmrl.common.errors import FieldError, renamed
+from lerobot_wmrl.common.exploration import ExplorationNoise
+from lerobot_wmrl.common.files import whole_folder
+from lerobot_wmrl.common.images import to_bytes
+from lerobot_wmrl.common.policies import load_policy, load_processors
+from lerobot_wmrl.data.embodiment import (
+    Embodiment,
+    component_names,
+    observed_range,
+    read_embodiment,
+    recorded_range,
+)
+from lerobot_wmrl.data.features import encoder_of, episode_features, matched, observation_row
+from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
+from lerobot_wmrl.envs.lerobot_env import FRAME_LIMIT, freeze_finished
+
+IMAGE_WRITERS = 4
+"""Threads that compress the frames of rollouts in a LeRobot environment."""
+
+
+class RolloutRecorder:
+    """A policy in an environment of LeRobot's, whose episodes become LeRobotDatasets.
+
+    Args:
+        env: the environment; if it has several tasks, they take turns.
+        policy: configuration of the policy.
+        robot: names and range of the actions, and names of the state; None for what `like` or the
+            environment says.
+        exploration: largest noise on the actions, as a share of half their range.
+        like: metadata of a dataset of the same robot.
+        like_columns: take its columns too, so that the new one can be merged with it.
+        num_envs: episodes at once.
+        video: store the cameras as videos; without `like`, which decides it.
+        max_frames: limit of an episode, if the environment's own limit is not lower.
+    """
+
+    def __init__(
+        self, env: EnvConfig, policy: PreTrainedConfig, robot: Embodiment | None, exploration: float = 0.0,
+        like: Any | None = None, num_envs: int = 1, video: bool = False, like_columns: bool = True,
+        max_frames: int | None = None,
+    ) -> None:  # fmt: skip
+        self.config, self.exploration, self.video = env, exploration, video
+        self.columns = like.features if like is not None and like_columns else None
+        self.robot_type = like.robot_type if like is not None else None
+        self.hold = env.done_frames if isinstance(env, WorldModelEnv) else 1
+        self.policy, self.processors = load_policy(policy).eval(), load_processors(policy)
+        self.env_processors = make_env_pre_post_processors(env, policy)
+        made = make_env(env, num_envs, use_async_envs=False)
+        self.envs = [each for tasks in made.values() for each in tasks.values()]
+        if max_frames is not None:
+            for each in self.envs:
+                each.set_attr(FRAME_LIMIT, min(max_frames, each.get_attr(FRAME_LIMIT)[0]))
+        for each in self.envs:
+            freeze_finished(each)
+        self.robot = robot or robot_of(env, self.envs[0], like)
+        self.range_is_guessed = robot is None and like is None and not isinstance(env, WorldModelEnv)
+        if like is not None and like_columns and like.fps != env.fps:
+            raise FieldError(
+                "like.root", like.root, f"has {like.fps} frames a second, the environment {env.fps}",
+                "give a dataset of the same rate, or `like_columns=false` if nothing is to be merged",
+            )  # fmt: skip
+
+    def close(self) -> None:
+        """Close the environments."""
+        for env in self.envs:
+            env.close()
+
+    def record(self, folder: Path, seeds: Sequence[int], report: Callable[[bool], None]) -> None:
+        """Record a dataset in `folder`, which appears when it is whole: one episode from each seed.
+
+        Where the environment has several tasks, consecutive seeds belong to different ones; the dataset has
+        the episodes of one task after those of another.
+
+        report: is told of every episode whether it succeeds.
+        """
+        dataset, clipped = None, list[float]()
+        with whole_folder(folder) as partial:
+            for env, chosen in self._batches(seeds):
+                seen, taken = self._roll_out(env, chosen)
+                dataset = dataset or self._create(partial, seen.observations[0])
+                for row, seed in enumerate(chosen):
+                    length = int(taken["done"][row].int().argmax()) + 1
+                    report(self._add_episode(dataset, seen, taken, row, seed, length))
+                    clipped += [float(shares[row]) for shares in seen.clipped[:length]]
+            assert dataset is not None, "there is no seed"
+            dataset.finalize()
+        warn_of_clipped(clipped)
+        if any(clipped) and self.range_is_guessed:
+            logging.warning(
+                "the range is that of the action space of %s; if the environment takes more, record again "
+                "with `like.root`, a dataset of the same robot whose actions show it", self.config.type,
+            )  # fmt: skip
+
+    def _batches(self, seeds: Sequence[int]) -> Iterator[tuple[Any, Sequence[int]]]:
+        """Yield the environments of a task, and the seeds of the next episodes in them."""
+        for task, env in enumerate(self.envs):
+            own = [seed for seed in seeds if seed % len(self.envs) == task]
+            for first in range(0, len(own), env.num_envs):
+                yield env, own[first : first + env.num_envs]
+
+    def _roll_out(self, env: Any, seeds: Sequence[int]) -> tuple["RecordingProcessors", dict[str, Tensor]]:
+        """Return what the policy saw and did from these seeds, and LeRobot's record of the outcome."""
+        spare = [seeds[-1]] * (env.num_envs - len(seeds))
+        noises = [ExplorationNoise(self.exploration, seed, self._scale()) for seed in [*seeds, *spare]]
+        seen = RecordingProcessors(*self.processors, noises, self.robot)
+        taken = rollout(
+            env, self.policy, *self.env_processors, seen.preprocess, seen.postprocess, seeds=[*seeds, *spare]
+        )
+        return seen, taken
+
+    def _scale(self) -> np.ndarray:
+        return (np.array(self.robot.action_high) - np.array(self.robot.action_low)) / 2
+
+    def _create(self, folder: Path, observation: Observation) -> LeRobotDataset:
+        """Create an empty dataset for what this observation shows."""
+        whole = {"dtype": "int64", "shape": (1,), "names": None}
+        own = {
+            **episode_features(observation, self.robot, "video" if self.video else "image"),
+            START_SEED: whole, START_KIND: whole,
+        }  # fmt: skip
+        features = own if self.columns is None else matched(own, self.columns)
+        return LeRobotDataset.create(
+            f"local/{folder.name.strip('.')}", self.config.fps, features, root=folder,
+            robot_type=self.robot_type, rgb_encoder=encoder_of(self.columns or {}),
+            use_videos=any(feature["dtype"] == "video" for feature in features.values()),
+            image_writer_threads=IMAGE_WRITERS,
+        )  # fmt: skip
+
+    def _add_episode(
+        self,
+        dataset: LeRobotDataset,
+        seen: "RecordingProcessors",
+        taken: dict[str, Tensor],
+        row: int,
+        seed: int,
+        length: int,
+    ) -> bool:
+        """Add the episode of one environment of a rollout. Return whether it succeeds."""
+        success = bool(taken["success"][row, length - 1])
+        labelled = "next.success" in dataset.features  # else next.done is taken for it
+        for step in range(length):
+            observation = seen.observations[step]
+            frame: dict[str, Any] = observation_row(observation, row)
+            solved = bool(taken["success"][row, step]) or (success and step >= length - self.hold)
+            frame |= {
+                ACTION: seen.actions[step][row],
+                "next.reward": np.array([float(taken["reward"][row, step])], np.float32),
+                "next.success": np.array([solved]),
+                "next.done": np.array([step == length - 1 if labelled else solved]),
+                START_SEED: np.array([seed]), START_KIND: np.array([KINDS.index(POLICY)]),
+            }  # fmt: skip
+            kept = {key: value for key, value in frame.items() if key in dataset.features}
+            dataset.add_frame({**kept, "task": (observation.get("task") or [""])[row]})
+        dataset.save_episode()
+        return success
+
+
+def robot_of(config: EnvConfig, env: Any, like: Any | None) -> Embodiment:
+    """Return the robot of an environment.
+
+    Args:
+        config: the environment's.
+        env: the environment.
+        like: metadata of a dataset of the same robot, whose names are taken, and whose range if it states
+            one. Else the range is that of the environment's action space, widened to that of the actions in
+            `like`: an environment may take more than its space says, as LeRobot's Aloha does (joint angles,
+            "from -1 to 1"). Without `like`, numbers are the names.
+
+    Raises:
+        FieldError: the actions of both have other numbers of components, or neither says how large they are.
+    """
+    if isinstance(config, WorldModelEnv):
+        return env.env.model.config.embodiment
+    space = env.single_action_space
+    low, high = np.asarray(space.low, float).tolist(), np.asarray(space.high, float).tolist()
+    bounded = bool(np.isfinite([low, high]).all())
+    if like is not None:
+        count = int(np.prod(like.features[ACTION]["shape"]))
+        if count != len(low):
+            raise FieldError(
+                "like.root", like.root, f"its actions have {count} components, the environment's {len(low)}",
+                "give a dataset of the same robot",
+            )  # fmt: skip
+        given = Embodiment()
+        with renamed("dataset.root", "like.root"):
+            if recorded_range(like.features[ACTION]) is None and bounded:
+                given = widened(config, low, high, like)
+            return read_embodiment(like, given)
+    if not bounded:
+        raise FieldError(
+            "env.type", config.type, "does not say between which values its actions are",
+            "give a dataset of the same robot, `like.root` or `like.repo_id`",
+        )  # fmt: skip
+    return Embodiment(config.fps, [str(index) for index in range(len(low))], low, high)
+
+
+def widened(config: EnvConfig, low: list[float], high: list[float], like: Any) -> Embodiment:
+    """Return the range of an environment's actions, widened to that of a dataset's; warns where it was."""
+    least, most = observed_range(like)
+    beyond = [
+        f"{name} {seen[0]:.4g} to {seen[1]:.4g} (in {config.type} {own[0]:.4g} to {own[1]:.4g})"
+        for name, own, seen in zip(
+            component_names(like.features[ACTION]), zip(low, high, strict=True),
+            zip(least, most, strict=True), strict=True,
+        )
+        if seen[0] < own[0] or seen[1] > own[1]
+    ]  # fmt: skip
+    if beyond:
+        logging.warning(
+            "like.root: actions go beyond the environment's action space, and so may the policy's: %s. Are "
+            "they in the same units?", ", ".join(beyond),
+        )  # fmt: skip
+    return Embodiment(action_low=np.minimum(low, least).tolist(), action_high=np.maximum(high, most).tolist())
+
+
+@dataclass
+class RecordingProcessors:
+    """Wrap a policy's processors: keep observations and actions, and add exploration noise to the actions.
+
+    Args:
+        before, after: the policy's pre- and postprocessor.
+        noises: what is added to the actions, one for each environment.
+        robot: robot whose range the actions keep.
+    """
+
+    before: Any
+    after: Any
+    noises: Sequence[ExplorationNoise]
+    robot: Embodiment
+    observations: list[Observation] = field(default_factory=list)
+    actions: list[np.ndarray] = field(default_factory=list)
+    clipped: list[Tensor] = field(default_factory=list)
+    """Of each step, the share of the components of the policy's actions that were out of range. (B,)"""
+
+    def preprocess(self, observation: Observation) -> Observation:
+        """Keep a batch of observations in LeRobot's names, images in uint8, and prepare it for the policy."""
+        self.observations.append(
+            {
+                name: to_bytes(value) if name.startswith(OBS_IMAGE) else value
+                for name, value in observation.items()
+            }
+        )
+        prepared: Observation = self.before(observation)
+        return prepared
+
+    def postprocess(self, action: Tensor) -> Tensor:
+        """Return the policy's actions in the dataset's units, with noise, within their range. (B, A)"""
+        low, high = torch.tensor(self.robot.action_low), torch.tensor(self.robot.action_high)
+        chosen = self.after(action).cpu().float()
+        self.clipped.append(clip_actions(chosen, low, high)[1])
+        noise = torch.from_numpy(np.stack([noise() for noise in self.noises])).float()
+        kept = (chosen + noise).clamp(low, high)
+        self.actions.append(kept.numpy())
+        return kept
