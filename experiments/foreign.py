@@ -11,7 +11,7 @@ from experiments.cells import Load, counted, points
 from experiments.study import ROOT, Study, read_cells
 from experiments.success import Results, rate
 from experiments.value import seconds
-from experiments.value_sections import Cell, against, published
+from experiments.value_cells import Cell, against, published
 from lerobot_wmrl.common.files import markdown_table as table
 from lerobot_wmrl.common.statistics import RunsMean
 from lerobot_wmrl.evaluation.comparison import RESULTS

@@ -8,7 +8,7 @@ from typing import Final
 from experiments import figures
 from experiments.cells import DOMAINS, Load, counted, points
 from experiments.study import ROOT, read_cells
-from experiments.value_sections import SCENES, Cell, best, gain, measured, published, shares
+from experiments.value_cells import SCENES, Cell, best, gain, measured, published, shares
 from lerobot_wmrl.common.files import markdown_table as table
 
 STUDY: Final = "value_four_tasks"

@@ -1,9 +1,11 @@
 """Sections of docs/results.md about policies: an answer in a sentence and one table, from the JSON."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Final
 
 from experiments.cells import DOMAINS, Load, counted, paired, percents, points, share
+from experiments.study import ROOT, read_cells
+from experiments.value_cells import SCENES, against, published
 from lerobot_wmrl.common.files import markdown_table as table
 from lerobot_wmrl.improve.improvement import CLONED, DISTILLED
 
@@ -164,3 +166,37 @@ probability of 0.95 in two consecutive frames); whether that explains the differ
 {table(["cloned from", "known scenes", "unseen scenes", "known scenes, on the same starts"], rows)}
 
 Each rate is over {found["episodes"]} starts; one seed."""
+
+
+DRIVEN: Final = {
+    "driven_cloning": "driven by keys in the world model",
+    "optimal_cloning": "planned in ManiSkill",
+    "human_like_cloning": "planned in ManiSkill, with pauses and detours",
+}
+"""Method → what its policy is cloned from."""
+
+
+def driven(load: Load) -> str:
+    """Return the section: success of policies cloned from driven demonstrations, beside planned ones."""
+    rows = []
+    for each in read_cells(ROOT / "experiments" / "driven.yaml"):
+        cell = published(load, "driven", each.variables["cell"])
+        if not cell:
+            continue
+        reference = cell["methods"]["driven_cloning"]
+        for name, title in DRIVEN.items():
+            found = cell["methods"][name]
+            rates = [
+                f"{100 * found[domain]['share']:.0f} %" if name == "driven_cloning"
+                else against(found[domain], reference[domain])
+                for domain in SCENES
+            ]  # fmt: skip
+            rows.append([cell["count"], title, cell["seed"], *rates])
+    return f"""Policies cloned from as many demonstrations of each kind, on the same starts. Changes are
+against the first row:
+
+{table(["episodes", "demonstrations", "seed", "known scenes", "unseen scenes"], rows)}
+
+A scripted person holds keys down for what a planner in the world model finds, which changes what PPO's
+policy would do, does again what fails, and ends an episode at success. LeRobot's own `lerobot-record`
+records it in real time, without the simulator."""

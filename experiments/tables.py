@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from experiments import foreign, four_tasks_section, judged
+from experiments import foreign, four_tasks_section, judged, value_cells, value_figure
 from experiments import policy_sections as policies
 from experiments import value_sections as value
 from experiments import world_model_sections as world_models
@@ -26,14 +26,18 @@ from lerobot_wmrl.common.files import write_text
 DOCS: Final = ROOT / "docs"
 STUDIES: Final = ROOT / "experiments"
 
-SECOND_ROWS: Final = partial(value.rows_above, study=value.SECOND_STUDY, parts=value.SECOND_PARTS)
+SECOND_ROWS: Final = partial(value.rows_above, study=value_cells.SECOND_STUDY, parts=value_cells.SECOND_PARTS)
 
-TASKS_ROWS: Final = partial(value.rows_above, study=value.TASKS_STUDY, parts=value.TASKS_PARTS)
+TASKS_ROWS: Final = partial(value.rows_above, study=value_cells.TASKS_STUDY, parts=value_cells.TASKS_PARTS)
 
 SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     "value_push": ("Policies", value.value_push),
     "value_pick_place": ("Policies", value.value_pick_place),
     "value_pick_place_longer": ("Policies", partial(SECOND_ROWS, ["longer_filtered"])),
+    "value_pick_place_longer_imagined": (
+        "Policies",
+        partial(SECOND_ROWS, ["longer_filtered", "longer_imagined_ppo"]),
+    ),
     "value_pick_place_simulator": ("Policies", partial(SECOND_ROWS, ["simulated_ppo"])),
     "value_pick_place_dyna": ("Policies", partial(SECOND_ROWS, ["dyna"])),
     "value_pick_place_iterated": ("Policies", partial(SECOND_ROWS, ["iterated", "iterated_ppo"])),
@@ -56,7 +60,7 @@ SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     "value_distilled_ppo": ("Policies", partial(value.rows_above, ["distilled_ppo"])),
     "value_ppo_distilled": ("Policies", partial(value.rows_above, ["ppo_distilled"])),
     "value_controls": ("Policies", value.value_controls),
-    "driven": ("Policies", value.driven),
+    "driven": ("Policies", policies.driven),
     "demo": ("Policies", policies.demo),
     "metaworld": ("Policies", foreign.section),
     "cloning_control": ("Policies", policies.cloning_control),
@@ -186,7 +190,7 @@ def main() -> None:
             sys.exit("docs/results.md is not what the JSON says: run python -m experiments.tables")
         return
     load, images = loader(DOCS), DOCS / "images"
-    value.draw_value(load, images / "value_push.png")
+    value_figure.draw_value(load, images / "value_push.png")
     four_tasks_section.draw(load, images / "value_four_tasks.png")
     write_text(target, page)
     print(f"wrote {target.relative_to(ROOT)}")

@@ -1,66 +1,48 @@
-"""What imagination is worth: its section of docs/results.md, and the figure, from published cells."""
+"""What imagination is worth: its sections of docs/results.md."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.container import ErrorbarContainer
-from matplotlib.figure import Figure
 from scipy.stats import ttest_1samp
 
-from experiments.cells import DOMAINS, Load, paired, points
+from experiments.cells import DOMAINS, Load, points
 from experiments.study import ROOT, read_cells
+from experiments.value_cells import (
+    BASELINES,
+    BUDGET,
+    PARTS,
+    REAL_EPISODES,
+    SCENES,
+    SECOND_PARTS,
+    SECOND_STUDY,
+    STUDY,
+    TASKS_GROUPS,
+    TASKS_PARTS,
+    TASKS_STUDY,
+    TITLES,
+    Cell,
+    Groups,
+    against,
+    best,
+    best_pair,
+    gain,
+    gains,
+    groups,
+    having,
+    mean,
+    mean_of,
+    measured,
+    minutes,
+    outcomes,
+    published,
+    shares,
+)
 from lerobot_wmrl.common.files import markdown_table as table
-from lerobot_wmrl.common.statistics import PairedChange, RunsMean
-from lerobot_wmrl.improve.report.figures import tidy
-
-TITLES: Final = {
-    "cloning": "BC of the demonstrations",
-    "longer": "BC of the demonstrations, three times as many steps",
-    "filtered": "filtered BC: demonstrations and successful rollouts",
-    "longer_filtered": "filtered BC, three times as many steps",
-    "iterated": "filtered BC, rollouts in three rounds",
-    "weighted": "advantage-weighted BC (RA-BC)",
-    "conditioned": "advantage-conditioned BC (RECAP)",
-    "simulated_ppo": "PPO in ManiSkill, as many episodes of full length as rollouts",
-    "imagined_ppo": "PPO in imagination",
-    "planned": "PPO in imagination, then planning in it at test time",
-    "dyna": "PPO in imagination, with rollouts in three rounds (Dyna)",
-    "iterated_ppo": "filtered BC, rollouts in three rounds, then PPO in imagination",
-    "imagined_cloning": "BC of recorded and imagined successes",
-    "distilled": "planner distilled in imagination",
-    "distilled_ppo": "planner distilled, then PPO in imagination",
-    "ppo_distilled": "PPO in imagination, then the planner distilled",
-    "longer_imagined_ppo": "PPO in imagination, from the longer BC",
-    "longer_ppo_distilled": "PPO in imagination, from the longer BC, then the planner distilled",
-}
-"""Methods in the order of the table."""
-
-IMAGINED: Final = (
-    "imagined_ppo", "planned", "dyna", "iterated_ppo", "imagined_cloning", "distilled", "distilled_ppo",
-    "ppo_distilled", "longer_imagined_ppo", "longer_ppo_distilled",
-)  # fmt: skip
-"""Methods that use a world model."""
-
-DRAWN: Final = {
-    "cloning": "#90a4ae",
-    "filtered": "#607d8b",
-    "longer_filtered": "#37474f",
-    "simulated_ppo": "#2f855a",
-    "imagined_ppo": "#f6ad55",
-    "planned": "#dd6b20",
-    "ppo_distilled": "#9b2c2c",
-}
-"""Methods of the figure, the main ones of the table, and their colours."""
 
 CONTROLLED: Final = ("imagined_ppo", "planned")
 """Those that controls are made for."""
-
-BASELINES: Final = tuple(method for method in TITLES if method not in IMAGINED)
-"""Methods that use none."""
 
 UNCHANGED: Final = "all episodes"
 CONTROLS: Final = {
@@ -71,116 +53,11 @@ CONTROLS: Final = {
 }
 """What a control's world model learnt from."""
 
-REAL_EPISODES: Final = ("demonstrations", "rollouts")
-BUDGET: Final = (*REAL_EPISODES, "seed")
-SCENES: Final = ("ind", "ood")
-"""Where success is measured: in known and in unseen scenes."""
-
 AIMED_GAIN: Final = 0.1
 """What was aimed at: how much more often methods with a world model succeed than those without one."""
 
 AIMED_SUCCESS: Final = (0.95, 0.88)
 """What was aimed at for the distilled planner: success in known and in unseen scenes."""
-
-STUDY: Final = "value_push"
-PARTS: Final = (
-    "value_longer",
-    "value_longer_imagined",
-    "value_others",
-    "value_iterated",
-    "value_simulator",
-    "value_dyna",
-    "value_imagined",
-    "value_distilled_ppo",
-    "value_ppo_distilled",
-)
-"""Studies whose cells add methods to its table."""
-
-SECOND_STUDY: Final = "value_pick_place"
-SECOND_PARTS: Final = (
-    "value_pick_place_longer",
-    "value_pick_place_simulator",
-    "value_pick_place_dyna",
-    "value_pick_place_iterated",
-)
-"""The same of the second task."""
-
-TASKS_STUDY: Final = "value_tasks"
-TASKS_PARTS: Final = ("value_tasks_simulator", "value_tasks_ppo_distilled")
-TASKS_GROUPS: Final = ("task", *REAL_EPISODES)
-"""The same of further tasks, and what their cells are grouped by."""
-
-Cell = dict[str, Any]
-Groups = dict[tuple[Any, ...], list[Cell]]
-"""Cells, one a seed, by what they have in common: demonstrations and rollouts, and the task where there are
-several."""
-
-
-def groups(
-    load: Load, study: str = STUDY, parts: Sequence[str] = PARTS, by: Sequence[str] = REAL_EPISODES
-) -> Groups:
-    """Return the published cells of a study, each with the methods of the same cell of its parts."""
-    found: Groups = {}
-    for each in read_cells(ROOT / "experiments" / f"{study}.yaml"):
-        cell, *others = (published(load, name, each.variables["cell"]) for name in (study, *parts))
-        if cell:
-            methods = {name: row for part in others if part for name, row in part["methods"].items()}
-            whole = {**cell, "methods": {**cell["methods"], **methods}}
-            found.setdefault(tuple(cell[name] for name in by), []).append(whole)
-    return found
-
-
-def published(load: Load, study: str, cell: str) -> Cell | None:
-    """Return the results of a cell, None where they are not published."""
-    try:
-        return load(f"{study}/{cell}")
-    except FileNotFoundError:
-        return None
-
-
-def outcomes(cells: Sequence[Cell], method: str, domain: str) -> list[list[int]]:
-    """Return the outcomes of a method's runs on the same starts, (R, E)."""
-    return [cell["methods"][method][domain]["outcomes"] for cell in cells if method in cell["methods"]]
-
-
-def mean(cells: Sequence[Cell], method: str, domain: str) -> float:
-    """Return a method's success, as a share, over the cells in which it has been run."""
-    return float(np.mean(outcomes(cells, method, domain)))
-
-
-def measured(cells: Sequence[Cell], methods: Iterable[str]) -> list[str]:
-    """Return the methods that have been run in any of the cells."""
-    return [method for method in methods if any(method in cell["methods"] for cell in cells)]
-
-
-def having(found: Groups, method: str) -> Groups:
-    """Return the cells in which a method has been run, without groups that have none."""
-    kept = {group: [cell for cell in cells if method in cell["methods"]] for group, cells in found.items()}
-    return {group: cells for group, cells in kept.items() if cells}
-
-
-def gain(cells: Sequence[Cell], method: str, baseline: str, domain: str) -> RunsMean:
-    """Return how much more often a method succeeds than a baseline on the same data and starts."""
-    both = [cell for cell in cells if {method, baseline} <= cell["methods"].keys()]
-    pairs = zip(outcomes(both, method, domain), outcomes(both, baseline, domain), strict=True)
-    return RunsMean.over([[a - b for a, b in zip(*pair, strict=True)] for pair in pairs])
-
-
-def gains(cells: Sequence[Cell], method: str, baseline: str, domain: str) -> list[float]:
-    """Return the gain of each cell, which is one seed."""
-    both = [cell for cell in cells if {method, baseline} <= cell["methods"].keys()]
-    return [mean([cell], method, domain) - mean([cell], baseline, domain) for cell in both]
-
-
-def best(cells: Sequence[Cell], methods: Sequence[str], domain: str) -> str:
-    """Return the method with the highest mean success, of those that have been run in all cells."""
-    complete = [method for method in methods if all(method in cell["methods"] for cell in cells)]
-    return max(complete, key=lambda method: mean(cells, method, domain))
-
-
-def best_pair(cells: Sequence[Cell], domain: str) -> tuple[str, str]:
-    """Return the best method with a world model, and the best one without."""
-    return best(cells, IMAGINED, domain), best(cells, BASELINES, domain)
 
 
 def value_push(load: Load) -> str:
@@ -404,21 +281,37 @@ often, by {100 * min(rises):.0f} to {100 * max(rises):.0f} points. What is left 
 
 {best_gains(longer, REAL_EPISODES)}
 
-It has a recording of its own of the same seeds. {from_longer(longer)}"""
+{own_recordings(longer)}{from_longer(longer)}"""
+
+
+def own_recordings(longer: Groups) -> str:
+    """Return in which cells the longer BC learnt from a recording of its own."""
+    own = {
+        spoken(group): [str(cell["seed"]) for cell in cells if "longer_filtered" in cell["recorded_anew"]]
+        for group, cells in longer.items()
+    }
+    said = [
+        f"{group}, seed{'s' if len(seeds) > 1 else ''} {', '.join(seeds)}"
+        for group, seeds in own.items()
+        if seeds
+    ]
+    return f"It has a recording of its own of the same seeds with {listed(said)}. " if said else ""
 
 
 def from_longer(found: Groups) -> str:
     """Return the success of PPO in imagination, and of the planner distilled, that begin from longer BC."""
     said = []
     for group, cells in having(found, "longer_imagined_ppo").items():
-        after, planner, before = (
-            " and ".join(f"{100 * mean(cells, method, domain):.0f}" for domain in SCENES)
-            for method in ("longer_imagined_ppo", "longer_ppo_distilled", "longer_filtered")
-        )
+        rates = {
+            method: " and ".join(f"{100 * mean(cells, method, domain):.0f}" for domain in SCENES)
+            for method in measured(cells, ("longer_filtered", "longer_imagined_ppo", "longer_ppo_distilled"))
+        }
+        before, after, *planner = rates.values()
         seeds = ", ".join(str(cell["seed"]) for cell in cells)
         said.append(
             f"with {spoken(group)} (seed {seeds}), PPO in imagination has {after} % (known, unseen scenes) "
-            f"from its {before} %, and the planner distilled after it {planner} %"
+            f"from its {before} %"
+            + "".join(f", and the planner distilled after it {each} %" for each in planner)
         )
     return f"Begun from it, {'; '.join(said)}." if said else "PPO and the planner have not begun from it yet."
 
@@ -483,40 +376,6 @@ One seed. The distilled planner has no control of its own. PPO in a world model 
 is a [pilot](pilots.md#a-world-model-of-demonstrations-alone)."""
 
 
-def driven(load: Load) -> str:
-    """Return the section: success of policies cloned from driven demonstrations, beside planned ones."""
-    rows = []
-    for each in read_cells(ROOT / "experiments" / "driven.yaml"):
-        cell = published(load, "driven", each.variables["cell"])
-        if not cell:
-            continue
-        reference = cell["methods"]["driven_cloning"]
-        for name, title in DRIVEN.items():
-            found = cell["methods"][name]
-            rates = [
-                f"{100 * found[domain]['share']:.0f} %" if name == "driven_cloning"
-                else against(found[domain], reference[domain])
-                for domain in SCENES
-            ]  # fmt: skip
-            rows.append([cell["count"], title, cell["seed"], *rates])
-    return f"""Policies cloned from as many demonstrations of each kind, on the same starts. Changes are
-against the first row:
-
-{table(["episodes", "demonstrations", "seed", "known scenes", "unseen scenes"], rows)}
-
-A scripted person holds keys down for what a planner in the world model finds, which changes what PPO's
-policy would do, does again what fails, and ends an episode at success. LeRobot's own `lerobot-record`
-records it in real time, without the simulator."""
-
-
-DRIVEN: Final = {
-    "driven_cloning": "driven by keys in the world model",
-    "optimal_cloning": "planned in ManiSkill",
-    "human_like_cloning": "planned in ManiSkill, with pauses and detours",
-}
-"""Method → what its policy is cloned from."""
-
-
 def improved(load: Load) -> Iterator[tuple[str, list[Any], Cell]]:
     """Yield the published cells of the study: name, budget and seed, success of the policy before PPO."""
     for each in read_cells(ROOT / "experiments" / f"{STUDY}.yaml"):
@@ -531,69 +390,3 @@ def controls(load: Load, cell: str) -> list[tuple[str, Cell]]:
     found = [(title, published(load, "value_controls", f"{cell}_{name}")) for name, title in CONTROLS.items()]
     changed = [(title, control["methods"]) for title, control in found if control]
     return changed and [(UNCHANGED, load(f"{STUDY}/{cell}")["methods"]), *changed]
-
-
-def against(row: dict[str, Any], before: dict[str, Any]) -> str:
-    """`81 %: 25 gained, 3 lost (p = 1e-05)`."""
-    change = PairedChange.between(before["outcomes"], row["outcomes"])
-    return f"{100 * row['share']:.0f} %: {paired(change.as_json())}"
-
-
-def minutes(cells: Sequence[Cell], method: str) -> str:
-    """Return the minutes that a method's training took, the mean over its runs."""
-    return f"{mean_of(cells, method, 'minutes'):.0f}"
-
-
-def mean_of(cells: Sequence[Cell], method: str, number: str) -> float:
-    """Return the mean of a number over the runs of a method."""
-    found = [cell["methods"][method][number] for cell in cells if method in cell["methods"]]
-    return float(sum(found) / len(found))
-
-
-def shares(cells: Sequence[Cell], method: str, domain: str) -> str:
-    """`62, 60 → 61 % (57–65)`, or `62 % (57–67)` of one seed."""
-    found = outcomes(cells, method, domain)
-    mean = RunsMean.over(found)
-    each = ", ".join(f"{100 * sum(run) / len(run):.0f}" for run in found)
-    seeds = f"{each} → " if len(found) > 1 else ""
-    return f"{seeds}{100 * mean.mean:.0f} % ({100 * mean.low:.0f}–{100 * mean.high:.0f})"
-
-
-def draw_value(load: Load, path: Path) -> None:
-    """Draw success for every budget: a panel a domain, a point a method with its interval.
-
-    Nothing is drawn before a cell has been published.
-    """
-    found = groups(load)
-    if not found:
-        return
-    figure = Figure(figsize=(9, 4.2), layout="constrained")
-    panels = figure.subplots(1, 2, sharey=True)
-    methods = measured([cell for cells in found.values() for cell in cells], DRAWN)
-    for axes, domain in zip(panels, SCENES, strict=True):
-        points = [
-            _draw_points(axes, found, method, domain, 0.11 * (number - (len(methods) - 1) / 2))
-            for number, method in enumerate(methods)
-        ]
-        axes.set_title(f"{DOMAINS[domain]} scenes")
-        axes.set_xlabel("real episodes: demonstrations + rollouts")
-        axes.set_xticks(range(len(found)), [f"{d} + {r}" for d, r in sorted(found)])
-    panels[0].set_ylabel("success in ManiSkill")
-    titles = [TITLES[method] for method in methods]
-    figure.legend(points, titles, loc="outside lower center", ncols=2, frameon=False, fontsize=9)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    tidy(figure).savefig(path, dpi=130)
-
-
-def _draw_points(axes: Axes, found: Groups, method: str, domain: str, shift: float) -> ErrorbarContainer:
-    """Draw a method's mean and interval beside those of others: hollow if it uses no world model."""
-    places, means = [], []
-    for place, budget in enumerate(sorted(found)):
-        if runs := outcomes(found[budget], method, domain):
-            places.append(place + shift)
-            means.append(RunsMean.over(runs))
-    whiskers = [[mean.mean - mean.low for mean in means], [mean.high - mean.mean for mean in means]]
-    return axes.errorbar(
-        places, [mean.mean for mean in means], whiskers, fmt="o", color=DRAWN[method],
-        markerfacecolor=DRAWN[method] if method in IMAGINED else "white",
-    )  # fmt: skip

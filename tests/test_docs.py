@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from experiments.tables import loader
-from experiments.value_sections import BASELINES, best, groups, outcomes
+from experiments.value_cells import BASELINES, best, groups, outcomes
 from lerobot_wmrl.common.statistics import RunsMean
 from lerobot_wmrl.common.stored_help import FOLDER
 from lerobot_wmrl.improve.improvement import CLONED, DISTILLED, PPO, SFT

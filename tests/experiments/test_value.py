@@ -12,16 +12,13 @@ from experiments import four_tasks_section, value
 from experiments.run import record_path
 from experiments.study import ROOT, Study, read_cells
 from experiments.tables import loader
+from experiments.value_cells import TITLES, best, gain, groups
+from experiments.value_figure import draw_value
 from experiments.value_sections import (
     CONTROLLED,
     CONTROLS,
-    TITLES,
     UNCHANGED,
     aims,
-    best,
-    draw_value,
-    gain,
-    groups,
     recorded_anew,
     value_controls,
     value_others,

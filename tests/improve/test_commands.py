@@ -1,0 +1,347 @@
+"""What is decided for data that does not exist, and the commands that come of it."""
+
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from lerobot.configs import PreTrainedConfig
+from lerobot.envs.configs import EnvConfig, PushtEnv
+from lerobot.policies.act.configuration_act import ACTConfig
+from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
+
+from lerobot_policy_cnn.configuration_cnn import CnnConfig
+from lerobot_wmrl.common.errors import STOPPED
+from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.common.presets import preset_settings
+from lerobot_wmrl.common.stages import claimed
+from lerobot_wmrl.data.dataset import ChosenEpisodes, open_dataset
+from lerobot_wmrl.data.episodes import read_episodes
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.improve import commands
+from lerobot_wmrl.improve import improvement as decisions
+from lerobot_wmrl.improve.findings import few_decisions
+from lerobot_wmrl.improve.improvement import DISTILLED, FITTED, PPO, SFT
+from lerobot_wmrl.scripts.improve import settings
+from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
+from lerobot_wmrl.world_models.configuration_world_model import AnchoredConfig
+from tests.improve.made_up import commands_of, improvement_of, made_commands
+
+
+@pytest.mark.parametrize(("longest", "clip", "length", "branches"), [(40, 42, 40, 0), (300, 100, 98, 2)])
+def test_long_episodes_are_imagined_in_parts(
+    longest: int, clip: int, length: int, branches: int, tmp_path: Path
+) -> None:
+    """From frames all over them, as many as it takes to cover them; so successes at their ends count."""
+    made = made_commands(tmp_path, longest=longest, usual=longest)
+    assert f"--model.clip_length={clip}" in made["world_model"]
+    judged = [flag for flag in made["check"] if flag.startswith("--episode_length")]
+    assert judged == ([] if branches else [f"--episode_length={length}"])
+    for stage in ("rl", "comparison"):
+        assert {f"--env.episode_length={length}", f"--env.dataset.branches={branches}"} <= {*made[stage]}
+
+
+def test_one_long_recording_does_not_divide_all_the_others(tmp_path: Path) -> None:
+    assert "--env.dataset.branches=2" in made_commands(tmp_path, longest=9000, usual=300)["rl"]
+
+
+@pytest.mark.parametrize(("longest", "branches"), [(5, 3), (19, 0)])
+def test_imagination_begins_all_over_the_rollouts_too(
+    longest: int, branches: int, make_synthetic_dataset: Any, tmp_path: Path
+) -> None:
+    """Here they have 20 frames. A frame more than the dataset has is no reason to begin in the middle."""
+    improvement = improvement_of(tmp_path, longest=longest, usual=longest, total=3)
+    assert improvement.branches == 0
+    make_synthetic_dataset(tmp_path / "merged", episodes=6)
+    improvement.config.rollouts = 3
+    assert improvement.branches == branches
+
+
+def test_no_start_is_imagined_twice_where_one_task_has_few(
+    make_synthetic_dataset: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Imagination begins in some of the episodes of a large dataset, and in fewer still of each task."""
+    root = make_synthetic_dataset(tmp_path / "merged", episodes=6).root
+    tasks = read_episodes(open_dataset(root)).column("start.task")
+    assert len(np.unique(tasks)) == 1
+    monkeypatch.setattr(decisions, "MAX_STARTS", 4)
+    improvement = improvement_of(tmp_path, total=6, fewest=6)
+    improvement.config.dataset = ChosenEpisodes(str(root))
+    assert "--n_episodes=4" in commands.compare(improvement, tmp_path, commands.imagination(improvement), 256)
+    table = read_episodes(open_dataset(root))
+    two = replace(table, columns={**table.columns, "start.task": np.array([0, 0, 0, 0, 1, 1])})
+    monkeypatch.setattr(type(improvement), "learnt", lambda self: two)
+    assert "--n_episodes=1" in commands.compare(improvement, tmp_path, commands.imagination(improvement), 256)
+
+
+def test_another_round_does_not_double_the_frames_of_a_rollout(tmp_path: Path) -> None:
+    improvement = improvement_of(tmp_path, longest=80)
+    improvement.config.rollouts, improvement.config.real_env = 3, PushtEnv()
+    improvement.config.selection_episodes = 0
+    assert improvement.frame_limit == 160
+    improvement.config.max_frames = 80
+    assert improvement.frame_limit == 80
+    assert "--max_frames=80" in (commands.another_round(improvement) or [])
+
+
+@pytest.mark.parametrize("size", ["tiny", "demo", "cpu"])
+@pytest.mark.parametrize("side", [16, 48, 63, 80, 84, 96, 112, 480])
+def test_frames_of_any_size_make_a_grid_that_the_transformer_divides(
+    size: str, side: int, tmp_path: Path
+) -> None:
+    command = made_commands(tmp_path, size, frame_side=side)["tokenizer"]
+    (given,) = (flag for flag in command if flag.startswith("--model.tokenizer.image_size="))
+    preset = preset_settings(size, "train-world-model", ["frame_tokenizer"])
+    sizes = {name.rpartition(".")[2]: value for name, value in preset.items() if "tokenizer." in name}
+    tokenizer = TokenizerConfig(**{**sizes, "image_size": int(given.partition("=")[2])})
+    dynamics = preset_settings(size, "train-world-model", ["action_world_model"])
+    grid = tokenizer.image_size // tokenizer.downsample
+    assert grid % int(dynamics.get("model.dynamics.patch", AnchoredConfig.patch)) == 0
+
+
+@pytest.mark.parametrize(("kind", "pixels", "flags"), [
+    (CnnConfig, 2 * 64**2, set()),
+    (CnnConfig, 480 * 640, {"--num_envs=23", "--algorithm.micro_batch_size=27"}),
+    (VQBeTConfig, 480 * 640, {"--num_envs=3", "--algorithm.recorded=false", "--algorithm.batch_size=5"}),
+])  # fmt: skip
+def test_large_frames_are_trained_on_in_smaller_numbers(
+    kind: type[PreTrainedConfig], pixels: int, flags: set[str], tmp_path: Path
+) -> None:
+    """A rollout holds at most 2 GiB of frames, all labels of a distillation too, and a pass 2²³ pixels.
+
+    VQ-BeT learns from five observations at once.
+    """
+    policy = kind(device="cpu", pretrained_path=tmp_path)
+    command = made_commands(
+        tmp_path, policy=policy, pixels=pixels, longest=98, usual=98, success_frames=3000
+    )["rl"]
+    limits = (
+        "--num_envs=", "--algorithm.micro_batch_size=", "--algorithm.batch_size=", "--algorithm.recorded=",
+    )  # fmt: skip
+    assert {flag for flag in command if flag.startswith(limits)} == flags
+
+
+def test_labels_of_large_frames_are_those_of_fewer_episodes_after_ppo_too(tmp_path: Path) -> None:
+    """Distillation keeps those of all six iterations, PPO the frames of one."""
+    command = made_commands(tmp_path, pixels=480 * 640, longest=98, usual=98)["distilled"]
+    assert {"--num_envs=3", "--algorithm.batch_size=27"} <= {*command}
+
+
+@pytest.mark.parametrize(("held_out", "split"), [(0, "all"), (9, "all"), (10, "validation")])
+def test_the_check_takes_held_out_episodes_where_there_are_enough(
+    tmp_path: Path, held_out: int, split: str
+) -> None:
+    assert f"--split={split}" in made_commands(tmp_path, held_out=held_out)["check"]
+
+
+BOTH, EARLY, NEITHER = "both outcomes", "both, but held-out successes alone", "successes alone"
+
+
+@pytest.mark.parametrize(("rollouts", "outcomes", "held_out", "root", "split"), [
+    (9, BOTH, 2, "data", "all"), (10, BOTH, 2, "rollouts", "all"), (10, BOTH, 10, "data", "validation"),
+    (200, BOTH, 10, "rollouts", "validation"), (200, EARLY, 2, "rollouts", "all"),
+    (200, EARLY, 10, "data", "validation"), (200, NEITHER, 2, "data", "all"),
+])  # fmt: skip
+def test_rollouts_are_checked_on_if_they_tell_more_than_the_dataset(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rollouts: int, outcomes: str, held_out: int, root: str,
+    split: str,
+) -> None:  # fmt: skip
+    number = np.arange(rollouts)
+    success = {BOTH: (number + number // 20) % 2 == 0, EARLY: number > 9, NEITHER: number >= 0}[outcomes]
+    table = SimpleNamespace(
+        success=np.append(np.ones(40, bool), success),
+        validation=np.append(np.ones(40, bool), number % 20 == 19),
+    )
+    monkeypatch.setattr(decisions, "read_episodes", lambda dataset: table)
+    monkeypatch.setattr(ChosenEpisodes, "open", lambda self: self.root)
+    improvement = improvement_of(tmp_path, held_out=held_out)
+    improvement.config.rollouts, improvement.config.real_env = rollouts, PushtEnv()
+    merged = {"dataset.root": str(tmp_path / "merged"), "dataset.episodes": [*range(40, 40 + rollouts)]}
+    wanted = {"data": {"dataset.root": "data"}, "rollouts": merged}[root]
+    assert improvement.checked() == (wanted, split)
+
+
+@pytest.mark.parametrize("better", [None, "before"])
+def test_rollouts_are_merged_and_successes_cloned_before_rl(
+    better: str | None, make_synthetic_dataset: Any, tmp_path: Path
+) -> None:
+    """Two of four episodes are chosen, and two rollouts; RL begins with the cloned policy, unless the world
+    model decides that the policy before is better."""
+    folder = tmp_path / "improve"
+    numbers = dict.fromkeys(("observation.state", "action", "effort"), "float32")
+    improvement = improvement_of(
+        folder, total=4, failures=2, columns={"observation.image": "video", **numbers}
+    )
+    config = improvement.config
+    config.rollouts, config.real_env, config.dataset.episodes = 2, PushtEnv(), [0, 3]
+    before, cloned, ppo, distilled = improvement.policies.values()
+    results = {
+        "finished": True, "policies": {"a": {"share": 0.1}, "b": {"share": 0.9}},
+        "pairs": [{"before": "a", "after": "b", "better": better and "b"}],
+    }  # fmt: skip
+    write_json(folder / "start" / "comparison.json", results)
+    stages = iter(commands.stages(improvement))
+    made = {stage.name: stage.command() for stage in islice(stages, 3)}
+    success = read_episodes(make_synthetic_dataset(folder / "merged", episodes=6)).success
+    made |= {stage.name: stage.command() for stage in stages}
+    assert {"--root=data", f"--new_root={folder / 'columns'}", "--operation.feature_names=['effort']"} <= {
+        *made["columns"]
+    }
+    assert {f"--like.root={folder / 'columns'}", "--max_frames=80", "--video=true", "--seed=50000"} <= {
+        *made["rollouts"]
+    }
+    assert f"--operation.roots=['{folder / 'columns'}', '{folder / 'rollouts'}']" in made["merged"]
+    episodes = [episode for episode in (0, 3, 4, 5) if success[episode]]
+    assert 0 < len(episodes) < 4
+    assert {f"--policy.path={before}", f"--dataset.episodes={episodes}".replace(" ", "")} <= {*made["cloned"]}
+    learnt = {f"--dataset.root={folder / 'merged'}", "--dataset.episodes=[0,3,4,5]"}
+    assert learnt <= {*made["tokenizer"]}
+    assert learnt <= {*made["world_model"]}
+    starts = {flag.replace("--", "--env.", 1) for flag in learnt}
+    assert {*starts, f"--policies=[{cloned},{before}]", "--n_episodes=4"} <= {*made["start"]}
+    assert {*starts, f"--policy.path={before if better else cloned}"} <= {*made["rl"]}
+    planner = {"--algorithm.type=distillation", "--algorithm.recorded=false", "--gate.action=off"}
+    assert {*starts, *planner, f"--policy.path={ppo}"} <= {*made["distilled"]}
+    everything = {f"--policies=[{before},{cloned},{ppo},{distilled}]", "--against=all", "--env.type=pusht"}
+    assert {*everything, "--n_episodes=100", "--seed=1000000"} <= {*made["comparison"]}
+    assert {*everything, "--n_episodes=50", "--seed=2000025"} <= {*made["choice"]}
+    measured = {"--selection.freq=10", "--selection.n_episodes=25", "--real_env.type=pusht"}
+    assert measured <= {*made["rl"]}
+    assert "checkpoints/best/" in ppo
+    assert "checkpoints/last/" in distilled
+
+
+@pytest.mark.parametrize(("real", "rollouts", "longest", "discount"), [
+    (None, 0, 40, 0.97),
+    (WmrlManiSkillEnv(task="push"), 300, 37, 0.97),
+    (PushtEnv(), 150, 150, 0.996),
+    (PushtEnv(), 0, 150, 0.992),
+    (None, 0, 5000, 0.999),
+])  # fmt: skip
+def test_the_discount_leaves_a_late_success_its_worth(
+    real: EnvConfig | None, rollouts: int, longest: int, discount: float, tmp_path: Path
+) -> None:
+    improvement = improvement_of(tmp_path, longest=longest)
+    improvement.config.real_env, improvement.config.rollouts = real, rollouts
+    assert improvement.discount == discount
+    if not rollouts:
+        rl = commands_of(improvement, "rl")["rl"]
+        assert f"--algorithm.gamma={discount}" in rl
+
+
+def test_without_starts_to_select_on_the_last_checkpoint_and_policy_are_taken(tmp_path: Path) -> None:
+    improvement = improvement_of(tmp_path)
+    improvement.config.real_env, improvement.config.selection_episodes = PushtEnv(), 0
+    made = commands_of(improvement, "rl", "choice")
+    assert [*made] == ["rl"]
+    assert not [flag for flag in made["rl"] if "selection" in flag]
+    assert "checkpoints/last/" in improvement.policies[PPO]
+    assert improvement.chosen() == DISTILLED
+
+
+@pytest.mark.parametrize(("real", "link"), [(None, "last"), (PushtEnv(), "best")])
+def test_rl_may_stop_by_its_own_rules_if_it_leaves_a_checkpoint(
+    real: PushtEnv | None, link: str, tmp_path: Path
+) -> None:
+    """After any other error it is tried again."""
+    improvement = improvement_of(tmp_path)
+    improvement.config.real_env = real
+    (rl,) = (stage for stage in commands.stages(improvement) if stage.name == "rl")
+    for other in {"last", "best"} - {link}:
+        (tmp_path / "rl" / "checkpoints" / other / "pretrained_model").mkdir(parents=True)
+    assert not rl.optional(STOPPED)
+    (tmp_path / "rl" / "checkpoints" / link / "pretrained_model").mkdir(parents=True)
+    assert rl.optional(STOPPED)
+    assert not rl.optional(1)
+
+
+@pytest.mark.parametrize(("kind", "iterations", "freq"), [
+    (CnnConfig, 1, 1), (CnnConfig, 3, 1), (CnnConfig, 5, 2), (CnnConfig, 60, 15), (CnnConfig, None, 10),
+    (VQBeTConfig, None, 2),
+])  # fmt: skip
+def test_rl_is_measured_four_times_at_most(
+    kind: type[PreTrainedConfig], iterations: int | None, freq: int, tmp_path: Path
+) -> None:
+    improvement = improvement_of(tmp_path, policy=kind(device="cpu", pretrained_path=tmp_path))
+    config = improvement.config
+    config.real_env, config.iterations, config.selection_episodes = PushtEnv(), iterations, 1
+    made = commands_of(improvement, "rl", "choice")
+    assert {f"--selection.freq={freq}", "--selection.n_episodes=1"} <= {*made["rl"]}
+    assert {"--n_episodes=1", "--seed=2000001"} <= {*made["choice"]}
+    assert all(
+        "checkpoints/best/" in improvement.policies[name] for name in {PPO, FITTED} & {*improvement.policies}
+    )
+
+
+@pytest.mark.parametrize(("kind", "names"), [
+    (CnnConfig, [SFT, PPO, DISTILLED]),
+    (ACTConfig, [SFT, PPO]),
+    (VQBeTConfig, [SFT, FITTED]),
+])  # fmt: skip
+def test_only_policies_for_which_it_was_measured_are_fitted_to_a_planner_after_ppo(
+    kind: type[PreTrainedConfig], names: list[str], tmp_path: Path
+) -> None:
+    improvement = improvement_of(tmp_path, policy=kind(device="cpu", pretrained_path=tmp_path))
+    assert [*improvement.policies] == names
+    optional = [stage.name for stage in commands.stages(improvement) if stage.optional(1)]
+    assert optional == (["distilled"] if DISTILLED in names else [])
+    assert improvement.chosen() == names[-1]
+
+
+@pytest.mark.parametrize(("adapters", "pixels", "flags"), [
+    (False, 2 * 64**2, ["--batch_size=32"]),
+    (True, 480 * 640, ["--batch_size=27", "--peft.method_type=LORA"]),
+])  # fmt: skip
+def test_cloning_suits_the_policy_and_its_frames(
+    adapters: bool, pixels: int, flags: list[str], small_dataset: Any, tmp_path: Path
+) -> None:
+    """Without the flag LeRobot writes adapters without the policy's configuration."""
+    policy = CnnConfig(device="cpu", pretrained_path=tmp_path, use_peft=adapters)
+    improvement = improvement_of(tmp_path, policy=policy, pixels=pixels, failures=2)
+    improvement.config.dataset.root = str(small_dataset.root)
+    command = commands_of(improvement, "cloned")["cloned"]
+    given = [flag for flag in command if flag.startswith(("--batch_size=", "--peft"))]
+    assert given == flags
+    assert "--dataset.episodes=[0,1,3,4]" in command
+
+
+def test_a_run_that_selects_nothing_goes_on_where_there_was_no_selection(tmp_path: Path) -> None:
+    improvement = improvement_of(tmp_path, failures=2)
+    given = settings(improvement.config, commands.stages(improvement))
+    older = {name: value for name, value in given.items() if name != "selection_episodes"}
+    write_json(tmp_path / "settings.json", older)
+    with claimed(tmp_path, given):
+        pass
+
+
+def test_a_folder_that_was_begun_with_other_stages_is_refused(tmp_path: Path) -> None:
+    """As by a version that did not clone."""
+    improvement = improvement_of(tmp_path, failures=2)
+    given = settings(improvement.config, commands.stages(improvement))
+    write_json(tmp_path / "settings.json", {**given, "stages": ["tokenizer", "world_model", "check", "rl"]})
+    with pytest.raises(ValueError, match="stages"), claimed(tmp_path, given):
+        pass
+
+
+def test_where_the_strict_threshold_recognises_nothing_the_check_s_own_is_taken(tmp_path: Path) -> None:
+    point = {"done_threshold": 0.5, "done_frames": 1}
+    for hits, found in ((0, point), (3, None)):
+        write_json(tmp_path / "check" / "metrics.json", {"true_positives": hits, "operating_point": point})
+        wanted = found or {"done_threshold": 0.95, "done_frames": 2}
+        assert {f"--env.{name}={value}" for name, value in wanted.items()} <= {*made_commands(tmp_path)["rl"]}
+
+
+def test_a_policy_that_seldom_decides_is_named(make_synthetic_dataset: Any, tmp_path: Path) -> None:
+    """However long recorded episodes are, an imagined one has at most 98 frames."""
+    table = read_episodes(make_synthetic_dataset(tmp_path / "data", episodes=2))
+    few = int(np.median(table.length)) // 5
+    assert not few_decisions(ACTConfig(device="cpu", n_action_steps=few), table)
+    assert not few_decisions(CnnConfig(device="cpu"), table)
+    table.length = np.array([600, 600])
+    assert (
+        "act takes 100 actions at a time, and an imagined episode has about 98 frames"
+        in (few_decisions(ACTConfig(device="cpu"), table)[0])
+    )
