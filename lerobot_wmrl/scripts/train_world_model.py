@@ -10,6 +10,7 @@ Running the same command again continues from the last checkpoint. `--preset=dem
 new data.
 """
 
+import json
 import shlex
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -25,11 +26,12 @@ from lerobot.configs.rewards import RewardModelConfig
 from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.distributed import LONGEST_WAIT, is_first_process
 from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least, require_choice
+from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.output_folders import claim_output_dir, require_free
 from lerobot_wmrl.common.precision import PRECISIONS, keep_freed_memory, training_dtype
 from lerobot_wmrl.common.presets import expand_preset, format_flags
 from lerobot_wmrl.common.tracking import make_wandb
-from lerobot_wmrl.data.dataset import TrainingData
+from lerobot_wmrl.data.dataset import TrainingData, fingerprint
 from lerobot_wmrl.data.episodes import EpisodeTable
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
 
@@ -39,6 +41,9 @@ MAY_DIFFER = ("resume", "job_name", "log_freq", "wandb")
 """Settings that a continued run may have otherwise than when it began."""
 
 HELD_OUT_FILE = "held_out.json"
+
+DATA_FILE = "datasets.json"
+"""What the datasets were like when a training began: their fingerprints."""
 
 
 @dataclass
@@ -157,6 +162,7 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
     set_seed(cfg.seed)
     model: Any = build_model(cfg.model, table, cfg.output_dir)
     require_free(cfg.output_dir, given, MAY_DIFFER)
+    require_same_data(cfg, table)
     if checkpoint is not None and int(checkpoint.name) >= cfg.steps:
         claim_output_dir(cfg.output_dir, given, MAY_DIFFER)
         print(f"{cfg.output_dir}: already trained for {cfg.steps} steps")
@@ -167,6 +173,21 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
         if cfg.model.push_to_hub:
             model.push_model_to_hub(cfg)
             print(f"Published as {cfg.model.repo_id}.")
+
+
+def require_same_data(cfg: TrainWorldModelConfig, table: EpisodeTable) -> None:
+    """Raise FieldError if a dataset has changed since the training in the output folder began."""
+    stored = cfg.output_dir / DATA_FILE
+    if stored.is_file() and json.loads(stored.read_text()) != fingerprints(cfg, table):
+        raise FieldError(
+            "dataset.root", table.dataset.root, f"has changed since the training in {cfg.output_dir} began",
+            "choose another `output_dir`, or restore the dataset to continue",
+        )  # fmt: skip
+
+
+def fingerprints(cfg: TrainWorldModelConfig, table: EpisodeTable) -> list[str]:
+    """Return what tells the content of each dataset."""
+    return [fingerprint(Path(root)) for root in (table.dataset.root, *cfg.dataset.more)]
 
 
 def run_training(
@@ -181,6 +202,8 @@ def run_training(
         sampler = make_joint_sampler(model, table, cfg.dataset, cfg.batch_size, seed)
         if is_first_process():
             claim_output_dir(cfg.output_dir, given, MAY_DIFFER)
+            if not (cfg.output_dir / DATA_FILE).is_file():
+                write_json(cfg.output_dir / DATA_FILE, fingerprints(cfg, table))
     dtype = training_dtype(cfg.precision, cfg.model.device)
     used = replace(cfg, precision=str(dtype).removeprefix("torch."))
     train(model, sampler, used, used.save_pretrained, make_wandb(cfg))
@@ -201,7 +224,6 @@ def conclusion(cfg: TrainWorldModelConfig, model: Any, table: EpisodeTable) -> s
 
 def quality(cfg: TrainWorldModelConfig, model: Any, table: EpisodeTable) -> str:
     """Say how good the model is on episodes that are held out, or in training if none is."""
-    from lerobot_wmrl.common.files import write_json
     from lerobot_wmrl.common.tracking import read_metrics
     from lerobot_wmrl.evaluation.reconstruction import write_reconstruction
     from lerobot_wmrl.world_models.training import held_out_metrics

@@ -94,7 +94,9 @@ def test_a_training_ends_with_what_it_made_how_good_it_is_and_what_comes_next(
 def test_a_run_is_resumed_where_there_is_one(
     small_dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    given = flags(Path(small_dataset.root), tmp_path / "run")
+    """Unless the data is other than it was."""
+    data = shutil.copytree(small_dataset.root, tmp_path / "data")
+    given = flags(data, tmp_path / "run")
     monkeypatch.setattr(sys, "argv", [*given, "--resume=true"])
     with pytest.raises(SystemExit):
         main()
@@ -108,6 +110,12 @@ def test_a_run_is_resumed_where_there_is_one(
     )
     main()
     assert f"{tmp_path / 'run'}: already trained for 2 steps" in capsys.readouterr().out
+    statistics = data / "meta" / "stats.json"
+    statistics.write_text(json.dumps(json.loads(statistics.read_text()), indent=1))
+    monkeypatch.setattr(sys, "argv", given)
+    with pytest.raises(SystemExit):
+        main()
+    assert f"--dataset.root={data}: has changed since the training in" in capsys.readouterr().err
 
 
 def test_wandb_gets_the_metrics_of_the_file(
