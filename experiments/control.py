@@ -26,6 +26,7 @@ from torch.distributions import Categorical, Distribution, Normal
 
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.envs.tensor_env import TensorEnv
 from lerobot_wmrl.rl.configuration_algorithms import PolicyGradientConfig, PPOConfig
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 from lerobot_wmrl.rl.protocol import Observation, Pipeline
@@ -72,7 +73,7 @@ TRAININGS: Final = {
 """CartPole-v1 is solved at 475 by gymnasium's own threshold; Pendulum-v1 has none, good policies get −200."""
 
 
-class ControlEnv(gym.vector.VectorEnv):
+class ControlEnv(TensorEnv):
     """Gymnasium's environments behind the tensor interface of the world model's."""
 
     def __init__(self, task: str, num_envs: int) -> None:

@@ -84,18 +84,20 @@ def groups(
     load: Load, study: str = STUDY, parts: Sequence[str] = PARTS, by: Sequence[str] = REAL_EPISODES
 ) -> Groups:
     """Return the published cells of a study, each with the methods of the same cell of its parts.
-    `recorded_anew` are those whose part has another recording."""
+
+    `recorded_anew` tells of each method that learnt from a recording of its own, of the same budget, how many
+    episodes of that succeed. Recordings with as many successes are taken for the same.
+    """
     found: Groups = {}
     for each in read_cells(ROOT / "experiments" / f"{study}.yaml"):
         cell, *others = (published(load, name, each.variables["cell"]) for name in (study, *parts))
         if cell:
-            parts_of = [part for part in others if part]
-            methods = {name: row for part in parts_of for name, row in part["methods"].items()}
-            anew = {
-                name for part in parts_of if part.get("real_successes") not in (None, cell["real_successes"])
-                for name in part["methods"]
-            }  # fmt: skip
-            whole = {**cell, "methods": {**cell["methods"], **methods}, "recorded_anew": anew}
+            whole = {**cell, "methods": {**cell["methods"]}, "recorded_anew": {}}
+            for part in (part for part in others if part):
+                own = part.get("real_successes")
+                for method, row in part["methods"].items():
+                    whole["methods"][method] = row
+                    whole["recorded_anew"][method] = None if own == cell["real_successes"] else own
             found.setdefault(tuple(cell[name] for name in by), []).append(whole)
     return found
 

@@ -70,7 +70,8 @@ def value_push(load: Load) -> str:
 {trained_longer(found)}
 
 {aims(found)}
-{recorded_anew(load)}
+In most cells all that the planner distilled after PPO needs, PPO included, was run again. In these its
+recording was then another one of the same budget: {recorded_anew(found, "ppo_distilled")}.
 
 PPO in imagination begins from filtered BC, or from BC of the demonstrations where that succeeds more often
 in the world model (256 starts or all, McNemar's test): {begun(cells)}. The gate was switched off in it. PPO
@@ -132,21 +133,14 @@ def spoken(group: tuple[Any, ...]) -> str:
     return ", ".join([*task, f"{demonstrations} demonstrations and {rollouts:,} rollouts"])
 
 
-def recorded_anew(load: Load) -> str:
-    """Return in which cells the planner distilled after PPO learnt from other episodes than other rows."""
-    found = []
-    for each in read_cells(ROOT / "experiments" / f"{STUDY}.yaml"):
-        stem = each.variables["cell"]
-        whole, part = (published(load, name, stem) for name in (STUDY, "value_ppo_distilled"))
-        if whole and part and whole["real_successes"] != part["real_successes"]:
-            found.append(
-                f"{spoken((whole['demonstrations'], whole['rollouts']))}, seed {whole['seed']} "
-                f"({part['real_successes']} successes, the others {whole['real_successes']})"
-            )
-    if not found:
-        return ""
-    return f"""In most cells all that it needs, PPO included, was run again. In these its recording was then
-another one of the same budget: {listed(found)}."""
+def recorded_anew(found: Groups, method: str) -> str:
+    """Return in which cells a method learnt from other episodes of the same budget than other rows."""
+    return listed([
+        f"{spoken(group)}, seed {cell['seed']} ({own} successes, the others {cell['real_successes']})"
+        for group, cells in found.items()
+        for cell in cells
+        if (own := cell["recorded_anew"].get(method)) is not None
+    ])  # fmt: skip
 
 
 def from_the_same_start(cells: Sequence[Cell]) -> str:
@@ -281,21 +275,8 @@ often, by {100 * min(rises):.0f} to {100 * max(rises):.0f} points. What is left 
 
 {best_gains(longer, REAL_EPISODES)}
 
-{own_recordings(longer)}{from_longer(longer)}"""
-
-
-def own_recordings(longer: Groups) -> str:
-    """Return in which cells the longer BC learnt from a recording of its own."""
-    own = {
-        spoken(group): [str(cell["seed"]) for cell in cells if "longer_filtered" in cell["recorded_anew"]]
-        for group, cells in longer.items()
-    }
-    said = [
-        f"{group}, seed{'s' if len(seeds) > 1 else ''} {', '.join(seeds)}"
-        for group, seeds in own.items()
-        if seeds
-    ]
-    return f"It has a recording of its own of the same seeds with {listed(said)}. " if said else ""
+The longer BC learnt from a recording of its own, of the same budget, in these cells:
+{recorded_anew(longer, "longer_filtered")}. {from_longer(longer)}"""
 
 
 def from_longer(found: Groups) -> str:

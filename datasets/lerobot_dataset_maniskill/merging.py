@@ -11,7 +11,7 @@ from lerobot.datasets.aggregate import aggregate_datasets
 from lerobot_dataset_maniskill.card import CARD_FILE, success_by_kind, write_card
 from lerobot_dataset_maniskill.writer import VOCABULARY_FILE, find_damage, write_vocabulary
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.output_folders import require_same
+from lerobot_wmrl.common.output_folders import different_settings, require_same
 from lerobot_wmrl.maniskill.embodiment import FPS
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
@@ -63,8 +63,8 @@ def already_recorded(
 
     Args:
         output_dir: where the dataset is to be.
-        settings: those that the dataset which is there says it was recorded with; None if it does not.
-        content: those that it is to be recorded with.
+        settings: the settings stored in the dataset at `output_dir`; None if it stores none.
+        content: the settings of this recording.
         episodes: how many it is to have.
     """
     if not output_dir.exists() or (output_dir.is_dir() and not any(output_dir.iterdir())):
@@ -80,8 +80,8 @@ def already_recorded(
 
 def require_same_recording(stored: Mapping[str, Any], content: Mapping[str, Any], folder: Path) -> None:
     """Raise FieldError unless both settings describe the same episodes."""
-    before = {**BY_DEFAULT, **stored}
-    require_same(folder, {key: before[key] for key in content if key in before}, content)
+    left_out = {name: value for name, value in BY_DEFAULT.items() if name in content}
+    require_same(folder, {**left_out, **stored}, content)
 
 
 def merge_shards(shards: Sequence[Path], output_dir: Path, repo_id: str) -> None:
@@ -133,7 +133,7 @@ def check_set(shards: Sequence[Path], contents: Sequence[Mapping[str, Any]]) -> 
         raise FieldError("merge_shards", "[]", "give the folders of all shards")
     first, *_ = contents = [{**BY_DEFAULT, **content} for content in contents]
     for shard, content in zip(shards, contents, strict=True):
-        differing = [key for key in first if key != "shard" and content.get(key) != first[key]]
+        differing = different_settings(first, content, ("shard",))
         if differing or content["shard"][1] != first["shard"][1]:
             raise FieldError(
                 "merge_shards",

@@ -16,8 +16,8 @@ from lerobot_dataset_maniskill.merging import already_recorded, merge_folders, r
 from lerobot_dataset_maniskill.writer import find_damage
 from lerobot_wmrl.common.constants import EVALUATION_SEED, GATE_SEED
 from lerobot_wmrl.common.errors import FieldError, within
-from lerobot_wmrl.common.files import write_json, writing
-from lerobot_wmrl.common.output_folders import locked, require_empty
+from lerobot_wmrl.common.files import foreign_files, write_json, writing
+from lerobot_wmrl.common.output_folders import locked
 from lerobot_wmrl.common.policies import check_weights
 from lerobot_wmrl.data.budget import Ledger
 from lerobot_wmrl.data.dataset import open_dataset
@@ -47,7 +47,7 @@ class Source(Protocol):
         """Record these parts into folders in `work`, with a progress bar."""
 
     def describe(self, merged: Path) -> None:
-        """Add to the merged dataset what is said of it beside its episodes; its settings among it."""
+        """Add to the merged episodes their settings, and what describes the dataset."""
 
     def settings(self, root: Path) -> dict[str, Any] | None:
         """Return the settings that a dataset says it was recorded with; None if it does not."""
@@ -76,7 +76,7 @@ def record(config: RecordConfig) -> None:
         if config.policy is not None:
             check_weights(config.policy)
         source.check()
-        with writing("output_dir", root), claimed(work, content):
+        with writing("output_dir", root), claimed(root, work, content):
             if missing := missing_parts(work, source.parts):
                 source.record(work, missing)
             merge(source, work, root, config.dataset_id)
@@ -89,7 +89,7 @@ def record(config: RecordConfig) -> None:
 def check_budget(config: RecordConfig, ledger: Ledger) -> None:
     """Raise FieldError for episodes from which a method under a budget must not learn.
 
-    The gate's rollouts have seeds of their own, on which nothing is reported.
+    The gate's rollouts in ManiSkill have seeds of their own, on which nothing is reported.
     """
     if isinstance(config.env, WorldModelEnv):
         from lerobot_wmrl.envs.start_frames import check_starts
@@ -97,12 +97,13 @@ def check_budget(config: RecordConfig, ledger: Ledger) -> None:
         with within("env"):
             check_starts(config.env.dataset, ledger)
         return
+    in_maniskill = isinstance(config.env, WmrlManiSkillEnv)
     if isinstance(config.env, WmrlManiSkillEnv) and config.env.split == "ood":
         raise FieldError(
             "env.split", "ood", "under a budget, nothing is recorded in unseen scenes", "choose ind"
         )
     end = config.seed + config.num_episodes
-    if config.seed < GATE_SEED and end > EVALUATION_SEED:
+    if end > EVALUATION_SEED and not (in_maniskill and config.seed >= GATE_SEED):
         raise FieldError(
             "seed", config.seed,
             f"under a budget, seeds from {EVALUATION_SEED} on are for evaluation; these reach {end - 1}",
@@ -118,19 +119,23 @@ def discard(work: Path, content: Mapping[str, Any]) -> None:
 
 
 @contextmanager
-def claimed(work: Path, content: Mapping[str, Any]) -> Iterator[None]:
-    """Lock the folder of unfinished work, which belongs to one configuration and one running command.
+def claimed(root: Path, work: Path, content: Mapping[str, Any]) -> Iterator[None]:
+    """Lock the folder of unfinished work for `root`. It belongs to one configuration and one running command.
 
     A command that fails before a part is recorded leaves no folder behind.
     """
     work.mkdir(parents=True, exist_ok=True)
-    with locked(work, work / LOCK):
+    (work / LOCK).touch()
+    with locked(root, work / LOCK):
         stored = work / CONTENT_FILE
         if stored.is_file() and has_parts(work):
-            require_same_recording(json.loads(stored.read_text()), content, work)
+            require_same_recording(json.loads(stored.read_text()), content, root)
         else:
-            if not stored.is_file():
-                require_empty(work, LOCK, CONTENT_FILE)
+            if not stored.is_file() and foreign_files(work, LOCK, CONTENT_FILE):
+                raise FieldError(
+                    "output_dir", root, f"{work} beside it, for what is unfinished, holds something else",
+                    "move that away, or choose another folder",
+                )  # fmt: skip
             write_json(stored, dict(content))
         try:
             yield

@@ -35,7 +35,7 @@ def require_free(output_dir: Path, config: Mapping[str, Any], free: Collection[s
     if marker.is_file():
         require_same(output_dir, json.loads(marker.read_text()), config, {"output_dir", *free})
     else:
-        require_empty(output_dir)
+        require_empty(output_dir, CONFIG_FILE)
 
 
 def require_empty(output_dir: Path, *own: str) -> None:
@@ -58,7 +58,7 @@ def require_same(
 @contextmanager
 def locked(output_dir: Path, file: Path) -> Iterator[None]:
     """Hold a file of the folder against other runs. Raises FieldError if one is there."""
-    with file.open("a") as held:
+    with file.open() as held:
         try:
             fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

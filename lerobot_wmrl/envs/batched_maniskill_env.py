@@ -15,12 +15,13 @@ from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.maniskill_env import image_observations, observation_space
 from lerobot_wmrl.envs.scene_results import SceneResults
+from lerobot_wmrl.envs.tensor_env import TensorEnv
 from lerobot_wmrl.maniskill.batched import BatchedFrame
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW, FPS
 from lerobot_wmrl.maniskill.scenes import scene_for_seed
 
 
-class BatchedManiSkillEnv(gym.vector.VectorEnv):
+class BatchedManiSkillEnv(TensorEnv):
     """B episodes in one simulation, with the observations and results of `ManiSkillTensorEnv`.
 
     Args:

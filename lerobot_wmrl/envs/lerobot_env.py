@@ -20,6 +20,7 @@ from lerobot_wmrl.common.errors import FieldError, within
 from lerobot_wmrl.common.policies import check_fit, seen_shape
 from lerobot_wmrl.envs.configuration_hub import HubEnv
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.envs.tensor_env import TensorEnv
 
 FRAME_LIMIT: Final = "_max_episode_steps"
 """Attribute of an environment that ends LeRobot's rollouts."""
@@ -28,10 +29,10 @@ SAME_START: Final = 0.01
 """Difference between two starts that rendering may make: of pixels in [0, 1], or in the state's units."""
 
 
-def make_tensor_env(config: EnvConfig, n_envs: int, device: str) -> gym.vector.VectorEnv:
+def make_tensor_env(config: EnvConfig, n_envs: int, device: str) -> TensorEnv:
     """Return `n_envs` environments for reinforcement learning, as this project's own or around LeRobot's."""
     if is_own(config):
-        own: gym.vector.VectorEnv = config.create_tensor_env(n_envs, device)
+        own: TensorEnv = config.create_tensor_env(n_envs, device)
         return own
     if isinstance(config, HubEnvConfig):
         raise FieldError(
@@ -108,17 +109,11 @@ def check_real_env(policy: PreTrainedConfig, config: EnvConfig, starts: int = 0)
     check_fit(policy, sized, env.single_action_space.shape[0], "real_env")
 
 
-class LeRobotTensorEnv(gym.vector.VectorEnv):
-    """B environments of LeRobot's, stepped one after the other, with SAME_STEP autoreset.
+class LeRobotTensorEnv(TensorEnv):
+    """B environments of LeRobot's, stepped one after the other.
 
-    Observations have LeRobot's names, as its rollout makes them: images (B, 3, H, W) in [0, 1], `task`
-    (B instructions). If the environment has several tasks, they are shared out among the B. An episode is
-    truncated after `_max_episode_steps` frames, which LIBERO leaves to LeRobot's rollout.
-
-    Actions (B, A) that are out of the environment's range are clipped to it and counted:
-    `info["reward_parts"]["clipped"]`, the share of components. NaN is refused. When an episode ends in a
-    step, `info["final_obs"]` holds the observations before the reset, and `info["final_info"]` holds
-    `is_success` and `episode_length`, (B,) each.
+    Observations are what its rollout makes of them. An episode is truncated after `_max_episode_steps`
+    frames, which LIBERO leaves to LeRobot's rollout. Actions that are NaN are refused.
     """
 
     def __init__(self, config: EnvConfig, n_envs: int, device: str) -> None:

@@ -16,6 +16,7 @@ from lerobot_wmrl.common.actions import clip_actions
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.scene_results import CountingAsyncVectorEnv, CountingSyncVectorEnv
+from lerobot_wmrl.envs.tensor_env import TensorEnv
 from lerobot_wmrl.maniskill.backend import simulating_context
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW, FPS, STATE_NAMES
 from lerobot_wmrl.maniskill.episode import Frame
@@ -126,15 +127,10 @@ def make_vector_env(
     )
 
 
-class ManiSkillTensorEnv(gym.vector.VectorEnv):
-    """B simulators, each in a process of its own, with tensors on `device` and SAME_STEP autoreset.
+class ManiSkillTensorEnv(TensorEnv):
+    """B simulators, each in a process of its own, with tensors on `device`.
 
-    If there are several tasks, they are shared out among the B: row b has task b mod their number.
-
-    The world model has the same interface. Observation: `observation.images.<camera>` (B, 3, H, W) float32 in
-    [0, 1], `observation.state` (B, 8), `task` (B instructions). When an episode ends in a step,
-    `info["final_obs"]` holds the observations before the reset (rows of the others equal the observation),
-    and `info["final_info"]` holds `is_success` and `episode_length`, (B,) each.
+    Row b has task b mod their number.
     """
 
     metadata = {"render_fps": FPS, "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012 (gymnasium's own)

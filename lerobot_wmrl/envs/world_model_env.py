@@ -19,6 +19,7 @@ from lerobot_wmrl.common.statistics import evenly_spaced
 from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.start_frames import GoalFeatures, StartImages, Starts, load_starts, read_start_images
+from lerobot_wmrl.envs.tensor_env import TensorEnv
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rewards.general import consecutive_count, is_done
 from lerobot_wmrl.rewards.loading import Reward, load_reward
@@ -34,13 +35,11 @@ from lerobot_wmrl.world_models.modeling_world_model import (
 )
 
 
-class WorldModelVectorEnv(gym.vector.VectorEnv):
-    """B imagined episodes: tensors in, tensors out, SAME_STEP autoreset with `final_obs` and `final_info`.
+class WorldModelVectorEnv(TensorEnv):
+    """B imagined episodes.
 
-    Observations: `observation.images.<camera>` (B, 3, H, W) in [0, 1], of the size that the dataset's frames
-    have, `observation.state` (B, P) if the model predicts it, `task` (B strings). Actions (B, A) in the
-    dataset's units; NaN is refused, and what is out of their range is clipped to it and counted:
-    `reward_parts["clipped"]`, the share of components.
+    Images have the size of the dataset's frames, and there is a state if the model predicts it. Actions that
+    are NaN are refused.
 
     A step synchronises with the device once, to learn whether an episode has ended and whether every action
     was a number. Resets are expensive, so they run only when an episode has ended, and only then the

@@ -68,7 +68,7 @@ def columns(improvement: Improvement) -> list[str]:
 
 def rollouts(improvement: Improvement) -> list[str]:
     config = improvement.config
-    like: Flags = {"like.root": str(improvement.dataset), "max_frames": improvement.frame_limit}
+    like: Flags = {"like.root": str(improvement.mergeable), "max_frames": improvement.frame_limit}
     return ["lerobot-wmrl-record", *format_flags({
         "policy.path": improvement.policy, **real_env(improvement, "env"),
         **({} if improvement.in_maniskill else like),
@@ -79,7 +79,7 @@ def rollouts(improvement: Improvement) -> list[str]:
 
 
 def merged(improvement: Improvement) -> list[str]:
-    parts = {"dataset": improvement.dataset, "rollouts": improvement.out / "rollouts"}
+    parts = {"dataset": improvement.mergeable, "rollouts": improvement.out / "rollouts"}
     return merge_command(improvement.out / "merged", parts)
 
 

@@ -181,7 +181,7 @@ class Improvement:
         return [name for name in self.found.columns if name not in recorded]
 
     @property
-    def dataset(self) -> Path:
+    def mergeable(self) -> Path:
         """Folder of the dataset with the columns that rollouts have too."""
         return self.out / "columns" if self.extra_columns else self.found.root
 

@@ -11,6 +11,7 @@ from lerobot_wmrl.common.constants import SELECTION_SEED
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.envs.lerobot_env import is_own
+from lerobot_wmrl.envs.tensor_env import TensorEnv
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv, make_success_env
 from lerobot_wmrl.evaluation.agreement import evaluate_policy, evaluate_within
 from lerobot_wmrl.rl.callbacks import Callback
@@ -26,7 +27,7 @@ class Trained(NamedTuple):
 
     policy: Any
     processors: tuple[Any, Any]
-    env: Any
+    env: TensorEnv
     config: EnvConfig
 
 

@@ -17,9 +17,7 @@ from lerobot_wmrl.common.presets import Flags, format_flags
 from lerobot_wmrl.common.processes import run_subcommand
 from lerobot_wmrl.data.budget import Ledger, budget_flags, spending
 from lerobot_wmrl.data.dataset import open_dataset
-from lerobot_wmrl.data.embodiment import (
-    Embodiment,
-)
+from lerobot_wmrl.data.embodiment import Embodiment
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.rl.rollout_recorder import RolloutRecorder

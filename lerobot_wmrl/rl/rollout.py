@@ -3,12 +3,12 @@
 T time, B environments, K action components, n steps of one decision (an action chunk).
 """
 
-import gymnasium as gym
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
 from lerobot_wmrl.common.distributed import hidden_progress, mean_over_processes
+from lerobot_wmrl.envs.tensor_env import TensorEnv
 from lerobot_wmrl.rl.observations import ObservationBuffer, as_read_back
 from lerobot_wmrl.rl.protocol import ActionSample, Observation, Pipeline, StochasticPolicy
 from lerobot_wmrl.rl.seeds import seeded_noise, start_seeds
@@ -179,13 +179,13 @@ class Actor:
 
 @torch.no_grad()
 def collect(
-    env: gym.vector.VectorEnv, policy: StochasticPolicy, pipeline: Pipeline, buffer: RolloutBuffer, seed: int,
+    env: TensorEnv, policy: StochasticPolicy, pipeline: Pipeline, buffer: RolloutBuffer, seed: int,
     group_size: int = 1,
 ) -> dict[str, float]:  # fmt: skip
     """Fill `buffer` with T steps of new episodes, and return metrics, averaged over all processes.
 
     Args:
-        env: B environments with `final_obs` in `info` (autoreset in the same step).
+        env: B environments.
         policy: draws the actions.
         pipeline: the policy's processors.
         buffer: receives the rollout; what it holds is overwritten.

@@ -21,6 +21,7 @@ from lerobot_wmrl.common.lerobot_compat import (
     should_save_checkpoint,
 )
 from lerobot_wmrl.common.tracking import Tracker
+from lerobot_wmrl.envs.tensor_env import TensorEnv
 from lerobot_wmrl.rl.callbacks import Callback, Callbacks
 from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
@@ -116,7 +117,11 @@ def train(
 
 
 def iterate(
-    env: Any, algorithm: TrainableAlgorithm, pipeline: Pipeline, rollout: RolloutBuffer, schedule: Schedule
+    env: TensorEnv,
+    algorithm: TrainableAlgorithm,
+    pipeline: Pipeline,
+    rollout: RolloutBuffer,
+    schedule: Schedule,
 ) -> dict[str, float]:
     """Run one iteration of the algorithm on seeds of its own, and return metrics."""
     rank, processes = rank_and_size()

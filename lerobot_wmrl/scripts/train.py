@@ -31,6 +31,7 @@ from lerobot_wmrl.common.precision import keep_freed_memory
 from lerobot_wmrl.common.presets import expand_preset
 from lerobot_wmrl.common.tracking import make_wandb
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
+from lerobot_wmrl.envs.tensor_env import TensorEnv
 from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 from lerobot_wmrl.rl.configuration_train import MAY_DIFFER, TrainConfig, check_config, load_config
@@ -62,7 +63,7 @@ def train_policy(cfg: TrainConfig) -> None:
         policy, processors = load_policy(config), load_processors(config)
         settings = draccus.encode(cfg)  # an environment of the hub tells its configuration of its actions
         with within("env"):
-            env: Any = make_tensor_env(cfg.env, cfg.num_envs, config.device or "cpu")
+            env = make_tensor_env(cfg.env, cfg.num_envs, config.device or "cpu")
         try:
             train_in(env, cfg, settings, policy, processors)
         finally:
@@ -90,7 +91,7 @@ def finished(cfg: TrainConfig) -> bool:
 
 
 def train_in(
-    env: Any,
+    env: TensorEnv,
     cfg: TrainConfig,
     settings: dict[str, Any],
     policy: Any,
@@ -140,16 +141,16 @@ def train_in(
     )  # fmt: skip
 
 
-def check_tasks(cfg: TrainConfig, env: Any) -> None:
+def check_tasks(cfg: TrainConfig, env: TensorEnv) -> None:
     """Raise FieldError if a task has no environment, or if GRPO finds no two episodes from the same start."""
-    tasks, grpo = getattr(env, "tasks", 1), isinstance(cfg.algorithm, GRPOConfig)
+    tasks, grpo = env.tasks, isinstance(cfg.algorithm, GRPOConfig)
     if grpo and tasks > 1:
         raise FieldError(
             "algorithm.type", cfg.algorithm.type,
             f"compares episodes from the same start, and the environment has {tasks} tasks",
             "choose one task, or ppo",
         )  # fmt: skip
-    if grpo and hasattr(env, "repeats_starts") and not env.repeats_starts():
+    if grpo and not env.repeats_starts():
         raise FieldError(
             "algorithm.type", cfg.algorithm.type,
             "compares episodes from the same start, and in this environment a seed does not decide it",

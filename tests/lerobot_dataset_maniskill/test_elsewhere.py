@@ -18,9 +18,11 @@ from lerobot.utils.constants import DEFAULT_FEATURES, OBS_IMAGE
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.merging import merge_folders
 from lerobot_dataset_maniskill.recorder import record
-from lerobot_wmrl.common.constants import START_SEED
+from lerobot_wmrl.common.constants import EVALUATION_SEED, GATE_SEED, START_SEED
+from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.images import to_bytes
 from lerobot_wmrl.common.policies import read_policy_config
+from lerobot_wmrl.data.budget import Ledger, Limits
 from lerobot_wmrl.data.dataset import DatasetSource, open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.features import matched
@@ -198,6 +200,29 @@ def test_an_interrupted_recording_continues_and_a_whole_one_is_left_alone(
     config.exploration = 0.5
     with pytest.raises(ValueError, match=r"other settings \(exploration 0\.0 → 0\.5\)"):
         record(config)
+
+
+def test_under_a_budget_no_seed_of_evaluation_selection_or_gate_is_recorded(
+    config: RecordConfig, tmp_path: Path
+) -> None:
+    config.budget = Ledger.create(tmp_path / "budget.json", Limits(rollouts=9)).path
+    for seed in (EVALUATION_SEED, GATE_SEED):
+        config.seed = seed
+        with pytest.raises(ValueError, match=rf"seed={seed}: under a budget"):
+            record(config)
+
+
+def test_a_part_that_a_killed_call_left_damaged_is_recorded_again(
+    config: RecordConfig, caplog: pytest.LogCaptureFixture
+) -> None:
+    work = config.root.with_name(f".{config.root.name}.recording")
+    for name in ("part-00000", ".part-00001.partial"):
+        (work / name / "meta").mkdir(parents=True)
+    write_json(work / "recording.json", config.recorded_content())
+    record(config)
+    assert "part-00000 is recorded again: corrupted" in caplog.text
+    assert not work.exists()
+    assert open_dataset(config.root).num_episodes == 3
 
 
 def test_without_demonstrations_the_environment_says_what_the_actions_are(
