@@ -8,11 +8,13 @@ import torch
 from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
+from lerobot_wmrl.envs.tensor_env import TensorEnv
+
 REACH = 0.15
 """Distance from the goal at which an episode succeeds."""
 
 
-class PointEnv(gym.vector.VectorEnv):
+class PointEnv(TensorEnv):
     """Move a point, in steps of at most 0.1 a component, to a goal in [-1, 1]²; three components, one idle.
 
     The state is point and goal (B, 4); with `image_size`, they are drawn as a red and a blue square too.
