@@ -139,7 +139,7 @@ def check_set(shards: Sequence[Path], contents: Sequence[Mapping[str, Any]]) -> 
                 "merge_shards",
                 shard,
                 f"belongs to another recording than {shards[0]} "
-                f"({', '.join(differing) or 'number of shards'} differ)",
+                f"({'; '.join(differing) or 'another number of shards'})",
             )
     count, numbers = first["shard"][1], [content["shard"][0] for content in contents]
     twice = sorted({number for number in numbers if numbers.count(number) > 1})
