@@ -70,20 +70,13 @@ class Rollouts:
             for name in missing:
                 recorder.record(work / name, self.seeds[name], report)
 
-    def describe(self, merged: Path) -> None:
-        """Describe the columns as `like` does, and keep the settings."""
+    def describe(self, merged: Path) -> str:
+        """Describe the columns as `like` does, keep the settings, and say what was recorded."""
         if self.config.like.given and self.config.like_columns:
             with within("like"):
                 describe_alike(merged, self.config.like.open().features)
         write_json(merged / SETTINGS_FILE, self.content)
-
-    def settings(self, root: Path) -> dict[str, Any] | None:
-        stored = root / SETTINGS_FILE
-        return json.loads(stored.read_text()) if stored.is_file() else None
-
-    def report(self, root: Path) -> str:
-        """Return what was recorded, how often it succeeds, and the next command."""
-        table = read_episodes(open_dataset(root))
+        root, table = self.config.root, read_episodes(open_dataset(merged))
         episodes, frames, fps = len(table.length), int(table.length.sum()), table.dataset.fps
         return (
             f"{root}: {episodes} episodes, {frames} frames ({frames / fps / 60:.1f} minutes)\n"
@@ -91,3 +84,7 @@ class Rollouts:
             f"next: lerobot-wmrl-train-world-model --model.type=frame_tokenizer --dataset.root={root} "
             "--output_dir=outputs/frame_tokenizer"
         )
+
+    def settings(self, root: Path) -> dict[str, Any] | None:
+        stored = root / SETTINGS_FILE
+        return json.loads(stored.read_text()) if stored.is_file() else None

@@ -12,7 +12,7 @@ from tqdm import tqdm
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.imagined import ImaginedPartRecorder
 from lerobot_dataset_maniskill.manifest import Part, planned_parts
-from lerobot_dataset_maniskill.merging import describe, recorded_settings, report
+from lerobot_dataset_maniskill.merging import describe, recorded_settings
 from lerobot_dataset_maniskill.worker import EpisodeResult, PartRecorder, Report, serve_parts
 from lerobot_wmrl.common.actions import warn_of_clipped
 from lerobot_wmrl.common.constants import KINDS
@@ -63,14 +63,11 @@ class ManiSkillEpisodes:
             else:
                 record_in_parallel(config, work, parts, count, report)
 
-    def describe(self, merged: Path) -> None:
-        describe(merged, self.config.dataset_id, self.content)
+    def describe(self, merged: Path) -> str:
+        return describe(merged, self.config.root, self.config.dataset_id, self.content)
 
     def settings(self, root: Path) -> dict[str, Any] | None:
         return recorded_settings(root)
-
-    def report(self, root: Path) -> str:
-        return report(root)
 
 
 @contextmanager

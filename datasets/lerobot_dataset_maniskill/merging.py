@@ -30,21 +30,21 @@ def merge_folders(folders: Sequence[Path], target: Path, repo_id: str) -> None:
     )  # fmt: skip
 
 
-def describe(merged: Path, repo_id: str, content: Mapping[str, Any]) -> None:
+def describe(merged: Path, output_dir: Path, repo_id: str, content: Mapping[str, Any]) -> str:
     """Add vocabulary, pictures and card to a dataset that is not in its place yet.
 
     Args:
         merged: the dataset.
+        output_dir: where it is to be.
         repo_id: its name.
         content: the settings that decide its episodes, written into its vocabulary.
+
+    Returns:
+        What was recorded, how often each kind succeeded, and the next command.
     """
     write_vocabulary(merged, content)
-    write_card(merged, repo_id, recorded_episodes(merged))
-
-
-def report(output_dir: Path) -> str:
-    """Return what was recorded, how often each kind succeeded, and the next command."""
-    table = recorded_episodes(output_dir)
+    table = recorded_episodes(merged)
+    write_card(merged, repo_id, table)
     frames = int(table["length"].sum())
     rates = (f"{kind} {wins}/{total}" for kind, (wins, total) in success_by_kind(table).items())
     command = "lerobot-wmrl-train-world-model --model.type=frame_tokenizer"
@@ -107,9 +107,9 @@ def merge_shards(shards: Sequence[Path], output_dir: Path, repo_id: str) -> None
     problem = find_damage(merged, content["num_episodes"])
     if problem:
         raise FieldError("merge_shards", _listed(shards), problem, "record the incomplete shards again")
-    describe(merged, repo_id, content)
+    report = describe(merged, output_dir, repo_id, content)
     merged.replace(output_dir)
-    print(report(output_dir))
+    print(report)
 
 
 def recorded_settings(root: Path) -> dict[str, Any] | None:

@@ -46,14 +46,15 @@ class Source(Protocol):
     def record(self, work: Path, missing: Sequence[str]) -> None:
         """Record these parts into folders in `work`, with a progress bar."""
 
-    def describe(self, merged: Path) -> None:
-        """Add to the merged episodes their settings, and what describes the dataset."""
+    def describe(self, merged: Path) -> str:
+        """Add to the merged episodes their settings, and what describes the dataset.
+
+        Returns:
+            What was recorded, how often it succeeds, and the next command.
+        """
 
     def settings(self, root: Path) -> dict[str, Any] | None:
         """Return the settings that a dataset says it was recorded with; None if it does not."""
-
-    def report(self, root: Path) -> str:
-        """Return what was recorded, how often it succeeds, and the next command."""
 
 
 def record(config: RecordConfig) -> None:
@@ -80,7 +81,6 @@ def record(config: RecordConfig) -> None:
             if missing := missing_parts(work, source.parts):
                 source.record(work, missing)
             merge(source, work, root, config.dataset_id)
-        print(source.report(root))
         shutil.rmtree(work, ignore_errors=True)
     if ledger is not None:
         ledger.charge(read_episodes(open_dataset(root)), imagined=imagined)
@@ -97,13 +97,13 @@ def check_budget(config: RecordConfig, ledger: Ledger) -> None:
         with within("env"):
             check_starts(config.env.dataset, ledger)
         return
-    in_maniskill = isinstance(config.env, WmrlManiSkillEnv)
-    if isinstance(config.env, WmrlManiSkillEnv) and config.env.split == "ood":
+    maniskill = config.env if isinstance(config.env, WmrlManiSkillEnv) else None
+    if maniskill and maniskill.split == "ood":
         raise FieldError(
             "env.split", "ood", "under a budget, nothing is recorded in unseen scenes", "choose ind"
         )
     end = config.seed + config.num_episodes
-    if end > EVALUATION_SEED and not (in_maniskill and config.seed >= GATE_SEED):
+    if end > EVALUATION_SEED and not (maniskill and config.seed >= GATE_SEED):
         raise FieldError(
             "seed", config.seed,
             f"under a budget, seeds from {EVALUATION_SEED} on are for evaluation; these reach {end - 1}",
@@ -167,11 +167,12 @@ def missing_parts(work: Path, parts: Mapping[str, int]) -> list[str]:
 
 
 def merge(source: Source, work: Path, root: Path, repo_id: str) -> None:
-    """Merge the parts and move the whole into place at once."""
+    """Merge the parts, move the whole into place at once, and report it."""
     merged = work / "merged"
     shutil.rmtree(merged, ignore_errors=True)
     merge_folders([work / name for name in source.parts], merged, repo_id)
     if problem := find_damage(merged, sum(source.parts.values())):
         raise ValueError(f"{work}: merging failed: {problem}; remove the folder and record again")
-    source.describe(merged)
+    report = source.describe(merged)
     merged.replace(root)
+    print(report)
