@@ -12,8 +12,12 @@ from experiments.value_cells import SCENES, Cell, best, gain, measured, publishe
 from lerobot_wmrl.common.files import markdown_table as table
 
 STUDY: Final = "value_four_tasks"
-PARTS: Final = ("value_four_tasks_simulator", "value_four_tasks_others")
-"""Stems of the study, and of those that add methods to its table."""
+PARTS: Final = {
+    "value_four_tasks_simulator": "simulated_ppo",
+    "value_four_tasks_others": "longer_filtered",
+    "value_four_tasks_ppo_distilled": "ppo_distilled",
+}
+"""Stems of the study, and of those that add a method to its table."""
 
 TITLES: Final = {
     "cloning": "BC",
@@ -170,17 +174,10 @@ def begun(cells: Sequence[Cell]) -> str:
     return f"PPO in imagination begins from the policy that succeeds most often there: {'; '.join(said)}."
 
 
-def simulator(load: Load) -> str:
-    """Return the section of PPO in ManiSkill, whose numbers are in the table."""
-    return f"""Its column is in [the table above](#{STUDY}): {TITLES["simulated_ppo"]}. Training took
-{spent(load, "value_four_tasks_simulator", "simulated_ppo")} minutes, those of BC among them."""
-
-
-def others(load: Load) -> str:
-    """Return the section of the methods that were run last, whose numbers are in the table."""
-    return f"""Its columns are in [the table above](#{STUDY}): {TITLES["longer_filtered"]}, and PPO in
-imagination, {TITLES["ppo_distilled"]}. All training up to the latter took
-{spent(load, "value_four_tasks_others", "ppo_distilled")} minutes."""
+def column_above(load: Load, part: str) -> str:
+    """Return the section of a study that adds a method to the table."""
+    return f"""Its column is in [the table above](#{STUDY}): {TITLES[PARTS[part]]}. Training took
+{spent(load, part, PARTS[part])} minutes, those of what it begins from among them."""
 
 
 def spent(load: Load, stem: str, method: str) -> str:

@@ -45,8 +45,10 @@ SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     "value_tasks_simulator": ("Policies", partial(TASKS_ROWS, ["simulated_ppo"])),
     "value_tasks_ppo_distilled": ("Policies", partial(TASKS_ROWS, ["ppo_distilled"])),
     "value_four_tasks": ("Policies", four_tasks_section.section),
-    "value_four_tasks_simulator": ("Policies", four_tasks_section.simulator),
-    "value_four_tasks_others": ("Policies", four_tasks_section.others),
+    **{
+        part: ("Policies", partial(four_tasks_section.column_above, part=part))
+        for part in four_tasks_section.PARTS
+    },
     "value_longer": ("Policies", partial(value.rows_above, ["longer", "longer_filtered"])),
     "value_longer_imagined": (
         "Policies",
