@@ -1,3 +1,5 @@
+"""An environment in which a world model is the simulator."""
+
 from dataclasses import replace
 from pathlib import Path
 
@@ -6,49 +8,18 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from gymnasium.vector import AutoresetMode
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wmrl.common.checkpoints import Checkpoint
-from lerobot_wmrl.common.constants import TASKS
 from lerobot_wmrl.data.dataset import ChosenEpisodes
-from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
-from lerobot_wmrl.envs.start_frames import branch_frames
-from lerobot_wmrl.envs.world_model_env import make_success_env
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH
-from lerobot_wmrl.rewards.configuration_rewards import EmbeddingConfig, GeneralConfig, ProxyConfig
-from lerobot_wmrl.rewards.modeling_rewards import EmbeddingRewardModel, ProxyRewardModel
+from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rewards.similarity import TokenizerSimilarity
 from lerobot_wmrl.scripts.eval_world_model import EvalWorldModelConfig, eval_world_model
 from lerobot_wmrl.world_models.frame_tokenizer import Decoded
-from tests.read_backs import fetched
-from tests.trained import CLIP_LENGTH, action_config, run_training
-
-B = 4
-IMAGE, STATE = "observation.images.third_view", "observation.state"
-
-
-@pytest.fixture(scope="module")
-def config(small_dataset, trained_models) -> WorldModelEnv:
-    return WorldModelEnv(
-        world_model_path=str(trained_models["action_world_model"]),
-        text_world_model_path=str(trained_models["text_world_model"]),
-        dataset=StartFrames(root=str(Path(small_dataset.root))),
-        episode_length=5,
-        done_threshold=0.999,
-    )
-
-
-@pytest.fixture
-def env(config):
-    return config.create_tensor_env(B)
-
-
-def always_done(env, flags: torch.Tensor) -> None:
-    """Make the model's done logit +20 where `flags` (B,) and −20 elsewhere."""
-    step = env.model.step
-    env.model.step = lambda *args: step(*args)._replace(done_logit=torch.where(flags, 20.0, -20.0))
+from tests.envs.imagination import IMAGE, STATE, B, always_done
+from tests.trained import CLIP_LENGTH, run_training
 
 
 def test_the_observation_is_what_the_config_announces(config, env):
@@ -176,25 +147,6 @@ def test_without_a_dense_part_no_goal_and_no_text_model_is_needed(config):
         replace(config, text_world_model_path="")
 
 
-def test_starts_can_be_chosen_by_task_and_scene(config):
-    def count(**chosen) -> int:
-        env = replace(config, dataset=replace(config.dataset, **chosen)).create_tensor_env(1)
-        return len(env.starts)
-
-    assert count() == 6
-    assert count(scenes=[1], tasks=[TASKS[0]]) == 3
-    assert count(split="train,ind", scenes=[0]) == 3
-    assert count(episodes=[4, 0, 5]) == 3
-    with pytest.raises(ValueError, match=r"^dataset\.episodes=\[9\]: there is no episode 9"):
-        count(episodes=[9])
-    with pytest.raises(ValueError, match=r"^dataset\.scenes=\[7\]: no episode"):
-        count(scenes=[7])
-    with pytest.raises(ValueError, match=rf"^dataset\.tasks=\['{TASKS[1]}'\]: no episode"):
-        count(tasks=[TASKS[1]])
-    with pytest.raises(ValueError, match=r"^dataset\.tasks=\['fly'\]: choose from"):
-        count(tasks=["fly"])
-
-
 def test_an_episode_that_restarts_forgets_what_came_before(env):
     always_done(env, torch.tensor([True, False, False, False]))
     env.reset(seed=0)
@@ -286,46 +238,6 @@ def test_lerobot_eval_gets_numpy_and_frozen_episodes(config):
     assert info["final_info"]["is_success"][0]
 
 
-def test_episodes_begin_in_saved_frames_as_in_those_of_the_dataset(config, env, small_dataset, tmp_path):
-    """The same frames, saved by hand; and a file that lacks something, or has it in another shape."""
-    rows = [small_dataset[int(row)] for row in small_dataset.meta.episodes["dataset_from_index"]]
-    whole = {
-        IMAGE: np.stack([(255 * row[IMAGE]).round().byte().permute(1, 2, 0).numpy() for row in rows]),
-        STATE: np.stack([row[STATE].numpy() for row in rows]),
-        "task": np.array([row["task"] for row in rows]),
-    }  # fmt: skip
-    path = tmp_path / "starts.npz"
-    saved = replace(config, dataset=StartFrames(frames=path, max_starts=4))
-    np.savez(path, **whole)
-    found, spread = saved.create_tensor_env(2).starts, [0, 2, 3, 5]
-    assert torch.equal(found.frames.tokens, env.starts.frames.tokens[spread])
-    assert torch.equal(found.frames.state, env.starts.frames.state[spread])
-    assert found.instructions == [env.starts.instructions[row] for row in spread]
-    for name, value in (
-        (IMAGE, whole[IMAGE][:, :16]), (STATE, whole[STATE][:, :3]), ("task", whole["task"][:3]),
-        ("task", np.array("push")), (STATE, whole[STATE][:5]),
-    ):  # fmt: skip
-        np.savez(path, **{**whole, name: value})
-        with pytest.raises(ValueError, match=rf"^dataset\.frames=.*needs {name} of shape \(6,"):
-            saved.create_tensor_env(2)
-    np.savez(path, **{name: value[:0] for name, value in whole.items()})
-    with pytest.raises(ValueError, match=rf"needs {IMAGE} of shape \('K', 32, 32, 3\), has \(0,"):
-        saved.create_tensor_env(2)
-    np.savez(path, **{**whole, STATE: whole[STATE] * np.nan})
-    with pytest.raises(ValueError, match=rf"^dataset\.frames=.*{STATE} contains NaN"):
-        saved.create_tensor_env(2)
-    np.savez(path, **whole)
-    cut = path.read_bytes()[: path.stat().st_size // 2]
-    with (tmp_path / "one.npy").open("wb") as file:
-        np.save(file, np.zeros(3))
-    for content in (b"no frames", b"", cut, (tmp_path / "one.npy").read_bytes()):
-        path.write_bytes(content)
-        with pytest.raises(ValueError, match=r"cannot be read.*numpy\.savez"):
-            saved.create_tensor_env(2)
-    with pytest.raises(ValueError, match="starts are given by a dataset and frames; give one"):
-        replace(config, dataset=replace(config.dataset, frames=path)).create_tensor_env(2)
-
-
 def test_lerobot_eval_gets_an_environment_for_each_task(config, make_synthetic_dataset, tmp_path):
     """Episodes of two tasks; both environments share their models."""
     dataset = make_synthetic_dataset(tmp_path / "two", episodes=6)
@@ -358,100 +270,6 @@ def test_models_that_do_not_fit_together_are_refused(config, small_dataset, trai
         replace(config, text_world_model_path=str(trained_models["action_world_model"])).create_tensor_env(1)
 
 
-def test_success_is_counted_from_starts_all_over_the_dataset(env):
-    counting = make_success_env(env, env.config.dataset, 3)
-    assert torch.equal(counting.starts.images, env.starts.images[[0, 2, 5]])
-    assert len(make_success_env(env, env.config.dataset, 50).starts) == 6, "none twice"
-
-
-@pytest.mark.parametrize(("given", "message"), [
-    ({"frames": Path("starts.npz"), "tasks": [TASKS[0]]}, "saved frames do not say their task"),
-    ({"frames": Path("starts.npz"), "split": "ood"}, "saved frames do not say their task, scene or split"),
-    ({"resets": 2, "split": "validation,ood"}, r"split=validation,ood: .*ManiSkill.* ind or ood"),
-    ({"resets": -1}, r"^dataset\.resets=-1: must be at least 1"),
-    ({"resets": 2, "branches": 1}, r"^dataset\.branches=1: .*; saved frames and resets are first frames"),
-    ({"root": "data", "branches": -1}, r"^dataset\.branches=-1: .* branch off from episodes of a dataset"),
-    ({"root": "data", "branches": 9, "max_starts": 9}, r"^dataset\.branches=9: .* more than the 9 starts"),
-    ({"resets": 2, "episodes": [1]}, r"^dataset\.episodes=\[1\]: .*leave it out"),
-])  # fmt: skip
-def test_what_starts_cannot_be_chosen_by_is_refused(config, given, message):
-    """Rather than ignored."""
-    with pytest.raises(ValueError, match=message):
-        replace(config, dataset=StartFrames(**given)).create_tensor_env(1)
-
-
-def fetched_by_steps(env, steps: int) -> list[int]:
-    """What the device is asked in each step of episodes that do not end."""
-    always_done(env, torch.zeros(B, dtype=torch.bool))
-    env.reset(seed=0)
-    action = torch.zeros(B, 7)
-    return [fetched(lambda: env.step(action)) for _ in range(steps)]
-
-
-REWARDS = {
-    "tokenizer": GeneralConfig(device="cpu"),
-    "mse": GeneralConfig(device="cpu", similarity="mse"),
-    "sparse": GeneralConfig(device="cpu", alpha=1.0),
-}
-
-
-@pytest.mark.parametrize("reward", list(REWARDS))
-def test_a_step_asks_the_device_only_whether_an_episode_has_ended(config, reward):
-    """Anchored dynamics ask once more in the first step, who begins."""
-    env = replace(config, reward=REWARDS[reward]).create_tensor_env(B)
-    assert fetched_by_steps(env, 4) == [2, 1, 1, 1]
-
-
-def test_learned_rewards_ask_nothing_more(env):
-    width, cameras = env.model.config.dynamics.width, env.model.config.tokenizer.cameras
-    for reward in (
-        ProxyRewardModel(ProxyConfig(device="cpu", cameras=cameras, image_size=32)),
-        EmbeddingRewardModel(EmbeddingConfig(device="cpu", world_model="untrained", hidden_size=width)),
-    ):
-        env.reward = reward.eval()
-        assert fetched_by_steps(env, 4) == [2, 1, 1, 1]
-
-
-def test_autoregressive_dynamics_never_ask_who_begins(config, small_dataset, trained_models, tmp_path):
-    model = action_config(trained_models["frame_tokenizer"], dynamics="autoregressive")
-    output = run_training(model, Path(small_dataset.root), tmp_path / "model", steps=1)
-    env = replace(config, world_model_path=str(output)).create_tensor_env(B)
-    assert fetched_by_steps(env, 4) == [1] * 4
-
-
-def test_anchored_dynamics_ask_who_begins_only_where_somebody_may(config):
-    """Whenever a clip is full, and after the restart of somebody: that once, and when that clip is full."""
-    env = replace(config, episode_length=50).create_tensor_env(B)
-    clip, still = env.model.config.clip_length, torch.zeros(B, 7)
-    quiet = [1] * (clip - 1)
-    assert fetched_by_steps(env, 2 * clip + 1) == [2, *quiet, 2, *quiet, 2]
-    step = env.model.step
-    always_done(env, torch.tensor([True, False, False, False]))
-    for _ in range(3):
-        env.step(still)
-    env.model.step = step
-    assert env._elapsed.tolist() == [0] + [2 * clip + 4] * 3
-    asked = [fetched(lambda: env.step(still)) for _ in range(clip + 1)]
-    assert asked == [2 if row in (0, clip - 4, clip) else 1 for row in range(clip + 1)]
-
-
-def test_instructions_are_those_of_the_starts(env):
-    """Of an episode that ended, and of the one after it."""
-    env.starts.instructions[:] = [f"task {row}" for row in range(len(env.starts))]
-
-    def expected() -> list[str]:
-        return [f"task {row}" for row in env._start_index.tolist()]
-
-    observation, _ = env.reset(seed=list(range(B)))
-    assert observation["task"] == expected()
-    always_done(env, torch.tensor([True, False, False, True]))
-    for _ in range(3):
-        before = expected()
-        observation, *_, info = env.step(torch.zeros(B, 7))
-    assert info["final_obs"]["task"] == before
-    assert observation["task"] == expected() != before
-
-
 def test_entropies_say_how_uncertain_the_world_model_is(config):
     """Done is certain, as likely as not, unlikely and excluded."""
     logits = torch.tensor([20.0, 0.0, -2.0, -20.0])
@@ -479,15 +297,3 @@ def test_episodes_last_as_long_as_the_world_model_has_learnt(config, trained_mod
         WorldModelEnv(world_model_path=path, done_frames=11, reward=GeneralConfig(alpha=1.0))
     with pytest.raises(ValueError, match="world_model_path: is missing"):
         _ = WorldModelEnv().horizon
-
-
-def test_starts_in_a_row_are_first_and_later_frames_alike(small_dataset: LeRobotDataset) -> None:
-    """Each episode's first frame, then those of its branches: before its success, none twice."""
-    table = read_episodes(small_dataset)
-    table.done[:] = False
-    table.done[table.start[1] + 2] = True
-    rows = branch_frames(table, np.array([0, 1]), branches=1)
-    first, second = table.start[:2]
-    assert rows.tolist() == [first, first + (table.length[0] - 1) // 2, second, second + 1]
-    table.done[second + 1] = True
-    assert branch_frames(table, np.array([1]), branches=1).tolist() == [second]
