@@ -38,6 +38,10 @@ SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
         "Policies",
         partial(SECOND_ROWS, ["longer_filtered", "longer_imagined_ppo"]),
     ),
+    "value_pick_place_discount": (
+        "Policies",
+        partial(SECOND_ROWS, ["discounted_ppo", "longer_discounted_ppo"]),
+    ),
     "value_pick_place_simulator": ("Policies", partial(SECOND_ROWS, ["simulated_ppo"])),
     "value_pick_place_dyna": ("Policies", partial(SECOND_ROWS, ["dyna"])),
     "value_pick_place_iterated": ("Policies", partial(SECOND_ROWS, ["iterated", "iterated_ppo"])),

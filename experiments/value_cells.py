@@ -28,12 +28,14 @@ TITLES: Final = {
     "ppo_distilled": "PPO in imagination, then the planner distilled",
     "longer_imagined_ppo": "PPO in imagination, from the longer BC",
     "longer_ppo_distilled": "PPO in imagination, from the longer BC, then the planner distilled",
+    "discounted_ppo": "PPO in imagination, discount 0.989",
+    "longer_discounted_ppo": "PPO in imagination, discount 0.989, from the longer BC",
 }
 """Methods in the order of the table."""
 
 IMAGINED: Final = (
     "imagined_ppo", "planned", "dyna", "iterated_ppo", "imagined_cloning", "distilled", "distilled_ppo",
-    "ppo_distilled", "longer_imagined_ppo", "longer_ppo_distilled",
+    "ppo_distilled", "longer_imagined_ppo", "longer_ppo_distilled", "discounted_ppo", "longer_discounted_ppo",
 )  # fmt: skip
 """Methods that use a world model."""
 
@@ -63,6 +65,7 @@ SECOND_STUDY: Final = "value_pick_place"
 SECOND_PARTS: Final = (
     "value_pick_place_longer",
     "value_pick_place_longer_imagined",
+    "value_pick_place_discount",
     "value_pick_place_simulator",
     "value_pick_place_dyna",
     "value_pick_place_iterated",

@@ -66,7 +66,9 @@ class BatchedManiSkillEnv(TensorEnv):
         self._elapsed += 1
         terminated = frame.success
         truncated = (self._elapsed >= self.max_episode_steps) & ~terminated
-        reward = self.config.reward.step_reward(terminated.float(), frame.reward, self._progress)
+        reward = self.config.reward.step_reward(
+            terminated.float(), frame.reward, self._progress, self.max_episode_steps
+        )
         self._progress = frame.reward
         observation = self._observation(frame)
         info: dict[str, Any] = {"reward_parts": {"clipped": share}}

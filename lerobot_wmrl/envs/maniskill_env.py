@@ -73,7 +73,9 @@ class ManiSkillEnv(gym.Env):
         truncated = not terminated and self._steps >= self._max_episode_steps
         return (
             self._observation(self._frame),
-            self.config.reward.step_reward(float(terminated), self._frame.reward, before.reward),
+            self.config.reward.step_reward(
+                float(terminated), self._frame.reward, before.reward, self._max_episode_steps
+            ),
             terminated,
             truncated,
             self._info(self._frame),

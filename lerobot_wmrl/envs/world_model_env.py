@@ -247,7 +247,7 @@ def load_world_models(config: WorldModelEnv, device: str | None) -> WorldModels:
         text_model = load_model(config.text_world_model_path, "text_world_model", device)
         check_same_tokenizer(model, text_model, "text_world_model_path", config.text_world_model_path)
     measure = make_similarity(getattr(config.reward, "similarity", "tokenizer"), model.state_mean.device)
-    return WorldModels(model, text_model, measure, load_reward(config.reward, model))
+    return WorldModels(model, text_model, measure, load_reward(config.reward, model, config.horizon))
 
 
 def make_world_model_env(config: WorldModelEnv, n_envs: int, device: str | None) -> WorldModelVectorEnv:

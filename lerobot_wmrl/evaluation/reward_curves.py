@@ -12,7 +12,7 @@ from lerobot_wmrl.data.frame_cache import frames_to_tensor
 from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.evaluation.replay import Recording
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
-from lerobot_wmrl.rewards.general import consecutive_count, general_reward, is_done
+from lerobot_wmrl.rewards.general import consecutive_count, general_reward, is_done, potential_discount
 from lerobot_wmrl.rewards.similarity import make_similarity
 from lerobot_wmrl.world_models.goal import imagine_goal, select_features
 from lerobot_wmrl.world_models.modeling_world_model import (
@@ -59,8 +59,9 @@ def reward_along_episode(
     similarity = measure(features, goal_features, cameras)
     paid = success_once(done_logit, threshold, frames)
     earned = general_reward(
-        paid, similarity[1:], similarity[:-1], alpha=reward.alpha, form=reward.form, gamma=reward.gamma
-    )
+        paid, similarity[1:], similarity[:-1],
+        alpha=reward.alpha, form=reward.form, gamma=potential_discount(reward, int(table.length.max())),
+    )  # fmt: skip
     picture = goal.decoded.images[0].permute(0, 2, 3, 1)
     return {
         "done_probability": done_logit.sigmoid().tolist(),

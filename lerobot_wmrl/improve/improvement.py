@@ -26,6 +26,7 @@ from lerobot_wmrl.evaluation.comparison import RESULTS, chosen_policy, most_succ
 from lerobot_wmrl.improve.configuration_improve import ImproveConfig
 from lerobot_wmrl.improve.findings import LONGEST_IMAGINATION, Findings, look, usual_length
 from lerobot_wmrl.improve.sizes import Sizes
+from lerobot_wmrl.rewards.general import default_discount
 
 SFT: Final = "SFT policy"
 CLONED: Final = "further BC on successes"
@@ -50,13 +51,6 @@ would fill the data."""
 
 ROLLOUT_COLUMNS: Final = (*DEFAULT_FEATURES, ACTION, REWARD, SUCCESS, DONE, START_SEED, START_KIND)
 """Columns of recorded rollouts, beside those that the policy sees and the environment declares."""
-
-LATEST_WORTH: Final = 0.3
-"""What PPO's discount leaves of a success in the last frame that an episode may take. A smaller discount
-factor hurries the policy, at costs that the world model may not see."""
-
-LARGEST_DISCOUNT: Final = 0.999
-"""Largest discount factor of PPO."""
 
 MAX_STARTS: Final = 1024
 """Frames in which imagination may begin, in all."""
@@ -273,8 +267,8 @@ class Improvement:
 
     @property
     def discount(self) -> float:
-        """PPO's discount factor."""
-        return min(LARGEST_DISCOUNT, round(LATEST_WORTH ** (1 / self.frame_limit), 3))
+        """PPO's discount factor: that of the real episodes, which may be longer than the imagined ones."""
+        return default_discount(self.frame_limit)
 
     @property
     def sizes(self) -> Sizes:

@@ -27,7 +27,7 @@ class GeneralConfig(RewardModelConfig):
         alpha: weight α of the sparse part (success); the dense part (similarity) has 1 − α.
         form: `potential` pays for getting closer to the goal frame, `absolute` (as published) for being
             close.
-        gamma: discount of the potential form; give it the algorithm's discount.
+        gamma: discount of the potential form, which should be PPO's; by default PPO's default.
         similarity: measure of similarity to the goal frame: `tokenizer`, 1 − LPIPS's formula on the
             tokenizer's features; `lpips_alex` or `lpips_vgg`, 1 − LPIPS, whose backbone must be in torch's
             cache; `mse`, 1 − the mean squared error.
@@ -35,7 +35,7 @@ class GeneralConfig(RewardModelConfig):
 
     alpha: float = 0.9
     form: str = "potential"
-    gamma: float = 0.97
+    gamma: float | None = None
     similarity: str = "tokenizer"
 
     def __post_init__(self) -> None:

@@ -15,6 +15,17 @@ from lerobot_wmrl.common.errors import FieldError, require_choice, require_share
 
 FORMS: Final = ("absolute", "potential")
 
+LATEST_WORTH: Final = 0.3
+"""What the discount leaves of a success in the last step that an episode may take. A smaller discount factor
+hurries the policy, at costs that the world model may not see."""
+
+LARGEST_DISCOUNT: Final = 0.999
+
+
+def default_discount(longest: int) -> float:
+    """Return the discount factor for episodes of up to `longest` steps, in thousandths."""
+    return min(LARGEST_DISCOUNT, round(LATEST_WORTH ** (1 / longest), 3))
+
 
 def is_done(done_logit: Tensor, threshold: float) -> Tensor:
     """Whether the done probability reaches θ (eq. 7). (B,) → (B,) bool"""
@@ -50,15 +61,20 @@ class GeneralRewardSettings(Protocol):
 
     alpha: float
     form: str
-    gamma: float
+    gamma: float | None
 
 
 def check_general_reward(settings: GeneralRewardSettings) -> None:
     """Raise FieldError for the first of the settings that is out of its range."""
     require_choice(settings, "form", FORMS)
     require_share(settings, "alpha")
-    if not 0 < settings.gamma <= 1:
+    if settings.gamma is not None and not 0 < settings.gamma <= 1:
         raise FieldError("gamma", settings.gamma, "must be a discount above 0 and at most 1")
+
+
+def potential_discount(settings: GeneralRewardSettings, longest: int) -> float:
+    """Return the discount of the potential form, in an environment of episodes of up to `longest` steps."""
+    return default_discount(longest) if settings.gamma is None else settings.gamma
 
 
 @dataclass
@@ -69,18 +85,24 @@ class RuleBasedReward:
         alpha: weight of success; progress has 1 − alpha.
         form: `potential` pays for progress made. `absolute` pays for being far on in every step; since
             success ends an episode, that can be worth more than success.
-        gamma: discount of the potential form; give it the algorithm's discount.
+        gamma: discount of the potential form, which should be PPO's; by default PPO's default.
     """
 
     alpha: float = 0.9
     form: str = "potential"
-    gamma: float = 0.97
+    gamma: float | None = None
 
     def __post_init__(self) -> None:
         check_general_reward(self)
 
     def step_reward[Number: (float, Tensor)](
-        self, success: Number, progress: Number, previous: Number
+        self, success: Number, progress: Number, previous: Number, longest: int
     ) -> Number:
-        """Return the reward of a step from `previous` to `progress` in [0, 1]. (B,) each, or numbers."""
-        return general_reward(success, progress, previous, alpha=self.alpha, form=self.form, gamma=self.gamma)
+        """Return the reward of a step from `previous` to `progress` in [0, 1]. (B,) each, or numbers.
+
+        `longest` is the number of steps that an episode may take.
+        """
+        return general_reward(
+            success, progress, previous,
+            alpha=self.alpha, form=self.form, gamma=potential_discount(self, longest),
+        )  # fmt: skip

@@ -1,5 +1,6 @@
 """Load an environment's reward: ours, or one of LeRobot's own reward models with its preprocessor."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -14,6 +15,7 @@ from torch import Tensor
 from lerobot_wmrl.common.checkpoints import resolve_checkpoint
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig, LearnedRewardConfig
+from lerobot_wmrl.rewards.general import potential_discount
 from lerobot_wmrl.rewards.modeling_rewards import EmbeddingRewardModel, ProxyRewardModel
 from lerobot_wmrl.world_models.checkpoint import load_model, read_config
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
@@ -30,8 +32,8 @@ class Reward(Protocol):
         """Return the reward of the frames in the environment's batch. → (B,)"""
 
 
-def load_reward(config: RewardModelConfig, model: ActionWorldModelRewardModel) -> Reward:
-    """Return the reward of an environment that imagines with `model`.
+def load_reward(config: RewardModelConfig, model: ActionWorldModelRewardModel, longest: int) -> Reward:
+    """Return the reward of an environment that imagines up to `longest` steps of an episode with `model`.
 
     A reward with a checkpoint takes its settings from there.
 
@@ -40,7 +42,7 @@ def load_reward(config: RewardModelConfig, model: ActionWorldModelRewardModel) -
     """
     device = model.state_mean.device.type
     if isinstance(config, GeneralConfig):
-        return make_reward_model(config)
+        return make_reward_model(replace(config, gamma=potential_discount(config, longest)))
     if not isinstance(config, LearnedRewardConfig):
         return load_lerobot_reward(config, model.config.tokenizer.camera_keys, device)
     if not config.pretrained_path:

@@ -36,11 +36,14 @@ class GeneralRewardModel(PreTrainedRewardModel):
             batch: `success` (B,), 1 on the one frame that completes the run of done frames, and, unless α is
                 1, `similarity` and `previous.similarity` to the goal frame, (B,) each.
         """
-        if not self.config.needs_goal:
+        config = self.config
+        if not config.needs_goal:
             return batch["success"]
+        if config.gamma is None:
+            raise FieldError("gamma", None, "how long episodes are is not known here", "give the discount")
         return general_reward(
             batch["success"], batch["similarity"], batch["previous.similarity"],
-            alpha=self.config.alpha, form=self.config.form, gamma=self.config.gamma,
+            alpha=config.alpha, form=config.form, gamma=config.gamma,
         )  # fmt: skip
 
 

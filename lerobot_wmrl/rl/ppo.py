@@ -92,7 +92,7 @@ class PPO(PolicyGradient):
         value, next_value = scale.restore(rollout.value), scale.restore(rollout.next_value)  # (T, B)
         advantages = generalised_advantages(
             rollout.reward, value, next_value, rollout.terminated, rollout.truncated,
-            config.gamma, config.gae_lambda, decided,
+            config.discount(rollout.longest), config.gae_lambda, decided,
         )  # fmt: skip
         target = advantages + value  # (T, B), the λ-returns
         if config.value_normalisation:

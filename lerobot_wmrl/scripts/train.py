@@ -17,6 +17,7 @@ Running the same command again continues from the last checkpoint. `--preset=dem
 `lerobot-eval --policy.path=outputs/rl/checkpoints/best/pretrained_model …` evaluates the result.
 """
 
+import logging
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,8 +31,12 @@ from lerobot_wmrl.common.output_folders import claim_output_dir
 from lerobot_wmrl.common.precision import keep_freed_memory
 from lerobot_wmrl.common.presets import expand_preset
 from lerobot_wmrl.common.tracking import make_wandb
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.envs.tensor_env import TensorEnv
+from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
+from lerobot_wmrl.rewards.general import RuleBasedReward, potential_discount
+from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 from lerobot_wmrl.rl.configuration_train import MAY_DIFFER, TrainConfig, check_config, load_config
@@ -107,6 +112,7 @@ def train_in(
     from lerobot_wmrl.rl.trainer import Schedule, make_algorithm, train
 
     check_tasks(cfg, env)
+    check_discount(cfg, env.max_episode_steps)
     config = policy.config
     observation = env.reset(seed=cfg.seed)[0]
     shown = shapes_of(observation)
@@ -160,6 +166,19 @@ def check_tasks(cfg: TrainConfig, env: TensorEnv) -> None:
         raise FieldError(
             "num_envs", env.num_envs, f"the environment has {tasks} tasks, and each needs one of its own",
             f"set it to a multiple of {tasks}, or choose fewer tasks",
+        )  # fmt: skip
+
+
+def check_discount(cfg: TrainConfig, longest: int) -> None:
+    """Warn if progress is rewarded with another discount than PPO's, in episodes of up to `longest` steps."""
+    reward = cfg.env.reward if isinstance(cfg.env, WorldModelEnv | WmrlManiSkillEnv) else None
+    if not (isinstance(cfg.algorithm, PPOConfig) and isinstance(reward, GeneralConfig | RuleBasedReward)):
+        return
+    discount, own = cfg.algorithm.discount(longest), potential_discount(reward, longest)
+    if reward.alpha < 1 and reward.form == "potential" and own != discount:
+        logging.warning(
+            "env.reward.gamma=%s: progress is rewarded with this discount, and PPO has %s, so that the time "
+            "spent near the goal counts too; set --env.reward.gamma=%s", own, discount, discount,
         )  # fmt: skip
 
 

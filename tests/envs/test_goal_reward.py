@@ -87,7 +87,7 @@ def test_the_paper_s_reward_is_largest_at_the_goal(config, measure):
 
 def test_by_default_lingering_earns_nothing_and_done_ends_the_episode(config, measure):
     """Amid the way and at the goal; the next episode is not paid for where the last one was."""
-    env = replace(config, reward=GeneralConfig(device="cpu")).create_tensor_env(1)
+    env = replace(config, reward=GeneralConfig(device="cpu", gamma=0.97)).create_tensor_env(1)
     way = way_to_goal(env)
     set_goal(env, measure, way[-1])
     env.reset(seed=0)

@@ -13,7 +13,7 @@ from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.maniskill_env import ManiSkillEnv, ManiSkillTensorEnv
 from lerobot_wmrl.maniskill.tasks import TASKS
-from lerobot_wmrl.rewards.general import RuleBasedReward
+from lerobot_wmrl.rewards.general import RuleBasedReward, default_discount
 
 HORIZON = 3
 STAY = np.array([0, 0, 0, 0, 0, 0, -1], np.float32)
@@ -60,7 +60,7 @@ def test_a_step_pays_for_the_progress_that_it_made(
         env.reset(seed=0)
         earned.append([env.step(down)[1] for _ in range(3)])
     progress, paid = earned
-    expected = [0.1 * (0.97 * now - before) for before, now in pairwise(progress)]
+    expected = [0.1 * (default_discount(HORIZON) * now - before) for before, now in pairwise(progress)]
     assert progress[0] != progress[-1]
     assert paid[1:] == pytest.approx(expected, abs=1e-5)
 

@@ -7,8 +7,15 @@ import torch
 
 from lerobot_wmrl.evaluation.reward_curves import success_once
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
-from lerobot_wmrl.rewards.general import RuleBasedReward, consecutive_count, general_reward, is_done
+from lerobot_wmrl.rewards.general import (
+    RuleBasedReward,
+    consecutive_count,
+    default_discount,
+    general_reward,
+    is_done,
+)
 from lerobot_wmrl.rewards.modeling_rewards import GeneralRewardModel
+from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 
 GAMMA = 0.97
 HORIZON = 40
@@ -27,8 +34,7 @@ def test_the_potential_form_pays_nothing_for_lingering_and_for_going_in_circles(
 
 
 def test_success_is_worth_more_than_any_lingering_with_the_default_weights():
-    config = GeneralConfig(device="cpu")
-    reward = GeneralRewardModel(config)
+    reward = GeneralRewardModel(GeneralConfig(device="cpu", gamma=GAMMA))
     still = torch.ones(1)
     linger = reward.compute_reward({"success": 0 * still, "similarity": still, "previous.similarity": still})
     finish = reward.compute_reward({"success": still, "similarity": still, "previous.similarity": still})
@@ -48,6 +54,22 @@ def test_success_is_paid_once():
     assert success_once(logits, 0.5, 3).tolist() == [0, 0, 0, 0, 0, 0, 1, 0, 0, 0]
 
 
+@pytest.mark.parametrize(("longest", "discount"), [(1, 0.3), (40, 0.97), (110, 0.989), (5000, 0.999)])
+def test_the_discount_leaves_a_success_in_the_last_step_its_worth(longest: int, discount: float) -> None:
+    """PPO's, and that of progress, unless they are given."""
+    assert PPOConfig().discount(longest) == default_discount(longest) == discount
+    assert PPOConfig(gamma=0.9).discount(longest) == 0.9
+    progress = RuleBasedReward(alpha=0.0).step_reward(0.0, 1.0, 0.0, longest)
+    assert progress == pytest.approx(discount)
+
+
+def test_alone_the_potential_form_needs_a_discount() -> None:
+    one = torch.ones(1)
+    batch = {"success": one, "similarity": one, "previous.similarity": one}
+    with pytest.raises(ValueError, match=r"^gamma=None: .* give the discount"):
+        GeneralRewardModel(GeneralConfig(device="cpu")).compute_reward(batch)
+
+
 def test_bad_settings_name_the_field():
     with pytest.raises(ValueError, match=r"^form=relative: choose"):
         GeneralConfig(device="cpu", form="relative")
@@ -62,7 +84,7 @@ def returned(reward: RuleBasedReward, progress: list[float], succeeds: bool) -> 
     steps = enumerate(pairwise(progress))
     last = len(progress) - 2
     return sum(
-        GAMMA**t * reward.step_reward(float(succeeds and t == last), now, before)
+        GAMMA**t * reward.step_reward(float(succeeds and t == last), now, before, HORIZON)
         for t, (before, now) in steps
     )
 

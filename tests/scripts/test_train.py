@@ -15,12 +15,15 @@ from safetensors.torch import load_file
 
 from lerobot_wmrl.common.presets import PRESETS
 from lerobot_wmrl.common.tracking import read_metrics
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
+from lerobot_wmrl.rewards.general import RuleBasedReward
+from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 from lerobot_wmrl.rl.configuration_train import TrainConfig, check_config
 from lerobot_wmrl.rl.trained_policy import evaluation
-from lerobot_wmrl.scripts.train import main, rollout_length
+from lerobot_wmrl.scripts.train import check_discount, main, rollout_length
 from tests.commands import run_here
 from tests.hub_server import Hub
 from tests.rl.checkpoints import save_untrained_policy
@@ -206,6 +209,21 @@ def test_bad_input_is_named_and_nothing_is_written(
 def test_impossible_settings_are_named(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         check_config(TrainConfig(**{"env": PointConfig(), **settings}))
+
+
+@pytest.mark.parametrize(("flags", "warned"), [
+    ({}, False), ({"gamma": 0.9}, True), ({"gamma": 0.9, "reward": RuleBasedReward(gamma=0.9)}, False),
+    ({"gamma": 0.9, "reward": RuleBasedReward(alpha=1.0)}, False),
+    ({"gamma": 0.9, "reward": RuleBasedReward(form="absolute")}, False),
+])  # fmt: skip
+def test_another_discount_of_progress_than_ppos_is_warned_of(
+    flags: dict[str, Any], warned: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    env = WmrlManiSkillEnv(reward=flags.get("reward", RuleBasedReward()))
+    cfg = TrainConfig(env=env, algorithm=PPOConfig(gamma=flags.get("gamma")))
+    check_discount(cfg, longest=60)
+    assert ("env.reward.gamma=0.98: progress" in caplog.text) == warned
+    assert ("set --env.reward.gamma=0.9" in caplog.text) == warned
 
 
 def test_a_rollout_reaches_the_end_of_an_episode() -> None:
