@@ -22,15 +22,18 @@ def frame_size(feature: Mapping[str, Any]) -> tuple[int, int]:
     return height, width
 
 
-def check_cameras(features: Mapping[str, Any], camera_keys: Sequence[str]) -> None:
-    """Raise FieldError unless the dataset has these cameras."""
+def check_cameras(features: Mapping[str, Any], camera_keys: Sequence[str], field: str | None = None) -> None:
+    """Raise FieldError unless the dataset has these cameras.
+
+    `field` is the setting that they can be changed by; None if a trained model has learnt them.
+    """
     for key in camera_keys:
         if key not in features:
             cameras = ", ".join(name for name in features if name.startswith(OBS_IMAGE)) or "none"
+            problem, remedy = f"the dataset has no {key} (its cameras: {cameras})", "use a dataset that has"
             raise FieldError(
-                "tokenizer.cameras", camera_names(camera_keys),
-                f"the dataset has no {key} (its cameras: {cameras})",
-                "set `tokenizer.cameras` to match, or use a dataset with this camera",
+                field or "cameras", camera_names(camera_keys), problem,
+                f"set `{field}` to match, or {remedy}" if field else remedy,
             )  # fmt: skip
 
 

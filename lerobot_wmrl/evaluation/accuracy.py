@@ -10,7 +10,7 @@ from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
 from lerobot_wmrl.common.statistics import Estimate, Proportion, bootstrap_ratio
-from lerobot_wmrl.data.embodiment import POSITION_NAMES
+from lerobot_wmrl.data.embodiment import POSITION_NAMES, component_names
 from lerobot_wmrl.data.episodes import EpisodeTable
 from lerobot_wmrl.data.frames import Context
 from lerobot_wmrl.evaluation.gate import first_run
@@ -121,8 +121,9 @@ def compare_frames(
 
 def predicts_tcp(recording: Recording, replay: EpisodeReplay) -> bool:
     """Whether the model predicts a state that begins with the TCP's position in metres."""
-    names = recording.table.dataset.features.get(OBS_STATE, {}).get("names") or []
-    return bool(replay.state.shape[-1]) and tuple(names[:3]) == POSITION_NAMES
+    if not replay.state.shape[-1]:
+        return False
+    return tuple(component_names(recording.table.dataset.features[OBS_STATE])[:3]) == POSITION_NAMES
 
 
 def tcp_error_mm(recording: Recording, replay: EpisodeReplay) -> Tensor:

@@ -20,6 +20,7 @@ from lerobot.utils.random_utils import set_seed
 from lerobot_wmrl.common.checkpoints import resolve_checkpoint
 from lerobot_wmrl.common.errors import FieldError, first_line
 from lerobot_wmrl.common.policies import (
+    check_units,
     check_weights,
     fit_to_environment,
     load_policy,
@@ -27,7 +28,9 @@ from lerobot_wmrl.common.policies import (
     read_policy_config,
 )
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
+from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
 from lerobot_wmrl.envs.lerobot_env import counts_resets, freeze_finished, is_own, runs_in_processes
+from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.evaluation.comparison import Comparison, Episode
 
 type Envs = dict[str, dict[int, gym.vector.VectorEnv]]
@@ -96,12 +99,24 @@ def _check_environment(config: PreTrainedConfig, env: EnvConfig) -> None:
     fit_to_environment(config, shown, action.shape[0])
 
 
-def load_policies(configs: Mapping[str, PreTrainedConfig]) -> list[LoadedPolicy]:
-    """Load the policies with their processors. FieldError if one cannot be loaded."""
+def load_policies(configs: Mapping[str, PreTrainedConfig], envs: Envs) -> list[LoadedPolicy]:
+    """Load the policies with their processors.
+
+    Raises:
+        FieldError: one cannot be loaded, or its actions are in other units than those of a world model.
+    """
+    worlds = [
+        adapter.env for adapter in _flat(envs)
+        if isinstance(adapter, EvaluationAdapter) and isinstance(adapter.env, WorldModelVectorEnv)
+    ]  # fmt: skip
     loaded = []
     for name, config in configs.items():
         with about_policy(name):
-            loaded.append(LoadedPolicy(config, load_policy(config), load_processors(config)))
+            policy = LoadedPolicy(config, load_policy(config), load_processors(config))
+            for env in worlds[:1]:  # all tasks share the world model
+                names = env.model.config.embodiment.action_names
+                check_units(config, policy.processors[1], names, env.action_low, env.action_high)
+        loaded.append(policy)
     return loaded
 
 

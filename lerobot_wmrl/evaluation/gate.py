@@ -13,6 +13,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.stats import mannwhitneyu
 from torch import Tensor
 
@@ -149,7 +150,7 @@ class Outcomes:
         probability = np.nan_to_num(self.padded_probability(frames))
         if probability.shape[1] < frames:
             return np.zeros(len(probability))
-        return np.lib.stride_tricks.sliding_window_view(probability, frames, axis=1).min(-1).max(1)
+        return sliding_window_view(probability, frames, axis=1).min(-1).max(1)
 
     def auc(self, frames: int) -> float:
         """Return the area under the ROC curve: how often a success scores higher than a failure.
@@ -336,11 +337,10 @@ def gate_details(outcomes: Outcomes, threshold: float, frames: int) -> dict[str,
 
 def first_run(fired: np.ndarray, frames: int) -> np.ndarray:
     """Return where the first run of `frames` consecutive True begins, −1 if there is none. (E, T) → (E,)"""
-    count, begin = np.zeros(fired.shape[0], int), np.full(fired.shape[0], -1)
-    for step, column in enumerate(fired.T):
-        count = np.where(column, count + 1, 0)
-        begin = np.where((begin < 0) & (count >= frames), step - frames + 1, begin)
-    return begin
+    if fired.shape[1] < frames:
+        return np.full(len(fired), -1)
+    runs = sliding_window_view(fired, frames, axis=1).min(-1)  # whether one begins there
+    return np.where(runs.max(1), runs.argmax(1), -1)
 
 
 def precision_recall_f1(predicted: np.ndarray, target: np.ndarray) -> dict[str, Estimate]:

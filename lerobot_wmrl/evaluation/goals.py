@@ -266,16 +266,13 @@ def balanced_accuracy(network: SuccessProbe, data: LabelledFrames) -> float:
 def labelled_frames(
     tokenizer: FrameTokenizer, recording: Recording, chosen: np.ndarray, rng: np.random.Generator
 ) -> LabelledFrames | None:
-    """Draw as many frames with success as without from the episodes in `chosen` (E,); None if one is missing.
-
-    The `next.success` of a row speaks of the frame its action led to, which is the next row's.
-    """
+    """Draw as many frames with success as without from episodes `chosen` (E,); None if one is missing."""
     table = recording.table
     episodes = np.repeat(np.arange(len(table.start)), table.length - 1)
     rows = np.concatenate(
         [start + np.arange(1, n) for start, n in zip(table.start, table.length, strict=True)]
     )
-    success = table.done[rows - 1]
+    success = table.shown[rows]
     classes = [np.flatnonzero(chosen[episodes] & (success == wanted)) for wanted in (True, False)]
     count = min(*map(len, classes), MAX_PROBE_FRAMES)
     if not count:

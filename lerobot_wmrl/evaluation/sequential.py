@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import gammaln
+from scipy.special import betaln
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,5 @@ class SequentialTest:
 def log_e_value(gained: np.ndarray, lost: np.ndarray) -> np.ndarray:
     """Return log(2ⁿ / ((n + 1) · C(n, gained))) with n = gained + lost: the likelihood of a coin with uniform
     bias over that of a fair one. (E,), (E,) → (E,)"""
-    n = gained + lost
-    log_binomial = gammaln(n + 1) - gammaln(gained + 1) - gammaln(lost + 1)
-    evidence: np.ndarray = n * math.log(2) - np.log(n + 1) - log_binomial
+    evidence: np.ndarray = (gained + lost) * math.log(2) + betaln(gained + 1, lost + 1)
     return evidence

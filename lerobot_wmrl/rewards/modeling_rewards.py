@@ -72,7 +72,7 @@ class ProxyRewardModel(HubCard, PreTrainedRewardModel):
         first = self.config.camera_keys[0]
         if not self.config.image_size and first in features:
             self.config.image_size = frame_size(features[first])[0]
-        check_cameras(features, self.config.camera_keys)
+        check_cameras(features, self.config.camera_keys, "cameras")
 
     def check_world_model(self, model: ActionWorldModelRewardModel) -> None:
         """Raise FieldError unless the model imagines frames like those that the network was trained on."""

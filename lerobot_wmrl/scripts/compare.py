@@ -130,7 +130,7 @@ def run(cfg: CompareConfig, comparison: "Comparison", configs: "dict[str, PreTra
         opened(cfg.env, cfg.batch_size, cfg.trust_remote_code, len(configs)) as envs,
     ):
         require_new_starts(envs[0], cfg.env, cfg.n_episodes)
-        policies = load_policies(configs)
+        policies = load_policies(configs, envs[0])
         claim_output_dir(cfg.output_dir, settings, may_differ(cfg))
         run_comparison(comparison, envs, cfg.env, policies, cfg.batch_size, cfg.seed, save)
 

@@ -121,7 +121,10 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     """Replay, measure, and write metrics.json, metrics.md and the pictures."""
     from lerobot_wmrl.common.constants import START_SCENE
     from lerobot_wmrl.common.files import write_json, write_text
+    from lerobot_wmrl.common.policies import check_weights, read_policy_config
     from lerobot_wmrl.data.episodes import choose_episodes, read_episodes
+    from lerobot_wmrl.evaluation.agreement import policy_checkpoints
+    from lerobot_wmrl.evaluation.compare import about_policy
     from lerobot_wmrl.evaluation.reconstruction import reconstruction_metrics
     from lerobot_wmrl.evaluation.replay import Recording
     from lerobot_wmrl.evaluation.report import evaluate, report_action_model, report_agreement
@@ -137,6 +140,9 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     check_dataset(model.config, table.dataset.meta)
     text_model = load_text_model(cfg, model)
     imagination = policies_imagination(cfg, table) if cfg.policies else None
+    for path in policy_checkpoints(cfg.policies) if cfg.policies else []:
+        with about_policy(str(path)):
+            check_weights(read_policy_config(str(path), []))
     scenes = scene_splits(table.column(START_SCENE), cfg.split)
     chosen = table.among(cfg.dataset.episodes)
     episodes = choose_episodes(table, cfg.split, cfg.max_episodes, scenes, chosen)
@@ -147,7 +153,7 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
         report_action_model(model, recording, evaluation, cfg.done_threshold, cfg.done_frames, cfg.output_dir)
     ]
     if text_model is not None:
-        reports.append(report_text_model(cfg, model, text_model, recording, evaluation))
+        reports.append(report_text_model(cfg, text_model, recording, evaluation))
     if imagination is not None:
         reports.append(report_agreement(policy_agreement(cfg, imagination), cfg.output_dir))
     metrics = {name: value for report in reports for name, value in report.metrics.items()}
@@ -283,7 +289,6 @@ def policy_agreement(cfg: EvalWorldModelConfig, imagination: "WorldModelEnv") ->
 
 def report_text_model(
     cfg: EvalWorldModelConfig,
-    model: "ActionWorldModelRewardModel",
     text_model: "TextWorldModelRewardModel",
     recording: "Recording",
     evaluation: "Evaluation",
@@ -295,7 +300,7 @@ def report_text_model(
 
     curves = {
         name: reward_along_episode(
-            model, text_model, cfg.reward, recording, replay.episode,
+            text_model, cfg.reward, recording, replay,
             threshold=cfg.done_threshold, frames=cfg.done_frames,
         )
         for name, replay in evaluation.shown.items()

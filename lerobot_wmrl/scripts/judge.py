@@ -253,7 +253,7 @@ def imagine(
         claim_output_dir(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER)
         for name, config in tqdm(missing.items(), desc="Imagining", unit="policy"):
             with about_policy(name):
-                policies = load_policies({name: config})
+                policies = load_policies({name: config}, envs)
                 blocks = [  # the seed of an episode is the number of its start
                     run_block([envs], env, policies, min(size, starts - begin), begin)
                     for begin in range(0, starts, size)

@@ -35,7 +35,7 @@ from lerobot.envs.configs import EnvConfig
 
 from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.command_line import RunConfig, run_command
-from lerobot_wmrl.common.errors import FieldError, require_at_least
+from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least
 from lerobot_wmrl.common.files import writing
 from lerobot_wmrl.common.policies import check_weights, read_policy_config, require_trained
 from lerobot_wmrl.data.dataset import DatasetSource
@@ -147,12 +147,16 @@ def play(cfg: PlayConfig) -> None:
 
     cfg.check()
     reward = {"reward": GeneralConfig()} if cfg.text_world_model.path else {}
-    env = DrivenEnv(
-        world_model_path=cfg.world_model.path, text_world_model_path=cfg.text_world_model.path,
-        episode_length=cfg.episode_length, done_threshold=cfg.done_threshold, done_frames=cfg.done_frames,
-        device=cfg.device if cfg.export is None else "cpu", **reward,
-    )  # fmt: skip
-    world = load_world(env, cfg.dataset, cfg.policy, cfg.real_env, cfg.end_at_success)
+    with (
+        renamed("world_model_path", "world_model.path"),
+        renamed("text_world_model_path", "text_world_model.path"),
+    ):
+        env = DrivenEnv(
+            world_model_path=cfg.world_model.path, text_world_model_path=cfg.text_world_model.path,
+            episode_length=cfg.episode_length, done_threshold=cfg.done_threshold, done_frames=cfg.done_frames,
+            device=cfg.device if cfg.export is None else "cpu", **reward,
+        )  # fmt: skip
+        world = load_world(env, cfg.dataset, cfg.policy, cfg.real_env, cfg.end_at_success)
     if cfg.export is not None:
         export(world, cfg.export, cfg.export_starts)
         return

@@ -160,8 +160,8 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
     given = draccus.encode(cfg)
     checkpoint = latest_checkpoint(cfg.output_dir)
     set_seed(cfg.seed)
-    model: Any = build_model(cfg.model, table, cfg.output_dir)
     require_free(cfg.output_dir, given, MAY_DIFFER)
+    model: Any = build_model(cfg.model, table, cfg.output_dir)
     require_same_data(cfg, table)
     if checkpoint is not None and int(checkpoint.name) >= cfg.steps:
         claim_output_dir(cfg.output_dir, given, MAY_DIFFER)

@@ -80,7 +80,7 @@ class FrameTokenizerRewardModel(HubCard, PreTrainedRewardModel):
 
     def __init__(self, config: FrameTokenizerConfig, dataset_meta: Any = None, **kwargs: Any) -> None:
         if dataset_meta is not None:
-            check_cameras(dataset_meta.features, config.tokenizer.camera_keys)
+            check_cameras(dataset_meta.features, config.tokenizer.camera_keys, "tokenizer.cameras")
             config = with_frame_sizes(config, dataset_meta.features)
         super().__init__(config)
         self.config: FrameTokenizerConfig = config

@@ -63,9 +63,16 @@ def openvla_config(
     return config
 
 
-def check_key(config: OpenVLAConfig) -> None:
-    """Raise FieldError if the processors beside the weights were made with another `unnorm_key`."""
-    stored = Path(config.pretrained_path or "") / CONFIG_FILE
+def check_key(config: OpenVLAConfig, source: str | Path, folder: Path) -> None:
+    """Raise FieldError if the processors were made with another `unnorm_key`.
+
+    Args:
+        config: says where they are: beside the weights, or beside adapters.
+        source: where the weights come from, a folder or a hub id.
+        folder: where they are on this machine.
+    """
+    path = str(config.pretrained_path or source)
+    stored = (folder if path == str(source) else Path(path)) / CONFIG_FILE
     made_with = json.loads(stored.read_text()).get("unnorm_key") if stored.is_file() else config.unnorm_key
     if made_with != config.unnorm_key:
         raise FieldError(

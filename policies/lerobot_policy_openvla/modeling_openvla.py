@@ -135,7 +135,7 @@ class OpenVLAPolicy(PreTrainedPolicy):
         if TOKENIZER_FILE not in files:
             raise ValueError(f"{pretrained_name_or_path}: {TOKENIZER_FILE} is missing beside the weights")
         if dataset_meta is None:
-            check_key(config)
+            check_key(config, pretrained_name_or_path, folder)
         policy = cls(config, files=files, dataset_meta=dataset_meta, empty=True)
         weights = weight_files(folder)
         stored = stored_bytes(weights) if as_stored else None

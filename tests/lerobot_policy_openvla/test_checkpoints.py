@@ -10,7 +10,7 @@ import torch
 from huggingface_hub import save_torch_state_dict
 from safetensors.torch import load_file, save_file
 
-from lerobot_policy_openvla import loading
+from lerobot_policy_openvla import loading, modeling_openvla
 from lerobot_policy_openvla.checkpoint import OpenVLACheckpoint, write_openvla
 from lerobot_policy_openvla.modeling_openvla import OpenVLAPolicy
 from tests.lerobot_policy_openvla.small import SMALL_SIZES, observe, small_policy
@@ -180,12 +180,18 @@ def test_without_a_key_nothing_is_acted(checkpoint: Path) -> None:
             act(observe())
 
 
-def test_a_key_is_not_changed_behind_the_processors_back(checkpoint: Path, tmp_path: Path) -> None:
-    policy = OpenVLAPolicy.from_openvla(checkpoint, unnorm_key="one")
-    policy.save_pretrained(tmp_path / "lerobot")
-    policy.config.pretrained_path, policy.config.unnorm_key = tmp_path / "lerobot", "two"
-    with pytest.raises(ValueError, match=r"unnorm_key=two: the processors in .* are for one"):
-        OpenVLAPolicy.from_pretrained(tmp_path / "lerobot", config=policy.config)
+@pytest.mark.parametrize("on_hub", [False, True])
+def test_a_key_is_not_changed_behind_the_processors_back(
+    checkpoint: Path, on_hub: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy, folder = OpenVLAPolicy.from_openvla(checkpoint, unnorm_key="one"), tmp_path / "lerobot"
+    policy.save_pretrained(folder)
+    if on_hub:
+        monkeypatch.setattr(modeling_openvla, "resolve_folder", lambda *_: folder)
+    source = Path("me/openvla") if on_hub else folder
+    policy.config.pretrained_path, policy.config.unnorm_key = source, "two"
+    with pytest.raises(ValueError, match=rf"unnorm_key=two: the processors in {source} are for one"):
+        OpenVLAPolicy.from_pretrained(source, config=policy.config)
 
 
 def test_unknown_heads_are_guessed_aloud(checkpoint: Path, caplog: pytest.LogCaptureFixture) -> None:

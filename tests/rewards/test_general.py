@@ -5,7 +5,6 @@ from itertools import pairwise
 import pytest
 import torch
 
-from lerobot_wmrl.evaluation.reward_curves import success_once
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rewards.general import (
     RuleBasedReward,
@@ -47,11 +46,6 @@ def test_done_must_fire_in_a_row():
         (count := consecutive_count(count, torch.tensor([fired == 1]))).item() for fired in (1, 1, 0, 1, 1, 1)
     ]
     assert runs == [1, 2, 0, 1, 2, 3]
-
-
-def test_success_is_paid_once():
-    logits = torch.tensor([-9.0, 9, 9, -9, 9, 9, 9, 9, 9, 9])
-    assert success_once(logits, 0.5, 3).tolist() == [0, 0, 0, 0, 0, 0, 1, 0, 0, 0]
 
 
 @pytest.mark.parametrize(("longest", "discount"), [(1, 0.3), (40, 0.97), (110, 0.989), (5000, 0.999)])

@@ -14,6 +14,7 @@ from lerobot_wmrl.scripts.convert_openvla import main as convert_openvla
 from lerobot_wmrl.scripts.demo import main as demo
 from lerobot_wmrl.scripts.eval_world_model import main as eval_world_model
 from lerobot_wmrl.scripts.judge import main as judge
+from lerobot_wmrl.scripts.play import main as play
 from lerobot_wmrl.scripts.train import main as train
 from lerobot_wmrl.scripts.train_world_model import main as train_world_model
 from tests.rl.checkpoints import save_untrained_policy
@@ -26,6 +27,7 @@ TWO = "--policies=[{policy},{other}]"
 FITTING = ["--policies=[{cnn},{copy}]", *SIMULATOR]
 JUDGED = ["--world_model.path={action_world_model}", "--dataset.root={data}"]
 NEW = "--target={foreign}/new"
+REAL = ["--real_env.type=wmrl_maniskill", "--real_env.image_size=32"]
 IMPORT = ["--direction=import", "--source={policy}"]
 ROLL_OUT = ["--policy.path={policy}", *SIMULATOR, "--num_episodes=1"]
 
@@ -51,6 +53,12 @@ ROLL_OUT = ["--policy.path={policy}", *SIMULATOR, "--num_episodes=1"]
     (eval_world_model, [*REPLAY, "--output_dir={foreign}"], "foreign: holds something else"),
     (eval_world_model, ["--model.path={frame_tokenizer}", "--dataset.root={data}"], "action_world_model"),
     (eval_world_model, [*REPLAY, "--max_episodes=0"], "--max_episodes=0: must be at least 1"),
+    (
+        eval_world_model, [*REPLAY, "--policies=[{foreign}]", "--policy_episodes=1", *REAL],
+        "foreign: no checkpoint there",
+    ),
+    (play, ["--world_model.path={foreign}", "--dataset.root={data}"], "foreign: no action_world_model there"),
+    (play, ["--world_model.path={foreign}", "--dataset.root={data}"], "--world_model.path="),
     (compare, ["--policies=[{policy}]", *SIMULATOR], "policy]: a comparison needs at least two"),
     (compare, ["--policies=[{cnn},{cnn}]", *SIMULATOR], "cnn: is given twice; give every"),
     (compare, ["--policies=[{cnn},{foreign}]", *SIMULATOR], "foreign: no checkpoint there"),
