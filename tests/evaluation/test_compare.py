@@ -353,9 +353,14 @@ def test_a_policy_must_fit_the_environment(imagination, saved, message, tmp_path
 
 def test_a_policy_in_other_units_than_the_world_model_is_refused(imagination, tmp_path):
     """Of its actions, each would be a corner of the range."""
-    policy = str(save_untrained_policy(tmp_path / "policy", actions=7, constant=1000.0))
-    config = CompareConfig([policy], imagination, n_episodes=6, output_dir=tmp_path / "out")
-    with pytest.raises(ValueError, match=rf"policies={policy}: was trained on actions .* is 1000 on average"):
+    policy, other = (
+        str(save_untrained_policy(tmp_path / name, actions=7, constant=mean))
+        for name, mean in {"degrees": 1000.0, "fits": 0.0}.items()
+    )
+    config = CompareConfig([policy, other], imagination, n_episodes=6, output_dir=tmp_path / "out")
+    with pytest.raises(
+        ValueError, match=rf"policies={policy}: .*was trained on actions .* is 1000 on average"
+    ):
         compare(config)
     assert not config.output_dir.exists()
 
