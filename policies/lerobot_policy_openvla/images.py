@@ -45,16 +45,6 @@ def check_images(images: Tensor) -> None:
         )
 
 
-def check_pixel_values(pixel_values: Tensor, size: int) -> None:
-    """Raise ValueError unless `pixel_values` are normalised images (B, 6, size, size)."""
-    shape = tuple(pixel_values.shape)
-    if pixel_values.ndim != 4 or shape[1:] != (6, size, size) or not pixel_values.is_floating_point():
-        raise ValueError(
-            f"pixel_values of shape {shape} and type {pixel_values.dtype}: this model needs normalised "
-            f"images (B, 6, {size}, {size}), floating point"
-        )
-
-
 def resize(images: Tensor, height: int, width: int) -> Tensor:
     """Resize as Pillow's BICUBIC does, on any device. uint8 (B, C, H, W) → uint8 (B, C, height, width)"""
     images = _resize_last(images, width)

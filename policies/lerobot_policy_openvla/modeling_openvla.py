@@ -29,7 +29,7 @@ from lerobot_policy_openvla.checkpoint import (
     weight_files,
 )
 from lerobot_policy_openvla.configuration_openvla import OpenVLAConfig
-from lerobot_policy_openvla.images import check_pixel_values, to_pixel_values
+from lerobot_policy_openvla.images import to_pixel_values
 from lerobot_policy_openvla.loading import (
     AS_STORED,
     CONVERTED,
@@ -43,7 +43,6 @@ from lerobot_policy_openvla.network import OpenVLANetwork, Prefix, make_value_he
 from lerobot_policy_openvla.prompts import (
     END_ID,
     PromptTokenizer,
-    aligned_prompts,
     select_inputs,
     train_tokenizer,
 )
@@ -208,16 +207,6 @@ class OpenVLAPolicy(PreTrainedPolicy):
         }
         return (losses.mean() if reduction == "mean" else losses.mean(dim=1)), metrics
 
-    def token_losses(
-        self, pixel_values: Tensor, input_ids: Tensor, attention_mask: Tensor, action_ids: Tensor
-    ) -> Tensor:
-        """Return −log p of every label (B, A + 1): the action ids, then the end token.
-
-        Arguments are those of `action_logits`. Raises ValueError if an id is no action token.
-        """
-        self.action_tokens.columns(action_ids)
-        return self._token_losses(self._prompted(pixel_values, input_ids, attention_mask), action_ids)[0]
-
     def _token_losses(self, prefix: Prefix, ids: Tensor) -> tuple[Tensor, Tensor]:
         """Return losses (B, A + 1), and the likeliest ids of the whole vocabulary (B, A)."""
         ids = ids.to(prefix.embeddings.device)
@@ -239,38 +228,8 @@ class OpenVLAPolicy(PreTrainedPolicy):
         """Return a chunk of one action (B, 1, A), int64."""
         return self.select_action(batch)[:, None]
 
-    @torch.no_grad()
-    def predict_action_ids(
-        self, pixel_values: Tensor, input_ids: Tensor, attention_mask: Tensor, num_ids: int
-    ) -> Tensor:
-        """Return the likeliest ids of the whole vocabulary (B, num_ids), as OpenVLA's own code predicts them.
-
-        There are always `num_ids` ids; the original stops at an end token, and then returns ids of the
-        prompt. The other arguments are those of `action_logits`."""
-        return self._greedy(self._prompted(pixel_values, input_ids, attention_mask), num_ids)
-
     def _greedy(self, prefix: Prefix, num_ids: int) -> Tensor:
         return self.model.decode(prefix, num_ids, lambda logits: logits.argmax(dim=1))[0]
-
-    def action_logits(
-        self, pixel_values: Tensor, input_ids: Tensor, attention_mask: Tensor, action_ids: Tensor
-    ) -> Tensor:
-        """Return teacher-forced logits of the 256 action tokens, by ascending id, at each place of
-        `action_ids`.
-
-        Args:
-            pixel_values: (B, 6, H, W), normalised for DINOv2 and for SigLIP.
-            input_ids: (B, L), prompts padded on the right; the lone space that OpenVLA puts between prompt
-                and action is added where it is not there.
-            attention_mask: (B, L), 0 where padded.
-            action_ids: (B, A).
-
-        Returns:
-            float32 (B, A, 256).
-        """
-        prefix = self._prompted(pixel_values, input_ids, attention_mask)
-        ids = action_ids.to(prefix.embeddings.device)
-        return self._action_logits(self.model.states(prefix, ids[:, :-1]))
 
     def sample(self, observation: Observation) -> Sample:
         """Draw action tokens; `evaluate` gives the same log-probs. Image and prompt are encoded once."""
@@ -305,12 +264,6 @@ class OpenVLAPolicy(PreTrainedPolicy):
         images, instructions = select_inputs(self.config, observation)
         pixel_values = to_pixel_values(images.to(self._device), self.config.sizes.image_size)
         ids, mask = self.prompts.batch(instructions)
-        return self._encoded(pixel_values, ids, mask)
-
-    def _prompted(self, pixel_values: Tensor, input_ids: Tensor, attention_mask: Tensor) -> Prefix:
-        """Encode images and prompts in OpenVLA's own form. Raises ValueError if they have another."""
-        check_pixel_values(pixel_values, self.config.sizes.image_size)
-        ids, mask = aligned_prompts(input_ids, attention_mask, self.prompts.space_id)
         return self._encoded(pixel_values, ids, mask)
 
     def _encoded(self, pixel_values: Tensor, ids: Tensor, mask: Tensor | None) -> Prefix:

@@ -61,46 +61,23 @@ class PromptTokenizer:
         return self.known[instruction]
 
     def batch(self, instructions: Sequence[str]) -> tuple[Tensor, Tensor | None]:
-        """Pad prompts behind <s>. Returns ids (B, L), and the mask (B, L) or None if nothing is padded."""
-        rows = [self.encode(instruction) for instruction in instructions]
-        longest = max(map(len, rows))
-        if all(len(row) == longest for row in rows):
-            return torch.tensor(rows), None
-        padding = [longest - len(row) for row in rows]
-        ids = [[BEGIN_ID] + [BEGIN_ID] * count + row[1:] for row, count in zip(rows, padding, strict=True)]
-        mask = [[1] + [0] * count + [1] * (len(row) - 1) for row, count in zip(rows, padding, strict=True)]
-        return torch.tensor(ids), torch.tensor(mask, dtype=torch.bool)
+        """Return the prompts' ids (B, L), and the mask (B, L) or None if nothing is padded."""
+        return padded([self.encode(instruction) for instruction in instructions])
 
 
-def aligned_prompts(input_ids: Tensor, attention_mask: Tensor, space_id: int) -> tuple[Tensor, Tensor | None]:
-    """Turn prompts padded on the right into prompts padded behind their first token.
-
-    Like OpenVLA, add the lone space where a prompt does not end with it.
-
-    Args:
-        input_ids: (B, L), every row beginning with <s>.
-        attention_mask: (B, L), zero or False where padded.
+def padded(rows: Sequence[Sequence[int]]) -> tuple[Tensor, Tensor | None]:
+    """Pad prompts behind their first token, <s>.
 
     Returns:
-        Ids (B, L'), and the mask (B, L') or None if nothing is padded.
+        Ids (B, L), and the mask (B, L) or None if nothing is padded.
     """
-    mask = attention_mask.bool()
-    if mask.shape != input_ids.shape or input_ids.ndim != 2:
-        raise ValueError(
-            f"input_ids {tuple(input_ids.shape)} and attention_mask {tuple(mask.shape)}: both must be (B, L)"
-        )
-    if not bool(mask[:, 0].all()):
-        raise ValueError("attention_mask: every row must begin with a token; pad prompts on the right")
-    last = mask.shape[1] - 1 - mask.flip(1).int().argmax(dim=1, keepdim=True)
-    ends = input_ids.gather(1, last) == space_id
-    ids = torch.cat([input_ids, torch.full_like(ends, space_id, dtype=input_ids.dtype)], dim=1)
-    mask = torch.cat([mask, ~ends], dim=1)
-    order = mask[:, 1:].int().argsort(dim=1, stable=True) + 1
-    order = torch.cat([torch.zeros_like(ends, dtype=order.dtype), order], dim=1)
-    ids, mask = ids.gather(1, order), mask.gather(1, order)
-    used = mask.any(dim=0)
-    ids, mask = ids[:, used], mask[:, used]
-    return ids, None if bool(mask.all()) else mask
+    longest = max(map(len, rows))
+    if all(len(row) == longest for row in rows):
+        return torch.tensor(rows), None
+    padding = [longest - len(row) for row in rows]
+    ids = [[BEGIN_ID] * (count + 1) + [*row[1:]] for row, count in zip(rows, padding, strict=True)]
+    mask = [[1] + [0] * count + [1] * (len(row) - 1) for row, count in zip(rows, padding, strict=True)]
+    return torch.tensor(ids), torch.tensor(mask, dtype=torch.bool)
 
 
 def train_tokenizer(instructions: Sequence[str], vocabulary: int) -> Tokenizer:

@@ -5,7 +5,7 @@ import pytest
 import torch
 from PIL import Image
 
-from lerobot_policy_openvla.images import check_pixel_values, resize, to_pixel_values
+from lerobot_policy_openvla.images import resize, to_pixel_values
 
 
 @pytest.mark.parametrize("size", [224, 64, 56])
@@ -43,12 +43,3 @@ def test_the_two_halves_are_one_picture_normalised_twice() -> None:
 def test_what_is_no_batch_of_pictures_is_refused(images: torch.Tensor) -> None:
     with pytest.raises(ValueError, match=r"needs \(B, 3, H, W\), torch\.uint8 or floating"):
         to_pixel_values(images, 32)
-
-
-@pytest.mark.parametrize("pixel_values", [
-    torch.zeros(1, 6, 32, 64), torch.zeros(6, 64, 64), torch.zeros(1, 3, 64, 64),
-    torch.zeros(1, 6, 64, 64, dtype=torch.uint8),
-])  # fmt: skip
-def test_pixel_values_of_another_size_or_type_are_refused(pixel_values: torch.Tensor) -> None:
-    with pytest.raises(ValueError, match=r"this model needs normalised images \(B, 6, 64, 64\)"):
-        check_pixel_values(pixel_values, 64)

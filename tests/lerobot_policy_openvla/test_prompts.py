@@ -1,9 +1,8 @@
 """Instructions become the ids that OpenVLA's training had, with the padding where it does no harm."""
 
 import pytest
-import torch
 
-from lerobot_policy_openvla.prompts import PromptTokenizer, aligned_prompts, train_tokenizer
+from lerobot_policy_openvla.prompts import PromptTokenizer, train_tokenizer
 
 TASKS = ["push the can forward", "pull the sponge back"]
 SPACE = 9
@@ -54,22 +53,3 @@ def test_batches_are_padded_behind_the_first_token(prompts: PromptTokenizer) -> 
     assert mask[:, 0].all()
     assert ids[1][mask[1]].tolist() == prompts.encode("push")
     assert prompts.batch(["push", "push"])[1] is None
-
-
-def test_prompts_are_aligned_and_end_with_the_space() -> None:
-    """The first row ends with it already, the second does not, the third is padded."""
-    given = torch.tensor([[1, 5, 6, SPACE], [1, 5, 6, 7], [1, 5, 0, 0]])
-    mask = torch.tensor([[1, 1, 1, 1], [1, 1, 1, 1], [1, 1, 0, 0]])
-    ids, seen = aligned_prompts(given, mask, SPACE)
-    assert seen is not None
-    rows = [row[kept].tolist() for row, kept in zip(ids, seen, strict=True)]
-    assert rows == [[1, 5, 6, SPACE], [1, 5, 6, 7, SPACE], [1, 5, SPACE]]
-    assert (ids[:, -1] == SPACE).all()
-    assert seen[:, 0].all()
-    assert aligned_prompts(given[:1], mask[:1], SPACE)[1] is None
-
-
-@pytest.mark.parametrize("mask", [torch.ones(1, 3), torch.tensor([[0, 1, 1, 1]])])
-def test_masks_that_mean_something_else_are_refused(mask: torch.Tensor) -> None:
-    with pytest.raises(ValueError, match=r"attention_mask"):
-        aligned_prompts(torch.tensor([[1, 5, 6, 7]]), mask, SPACE)

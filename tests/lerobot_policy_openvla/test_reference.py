@@ -9,7 +9,9 @@ from torch import Tensor
 
 from lerobot_policy_openvla.images import to_pixel_values
 from lerobot_policy_openvla.modeling_openvla import OpenVLAPolicy
+from lerobot_policy_openvla.network import Prefix
 from lerobot_policy_openvla.processor_openvla import make_openvla_pre_post_processors
+from lerobot_policy_openvla.prompts import padded
 from tests.lerobot_policy_openvla.reference import WHOLE, Reference, whole_reference
 
 FEATURES, LOGITS, ACTIONS = 5e-5, 2e-4, 1e-6
@@ -25,19 +27,22 @@ def pixels(reference: Reference, sample: int) -> Tensor:
     return to_pixel_values(reference.image(sample), 224)
 
 
-def prompts(reference: Reference, name: str = "input_ids") -> tuple[Tensor, Tensor]:
-    """The samples' ids, padded on the right as the original pads them, and their mask."""
-    rows = [reference(f"s{sample}_{name}") for sample in reference.samples]
-    ids = torch.nn.utils.rnn.pad_sequence(rows, batch_first=True, padding_value=32000)
-    return ids, ids != 32000
-
-
 def stacked(reference: Reference, name: str) -> Tensor:
     return torch.stack([reference(f"s{sample}_{name}") for sample in reference.samples])
 
 
 def all_pixels(reference: Reference) -> Tensor:
     return torch.cat([pixels(reference, sample) for sample in reference.samples])
+
+
+def prefix(policy: OpenVLAPolicy, reference: Reference, name: str = "input_ids") -> Prefix:
+    """The samples' pixels, and their ids with the lone space that the original adds where it is missing."""
+    rows, space = (
+        [reference(f"s{sample}_{name}").tolist() for sample in reference.samples],
+        policy.prompts.space_id,
+    )
+    ids, mask = padded([row if row[-1] == space else [*row, space] for row in rows])
+    return policy._encoded(all_pixels(reference), ids, mask)
 
 
 def test_pixels_are_equal_bit_by_bit(reference: Reference) -> None:
@@ -71,7 +76,8 @@ def test_logits_and_log_probs_of_a_padded_batch(
 ) -> None:
     """Whether or not the prompts end with the lone space that the original adds."""
     actions = stacked(reference, "tf_action_token_ids")
-    logits = original.action_logits(all_pixels(reference), *prompts(reference, name), actions)
+    states = original.model.states(prefix(original, reference, name), actions[:, :-1])
+    logits = original._action_logits(states)
     assert logits.shape == (len(reference.samples), 7, 256)
     assert (logits - stacked(reference, "tf_logits_action")).abs().max() < LOGITS
     columns = original.action_tokens.columns(actions)[..., None]
@@ -81,7 +87,7 @@ def test_logits_and_log_probs_of_a_padded_batch(
 
 @pytest.mark.parametrize("num_ids", [7, 8])
 def test_greedy_ids_of_a_padded_batch(reference: Reference, original: OpenVLAPolicy, num_ids: int) -> None:
-    ids = original.predict_action_ids(all_pixels(reference), *prompts(reference), num_ids=num_ids)
+    ids = original._greedy(prefix(original, reference), num_ids)
     assert stacked(reference, "gen_margin").min() > LOGITS
     assert torch.equal(ids, stacked(reference, "gen8_token_ids")[:, :num_ids])
 
@@ -119,7 +125,7 @@ def whole() -> Reference:
 def test_the_loss_of_a_padded_batch_and_its_gradients(whole: Reference) -> None:
     policy = OpenVLAPolicy.from_openvla(whole.folder)
     actions = policy.action_tokens.encode(stacked(whole, "train_action"))
-    losses = policy.token_losses(all_pixels(whole), *prompts(whole), actions)
+    losses, _ = policy._token_losses(prefix(policy, whole), actions)
     labelled = whole("batch_labels")[:, 1:] != -100
     assert (losses.flatten() - whole("batch_nll")[labelled]).abs().max() < LOGITS
     assert losses.mean().item() == pytest.approx(whole.arrays["batch_loss"].item(), abs=LOGITS)
