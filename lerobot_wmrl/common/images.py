@@ -23,9 +23,10 @@ def to_bytes(images: Tensor) -> Tensor:
     return (images * 255).round().byte()
 
 
-def as_bytes(images: Tensor) -> Tensor:
-    """Convert images to uint8, from [0, 1] if they are not in uint8."""
-    return images if images.dtype == torch.uint8 else to_bytes(images)
+def to_pixels(images: Tensor) -> np.ndarray:
+    """Return images in [0, 1], or uint8 already, as numpy's libraries want them. (…, C, H, W) → uint8
+    (…, H, W, C)"""
+    return (images if images.dtype == torch.uint8 else to_bytes(images)).movedim(-3, -1).cpu().numpy()
 
 
 def jpeg(image: np.ndarray) -> bytes:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.images import as_bytes
+from lerobot_wmrl.common.images import to_pixels
 from lerobot_wmrl.data.embodiment import HIGH, LOW, Embodiment
 
 
@@ -38,7 +38,7 @@ def observation_row(observation: Observation, row: int) -> dict[str, np.ndarray]
     Images of the batch are in [0, 1], or uint8 already.
     """
     return {
-        key: as_bytes(value[row]).permute(1, 2, 0).cpu().numpy()
+        key: to_pixels(value[row])
         if key.startswith(OBS_IMAGE)
         else value[row].cpu().numpy().astype(np.float32)
         for key, value in observation.items()

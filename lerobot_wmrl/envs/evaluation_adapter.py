@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lerobot_wmrl.common.actions import warn_of_clipped
 from lerobot_wmrl.common.constants import Observation
-from lerobot_wmrl.common.images import to_bytes
+from lerobot_wmrl.common.images import to_pixels
 
 
 class EvaluationAdapter(gym.vector.VectorEnv):
@@ -113,7 +113,7 @@ def images_to_numpy(observation: Observation) -> dict[str, np.ndarray]:
     """
     prefix = f"{OBS_IMAGES}."
     return {
-        key.removeprefix(prefix): to_bytes(value).permute(0, 2, 3, 1).cpu().numpy()
+        key.removeprefix(prefix): to_pixels(value)
         for key, value in observation.items()
         if key.startswith(OBS_IMAGE)
     }

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from lerobot_wmrl.common.constants import START_SCENE, START_TASK, TASKS
 from lerobot_wmrl.common.errors import FieldError, within
-from lerobot_wmrl.common.images import stretch, to_bytes
+from lerobot_wmrl.common.images import stretch, to_pixels
 from lerobot_wmrl.common.statistics import evenly_spaced
 from lerobot_wmrl.data.budget import Ledger
 from lerobot_wmrl.data.episodes import EpisodeTable, choose_episodes, read_episodes
@@ -236,7 +236,7 @@ def observed_frame(observation: Mapping[str, Any], sizes: TokenizerConfig) -> St
         ValueError: it lacks a camera of the tokenizer.
     """
     seen = {name: value.cpu() for name, value in observation.items() if isinstance(value, Tensor)}
-    images = to_bytes(stack_cameras(seen, sizes.camera_keys, sizes.image_size)).movedim(-3, -1).numpy()
+    images = to_pixels(stack_cameras(seen, sizes.camera_keys, sizes.image_size))
     state = seen.get(OBS_STATE, torch.zeros(len(images), 0)).float().numpy()
     unknown = np.full(len(images), -1)
     return StartImages(images, images, state, list(observation["task"]), unknown, without_depth)

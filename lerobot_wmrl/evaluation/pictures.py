@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.figure import Figure
-from torch import Tensor
 
 from lerobot_wmrl.common.frame_strips import GAP, enlarged, in_a_row
-from lerobot_wmrl.common.images import to_bytes
+from lerobot_wmrl.common.images import to_pixels
 from lerobot_wmrl.common.statistics import evenly_spaced
 from lerobot_wmrl.evaluation.agreement import Agreement
 from lerobot_wmrl.evaluation.gate import SWEEP_FRAMES, SWEEP_THRESHOLDS, Gate
@@ -31,15 +30,10 @@ def side_by_side(
     recorded = recording.frames[recording.compared_rows(replay.episode)]
     first, context = recording.first_frames(np.array([replay.episode]), model.tokenizer)
     tokens = torch.cat([first, replay.tokens[: len(recorded) - 1]])
-    imagined = to_uint8(model.tokenizer.decode(tokens, context[[0] * len(tokens)]))
+    imagined = to_pixels(model.tokenizer.decode(tokens, context[[0] * len(tokens)]))
     rows = [np.concatenate(list(cameras.swapaxes(0, 1)), 2) for cameras in (recorded, imagined)]
     gap = np.full((len(recorded), GAP, *rows[0].shape[2:]), 255, np.uint8)
     return np.concatenate([rows[0], gap, rows[1]], 1)
-
-
-def to_uint8(images: Tensor) -> np.ndarray:
-    """(T, N, 3, H, W) in [0, 1] → (T, N, H, W, 3) uint8"""
-    return to_bytes(images).permute(0, 1, 3, 4, 2).cpu().numpy()
 
 
 def save_animation(frames: np.ndarray, path: Path) -> None:
@@ -59,7 +53,7 @@ def save_goals(goals: Goals, path: Path) -> None:
     rows = {"start": goals.start[shown], "goal": goals.goal[shown]}
     if goals.finals is not None and (goals.nearest >= 0).all():
         rows["nearest final"] = goals.finals.images[goals.nearest[shown]]
-    pictures = {title: to_uint8(images) for title, images in rows.items()}
+    pictures = {title: to_pixels(images) for title, images in rows.items()}
     size = 1.5 * len(shown), 1.7 * len(pictures)
     figure = Figure(figsize=size)
     axes = figure.subplots(len(pictures), len(shown), squeeze=False)

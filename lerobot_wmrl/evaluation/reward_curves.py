@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from lerobot_wmrl.common.images import to_bytes
+from lerobot_wmrl.common.images import to_pixels
 from lerobot_wmrl.data.frame_cache import frames_to_tensor
 from lerobot_wmrl.evaluation.gate import first_run
 from lerobot_wmrl.evaluation.replay import EpisodeReplay, Recording
@@ -56,6 +56,6 @@ def reward_along_episode(
         "similarity": similarity[1:].tolist(),
         "return": earned.cumsum(0).tolist(),
         "goal_reached": bool(goal.reached[0]),
-        "goal_frame": to_bytes(goal.decoded.images[0].permute(0, 2, 3, 1)).cpu().numpy(),
+        "goal_frame": to_pixels(goal.decoded.images[0]),
         "final_frame": np.asarray(recording.frames[rows][-1]),
     }

@@ -18,7 +18,7 @@ from lerobot.utils.constants import OBS_IMAGE
 from torch import Tensor
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.images import jpeg, to_bytes
+from lerobot_wmrl.common.images import jpeg, to_pixels
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.envs.start_frames import StartImages
 from lerobot_wmrl.envs.world_model_env import Observation, WorldModels, WorldModelVectorEnv, make_env_at
@@ -234,7 +234,7 @@ class Drive:
 def encode_observation(observation: Observation, cameras: Sequence[str] = ()) -> list[str]:
     """Encode the images of a batch of one, of these cameras or of all."""
     names = cameras or [name for name in observation if name.startswith(OBS_IMAGE)]
-    return encode_images([to_bytes(observation[name][0]).permute(1, 2, 0).cpu().numpy() for name in names])
+    return encode_images([to_pixels(observation[name][0]) for name in names])
 
 
 def encode_images(images: Sequence[np.ndarray] | np.ndarray) -> list[str]:

@@ -157,12 +157,10 @@ class LabelPage:
 
     def _pictures(self, row: int) -> dict[str, bytes]:
         """Return the pictures of a row of the dataset by camera, as JPEG."""
-        from lerobot_wmrl.common.images import jpeg, to_bytes
+        from lerobot_wmrl.common.images import jpeg, to_pixels
 
         found = self.dataset[row]
-        return {
-            camera: jpeg(to_bytes(found[camera].float()).permute(1, 2, 0).numpy()) for camera in self.cameras
-        }
+        return {camera: jpeg(to_pixels(found[camera])) for camera in self.cameras}
 
     async def _label(self, request: "web.Request") -> "web.Response":
         from aiohttp import web

@@ -12,7 +12,7 @@ from lerobot.utils.constants import OBS_STATE
 from lerobot_robot_imagined.config_imagined import ImaginedRobotConfig
 from lerobot_robot_imagined.keys import EpisodeKeys
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.images import to_bytes
+from lerobot_wmrl.common.images import to_pixels
 from lerobot_wmrl.envs.configuration_world_model import DrivenEnv
 from lerobot_wmrl.envs.start_frames import read_start_images
 from lerobot_wmrl.envs.world_model_env import load_world_models, make_env_at
@@ -112,10 +112,7 @@ class ImaginedRobot(Robot):
             self._begin()
         self.began = self.began or time.perf_counter()
         state = self.observation[OBS_STATE][0].tolist() if OBS_STATE in self.observation else []
-        images = (
-            to_bytes(self.observation[key][0]).permute(1, 2, 0).cpu().numpy()
-            for key in self.model.tokenizer.camera_keys
-        )
+        images = (to_pixels(self.observation[key][0]) for key in self.model.tokenizer.camera_keys)
         return dict(zip(self.observation_features, [*state, *images], strict=True))
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from lerobot_dataset_maniskill.merging import merge_folders
 from lerobot_dataset_maniskill.recorder import record
 from lerobot_wmrl.common.constants import EVALUATION_SEED, GATE_SEED, START_SEED
 from lerobot_wmrl.common.files import write_json
-from lerobot_wmrl.common.images import to_bytes
+from lerobot_wmrl.common.images import to_pixels
 from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.data.budget import Ledger, Limits
 from lerobot_wmrl.data.dataset import DatasetSource, open_dataset
@@ -96,7 +96,7 @@ def test_videos_are_encoded_as_those_of_the_dataset(
     for row in range(2):
         frame = {name: value for name, value in given[row].items() if name in {*own, "task"}}
         frame |= {name: value.reshape(1) for name, value in frame.items() if name.startswith("next.")}
-        videos.add_frame({**frame, OBS_IMAGE: to_bytes(frame[OBS_IMAGE]).permute(1, 2, 0).numpy()})
+        videos.add_frame({**frame, OBS_IMAGE: to_pixels(frame[OBS_IMAGE])})
     videos.save_episode()
     videos.finalize()
     file = videos.root / "meta" / "info.json"

@@ -7,13 +7,14 @@ import pytest
 import torch
 
 from lerobot_wmrl.common.checkpoints import Checkpoint
+from lerobot_wmrl.common.images import to_pixels
 from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames, cached_tokens, frames_to_tensor
 from lerobot_wmrl.data.frames import NO_CONTEXT
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.start_frames import read_start_images
-from lerobot_wmrl.evaluation.pictures import side_by_side, to_uint8
+from lerobot_wmrl.evaluation.pictures import side_by_side
 from lerobot_wmrl.evaluation.replay import Recording, replay_episodes
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.scripts.eval_world_model import EvalWorldModelConfig, eval_world_model
@@ -209,7 +210,7 @@ def test_evaluation_decodes_beside_the_start_and_runs_whole(models, small_datase
     source = Recording(table, frames)
     for run in replay_episodes(model, source, np.array([3, 1])):
         context = model.tokenizer.context(frames_to_tensor(frames[table.start[[run.episode]]]))
-        expected = to_uint8(model.tokenizer.decode(run.tokens[:1], context).detach())[0, 0]
+        expected = to_pixels(model.tokenizer.decode(run.tokens[:1], context).detach())[0, 0]
         assert np.array_equal(side_by_side(model, source, run)[1, -len(expected) :], expected)
     eval_world_model(
         EvalWorldModelConfig(
