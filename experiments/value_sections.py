@@ -280,21 +280,21 @@ The longer BC learnt from a recording of its own, of the same budget, in these c
 
 
 def from_longer(found: Groups) -> str:
-    """Return the success of PPO in imagination, and of the planner distilled, that begin from longer BC."""
+    """Return the success of what begins from longer BC in imagination."""
+    begun = ("longer_imagined_ppo", "longer_ppo_distilled", "longer_discounted_ppo")
     said = []
     for group, cells in having(found, "longer_imagined_ppo").items():
-        rates = {
-            method: " and ".join(f"{100 * mean(cells, method, domain):.0f}" for domain in SCENES)
-            for method in measured(cells, ("longer_filtered", "longer_imagined_ppo", "longer_ppo_distilled"))
-        }
-        before, after, *planner = rates.values()
+        before, *after = (
+            f'"{TITLES[method]}" '
+            + " and ".join(f"{100 * mean(cells, method, domain):.0f}" for domain in SCENES)
+            for method in measured(cells, ("longer_filtered", *begun))
+        )
         seeds = ", ".join(str(cell["seed"]) for cell in cells)
         said.append(
-            f"with {spoken(group)} (seed {seeds}), PPO in imagination has {after} % (known, unseen scenes) "
-            f"from its {before} %"
-            + "".join(f", and the planner distilled after it {each} %" for each in planner)
+            f"With {spoken(group)} (seed {seeds}): {before} % (known, unseen scenes), and from there "
+            f"{', '.join(f'{each} %' for each in after)}."
         )
-    return f"Begun from it, {'; '.join(said)}." if said else "PPO and the planner have not begun from it yet."
+    return " ".join(said) or "PPO and the planner have not begun from it yet."
 
 
 def beyond_seeds(found: Groups) -> str:
