@@ -83,10 +83,8 @@ def cached_frames(dataset: LeRobotDataset, camera_keys: Sequence[str], side: int
 
     def fill(target: np.ndarray) -> None:
         for episode in tqdm(range(dataset.num_episodes), desc="Decoding frames", unit="episode"):
-            whole = rows_of(dataset, episode)
-            for camera, name in enumerate(camera_keys):
-                for first in range(whole.start, whole.stop, DECODED):
-                    rows = slice(first, min(first + DECODED, whole.stop))
+            for rows in parts_of(dataset, episode):
+                for camera, name in enumerate(camera_keys):
                     frames = stretch(decode(dataset, episode, name, rows), side, side)
                     target[rows, camera] = frames.permute(0, 2, 3, 1).numpy()
 
@@ -190,6 +188,12 @@ def rows_of(dataset: LeRobotDataset, episode: int) -> slice:
     return slice(rows["dataset_from_index"], rows["dataset_to_index"])
 
 
+def parts_of(dataset: LeRobotDataset, episode: int) -> list[slice]:
+    """Return an episode's rows in parts whose frames are decoded at once."""
+    rows = rows_of(dataset, episode)
+    return [slice(first, min(first + DECODED, rows.stop)) for first in range(rows.start, rows.stop, DECODED)]
+
+
 def decode_episode(dataset: LeRobotDataset, episode: int, key: str) -> Tensor:
     """Decode one episode and camera, uint8 (T, 3, H, W), from video or from stored images."""
     return decode(dataset, episode, key, rows_of(dataset, episode))
@@ -198,10 +202,15 @@ def decode_episode(dataset: LeRobotDataset, episode: int, key: str) -> Tensor:
 def decode(dataset: LeRobotDataset, episode: int, key: str, rows: slice) -> Tensor:
     """Decode some rows of an episode, which are the dataset's, in one camera: uint8 (T, 3, H, W)."""
     if key not in dataset.meta.video_keys:
-        images = dataset.hf_dataset.with_format(None, columns=[key])[rows][key]
-        frames = np.stack([np.asarray(image.convert("RGB")) for image in images])
+        frames = np.stack([np.asarray(image.convert("RGB")) for image in stored_images(dataset, key, rows)])
         return torch.from_numpy(frames).permute(0, 3, 1, 2)
     return decode_video(dataset, episode, key, rows)
+
+
+def stored_images(dataset: LeRobotDataset, key: str, rows: slice) -> list[Any]:
+    """Return rows of a camera that the dataset stores as images, as PIL opens them."""
+    images: list[Any] = dataset.hf_dataset.with_format(None, columns=[key])[rows][key]
+    return images
 
 
 def decode_video(dataset: LeRobotDataset, episode: int, key: str, rows: slice) -> Tensor:
@@ -297,28 +306,26 @@ def cached_depth(dataset: LeRobotDataset, camera_keys: Sequence[str], grid: int)
 
     def fill(target: np.ndarray) -> None:
         for episode in tqdm(range(dataset.num_episodes), desc="Decoding depth", unit="episode"):
-            maps = torch.cat([decode_depth(dataset, episode, name) for name in keys], 1)
-            target[rows_of(dataset, episode)] = token_depth(maps, grid).numpy()
+            for rows in parts_of(dataset, episode):
+                maps = torch.cat([decode_depth(dataset, episode, name, rows) for name in keys], 1)
+                target[rows] = token_depth(maps, grid).numpy()
 
     shape = (dataset.num_frames, len(keys) * grid**2)
     return memory_map(cache_dir(dataset) / f"depth-{key}.npy", shape, np.float32, fill)
 
 
-def decode_depth(dataset: LeRobotDataset, episode: int, key: str) -> Tensor:
-    """Decode the depth of one episode and camera, (T, 1, H, W) metres, from video or from stored images."""
+def decode_depth(dataset: LeRobotDataset, episode: int, key: str, rows: slice) -> Tensor:
+    """Decode the depth of some rows of an episode in one camera, (T, 1, H, W) metres."""
     info = dataset.features[key].get("info") or {}
     if key in dataset.meta.video_keys:
-        codes = decode_video(dataset, episode, key, rows_of(dataset, episode))
+        codes = decode_video(dataset, episode, key, rows)
         encoder = DepthEncoderConfig.from_video_info(info)
         metres = dequantize_depth(
             codes, encoder.depth_min, encoder.depth_max, encoder.shift, encoder.use_log,
             output_unit=DEPTH_METER_UNIT,
         )  # fmt: skip
         return torch.where(codes.int() > 0, torch.as_tensor(metres), 0.0)
-    rows = dataset.meta.episodes[episode]
-    indices = range(rows["dataset_from_index"], rows["dataset_to_index"])
-    stored = dataset.hf_dataset.with_format(None, columns=[key])[indices][key]
-    maps = np.stack([np.asarray(image) for image in stored])
+    maps = np.stack([np.asarray(image) for image in stored_images(dataset, key, rows)])
     unit = info.get("depth_unit") or infer_depth_unit(maps.dtype)
     scale = 1.0 if unit == DEPTH_METER_UNIT else 1 / MM_PER_METRE
     return torch.from_numpy(maps.astype(np.float32) * np.float32(scale))[:, None]
