@@ -26,7 +26,7 @@ TITLES: Final = {
     "longer_filtered": "longer filtered BC",
     "simulated_ppo": "PPO in ManiSkill",
     "imagined_ppo": "PPO in imagination",
-    "ppo_distilled": "then the planner distilled",
+    "ppo_distilled": "PPO in imagination, then the planner distilled",
 }
 """Methods in the order of picture and table."""
 

@@ -147,7 +147,13 @@ def test_the_readme_says_what_was_measured() -> None:
     (from_it,) = having(second, "longer_imagined_ppo").values()
     assert len(from_it) == 1
     assert gain(from_it, "longer_imagined_ppo", "longer_filtered", "ind").mean < 0
-    assert "Longer BC does as well (two), and PPO from it gains nothing (one)." in text
+    (discounted,) = having(second, "longer_discounted_ppo").values()
+    assert [cell["seed"] for cell in discounted] == [cell["seed"] for cell in from_it]
+    before, after, longest = (
+        "/".join(str(best_success(discounted, (method,), domain)) for domain in ("ind", "ood"))
+        for method in ("longer_filtered", "longer_imagined_ppo", "longer_discounted_ppo")
+    )
+    assert f"PPO makes {after} of its {before}, {longest} with today's discount (one)." in text
     unseen = (best_success(pick_place, methods, "ood") for methods in (("imagined_ppo",), BASELINES))
     assert abs(next(unseen) - next(unseen)) <= 1
     driven = [json.loads(path.read_text()) for path in (results / "driven").glob("*.json")]

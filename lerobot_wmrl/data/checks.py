@@ -23,17 +23,19 @@ def frame_size(feature: Mapping[str, Any]) -> tuple[int, int]:
 
 
 def check_cameras(features: Mapping[str, Any], camera_keys: Sequence[str], field: str | None = None) -> None:
-    """Raise FieldError unless the dataset has these cameras.
+    """Raise ValueError unless the dataset has these cameras.
 
-    `field` is the setting that they can be changed by; None if a trained model has learnt them.
+    It is a FieldError about `field`, the setting of the cameras, unless a trained model has learnt them.
     """
     for key in camera_keys:
         if key not in features:
             cameras = ", ".join(name for name in features if name.startswith(OBS_IMAGE)) or "none"
-            problem, remedy = f"the dataset has no {key} (its cameras: {cameras})", "use a dataset that has"
+            problem = f"the dataset has no {key} (its cameras: {cameras})"
+            if field is None:
+                raise ValueError(f"{problem}, which the model has learnt to look at; use one that has it")
             raise FieldError(
-                field or "cameras", camera_names(camera_keys), problem,
-                f"set `{field}` to match, or {remedy}" if field else remedy,
+                field, camera_names(camera_keys), problem,
+                f"set `{field}` to match, or use a dataset with this camera",
             )  # fmt: skip
 
 

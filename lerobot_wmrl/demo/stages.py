@@ -50,7 +50,7 @@ class DemoConfig(RunConfig):
     scenes, and in imagination, from frames of the dataset.
 
     Running the same command again continues after the last finished piece of work. `--preset=demo` (the
-    default) takes less than an hour on two cores, `--preset=tiny` a few minutes and shows only that
+    default) takes about an hour on two cores, `--preset=tiny` a few minutes and shows only that
     everything runs; flags further right override the preset. The page to read is `report.html`.
 
     Args:

@@ -1,6 +1,7 @@
 """ManiSkill as an environment: one episode in numpy, several for lerobot-eval, and as tensors for PPO."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, ClassVar
 
@@ -21,6 +22,7 @@ from lerobot_wmrl.maniskill.backend import simulating_context
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW, FPS, STATE_NAMES
 from lerobot_wmrl.maniskill.episode import Frame
 from lerobot_wmrl.maniskill.scenes import scene_for_seed
+from lerobot_wmrl.rewards.general import potential_discount
 
 
 class ManiSkillEnv(gym.Env):
@@ -138,7 +140,8 @@ class ManiSkillTensorEnv(TensorEnv):
     metadata = {"render_fps": FPS, "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012 (gymnasium's own)
 
     def __init__(self, config: WmrlManiSkillEnv, n_envs: int, device: str) -> None:
-        tasks = config.each_task()
+        longest = potential_discount(config.reward, config.horizon)  # PPO has one discount for all tasks
+        tasks = replace(config, reward=replace(config.reward, gamma=longest)).each_task()
         self.tasks = len(tasks)
         rows = [tasks[row % self.tasks] for row in range(n_envs)]
         self.envs = make_vector_env(rows, use_async_envs=n_envs > 1, freeze=False)

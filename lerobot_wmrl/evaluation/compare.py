@@ -28,7 +28,6 @@ from lerobot_wmrl.common.policies import (
     read_policy_config,
 )
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
-from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
 from lerobot_wmrl.envs.lerobot_env import counts_resets, freeze_finished, is_own, runs_in_processes
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.evaluation.comparison import Comparison, Episode
@@ -99,24 +98,27 @@ def _check_environment(config: PreTrainedConfig, env: EnvConfig) -> None:
     fit_to_environment(config, shown, action.shape[0])
 
 
-def load_policies(configs: Mapping[str, PreTrainedConfig], envs: Envs) -> list[LoadedPolicy]:
-    """Load the policies with their processors.
+def check_actions(configs: Mapping[str, PreTrainedConfig], envs: Envs) -> None:
+    """Raise FieldError if a policy's actions are in other units than those of a world model."""
+    for name, config in configs.items():
+        with about_policy(name):
+            check_imagined_units(config, load_processors(config), envs)
 
-    Raises:
-        FieldError: one cannot be loaded, or its actions are in other units than those of a world model.
-    """
-    worlds = [
-        adapter.env for adapter in _flat(envs)
-        if isinstance(adapter, EvaluationAdapter) and isinstance(adapter.env, WorldModelVectorEnv)
-    ]  # fmt: skip
+
+def check_imagined_units(config: PreTrainedConfig, processors: tuple[Any, Any], envs: Envs) -> None:
+    """Raise FieldError if a policy's actions are in other units than those of a world model."""
+    for adapter in _flat(envs)[:1]:  # all tasks share the world model
+        if isinstance(env := getattr(adapter, "env", None), WorldModelVectorEnv):
+            names = env.model.config.embodiment.action_names
+            check_units(config, processors[1], names, env.action_low, env.action_high)
+
+
+def load_policies(configs: Mapping[str, PreTrainedConfig]) -> list[LoadedPolicy]:
+    """Load the policies with their processors. FieldError if one cannot be loaded."""
     loaded = []
     for name, config in configs.items():
         with about_policy(name):
-            policy = LoadedPolicy(config, load_policy(config), load_processors(config))
-            for env in worlds[:1]:  # all tasks share the world model
-                names = env.model.config.embodiment.action_names
-                check_units(config, policy.processors[1], names, env.action_low, env.action_high)
-        loaded.append(policy)
+            loaded.append(LoadedPolicy(config, load_policy(config), load_processors(config)))
     return loaded
 
 

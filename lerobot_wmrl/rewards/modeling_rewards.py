@@ -39,11 +39,12 @@ class GeneralRewardModel(PreTrainedRewardModel):
         config = self.config
         if not config.needs_goal:
             return batch["success"]
-        if config.gamma is None:
+        gamma = config.gamma
+        if gamma is None and config.form == "potential":
             raise FieldError("gamma", None, "how long episodes are is not known here", "give the discount")
         return general_reward(
             batch["success"], batch["similarity"], batch["previous.similarity"],
-            alpha=config.alpha, form=config.form, gamma=config.gamma,
+            alpha=config.alpha, form=config.form, gamma=gamma or 1.0,
         )  # fmt: skip
 
 

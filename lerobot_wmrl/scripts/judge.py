@@ -235,7 +235,7 @@ def imagine(
     cfg: JudgeConfig, env: WorldModelEnv, judgement: "Judgement", configs: "Mapping[str, PreTrainedConfig]"
 ) -> None:
     """Imagine the episodes of the policies that have none yet; write the results after every policy."""
-    from lerobot_wmrl.evaluation.compare import about_policy, load_policies, opened, run_block
+    from lerobot_wmrl.evaluation.compare import about_policy, check_actions, load_policies, opened, run_block
     from lerobot_wmrl.evaluation.judgement import RESULTS
 
     def write() -> None:
@@ -250,10 +250,11 @@ def imagine(
     group = regrouped("dataset", "starts") if cfg.starts_given else nullcontext()
     with group, opened(env, size, False, 1) as (envs,):
         starts = starts_of_one_task(envs, cfg)
+        check_actions(missing, envs)
         claim_output_dir(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER)
         for name, config in tqdm(missing.items(), desc="Imagining", unit="policy"):
             with about_policy(name):
-                policies = load_policies({name: config}, envs)
+                policies = load_policies({name: config})
                 blocks = [  # the seed of an episode is the number of its start
                     run_block([envs], env, policies, min(size, starts - begin), begin)
                     for begin in range(0, starts, size)

@@ -60,7 +60,7 @@ def read_config(
         device = accelerator.type if accelerator else "cpu"
     try:
         return RewardModelConfig.from_pretrained(str(folder), cli_overrides=[f"--device={device}"])
-    except OSError as error:
+    except FileNotFoundError as error:
         raise FieldError(
             field, path, f"no {expected_type} there, nor on the hub ({first_line(error)})",
             "give its training's output folder, or a hub id",

@@ -78,7 +78,7 @@ def check_key(config: OpenVLAConfig, source: str | Path, folder: Path) -> None:
         raise FieldError(
             "unnorm_key",
             config.unnorm_key,
-            f"the processors in {config.pretrained_path} are for {made_with}",
+            f"the processors in {path} are for {made_with}",
             "import the checkpoint again, with this key",
         )
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
+from lerobot_wmrl.rewards.general import default_discount
 from lerobot_wmrl.rewards.similarity import PerceptualSimilarity, Similarity, make_similarity
 
 STILL = torch.zeros(1, 7)
@@ -87,7 +88,7 @@ def test_the_paper_s_reward_is_largest_at_the_goal(config, measure):
 
 def test_by_default_lingering_earns_nothing_and_done_ends_the_episode(config, measure):
     """Amid the way and at the goal; the next episode is not paid for where the last one was."""
-    env = replace(config, reward=GeneralConfig(device="cpu", gamma=0.97)).create_tensor_env(1)
+    env = replace(config, reward=GeneralConfig(device="cpu")).create_tensor_env(1)
     way = way_to_goal(env)
     set_goal(env, measure, way[-1])
     env.reset(seed=0)
@@ -96,4 +97,6 @@ def test_by_default_lingering_earns_nothing_and_done_ends_the_episode(config, me
     for row, paid in enumerate(paid_along(env, [way[-1]] * config.done_frames, done=20.0), start=1):
         assert (paid > 0.5) == (row == config.done_frames)
     assert env._elapsed.item() == 0
-    assert paid_along(env, way[:1])[0] == pytest.approx(-0.1 * 0.03 * env.goals.similarity.item(), abs=1e-5)
+    assert paid_along(env, way[:1])[0] == pytest.approx(
+        0.1 * (default_discount(config.horizon) - 1) * env.goals.similarity.item(), abs=1e-5
+    )

@@ -147,6 +147,8 @@ def test_tasks_are_shared_out_among_the_environments_of_the_trainer() -> None:
     env = ManiSkillTensorEnv(WmrlManiSkillEnv(task="push,pick_place", image_size=32), 3, "cpu")
     try:
         assert env.envs.call("task") == ("push", "pick_place", "push")
+        rewards = [config.reward.gamma for config in env.envs.get_attr("config")]
+        assert rewards == [default_discount(env.max_episode_steps)] * 3, "PPO has one for all"
         assert env.tasks == 2
     finally:
         env.close()

@@ -28,7 +28,9 @@ from lerobot_wmrl.evaluation.accuracy import (
 from lerobot_wmrl.evaluation.gate import Outcomes, gate_at, success_gate
 from lerobot_wmrl.evaluation.replay import EpisodeReplay, Recording, replay_episodes
 from lerobot_wmrl.evaluation.report import evaluate
+from lerobot_wmrl.evaluation.reward_curves import reward_along_episode
 from lerobot_wmrl.maniskill.recordings import scene_splits
+from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.scripts.eval_world_model import EvalWorldModelConfig, eval_world_model
 from lerobot_wmrl.world_models.checkpoint import load_model
 from tests.relabelled import UNLABELLED, relabelled
@@ -220,6 +222,21 @@ def test_episodes_of_which_nobody_knows_the_outcome_are_no_failures(small_datase
     assert (metrics["failures"], metrics["successes"], metrics["passed"]) == (0, 0, False)
     assert metrics["headline"]["done_f1"]["value"] is None
     assert (metrics["headline"]["psnr"]["episodes"], metrics["extreme_actions"]["episodes"]) == (6, 6)
+
+
+def test_success_is_paid_once_in_the_frame_that_completes_it(source, model, trained_models):
+    text_model = load_model(trained_models["text_world_model"], "text_world_model")
+    replay, frames = perfect(source, model, 0), 3
+    probability = torch.ones_like(replay.done_probability)
+    probability[[0, 3]] = 0.0  # the first run has two frames
+    found = reward_along_episode(
+        text_model, GeneralConfig(device="cpu", alpha=1.0), source,
+        replace(replay, done_probability=probability), threshold=0.5, frames=frames,
+    )  # fmt: skip
+    count = len(probability) - 1
+    assert found["return"] == [0.0] * 6 + [1.0] * (count - 6)
+    assert found["done_probability"] == probability[:-1].tolist()
+    assert len(found["similarity"]) == count
 
 
 def test_the_command_writes_figures_and_pictures(small_dataset, trained_models, tmp_path, capsys):

@@ -11,7 +11,7 @@ from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.scripts.eval_world_model import EvalWorldModelConfig, eval_world_model
-from lerobot_wmrl.world_models.checkpoint import load_model
+from lerobot_wmrl.world_models.checkpoint import load_model, read_config
 from tests.trained import action_config, run_training, text_config, tokenizer_config
 
 
@@ -43,6 +43,12 @@ def test_a_published_model_is_the_trained_one(name, hub, small_dataset, trained_
     expected = load_model(folder, name).compute_reward(batch)
     for model in (model_class.from_pretrained(f"somebody/{name}"), load_model(f"somebody/{name}", name)):
         assert torch.equal(model.compute_reward(batch), expected)
+
+
+def test_a_model_that_is_nowhere_is_named(hub):
+    message = r"^world_model_path=somebody/nothing: no action_world_model there, nor on the hub"
+    with pytest.raises(FieldError, match=message):
+        read_config("somebody/nothing", "action_world_model")
 
 
 def test_what_was_trained_but_not_published_is_published_by_the_same_command(hub, small_dataset, tmp_path):
