@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
@@ -17,6 +18,7 @@ from lerobot_wmrl.common.constants import KINDS
 from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
+from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
@@ -141,9 +143,20 @@ def test_a_planner_acts_as_a_policy(config, trained_models):
 def test_what_a_policy_does_out_of_range_is_reported(config, tmp_path, caplog):
     record(config)
     assert "out of range" not in caplog.text
-    policy = read_policy_config(str(save_untrained_policy(tmp_path / "far", actions=7, constant=2.0)), [])
-    record(replace(config, output_dir=tmp_path / "clipped", policy=policy))
+
+    def acting(name: str, action: np.ndarray) -> PreTrainedConfig:
+        saved = save_untrained_policy(tmp_path / name, actions=7, constant=action.tolist())
+        return read_policy_config(str(saved), [])
+
+    far = acting("far", 1.5 * np.array(ACTION_HIGH))
+    record(replace(config, output_dir=tmp_path / "clipped", policy=far))
     assert "100.0 % of the components of the policy's actions were out of range" in caplog.text
+    other = replace(
+        config, output_dir=tmp_path / "refused", policy=acting("units", 9 * np.array(ACTION_HIGH))
+    )
+    with pytest.raises(ValueError, match="use a policy with the same actions in the same units"):
+        record(other)
+    assert not other.output_dir.exists()
 
 
 def test_a_policy_without_weights_is_refused(config):

@@ -1,5 +1,6 @@
 """Checkpoints of untrained policies."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -16,9 +17,12 @@ def save_untrained_policy(
     camera: str = "third_view",
     size: int | tuple[int, int] = 32,
     actions: int = 3,
-    constant: float | None = None,
+    constant: float | Sequence[float] | None = None,
 ) -> Path:
-    """A policy that sees one camera, with its processors; with `constant` all its actions are that number."""
+    """A policy that sees one camera, with its processors.
+
+    With `constant` all its actions are that one, or have that number in every component.
+    """
     image = PolicyFeature(
         type=FeatureType.VISUAL, shape=(3, *((size, size) if isinstance(size, int) else size))
     )
@@ -30,7 +34,8 @@ def save_untrained_policy(
     )
     CnnPolicy(config).save_pretrained(folder)
     mean, std = (0.0, 1.0) if constant is None else (constant, 0.0)
-    stats = {"action": {"mean": torch.full((actions,), mean), "std": torch.full((actions,), std)}}
+    means = torch.as_tensor(mean, dtype=torch.float32).expand(actions)
+    stats = {"action": {"mean": means, "std": torch.full((actions,), std)}}
     for processor in make_pre_post_processors(config, dataset_stats=stats):
         processor.save_pretrained(folder)
     return folder
