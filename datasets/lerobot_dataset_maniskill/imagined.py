@@ -16,7 +16,7 @@ from lerobot_dataset_maniskill.worker import EpisodeResult, Report, out_of_range
 from lerobot_dataset_maniskill.writer import Outcome, StartColumns, add_step
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.exploration import ExplorationNoise
-from lerobot_wmrl.common.policies import check_units, fit_to_environment, load_policy, load_processors
+from lerobot_wmrl.common.policies import fit_to_environment, load_policy, load_processors
 from lerobot_wmrl.envs.evaluation_adapter import images_to_numpy
 from lerobot_wmrl.envs.start_frames import maniskill_side
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW, ACTION_NAMES, STATE_NAMES, TRANSLATION
@@ -47,8 +47,7 @@ class ImaginedPartRecorder:
         fit_to_environment(config.policy, shown, len(ACTION_NAMES))
         self.policy: Any = load_policy(config.policy).eval()
         self.processors = load_processors(config.policy)
-        low, high = self.env.action_low, self.env.action_high
-        check_units(config.policy, self.processors[1], ACTION_NAMES, low, high)
+        self.env.check_units(config.policy, self.processors[1])
         self.pipeline = make_pipeline(config.policy, *self.processors)
 
     def record(self, part: Part, report: Report) -> None:

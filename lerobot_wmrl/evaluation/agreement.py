@@ -67,7 +67,7 @@ def evaluate_policy(
         seed: seed of the first episode; each further one adds one.
     """
     made: Any = make_env(env, min(num_envs, episodes), use_async_envs=runs_in_processes(env))
-    check_imagined_units(policy.config, processors, made)
+    check_imagined_units(policy.config, processors[1], made)
     envs = {suite: {task: StepCounter(one) for task, one in tasks.items()} for suite, tasks in made.items()}
     info = eval_policy_all(
         envs, policy, *make_env_pre_post_processors(env, policy.config), *processors,

@@ -20,7 +20,6 @@ from lerobot.utils.random_utils import set_seed
 from lerobot_wmrl.common.checkpoints import resolve_checkpoint
 from lerobot_wmrl.common.errors import FieldError, first_line
 from lerobot_wmrl.common.policies import (
-    check_units,
     check_weights,
     fit_to_environment,
     load_policy,
@@ -102,15 +101,14 @@ def check_actions(configs: Mapping[str, PreTrainedConfig], envs: Envs) -> None:
     """Raise FieldError if a policy's actions are in other units than those of a world model."""
     for name, config in configs.items():
         with about_policy(name):
-            check_imagined_units(config, load_processors(config), envs)
+            check_imagined_units(config, load_processors(config)[1], envs)
 
 
-def check_imagined_units(config: PreTrainedConfig, processors: tuple[Any, Any], envs: Envs) -> None:
-    """Raise FieldError if a policy's actions are in other units than those of a world model."""
+def check_imagined_units(config: PreTrainedConfig, postprocessor: Any, envs: Envs) -> None:
+    """Raise FieldError if the environments imagine, and the policy's actions are in other units."""
     for adapter in _flat(envs)[:1]:  # all tasks share the world model
         if isinstance(env := getattr(adapter, "env", None), WorldModelVectorEnv):
-            names = env.model.config.embodiment.action_names
-            check_units(config, processors[1], names, env.action_low, env.action_high)
+            env.check_units(config, postprocessor)
 
 
 def load_policies(configs: Mapping[str, PreTrainedConfig]) -> list[LoadedPolicy]:

@@ -103,7 +103,7 @@ def train_in(
     processors: tuple[Any, Any],
 ) -> None:
     """Check that policy and environment fit, then train. `settings` are the configuration's, as JSON."""
-    from lerobot_wmrl.common.policies import adopt_features, check_fit, check_units, with_new_adapters
+    from lerobot_wmrl.common.policies import adopt_features, check_fit, with_new_adapters
     from lerobot_wmrl.envs.lerobot_env import check_real_env, shapes_of
     from lerobot_wmrl.rl.budget import charge_steps
     from lerobot_wmrl.rl.make_callbacks import Trained, make_callbacks
@@ -119,8 +119,7 @@ def train_in(
     adopt_features(config, shown)
     check_fit(config, shown, env.single_action_space.shape[-1])
     if isinstance(cfg.env, WorldModelEnv):
-        names = env.model.config.embodiment.action_names
-        check_units(config, processors[1], names, env.action_low, env.action_high)
+        env.check_units(config, processors[1])
     if cfg.real_env is not None:
         check_real_env(config, cfg.real_env)
     if cfg.peft is not None:
