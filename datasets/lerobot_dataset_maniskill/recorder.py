@@ -125,7 +125,6 @@ def claimed(root: Path, work: Path, content: Mapping[str, Any]) -> Iterator[None
     A command that fails before a part is recorded leaves no folder behind.
     """
     work.mkdir(parents=True, exist_ok=True)
-    (work / LOCK).touch()
     with locked(root, work / LOCK):
         stored = work / CONTENT_FILE
         if stored.is_file() and has_parts(work):

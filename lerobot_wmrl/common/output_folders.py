@@ -1,12 +1,12 @@
 """Output folders: each belongs to the settings of one run, which the same command may continue."""
 
-import fcntl
 import json
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
+from filelock import FileLock, Timeout
 from lerobot.utils.utils import flatten_dict
 
 from lerobot_wmrl.common.errors import FieldError
@@ -56,16 +56,28 @@ def require_same(
 
 
 @contextmanager
-def locked(output_dir: Path, file: Path) -> Iterator[None]:
-    """Hold a file of the folder against other runs. Raises FieldError if one is there."""
-    with file.open() as held:
-        try:
-            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise FieldError(
-                "output_dir", output_dir, "another run of this command is there", "wait for it"
-            ) from None
+def locked(output_dir: Path, lock: Path, seconds: float = 0) -> Iterator[None]:
+    """Hold a lock file, which is made where it is missing, against others who write the folder.
+
+    Args:
+        output_dir: the folder.
+        lock: the lock file, which holds nothing.
+        seconds: how long to wait for another one.
+
+    Raises:
+        FieldError: somebody else still holds it then.
+    """
+    held = FileLock(lock, timeout=seconds)
+    try:
+        held.acquire()
+    except Timeout:
+        raise FieldError(
+            "output_dir", output_dir, "another command writes there", "wait for it, or choose another folder"
+        ) from None
+    try:
         yield
+    finally:
+        held.release()
 
 
 def different_settings(

@@ -35,6 +35,7 @@ from lerobot_wmrl.common.precision import keep_freed_memory
 from lerobot_wmrl.common.processes import die_with, find_program, not_installed, own_progress_lock
 
 MARKER = "settings.json"
+LOCK = ".lock"
 
 FAILED = "failed"
 """In the record of an optional stage that failed: the last line of its output."""
@@ -102,12 +103,14 @@ def claimed(output_dir: Path, settings: Mapping[str, Any]) -> Iterator[None]:
         FieldError: the folder holds other things, was claimed with other settings, or is in use.
     """
     marker = output_dir / MARKER
-    if marker.exists():
-        require_same(output_dir, json.loads(marker.read_text()), settings)
-    else:
-        require_empty(output_dir, MARKER)
-        write_json(marker, dict(settings))
-    with locked(output_dir, marker):
+    if not marker.exists():
+        require_empty(output_dir, MARKER, LOCK)
+        output_dir.mkdir(parents=True, exist_ok=True)
+    with locked(output_dir, output_dir / LOCK):
+        if marker.exists():
+            require_same(output_dir, json.loads(marker.read_text()), settings)
+        else:
+            write_json(marker, dict(settings))
         yield
 
 

@@ -10,7 +10,6 @@ An episode is known by a digest of its start and actions, which stays the same w
 or copied.
 """
 
-import fcntl
 import json
 import os
 from collections import Counter
@@ -22,6 +21,7 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from filelock import FileLock
 
 from lerobot_wmrl.common.constants import KINDS, PLAY, POLICY, START_COLUMNS, START_KIND
 from lerobot_wmrl.common.errors import FieldError, require_at_least
@@ -185,12 +185,9 @@ class Ledger:
             yield entries
             self._write(entries)
 
-    @contextmanager
-    def _locked(self) -> Iterator[None]:
-        """Wait until no other process changes the ledger. It is replaced, so a file beside it is locked."""
-        with self.path.with_name(f".{self.path.name}.lock").open("w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-            yield
+    def _locked(self) -> FileLock:
+        """Return a lock beside the ledger, which is itself replaced. It waits for other processes."""
+        return FileLock(self.path.with_name(f".{self.path.name}.lock"))
 
     def _write(self, entries: Entries) -> None:
         write_json(self.path, asdict(entries))

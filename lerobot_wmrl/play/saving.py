@@ -3,16 +3,16 @@
 import os
 import shutil
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from filelock import FileLock, Timeout
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import ACTION, DEFAULT_FEATURES
 
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.output_folders import locked
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.embodiment import Embodiment, check_same_robot
 from lerobot_wmrl.data.features import episode_features, observation_row
@@ -106,7 +106,7 @@ def replacing(folder: Path) -> Iterator[Path]:
     """
     partial, old = beside(folder)
     partial.parent.mkdir(parents=True, exist_ok=True)
-    with locked(folder):
+    with exclusive(folder):
         shutil.rmtree(partial, ignore_errors=True)
         if folder.is_dir() and any(folder.iterdir()):
             shutil.copytree(folder, partial, copy_function=link_or_copy)
@@ -131,27 +131,16 @@ def recover(folder: Path) -> None:
     partial, old = beside(folder)
     if not (partial.exists() or old.exists()):
         return
-    with locked(folder):
+    with exclusive(folder):
         if old.is_dir() and not folder.exists():
             old.replace(folder)
         for leftover in (partial, old):
             shutil.rmtree(leftover, ignore_errors=True)
 
 
-@contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Lock a dataset while it is replaced. FieldError if somebody else does not come to an end."""
-    lock = FileLock(folder.with_name(f".{folder.name}.lock"), timeout=WAITING_SECONDS)
-    try:
-        lock.acquire()
-    except Timeout as error:
-        raise FieldError(
-            "output_dir", folder, "another server is saving there", "save again, or give it another folder"
-        ) from error
-    try:
-        yield
-    finally:
-        lock.release()
+def exclusive(folder: Path) -> AbstractContextManager[None]:
+    """Hold a dataset while it is replaced. FieldError if somebody else does not come to an end."""
+    return locked(folder, folder.with_name(f".{folder.name}.lock"), WAITING_SECONDS)
 
 
 def beside(folder: Path) -> tuple[Path, Path]:

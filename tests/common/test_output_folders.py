@@ -26,8 +26,7 @@ def test_a_file_and_a_foreign_folder_are_left_alone(tmp_path: Path) -> None:
 
 def test_a_folder_is_held_by_one_run_at_a_time(tmp_path: Path) -> None:
     file = tmp_path / "lock"
-    file.touch()
-    with locked(tmp_path, file), pytest.raises(ValueError, match="another run"), locked(tmp_path, file):
+    with locked(tmp_path, file), pytest.raises(ValueError, match="another command"), locked(tmp_path, file):
         pass
     with locked(tmp_path, file):
         pass

@@ -177,7 +177,7 @@ def test_other_settings_are_refused_by_name(tmp_path: Path) -> None:
 
 
 def test_two_runs_do_not_share_a_folder(tmp_path: Path) -> None:
-    with claimed(tmp_path, {}), pytest.raises(ValueError, match="another run"), claimed(tmp_path, {}):
+    with claimed(tmp_path, {}), pytest.raises(ValueError, match="another command"), claimed(tmp_path, {}):
         pass
 
 
