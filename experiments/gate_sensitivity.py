@@ -53,7 +53,8 @@ def repeated(
     found = np.zeros((len(table.start), len(errors_mm)), bool)
     for episode in tqdm(range(len(table.start)), desc="Repeating episodes", unit="episode"):
         task, scene, seed = (int(real[name][episode]) for name in ("task", "scene", "seed"))
-        actions = table.action[table.start[episode] :][: table.length[episode]]
+        (rows,) = table.rows([episode])
+        actions = table.action[rows]
         direction = np.random.default_rng(seed).normal(size=2)
         simulation.task = task_of(TASKS[task])
         for column, error in enumerate(errors_mm):

@@ -98,9 +98,9 @@ def judged(
 def recorded(table: EpisodeTable, episodes: np.ndarray, column: np.ndarray, steps: int) -> np.ndarray:
     """Return a column of the dataset by episode, NaN after its end. (rows,) → (E, steps)"""
     values = np.full((len(episodes), steps), np.nan)
-    for row, episode in enumerate(episodes):
-        length = min(int(table.length[episode]), steps)
-        values[row, :length] = column[table.start[episode] :][:length]
+    for row, rows in enumerate(table.rows(episodes)):
+        kept = column[rows][:steps]
+        values[row, : len(kept)] = kept
     return values
 
 

@@ -201,12 +201,9 @@ def spending(kind: str) -> str:
 def episode_digests(table: EpisodeTable) -> list[str]:
     """Return a digest of each episode: sha256 of its task, scene, seed and kind, and its actions. [E]"""
     starts = np.stack([table.column(name) for name in START_COLUMNS], 1).astype("<i8")  # (E, 4)
-    rows = [
-        table.action[first : first + length] for first, length in zip(table.start, table.length, strict=True)
-    ]
     return [
-        sha256(start.tobytes() + actions.astype("<f4").tobytes()).hexdigest()
-        for start, actions in zip(starts, rows, strict=True)
+        sha256(start.tobytes() + table.action[rows].astype("<f4").tobytes()).hexdigest()
+        for start, rows in zip(starts, table.rows(range(len(starts))), strict=True)
     ]
 
 

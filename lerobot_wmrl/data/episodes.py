@@ -95,7 +95,7 @@ class EpisodeTable:
     @property
     def success(self) -> np.ndarray:
         """Whether success was ever reached. (E,)"""
-        return np.array([self.done[a : a + n].any() for a, n in zip(self.start, self.length, strict=True)])
+        return np.array([self.done[rows].any() for rows in self.rows(range(len(self.start)))])
 
     @property
     def validation(self) -> np.ndarray:

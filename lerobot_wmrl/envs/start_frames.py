@@ -367,12 +367,12 @@ def load_starts(
     if text_model is None:
         return starts, None
     begin = Frames(tokens, state, context, frames.depth(text_model))
-    goals = imagine_goals(text_model, begin, frames.instructions, measure.features(decoded), measure)
+    goals = imagine_goal_features(text_model, begin, frames.instructions, measure.features(decoded), measure)
     return starts, goals
 
 
 @torch.no_grad()
-def imagine_goals(
+def imagine_goal_features(
     model: TextWorldModelRewardModel, frames: Frames, instructions: list[str], features: Features,
     measure: Similarity,
 ) -> GoalFeatures:  # fmt: skip

@@ -148,8 +148,7 @@ def final_rows(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     episodes = table.success.nonzero()[0]
     episodes = episodes[evenly_spaced(len(episodes), MAX_FINALS)]
     rows = [
-        start + min(int(table.done[start : start + n].argmax()) + 1, n - 1)
-        for start, n in zip(table.start[episodes], table.length[episodes], strict=True)
+        min(each.start + int(table.done[each].argmax()) + 1, each.stop - 1) for each in table.rows(episodes)
     ]
     return episodes, np.array(rows, int)
 

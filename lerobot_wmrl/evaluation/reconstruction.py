@@ -131,7 +131,7 @@ def _rows(table: EpisodeTable, episodes: np.ndarray, at_most: int) -> tuple[np.n
     """Return the rows of the episodes, evenly thinned, and for each the row where its episode begins."""
     lengths = table.length[episodes]
     starts = np.repeat(table.start[episodes], lengths)
-    rows = np.concatenate([table.start[episode] + np.arange(table.length[episode]) for episode in episodes])
+    rows = np.concatenate([np.arange(rows.start, rows.stop) for rows in table.rows(episodes)])
     kept = evenly_spaced(len(rows), at_most)
     return rows[kept], starts[kept]
 

@@ -136,9 +136,9 @@ def describe(world: World, table: EpisodeTable, rows: np.ndarray) -> dict[str, A
 
 def recorded(world: World, table: EpisodeTable, row: int) -> Mapping[str, Any]:
     """Return the state in which an episode begins, and its actions."""
-    first, end = int(table.start[row]), int(table.start[row] + table.length[row])
-    state = table.state[first, : world.model.state_size] if world.model.state_size else np.zeros(0)
-    return {"state": state.tolist(), "actions": table.action[first:end].tolist()}
+    (rows,) = table.rows([row])
+    state = table.state[rows.start, : world.model.state_size]  # of size 0 where the model has none
+    return {"state": state.tolist(), "actions": table.action[rows].tolist()}
 
 
 def write_frames(world: World, table: EpisodeTable, rows: np.ndarray, folder: Path) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 from lerobot_wmrl.common.errors import FieldError, Stopped, require_at_least
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.play.checks import LAST_PORT, whole_number
-from lerobot_wmrl.rewards.success_rules import SuccessRule, next_frame_solved, rows_of
+from lerobot_wmrl.rewards.success_rules import SuccessRule, frame_positions, next_frame_solved
 
 if TYPE_CHECKING:
     from aiohttp import web
@@ -203,7 +203,7 @@ class LabelPage:
 
 def solved_frames(labels: Mapping[int, int | None], dataset: "LeRobotDataset") -> np.ndarray:
     """Mark the frames in which the task is solved. (N,)"""
-    episode, frame, _ = rows_of(dataset)
+    episode, frame, _ = frame_positions(dataset)
     never = np.iinfo(np.int64).max
     first = {index: never if begins is None else begins for index, begins in labels.items()}
     return np.asarray(frame >= np.array([first.get(int(index), never) for index in episode]))

@@ -51,7 +51,7 @@ class EndsRule(SuccessRule):
         require_at_least(self, 1, "last")
 
     def labels(self, dataset: "LeRobotDataset") -> np.ndarray:
-        episode, frame, length = rows_of(dataset)
+        episode, frame, length = frame_positions(dataset)
         solved = frame >= length - self.last
         if self.episodes is not None:
             require_episodes("episodes", self.episodes, dataset)
@@ -72,7 +72,7 @@ class FirstFramesRule(SuccessRule):
     first: dict[int, int] = field(default_factory=dict)
 
     def labels(self, dataset: "LeRobotDataset") -> np.ndarray:
-        episode, frame, length = rows_of(dataset)
+        episode, frame, length = frame_positions(dataset)
         require_episodes("first", self.first, dataset)
         solved = np.zeros(len(episode), bool)
         for index, first in self.first.items():
@@ -136,7 +136,7 @@ class RewardModelRule(SuccessRule):
         return reach(rewards_of(self, dataset), self.threshold)
 
 
-def rows_of(dataset: "LeRobotDataset") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def frame_positions(dataset: "LeRobotDataset") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return each frame's episode, its place in it, and the episode's length, (N,) each."""
     rows = dataset.hf_dataset.with_format("numpy", columns=["episode_index", "frame_index"])[:]
     _, index, count = np.unique(rows["episode_index"], return_inverse=True, return_counts=True)
@@ -151,7 +151,7 @@ def next_frame_solved(solved: np.ndarray, dataset: "LeRobotDataset") -> np.ndarr
     Args:
         solved: whether the task is solved in each row's own frame. (N,)
     """
-    _, frame, length = rows_of(dataset)
+    _, frame, length = frame_positions(dataset)
     return np.where(frame == length - 1, solved, np.roll(solved, -1))
 
 

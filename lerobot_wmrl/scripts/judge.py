@@ -9,7 +9,7 @@ is corrected. The interval of the estimate holds if the world model errs about a
 rollouts.
 
 Better: give policies whose real success is known, nine or more of different trainings (`--references`). A
-line through their rates then predicts the real success of the others, whatever the world model gets wrong.
+line through their rates then predicts the real success of the others.
 It holds for policies that could have been among the references.
 
 A policy that was trained in this world model is not judged: it may have learnt what only looks like success

@@ -29,7 +29,7 @@ from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.data.episodes import SUCCESS
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.play import labels  # noqa: F401 (registers `by_hand`)
-from lerobot_wmrl.rewards.success_rules import EndsRule, SuccessRule, rows_of
+from lerobot_wmrl.rewards.success_rules import EndsRule, SuccessRule, frame_positions
 
 if TYPE_CHECKING:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -63,7 +63,7 @@ def label(cfg: LabelConfig) -> None:
     success = cfg.success.labels(dataset)
     with writing("output_dir", cfg.output_dir, resumes=False):
         write_labelled(dataset, success, cfg.output_dir, cfg.repo_id or f"local/{cfg.output_dir.name}")
-    episode, *_ = rows_of(dataset)
+    episode, *_ = frame_positions(dataset)
     runs = [longest_run(success[episode == index]) for index in np.unique(episode)]
     print("\n".join(report(runs, cfg)))
 
