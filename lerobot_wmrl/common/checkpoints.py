@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from huggingface_hub import snapshot_download
 from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
 from safetensors import SafetensorError
@@ -41,6 +42,12 @@ def resolve_checkpoint(path: str | Path) -> Path:
         if (candidate / "config.json").is_file():
             return candidate
     return root
+
+
+def local_checkpoint(path: str | Path) -> Path:
+    """Return the folder with a checkpoint's model. One on the hub is downloaded into its cache."""
+    folder = resolve_checkpoint(path)
+    return folder if folder.is_dir() else Path(snapshot_download(str(path)))
 
 
 def last_checkpoint(folder: Path) -> Path:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from huggingface_hub import snapshot_download
 from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.default import PeftConfig as AdapterSettings
@@ -15,7 +14,7 @@ from lerobot.utils.constants import ACTION, OBS_IMAGE
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from lerobot_wmrl.common.checkpoints import ADAPTERS_FILE, resolve_checkpoint
+from lerobot_wmrl.common.checkpoints import ADAPTERS_FILE, local_checkpoint, resolve_checkpoint
 from lerobot_wmrl.common.errors import FieldError, first_line
 from lerobot_wmrl.common.files import whole_folder
 
@@ -46,9 +45,7 @@ def copy_checkpoint(config: PreTrainedConfig, folder: Path) -> None:
     """
     if folder.exists():
         return
-    source = Path(str(config.pretrained_path))
-    if not source.is_dir():
-        source = Path(snapshot_download(str(source)))
+    source = local_checkpoint(str(config.pretrained_path))
     with whole_folder(folder) as partial:
         config.save_pretrained(partial)
         for file in source.iterdir():

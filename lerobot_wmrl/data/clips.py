@@ -75,7 +75,8 @@ class ClipSampler:
     """Draw clips of tokens for the world models.
 
     Success can depend on where the episode began (an object pushed 10 cm), so only clips that begin with
-    their episode carry done labels, unless the context shows the beginning to all.
+    their episode carry done labels, unless the context shows the beginning to all. A dataset that does not
+    say where success holds gives none.
 
     Args:
         table: the episodes.
@@ -89,7 +90,6 @@ class ClipSampler:
         depth: (rows, S) metres of each token, for models that look at depth.
         context: (E, N, C, g, g) of the episodes' first frames, for models that look at it.
         features: (rows, F) of the tokenizer's success classifier, for models that predict them.
-        done_known: False if done must not be learnt from this table.
     """
 
     table: EpisodeTable
@@ -103,7 +103,6 @@ class ClipSampler:
     depth: np.ndarray | None = None
     context: np.ndarray | None = None
     features: np.ndarray | None = None
-    done_known: bool = True
 
     def __post_init__(self) -> None:
         """Weigh success by how rare it is."""
@@ -128,7 +127,7 @@ class ClipSampler:
             rows, self.table.length[episodes][:, None] - 1
         )
         shows_start = self.context is not None
-        known = valid & self.done_known & (shows_start | (offsets == 0))[:, None]
+        known = valid & self.table.done_known & (shows_start | (offsets == 0))[:, None]
         context = NO_CONTEXT if self.context is None else Context((self._tensor(self.context[episodes]),))
         return Clip(
             self._tensor(self.tokens[rows]).long(),

@@ -12,7 +12,7 @@ from lerobot.rewards.pretrained import PreTrainedRewardModel
 from lerobot.utils.constants import OBS_IMAGE
 from torch import Tensor
 
-from lerobot_wmrl.common.checkpoints import resolve_checkpoint
+from lerobot_wmrl.common.checkpoints import local_checkpoint
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig, LearnedRewardConfig
 from lerobot_wmrl.rewards.general import potential_discount
@@ -81,18 +81,27 @@ def load_lerobot_reward(config: RewardModelConfig, cameras: list[str], device: s
     """
     config.device = device
     if config.pretrained_path:
-        folder = resolve_checkpoint(config.pretrained_path)
-        config = read_config(folder, config.type, device)
-        config.pretrained_path = str(folder)
+        path = config.pretrained_path
+        config = read_config(path, config.type, device)
+        config.pretrained_path = str(local_checkpoint(path))
     check_observation(config, cameras)
     return LeRobotReward(make_reward_model(config), load_preprocessor(config))
 
 
 def load_preprocessor(config: RewardModelConfig) -> PolicyProcessorPipeline:
-    """Return the preprocessor in a reward's checkpoint, or a new one where there is none."""
-    saved = sorted(Path(config.pretrained_path).glob(PREPROCESSORS)) if config.pretrained_path else []
-    if not saved:
+    """Return the preprocessor in a reward's checkpoint, or a new one for a reward without a checkpoint.
+
+    Raises:
+        FieldError: the checkpoint has none, so that nobody knows how it normalises.
+    """
+    if not config.pretrained_path:
         return make_reward_pre_post_processors(config)[0]
+    saved = sorted(Path(config.pretrained_path).glob(PREPROCESSORS))
+    if not saved:
+        raise FieldError(
+            "reward.pretrained_path", config.pretrained_path, f"has no preprocessor ({PREPROCESSORS})",
+            "give a checkpoint as lerobot-train writes it",
+        )  # fmt: skip
     overrides = {"device_processor": {"device": config.device}}
     return PolicyProcessorPipeline.from_pretrained(
         saved[0].parent, config_filename=saved[0].name, overrides=overrides

@@ -2,7 +2,6 @@
 
 from collections.abc import Collection
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -187,19 +186,18 @@ def rewards_of(rule: RewardModelRule, dataset: "LeRobotDataset") -> np.ndarray:
     The model is shown what its configuration asks for, frames before and after included, as in lerobot-train.
     """
     import torch
-    from huggingface_hub import snapshot_download
     from lerobot.configs.rewards import RewardModelConfig
     from lerobot.datasets.factory import resolve_delta_timestamps
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
     from lerobot.rewards.factory import make_reward_model
     from tqdm import tqdm
 
-    from lerobot_wmrl.common.checkpoints import resolve_checkpoint
+    from lerobot_wmrl.common.checkpoints import local_checkpoint
     from lerobot_wmrl.data.dataset import VIDEO_BACKEND
     from lerobot_wmrl.rewards.loading import load_preprocessor
 
     try:
-        folder = resolve_checkpoint(rule.path if Path(rule.path).is_dir() else snapshot_download(rule.path))
+        folder = local_checkpoint(rule.path)
         config = RewardModelConfig.from_pretrained(folder)
     except Exception as error:  # a missing file, a type that nobody registered, or what the hub answers
         raise FieldError(

@@ -92,7 +92,6 @@ def make_sampler(
     chosen: Sequence[int] | None,
     batch_size: int,
     seed: int,
-    done_known: bool = True,
 ) -> ClipSampler | FrameSampler:
     """Make the sampler of training batches for this kind of model.
 
@@ -102,7 +101,6 @@ def make_sampler(
         chosen: indices of episodes to learn from, all by default; held-out episodes are left out.
         batch_size: frames (tokenizer) or clips (world models) a batch.
         seed: seed of the draws.
-        done_known: False if done must not be learnt from this table.
 
     Raises:
         FieldError: there is no episode to learn from.
@@ -136,14 +134,14 @@ def make_sampler(
     elif not table.done_known:
         logging.warning(
             "dataset.root=%s: has neither next.success nor next.done: the model cannot learn from it what "
-            "success is",
+            "success is, and keeps what it knows of it",
             table.dataset.root,
         )
-    return make_clip_sampler(model, table, episodes.nonzero()[0], batch_size, seed, done_known)
+    return make_clip_sampler(model, table, episodes.nonzero()[0], batch_size, seed)
 
 
 def make_clip_sampler(
-    model: Any, table: EpisodeTable, episodes: np.ndarray, batch_size: int, seed: int, done_known: bool = True
+    model: Any, table: EpisodeTable, episodes: np.ndarray, batch_size: int, seed: int
 ) -> ClipSampler:
     """Make a sampler of clips from these episodes, with what else the model looks at or predicts."""
     config, tokenizer, dataset = model.config, model.tokenizer, table.dataset
@@ -168,31 +166,22 @@ def make_clip_sampler(
         depth=cached_depth(dataset, cameras, tokenizer.grid) if config.depth else None,
         context=cached_context(dataset, cameras, tokenizer) if config.context_channels else None,
         features=cached_features(dataset, cameras, tokenizer) if config.predicts_success else None,
-        done_known=done_known,
     )
 
 
 def make_joint_sampler(
     model: PreTrainedRewardModel, table: EpisodeTable, data: TrainingData, batch_size: int, seed: int
 ) -> ClipSampler | FrameSampler | InTurn:
-    """Make the sampler for the episodes of `data`, which are in `table`, and for its further datasets.
-
-    If some of the datasets say what success is, done is not learnt from the others.
-    """
+    """Make the sampler for the episodes of `data`, which are in `table`, and for its further datasets."""
     more = data.read_more()
     with renamed("dataset.root", "dataset.more"):
         for other in more:
             check_dataset(model.config, other.dataset.meta)
     if isinstance(model.config, ActionWorldModelConfig):
         note_outcomes(model.config, [(table, data.episodes), *((each, None) for each in more)])
-    unlabelled = not any(each.done_known for each in (table, *more))
-
-    def sampler(each: EpisodeTable, chosen: Sequence[int] | None) -> ClipSampler | FrameSampler:
-        return make_sampler(model, each, chosen, batch_size, seed, unlabelled or each.done_known)
-
-    first = sampler(table, data.episodes)
+    first = make_sampler(model, table, data.episodes, batch_size, seed)
     with renamed("dataset.root", "dataset.more"):
-        others = [sampler(each, None) for each in more]
+        others = [make_sampler(model, each, None, batch_size, seed) for each in more]
     return InTurn(first, others) if others else first
 
 

@@ -1,10 +1,12 @@
 """LeRobot's own reward models in the place of ours: its success classifier, with the normalisation it has."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from huggingface_hub import HfApi
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.rewards.classifier.configuration_classifier import RewardClassifierConfig
 from lerobot.rewards.classifier.modeling_classifier import Classifier
@@ -59,6 +61,24 @@ def test_the_environment_pays_what_lerobots_classifier_says_of_prepared_frames(c
     torch.testing.assert_close(asked[0], (observation[IMAGE] - MEAN) / STD, atol=1e-4, rtol=1e-4)
     expected = Classifier.from_pretrained(classifier).eval().compute_reward({IMAGE: asked[0]})
     assert torch.equal(reward, expected)
+
+
+def test_a_classifier_on_the_hub_brings_its_preprocessor(config, classifier, hub, tmp_path):
+    HfApi().create_repo("somebody/classifier")
+    HfApi().upload_folder(repo_id="somebody/classifier", folder_path=classifier)
+    published = RewardClassifierConfig(device="cpu", pretrained_path="somebody/classifier")
+    env = replace(config, reward=published).create_tensor_env(4)
+    image = torch.rand(4, 3, 32, 32)
+    prepared = env.reward.preprocessor({IMAGE: image})
+    torch.testing.assert_close(prepared[IMAGE], (image - MEAN) / STD)
+
+    bare = tmp_path / "bare"
+    shutil.copytree(classifier, bare)
+    for file in bare.glob("*preprocessor.json"):
+        file.unlink()
+    reward = RewardClassifierConfig(device="cpu", pretrained_path=str(bare))
+    with pytest.raises(ValueError, match=r"^reward\.pretrained_path=.*bare: has no preprocessor"):
+        replace(config, reward=reward).create_tensor_env(1)
 
 
 def test_what_an_environment_cannot_show_is_refused(config, classifier, tmp_path):
