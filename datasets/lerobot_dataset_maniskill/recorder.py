@@ -19,7 +19,7 @@ from lerobot_wmrl.common.errors import FieldError, within
 from lerobot_wmrl.common.files import foreign_files, write_json, writing
 from lerobot_wmrl.common.output_folders import locked
 from lerobot_wmrl.common.policies import check_weights
-from lerobot_wmrl.data.budget import Ledger
+from lerobot_wmrl.data.budget import IMAGINED, ROLLOUTS, Ledger
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
@@ -83,7 +83,9 @@ def record(config: RecordConfig) -> None:
             merge(source, work, root, config.dataset_id)
         shutil.rmtree(work, ignore_errors=True)
     if ledger is not None:
-        ledger.charge(read_episodes(open_dataset(root)), imagined=imagined)
+        # columns `like` another dataset's may not say who acted
+        acted = ROLLOUTS if config.policy is not None else None
+        ledger.charge(read_episodes(open_dataset(root)), IMAGINED if imagined else acted)
 
 
 def check_budget(config: RecordConfig, ledger: Ledger) -> None:

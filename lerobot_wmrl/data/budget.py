@@ -123,20 +123,20 @@ class Ledger:
         """Raise FieldError unless so many more episodes, by what they are spent on, are within the limits."""
         self.read().require_left(self.path, wanted)
 
-    def charge(self, table: EpisodeTable, imagined: bool = False) -> None:
+    def charge(self, table: EpisodeTable, spent: str | None = None) -> None:
         """Enter a dataset's episodes, those that are not there yet.
 
         Args:
             table: the dataset.
-            imagined: whether a world model made it; its episodes cost nothing.
+            spent: what all of them are spent on, or IMAGINED if a world model made them; by default what the
+                dataset says of who acted.
 
         Raises:
             FieldError: they exceed a limit. Nothing is entered.
         """
         kinds = [KINDS[kind] if kind >= 0 else "" for kind in table.column(START_KIND)]
-        spent = [IMAGINED if imagined else spending(kind) for kind in kinds]
         source = Path(table.dataset.root).name
-        found = dict(zip(episode_digests(table), spent, strict=True))
+        found = dict(zip(episode_digests(table), [spent or spending(kind) for kind in kinds], strict=True))
         with self._changing() as entries:
             new = {digest: name for digest, name in found.items() if digest not in entries.episodes}
             entries.require_left(self.path, Counter(new.values()))

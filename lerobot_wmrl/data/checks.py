@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from lerobot.utils.constants import OBS_IMAGE, OBS_IMAGES
+from lerobot.utils.constants import OBS_IMAGES
 
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.episodes import EpisodeTable, success_column
@@ -22,14 +22,22 @@ def frame_size(feature: Mapping[str, Any]) -> tuple[int, int]:
     return height, width
 
 
+def shows_colours(feature: Mapping[str, Any]) -> bool:
+    """Return whether a feature is a camera's, and not its depth (as LeRobot's `depth_keys` tell)."""
+    notes = {**(feature.get("video_info") or {}), **(feature.get("info") or {})}
+    depth = notes.get("is_depth_map") or notes.get("video.is_depth_map")
+    return feature["dtype"] in ("image", "video") and not depth
+
+
 def check_cameras(features: Mapping[str, Any], camera_keys: Sequence[str], field: str | None = None) -> None:
     """Raise ValueError unless the dataset has these cameras.
 
     It is a FieldError about `field`, the setting of the cameras, unless a trained model has learnt them.
     """
+    coloured = [name for name, feature in features.items() if shows_colours(feature)]
     for key in camera_keys:
-        if key not in features:
-            cameras = ", ".join(name for name in features if name.startswith(OBS_IMAGE)) or "none"
+        if key not in coloured:
+            cameras = ", ".join(coloured) or "none"
             problem = f"the dataset has no {key} (its cameras: {cameras})"
             if field is None:
                 raise ValueError(f"{problem}, which the model has learnt to look at; use one that has it")

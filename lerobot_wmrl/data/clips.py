@@ -229,8 +229,9 @@ def clip_from_windows(
 
     Args:
         tokens: (B, T, S), of the windows' frames.
-        batch: action (B, T, A), observation.state (B, T, P), either (B, T) where it has one component;
-            next.done (B,) or (B, 1), task, `*_is_pad` (B, T); all but the action may be missing.
+        batch: action (B, T, A), or (B, 1 + T, A) with the one before the window; observation.state (B, T, P);
+            either without its last axis where it has one component; next.done (B,) or (B, 1), task,
+            `*_is_pad` of the same length; all but the action may be missing.
         camera_key: the camera whose padding counts.
         state_size: P, 0 for a model without `observation.state`.
         depth: (B, T, S) metres, of the windows' frames.
@@ -240,9 +241,12 @@ def clip_from_windows(
         ValueError: the action is missing or has another length than the frames; NaN or infinity in a number.
     """
     (rows, length), device = tokens.shape[:2], tokens.device
-    action = batch.get(ACTION)
-    if action is not None and action.shape == (rows, length):
+    action, begins = batch.get(ACTION), torch.zeros(rows, 1, dtype=torch.bool, device=device)
+    if action is not None and action.shape in ((rows, length), (rows, length + 1)):
         action = action[..., None]
+    if action is not None and action.ndim == 3 and action.shape[1] == length + 1:
+        action = action[:, 1:]  # where there is none before the window, it begins with its episode
+        begins = batch.get(f"{ACTION}_is_pad", begins).to(device)[:, :1]
     if action is None or action.ndim != 3 or action.shape[1] != length:
         found = "none" if action is None else f"shape {tuple(action.shape)}"
         raise ValueError(f"action: {found}, but the batch has windows of {length} frames; give one a frame")
@@ -254,11 +258,12 @@ def clip_from_windows(
             raise ValueError(f"{name}: holds NaN or infinity; remove the episodes that do from the dataset")
     padded = batch.get(f"{camera_key}_is_pad", torch.zeros(rows, length, dtype=torch.bool)).to(device)
     before, index = padded.sum(1, keepdim=True), unpadded_rows(padded)
+    begins = begins | (before > 0)
     valid = torch.arange(length, device=device) < length - before
     last = torch.arange(length, device=device) == length - 1 - before
     done, known = torch.zeros(rows, length, device=device), torch.zeros_like(last)
     if isinstance(batch.get(DONE), Tensor):  # LeRobot's processors put False where the dataset has none
-        done, known = last * batch[DONE].reshape(rows, 1).float(), last & (before > 0)
+        done, known = last * batch[DONE].reshape(rows, 1).float(), last & begins
     tokens, state, action = (take_steps(values, index) for values in (tokens, state, action))
     depth, features = (each if each is None else take_steps(each, index) for each in (depth, features))
     clip = Clip(tokens, state, action, done, valid, known, list(batch.get("task", [""] * rows)), depth)

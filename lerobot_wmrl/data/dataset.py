@@ -55,12 +55,12 @@ class DatasetSource:
         return {f"dataset.{name}": value for name, value in named.items() if value}
 
     def open(self) -> LeRobotDataset:
-        """Open the dataset; download it first if it has a name on the hub and is not in `root`.
+        """Open the dataset; download what is missing in `root` first if it has a name on the hub.
 
         Raises:
             FieldError: there is none, it is not whole, or it cannot be downloaded.
         """
-        if self.repo_id and not (self.root and (Path(self.root) / "meta" / "info.json").is_file()):
+        if self.repo_id and not (self.root and is_whole(Path(self.root))):
             return download_dataset(self.repo_id, self.revision, self.root or None)
         return open_dataset(self.root, self.repo_id)
 
@@ -156,6 +156,11 @@ def fingerprint(root: Path) -> str:
     """Return a short hash of a dataset's folder `meta`, which changes with episodes, columns and values."""
     files = sorted(path for suffix in ("json", "parquet") for path in (root / "meta").rglob(f"*.{suffix}"))
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:12]
+
+
+def is_whole(root: Path) -> bool:
+    """Return whether a dataset's folder has all its files, which a download that was stopped has not."""
+    return (root / "meta" / "info.json").is_file() and not missing_files(root)
 
 
 def missing_files(root: Path) -> list[Path]:

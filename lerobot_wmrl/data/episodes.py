@@ -147,9 +147,10 @@ def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
         if not finite.all():
             row = int(np.argmin(finite))
             raise bad_row(dataset, column, row, np.asarray(rows[column][row]).tolist())
-    frames = len(rows["episode_index"])
+    frames, done = len(rows["episode_index"]), np.zeros(len(rows["episode_index"]), bool)
+    if success is not None:
+        done = truth_of(dataset, success, rows[success])
     _, start, length = np.unique(rows["episode_index"], return_index=True, return_counts=True)
-    done = np.asarray(rows[success]).reshape(-1).astype(bool) if success else np.zeros(frames, bool)
     inferred, ending = None, end_at_success(done, start, length)
     # next.done may say no more than that episodes end
     if success != DONE and 2 * ending.sum() > np.logical_or.reduceat(done, start).sum():
@@ -224,6 +225,21 @@ def check_whole(dataset: LeRobotDataset, column: str) -> None:
     rows = dataset.hf_dataset.select_columns([column]).with_format("arrow")[:][column]
     if rows.null_count:
         raise bad_row(dataset, column, rows.is_null().index(True).as_py(), "missing")
+
+
+def truth_of(dataset: LeRobotDataset, column: str, values: ArrayLike) -> np.ndarray:
+    """Return a column of truth values, (N,). FieldError unless they are 0 and 1, or False and True."""
+    values = np.asarray(values).reshape(-1)
+    other = ~np.isin(values, (0, 1))
+    if other.any():
+        raise FieldError(
+            "dataset.root", dataset.root,
+            f"{column} is {values[int(np.argmax(other))]} in row {int(np.argmax(other))}, where it should be "
+            "true or false",
+            f"take numbers from a threshold on for true: lerobot-wmrl-label --dataset.root={dataset.root} "
+            f"--success.type=column --success.column={column} --success.threshold=…",
+        )  # fmt: skip
+    return values.astype(bool)
 
 
 def bad_row(dataset: LeRobotDataset, column: str, row: int, found: object) -> FieldError:

@@ -68,20 +68,27 @@ def matched(own: Mapping[str, Any], columns: Mapping[str, Any]) -> dict[str, Any
     """Return the features with which a recording of `own` can be merged with a dataset of `columns`.
 
     Raises:
-        FieldError: the dataset has a column that a rollout lacks, or has in another shape.
+        FieldError: the dataset has a column that a rollout lacks, or has in another shape or type.
     """
     wanted = {name: dict(feature) for name, feature in columns.items() if name not in DEFAULT_FEATURES}
     for name, feature in wanted.items():
-        found = tuple(own[name]["shape"]) if name in own else None
-        if found != tuple(feature["shape"]):
+        found, needed = (_kept_as(each) for each in (own.get(name), feature))
+        if found != needed:
             raise FieldError(
-                "like.root", name, f"the dataset has it with shape {tuple(feature['shape'])}, a rollout has "
-                f"{found or 'none'}",
+                "like.root", name, f"the dataset has it as {needed}, a rollout has {found}",
                 "give `like_columns=false`, and the recording as `dataset.more` to what learns from it",
             )  # fmt: skip
         if "info" in feature and feature["dtype"] == "video":
             feature.pop("info")  # the encoder's, which LeRobot writes
     return wanted
+
+
+def _kept_as(feature: Mapping[str, Any] | None) -> str:
+    """`float32 of shape (7,)`. Images may be stored one by one or as video."""
+    if feature is None:
+        return "none"
+    kind = "images" if feature["dtype"] in ("image", "video") else feature["dtype"]
+    return f"{kind} of shape {tuple(feature['shape'])}"
 
 
 def video_info(feature: Mapping[str, Any]) -> dict[str, Any]:

@@ -289,9 +289,9 @@ def digest(parts: Sequence[object]) -> str:
 
 
 def token_depth(metres: Tensor, grid: int) -> Tensor:
-    """Average what was measured (> 0, finite) in each token's square, 0 where nothing was.
+    """Average what a camera measured (> 0, finite) in each token's square, 0 where nothing was.
 
-    metres (F, N, H, W) → (F, N·g²)
+    metres (F, 1, H, W) → (F, g²)
     """
     known = torch.isfinite(metres) & (metres > 0)
     share = F.adaptive_avg_pool2d(known.float(), grid)
@@ -307,8 +307,8 @@ def cached_depth(dataset: LeRobotDataset, camera_keys: Sequence[str], grid: int)
     def fill(target: np.ndarray) -> None:
         for episode in tqdm(range(dataset.num_episodes), desc="Decoding depth", unit="episode"):
             for rows in parts_of(dataset, episode):
-                maps = torch.cat([decode_depth(dataset, episode, name, rows) for name in keys], 1)
-                target[rows] = token_depth(maps, grid).numpy()
+                cameras = [token_depth(decode_depth(dataset, episode, name, rows), grid) for name in keys]
+                target[rows] = torch.cat(cameras, 1).numpy()
 
     shape = (dataset.num_frames, len(keys) * grid**2)
     return memory_map(cache_dir(dataset) / f"depth-{key}.npy", shape, np.float32, fill)
@@ -332,7 +332,9 @@ def decode_depth(dataset: LeRobotDataset, episode: int, key: str, rows: slice) -
 
 
 def depth_of_windows(batch: Mapping[str, Any], camera_keys: Sequence[str], grid: int) -> Tensor:
-    """Average depth maps (B, T, 1, H, W) in millimetres, as lerobot-train gives, to metres a token (B, T, S).
+    """Average depth maps in millimetres, as lerobot-train gives them, to metres a token.
+
+    (B, T, 1, H, W) of each camera → (B, T, S)
 
     Raises:
         FieldError: the depth of a camera is missing.
@@ -340,5 +342,6 @@ def depth_of_windows(batch: Mapping[str, Any], camera_keys: Sequence[str], grid:
     missing = [name for name in map(depth_key, camera_keys) if name not in batch]
     if missing:
         raise FieldError("depth", True, f"the batch lacks {missing}", "use a dataset recorded with depth")
-    maps = torch.cat([batch[depth_key(camera)] for camera in camera_keys], 2).float() / MM_PER_METRE
-    return token_depth(maps.flatten(0, 1), grid).unflatten(0, maps.shape[:2])
+    maps = [batch[depth_key(camera)].float() / MM_PER_METRE for camera in camera_keys]
+    cameras = [token_depth(each.flatten(0, 1), grid).unflatten(0, each.shape[:2]) for each in maps]
+    return torch.cat(cameras, 2)

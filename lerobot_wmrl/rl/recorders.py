@@ -10,12 +10,11 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from tqdm import trange
 
-from lerobot_wmrl.common.constants import POLICY
 from lerobot_wmrl.common.lerobot_commands import env_flags
 from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.common.presets import Flags, format_flags
 from lerobot_wmrl.common.processes import run_subcommand
-from lerobot_wmrl.data.budget import Ledger, budget_flags, spending
+from lerobot_wmrl.data.budget import ROLLOUTS, Ledger, budget_flags
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.embodiment import Embodiment
 from lerobot_wmrl.data.episodes import read_episodes
@@ -94,7 +93,7 @@ class EnvRecorder:
         ledger = None if self.budget is None else Ledger(self.budget)
         if not folder.is_dir():
             if ledger is not None:
-                ledger.require_left({spending(POLICY): episodes})
+                ledger.require_left({ROLLOUTS: episodes})
             path = str(checkpoint / PRETRAINED_MODEL_DIR)
             policy = read_policy_config(path, [f"--device={self.device}"])
             rollouts = RolloutRecorder(
@@ -103,4 +102,4 @@ class EnvRecorder:
             with trange(episodes, desc="Recording rollouts", unit="episode") as bar, closing(rollouts):
                 rollouts.record(folder, range(seed, seed + episodes), lambda success: bar.update())
         if ledger is not None:
-            ledger.charge(read_episodes(open_dataset(folder)))
+            ledger.charge(read_episodes(open_dataset(folder)), ROLLOUTS)

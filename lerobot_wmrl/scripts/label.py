@@ -18,6 +18,7 @@ command says how many episodes succeed and for how long, and what cannot be lear
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -29,7 +30,7 @@ from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.data.episodes import SUCCESS
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.play import labels  # noqa: F401 (registers `by_hand`)
-from lerobot_wmrl.rewards.success_rules import EndsRule, SuccessRule, frame_positions
+from lerobot_wmrl.rewards.success_rules import ColumnRule, EndsRule, SuccessRule, frame_positions
 
 if TYPE_CHECKING:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -69,8 +70,12 @@ def label(cfg: LabelConfig) -> None:
 
 
 def check(cfg: LabelConfig, dataset: "LeRobotDataset") -> None:
-    """Raise FieldError if the dataset is labelled already, or there is something at `output_dir`."""
-    if SUCCESS in dataset.features:
+    """Raise FieldError if the dataset is labelled already, or there is something at `output_dir`.
+
+    A column `next.success` of numbers becomes one of truth values where the rule reads it.
+    """
+    read = cfg.success.column if isinstance(cfg.success, ColumnRule) else None
+    if SUCCESS in dataset.features and read != SUCCESS:
         raise FieldError(
             "dataset.root", cfg.dataset.root, f"has a column {SUCCESS} already",
             "train with it, or remove it first: lerobot-edit-dataset --operation.type=remove_feature "
@@ -82,10 +87,15 @@ def check(cfg: LabelConfig, dataset: "LeRobotDataset") -> None:
 
 def write_labelled(dataset: "LeRobotDataset", success: np.ndarray, output_dir: Path, repo_id: str) -> None:
     """Copy a dataset with `next.success` (N,) by LeRobot's own function; the folder is whole or absent."""
-    from lerobot.datasets.dataset_tools import add_features
+    from lerobot.datasets.dataset_tools import add_features, remove_feature
 
     column = {SUCCESS: (success[:, None], {"dtype": "bool", "shape": (1,), "names": None})}
-    with whole_folder(output_dir) as partial:
+    output_dir.parent.mkdir(parents=True, exist_ok=True)
+    with whole_folder(output_dir) as partial, TemporaryDirectory(dir=output_dir.parent) as numbers:
+        if SUCCESS in dataset.features:
+            dataset = remove_feature(
+                dataset, SUCCESS, output_dir=Path(numbers, "unlabelled"), repo_id=repo_id
+            )
         add_features(dataset, column, output_dir=partial, repo_id=repo_id)
 
 

@@ -132,7 +132,10 @@ class WorldModelConfig(RewardModelConfig):
     def observation_delta_indices(self) -> list[int]:
         return list(range(1 - self.clip_length, 1))
 
-    action_delta_indices = observation_delta_indices
+    @property
+    def action_delta_indices(self) -> list[int]:
+        """One action more than frames: where it is padding, the window begins with its episode."""
+        return list(range(-self.clip_length, 1))
 
 
 @RewardModelConfig.register_subclass("action_world_model")

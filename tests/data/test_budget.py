@@ -11,9 +11,9 @@ import pytest
 from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_wmrl.common.constants import KINDS
+from lerobot_wmrl.common.constants import KINDS, START_KIND
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.budget import Ledger, Limits, episode_digests, spending
+from lerobot_wmrl.data.budget import IMAGINED, ROLLOUTS, Ledger, Limits, episode_digests, spending
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
 
@@ -63,9 +63,16 @@ def test_nothing_is_entered_beyond_a_limit(table: EpisodeTable, tmp_path: Path) 
     assert ledger.path.read_text() == before
 
 
+def test_what_a_dataset_does_not_say_can_be_said(ledger: Ledger, table: EpisodeTable) -> None:
+    """A recording with the columns of another dataset may not say who acted."""
+    table.columns = {name: values for name, values in table.columns.items() if name != START_KIND}
+    ledger.charge(table, ROLLOUTS)
+    assert spent(ledger) == {"rollouts": 6}
+
+
 def test_imagined_episodes_are_known_and_cost_nothing(table: EpisodeTable, tmp_path: Path) -> None:
     ledger = Ledger.create(tmp_path / "budget.json", Limits())
-    ledger.charge(table, imagined=True)
+    ledger.charge(table, IMAGINED)
     assert spent(ledger) == {"imagined": 6}
     ledger.require_known(table)
 

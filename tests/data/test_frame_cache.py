@@ -14,8 +14,9 @@ from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data import frame_cache
+from lerobot_wmrl.data.checks import check_cameras
 from lerobot_wmrl.data.dataset import ChosenEpisodes
-from lerobot_wmrl.data.frame_cache import cached_depth, token_depth
+from lerobot_wmrl.data.frame_cache import cached_depth, depth_of_windows, token_depth
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.maniskill.embodiment import FPS
 from lerobot_wmrl.scripts.eval_world_model import EvalWorldModelConfig, eval_world_model
@@ -86,6 +87,23 @@ def test_depth_stored_as_images_is_read_in_its_unit(dtype, unit, tmp_path, monke
     dataset.finalize()
     stored = LeRobotDataset("local/stored", root=tmp_path / "stored")
     np.testing.assert_allclose(cached_depth(stored, [CAMERA], GRID), squares(maps), atol=1e-3)
+
+
+def test_cameras_may_have_depth_of_different_sizes():
+    batch = {
+        "top_depth": torch.full((2, 3, 1, 16, 16), 1000),
+        "wrist_depth": torch.full((2, 3, 1, 8, 12), 2000),
+    }
+    depth = depth_of_windows(batch, ["top", "wrist"], GRID)
+    assert torch.equal(depth, torch.tensor([1.0, 2.0]).repeat_interleave(GRID**2).expand(2, 3, -1))
+
+
+@pytest.mark.parametrize("name", ["third_view_depth", "../state"])
+def test_only_a_camera_of_colours_is_looked_at(name, deep_dataset):
+    features = {**deep_dataset.features, "observation.images.../state": deep_dataset.features["action"]}
+    key = f"observation.images.{name}"
+    with pytest.raises(ValueError, match=r"has no .* \(its cameras: observation.images.third_view\)"):
+        check_cameras(features, [key], "tokenizer.cameras")
 
 
 def test_training_reads_depth_and_a_checkpoint_keeps_its_branch(deep_dataset, models):

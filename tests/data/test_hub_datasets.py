@@ -49,6 +49,8 @@ def test_it_is_downloaded_to_a_new_folder(published: LeRobotDataset, hub: Hub, t
     hub.requests.clear()
     source.open()
     assert not hub.requests, "it is there"
+    next((tmp_path / "mine" / "data").rglob("*.parquet")).unlink()  # as a download that was stopped leaves it
+    assert read_episodes(source.open()).action.shape == read_episodes(published).action.shape
 
 
 def test_a_tokenizer_trains_on_it(published: LeRobotDataset, tmp_path: Path) -> None:

@@ -262,5 +262,8 @@ def test_columns_that_a_rollout_lacks_are_named(
     config.like = DatasetSource(str(panda.root))
     with pytest.raises(ValueError, match="its actions have 7 components, the environment's 2"):
         record(config)
-    with pytest.raises(ValueError, match=r"third_view: the dataset has it with shape \(32, 32, 3\)"):
-        matched({"action": {"shape": (7,)}}, panda.meta.features)
+    with pytest.raises(ValueError, match=r"third_view: the dataset has it as images of .* has none"):
+        matched({"action": {"dtype": "float32", "shape": (7,)}}, panda.meta.features)
+    precise = {"action": {"dtype": "float64", "shape": (2,)}}
+    with pytest.raises(ValueError, match=r"action: the dataset has it as float64 .*, a rollout has float32"):
+        matched({"action": {"dtype": "float32", "shape": (2,)}}, precise)

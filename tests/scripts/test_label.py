@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from lerobot.datasets.dataset_tools import remove_feature
+from lerobot.datasets.dataset_tools import add_features, remove_feature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.rewards.factory import make_reward_pre_post_processors
 from lerobot.rewards.sarm.configuration_sarm import SARMConfig
 
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.rewards.configuration_rewards import ProxyConfig
@@ -55,6 +56,21 @@ def test_demonstrations_succeed_at_their_ends(
     for row in (0, len(before) - 1):
         np.testing.assert_array_equal(before[row][IMAGE], after[row][IMAGE])
         np.testing.assert_array_equal(before[row]["action"], after[row]["action"])
+
+
+def test_numbers_in_the_place_of_labels_are_named_and_become_labels(
+    small_dataset: LeRobotDataset, unlabelled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    numbers = np.linspace(0, 1, small_dataset.num_frames, dtype=np.float32)[:, None]
+    column = {"next.success": (numbers, {"dtype": "float32", "shape": (1,), "names": None})}
+    add_features(open_dataset(unlabelled), column, output_dir=tmp_path / "numbers", repo_id="local/numbers")
+    message = r"next\.success is 0\.\d+ in row 1, .*--success\.type=column --success\.column=next\.success"
+    with pytest.raises(FieldError, match=message):
+        read_episodes(open_dataset(tmp_path / "numbers"))
+    flags = ["--success.type=column", "--success.column=next.success", "--success.threshold=0.5"]
+    found = label(monkeypatch, tmp_path / "numbers", tmp_path / "labelled", *flags)
+    assert [*chain(*found)] == (numbers[:, 0] >= 0.5).tolist()
+    assert {path.name for path in tmp_path.iterdir()} == {"numbers", "labelled"}
 
 
 def test_the_others_fail_where_successes_are_named(

@@ -10,7 +10,7 @@ from torch import Tensor
 from lerobot_wmrl.data.clips import Clip
 from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.world_models import losses
-from lerobot_wmrl.world_models.autoregressive.depth import FAR, metres, normalize_depth
+from lerobot_wmrl.world_models.autoregressive.depth import FAR, depth_loss, metres, normalize_depth
 from lerobot_wmrl.world_models.autoregressive.dynamics import Inputs
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig
 from lerobot_wmrl.world_models.layers import Condition
@@ -175,6 +175,14 @@ def test_a_moving_depth_is_learnt_and_imagined():
     imagined = torch.stack([model.step(state, action).depth for action in clip.action[:, :-1].unbind(1)], 1)
     error, still = ((depth - clip.depth[:, 1:]).abs().mean() for depth in (imagined, clip.depth[:, :1]))
     assert error < still / 4
+
+
+def test_what_was_not_measured_is_not_learnt():
+    depth = torch.full((1, 3, 2), 0.5)
+    depth[0, 1, 0] = -1.0  # 0 m
+    predicted = torch.full_like(depth, 0.25)
+    error, _ = depth_loss(predicted, depth, torch.ones(1, 3, dtype=torch.bool))
+    assert error == 0.25
 
 
 def test_depth_that_is_missing_or_on_another_grid_is_named():

@@ -46,7 +46,7 @@ def made_up_episodes() -> EpisodeTable:
     start, length = np.arange(EPISODES) * ROWS, np.full(EPISODES, ROWS)
     optimal = {"start.kind": np.zeros(EPISODES, int)}
     instructions = ["push the can", "pull the box"] * (EPISODES // 2)
-    dataset: Any = SimpleNamespace(root="made up")
+    dataset: Any = SimpleNamespace(root="made up", features={"next.success"})
     return EpisodeTable(dataset, state, action, done, start, length, instructions, optimal)
 
 

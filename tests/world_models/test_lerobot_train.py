@@ -140,6 +140,11 @@ def test_only_windows_that_hold_their_episodes_start_have_a_done_label_and_it_is
     clip = clip_from_windows(batch["action"].long(), batch, "camera", state_size=0)
     assert clip.done_known.nonzero().tolist() == [[0, 2], [1, 3]]
     assert clip.done[clip.done_known].tolist() == [1, 0]
+    row = torch.arange(-1, 5) - torch.tensor([[2], [1], [0]])
+    more = {"action": row.clamp(min=0)[..., None].float(), "action_is_pad": row < 0}
+    clip = clip_from_windows(batch["action"].long(), {**batch, **more}, "camera", state_size=0)
+    assert clip.action[..., 0].tolist() == [[0, 1, 2, 2, 2], [0, 1, 2, 3, 3], [0, 1, 2, 3, 4]]
+    assert clip.done_known.nonzero().tolist() == [[0, 2], [1, 3], [2, 4]]
     unlabelled = clip_from_windows(
         batch["action"].long(), {**batch, "next.done": False}, "camera", state_size=0
     )

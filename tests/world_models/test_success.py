@@ -147,7 +147,7 @@ def rare(length: int) -> EpisodeTable:
     done = np.zeros(rows, bool)
     done[start[:5] + length - 2] = True
     numbers = np.zeros((rows, 1), np.float32)
-    dataset: Any = SimpleNamespace(root="made up")
+    dataset: Any = SimpleNamespace(root="made up", features={"next.success"})
     return EpisodeTable(dataset, numbers, numbers, done, start, np.full(10, length), ["open"] * 10)
 
 

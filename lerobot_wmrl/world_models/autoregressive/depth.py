@@ -18,7 +18,7 @@ from lerobot_wmrl.world_models.layers import Condition, FrameEmbedding, FrameHea
 from lerobot_wmrl.world_models.losses import masked_mean
 
 FAR: Final = 2.5
-"""Metres: what is further away counts as that far, as in the recorder's depth maps."""
+"""Metres: what is further away counts as that far. The simulator's cameras see nothing beyond it."""
 
 
 def normalize_depth(depth: Tensor | None, tokens: Tensor) -> Tensor:
@@ -85,8 +85,11 @@ class DepthBranch(nn.Module):
 
 
 def depth_loss(predicted: Tensor, depth: Tensor, valid: Tensor) -> tuple[Tensor, dict[str, float]]:
-    """Mean absolute error of predicted (B, T, S) against the next frames' depth where valid (B, T)."""
+    """Mean absolute error of predicted (B, T, S) against the next frames' depth where valid (B, T).
+
+    Tokens without a measurement, of 0 m, are left out.
+    """
     errors = (predicted[:, :-1].float() - depth[:, 1:]).abs()
-    known = known_transitions(valid)[..., None]
+    known = known_transitions(valid)[..., None] & (depth[:, 1:] > -1)
     error = masked_mean(errors, known)
     return error, {"depth_error_mm": 1000 * FAR / 2 * error.item()}
