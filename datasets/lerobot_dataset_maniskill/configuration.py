@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import draccus
-from huggingface_hub import get_token
 from huggingface_hub.errors import HFValidationError
 from huggingface_hub.utils import validate_repo_id
 from lerobot.configs import parser
@@ -18,6 +17,7 @@ from lerobot_dataset_maniskill.planners import MOTIONS
 from lerobot_wmrl.common.command_line import RunConfig
 from lerobot_wmrl.common.constants import EVALUATION_SEED, KINDS, POLICY
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
+from lerobot_wmrl.common.hub import check_login
 from lerobot_wmrl.common.policies import read_policy_config, require_trained
 from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
@@ -221,10 +221,7 @@ class RecordConfig(RunConfig):
             validate_repo_id(self.dataset_id)
         except HFValidationError as error:
             raise FieldError("repo_id", self.repo_id, str(error)) from error
-        if get_token() is None:
-            raise FieldError(
-                "push_to_hub", "true", "nobody is logged in to the hub here", "run hf auth login"
-            )
+        check_login()
 
     @property
     def root(self) -> Path:

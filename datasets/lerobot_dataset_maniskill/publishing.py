@@ -5,20 +5,19 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-import httpx
 from huggingface_hub import HfApi
 from huggingface_hub.constants import REPO_TYPE_DATASET
-from huggingface_hub.errors import HfHubHTTPError, RevisionNotFoundError
+from huggingface_hub.errors import RevisionNotFoundError
 from lerobot.datasets.dataset_metadata import CODEBASE_VERSION
 
 from lerobot_dataset_maniskill.card import CARD_FILE, MEDIA, name_card
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.hub import publishing
 
 PUBLISHED: Final = [str(CARD_FILE), *(f"{folder}/*" for folder in ("data", "meta", "videos", MEDIA))]
 """The files of a dataset: they are uploaded, and removed from the hub where the recording has them not."""
 
-DENIED: Final = (401, 403, 404)
-"""HTTP statuses for a token that may not write. The hub answers 404 for what the token may not see."""
+ONLY_PUBLISHES: Final = "the recording is whole in {root}, the same command again only publishes it"
 
 
 def publish(api: HfApi, root: Path, repo_id: str, private: bool) -> None:
@@ -34,20 +33,13 @@ def publish(api: HfApi, root: Path, repo_id: str, private: bool) -> None:
         FieldError: says what the hub refuses, or that it cannot be reached.
     """
     name_card(root, repo_id)
-    try:
+    with publishing(repo_id, ONLY_PUBLISHES.format(root=root)):
         create(api, repo_id, private)
         api.upload_folder(
             repo_id=repo_id, repo_type=REPO_TYPE_DATASET, folder_path=root,
             allow_patterns=PUBLISHED, delete_patterns=PUBLISHED,
         )  # fmt: skip
         tag_version(api, repo_id)
-    except (httpx.HTTPError, OSError, RuntimeError) as error:
-        raise FieldError(
-            "push_to_hub",
-            "true",
-            f"{repo_id} is not published: {reason(error)}",
-            f"the recording is whole in {root}, the same command again only publishes it",
-        ) from error
     print(f"published: {api.endpoint}/datasets/{repo_id}")
 
 
@@ -71,16 +63,3 @@ def tag_version(api: HfApi, repo_id: str) -> None:
     with suppress(RevisionNotFoundError):
         api.delete_tag(repo_id, tag=CODEBASE_VERSION, repo_type=REPO_TYPE_DATASET)
     api.create_tag(repo_id, tag=CODEBASE_VERSION, repo_type=REPO_TYPE_DATASET)
-
-
-def reason(error: Exception) -> str:
-    """Return why publishing failed, and what helps."""
-    if isinstance(error, (httpx.TransportError, ConnectionError)):
-        return f"the hub cannot be reached ({error})"
-    if not isinstance(error, HfHubHTTPError):
-        return f"the upload failed ({error})"
-    status = error.response.status_code
-    refusal = f"the hub refuses ({status}, {error.server_message or error.response.reason_phrase})"
-    if status in DENIED:
-        return f"{refusal}; log in with a token that may write there: `hf auth login`"
-    return refusal

@@ -77,9 +77,10 @@ def run(config: RecordConfig) -> None:
     from huggingface_hub import HfApi
 
     from lerobot_dataset_maniskill.merging import merge_shards
-    from lerobot_dataset_maniskill.publishing import publish
+    from lerobot_dataset_maniskill.publishing import ONLY_PUBLISHES, publish
     from lerobot_dataset_maniskill.recorder import record
     from lerobot_dataset_maniskill.worker import silence_libraries
+    from lerobot_wmrl.common.hub import publishing
     from lerobot_wmrl.data.dataset import open_dataset
 
     silence_libraries()
@@ -91,7 +92,8 @@ def run(config: RecordConfig) -> None:
     else:
         record(config)
     if config.push_to_hub and config.elsewhere:
-        open_dataset(config.root, config.dataset_id).push_to_hub(private=config.private)
+        with publishing(config.dataset_id, ONLY_PUBLISHES.format(root=config.root)):
+            open_dataset(config.root, config.dataset_id).push_to_hub(private=config.private)
     elif config.push_to_hub:
         publish(HfApi(), config.root, config.dataset_id, config.private)
 

@@ -13,7 +13,7 @@ from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 
 from lerobot_wmrl.common.command_line import RunConfig
 from lerobot_wmrl.common.constants import EVALUATION_SEED
-from lerobot_wmrl.common.errors import FieldError, require_at_least
+from lerobot_wmrl.common.errors import FieldError, require_at_least, within
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.rl.configuration_algorithms import PolicyGradientConfig, PPOConfig
 from lerobot_wmrl.rl.configuration_callbacks import CallbackSettings
@@ -152,7 +152,11 @@ def load_config(cfg: TrainConfig) -> PreTrainedConfig:
     if cfg.policy.push_to_hub and not cfg.policy.repo_id:
         raise FieldError("policy.push_to_hub", True, "give its name on the hub, --policy.repo_id=user/name")
     if cfg.policy.push_to_hub:
+        from lerobot_wmrl.common.hub import check_login
+
         require_published_base(cfg, cfg.policy)
+        with within("policy"):
+            check_login()
     return cfg.policy
 
 

@@ -10,6 +10,7 @@ from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 
 from lerobot_wmrl.common.checkpoints import best_checkpoint, last_checkpoint
 from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.errors import within
 from lerobot_wmrl.common.presets import format_flags
 from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
 from lerobot_wmrl.rl.configuration_train import TrainConfig
@@ -94,19 +95,21 @@ def publish(cfg: TrainConfig, lines: list[str]) -> None:
         return
     from huggingface_hub import HfApi
 
+    from lerobot_wmrl.common.hub import publishing
     from lerobot_wmrl.world_models.hub_card import card_metadata
 
     api = HfApi()
-    name = api.create_repo(config.repo_id, private=config.private, exist_ok=True).repo_id
     described = [lines[0].removeprefix(f"{cfg.output_dir}: "), *lines[1:-1]]
     description, start = "\n".join(f"- {line}" for line in described), str(config.pretrained_path)
-    card = CARD.format(
-        metadata=card_metadata(config, model_name=name).to_yaml(), name=name, type=config.type,
-        description=description,
-        start="a policy that is not published" if Path(start).exists() else f"`{start}`",
-        command=evaluation(cfg, name, shared=True),
-    )  # fmt: skip
-    with TemporaryDirectory() as temporary:
+    kept = f"the policy is whole in {cfg.output_dir}, the same command again only publishes it"
+    with within("policy"), publishing(config.repo_id, kept), TemporaryDirectory() as temporary:
+        name = api.create_repo(config.repo_id, private=config.private, exist_ok=True).repo_id
+        card = CARD.format(
+            metadata=card_metadata(config, model_name=name).to_yaml(), name=name, type=config.type,
+            description=description,
+            start="a policy that is not published" if Path(start).exists() else f"`{start}`",
+            command=evaluation(cfg, name, shared=True),
+        )  # fmt: skip
         folder = Path(temporary) / "policy"
         shutil.copytree(chosen_checkpoint(cfg) / PRETRAINED_MODEL_DIR, folder)
         (folder / "README.md").write_text(card)

@@ -121,6 +121,7 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     """Replay, measure, and write metrics.json, metrics.md and the pictures."""
     from lerobot_wmrl.common.constants import START_SCENE
     from lerobot_wmrl.common.files import write_json, write_text
+    from lerobot_wmrl.common.hub import check_login
     from lerobot_wmrl.common.policies import check_weights, read_policy_config
     from lerobot_wmrl.data.episodes import choose_episodes, read_episodes
     from lerobot_wmrl.evaluation.agreement import policy_checkpoints
@@ -130,11 +131,10 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     from lerobot_wmrl.evaluation.report import evaluate, report_action_model, report_agreement
     from lerobot_wmrl.maniskill.recordings import scene_splits
     from lerobot_wmrl.world_models.checkpoint import check_dataset, load_model
-    from lerobot_wmrl.world_models.hub_card import check_login
 
     cfg.check()
     if cfg.push_to_hub:
-        check_login(cfg.model.path)
+        check_login()
     model = load_model(cfg.model.path, "action_world_model", cfg.device, "model.path")
     table = read_episodes(cfg.dataset.open())
     check_dataset(model.config, table.dataset.meta)

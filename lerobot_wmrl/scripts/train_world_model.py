@@ -25,7 +25,7 @@ from lerobot.configs.rewards import RewardModelConfig
 
 from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.distributed import LONGEST_WAIT, is_first_process
-from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least, require_choice
+from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least, require_choice, within
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.output_folders import claim_output_dir, require_free
 from lerobot_wmrl.common.precision import PRECISIONS, keep_freed_memory, training_dtype
@@ -105,8 +105,13 @@ def check_config(cfg: TrainWorldModelConfig) -> None:
         raise FieldError("model.type", cfg.model.type, f"this command trains {', '.join(TRAINED)}")
     require_at_least(cfg, 1, "steps", "batch_size", "save_freq", "log_freq")
     require_choice(cfg, "precision", PRECISIONS)
-    if cfg.model.push_to_hub and not cfg.model.repo_id:
-        raise FieldError("model.push_to_hub", True, "needs a name on the hub", "give `model.repo_id`")
+    if cfg.model.push_to_hub:
+        from lerobot_wmrl.common.hub import check_login
+
+        if not cfg.model.repo_id:
+            raise FieldError("model.push_to_hub", True, "needs a name on the hub", "give `model.repo_id`")
+        with within("model"):
+            check_login()
 
 
 def check_processes(cfg: TrainWorldModelConfig, processes: int) -> None:
@@ -171,7 +176,8 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
     if is_first_process():
         print(f"\n{conclusion(cfg, model, table)}")
         if cfg.model.push_to_hub:
-            model.push_model_to_hub(cfg)
+            with within("model"):
+                model.push_model_to_hub(cfg)
             print(f"Published as {cfg.model.repo_id}.")
 
 

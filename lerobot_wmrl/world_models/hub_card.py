@@ -7,18 +7,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, ClassVar, Final
 
-import httpx
-from huggingface_hub import (
-    CommitOperationAdd,
-    CommitOperationDelete,
-    HfApi,
-    ModelCard,
-    ModelCardData,
-    get_token,
-)
-from huggingface_hub.errors import HFValidationError
+from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, ModelCard, ModelCardData
 
-from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.hub import publishing
 
 CARD = """---
 {metadata}
@@ -60,8 +51,11 @@ class HubCard:
         """
         model: Any = self
         api = HfApi()
-        repo_id = api.create_repo(model.config.repo_id, private=model.config.private, exist_ok=True).repo_id
-        with TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        kept = f"the model is whole in {cfg.output_dir}"
+        with publishing(model.config.repo_id, kept), TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+            repo_id = api.create_repo(
+                model.config.repo_id, private=model.config.private, exist_ok=True
+            ).repo_id
             model.save_pretrained(folder)
             cfg.save_pretrained(Path(folder))
             self.generate_model_card(cfg.dataset.repo_id).save(Path(folder) / "README.md")
@@ -106,7 +100,7 @@ def publish_evaluation(name: str, text: str, files: Mapping[str, bytes]) -> None
         FieldError: it may not be written, or the hub cannot be reached.
     """
     api = HfApi()
-    try:
+    with publishing(f"the evaluation of {name}", "repeat the command"):
         card = ModelCard.load(name)
         before = re.sub(r"<!-- evaluation -->.*<!-- end of evaluation -->", "", card.text, flags=re.S)
         card.text = f"{before.rstrip()}\n\n{SECTION.format(text=text)}"
@@ -118,18 +112,4 @@ def publish_evaluation(name: str, text: str, files: Mapping[str, bytes]) -> None
             CommitOperationAdd("README.md", str(card).encode()),
         ]
         commit = api.create_commit(name, operations, commit_message="Add an evaluation")
-    except (OSError, httpx.HTTPError, HFValidationError) as error:
-        raise FieldError(
-            "push_to_hub", True, f"the card of {name} cannot be written ({error})",
-            "log in with `hf auth login` to an account that may write there, and repeat the command",
-        ) from error  # fmt: skip
     logging.info("published at %s", commit.repo_url)
-
-
-def check_login(name: str) -> None:
-    """Raise FieldError if nobody is logged in to the hub, where a model of this name is to be changed."""
-    if get_token() is None:
-        raise FieldError(
-            "push_to_hub", True, f"the card of {name} cannot be written: nobody is logged in to the hub",
-            "log in with `hf auth login` to an account that may write there",
-        )  # fmt: skip

@@ -128,6 +128,11 @@ def test_it_says_what_it_made_and_publishes_it_if_asked(
     last = out / "checkpoints" / "last" / "pretrained_model"
     assert f"next: lerobot-eval --policy.path={last} --env.type=test_point" in told
     assert not hub.repos
+    with monkeypatch.context() as nobody:
+        nobody.setattr("lerobot_wmrl.common.hub.get_token", lambda: None)
+        with pytest.raises(SystemExit):
+            improve(nobody, *flags, "--policy.push_to_hub=true", "--policy.repo_id=me/improved")
+    assert "--policy.push_to_hub=true: nobody is logged in to the hub here" in capsys.readouterr().err
     improve(monkeypatch, *flags, "--policy.push_to_hub=true", "--policy.repo_id=me/improved")
     published = hub.repos["models", "me/improved"].head
     assert published["model.safetensors"] == (last / "model.safetensors").read_bytes()

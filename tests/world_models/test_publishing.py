@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import httpx
 import pytest
 import torch
 from lerobot.rewards.factory import get_reward_model_class
@@ -96,13 +97,34 @@ def test_an_evaluation_is_put_on_the_card_and_replaced_by_the_next(
     assert repo.head["model.safetensors"] == weights
 
 
+def test_a_training_without_a_login_is_not_begun(hub, small_dataset, tmp_path, monkeypatch):
+    monkeypatch.setattr("lerobot_wmrl.common.hub.get_token", lambda: None)
+    config = tokenizer_config()
+    config.push_to_hub, config.repo_id = True, "somebody/tokenizer"
+    with pytest.raises(FieldError, match=r"^model\.push_to_hub=true: nobody is logged in"):
+        run_training(config, Path(small_dataset.root), tmp_path / "run", steps=1)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_hub_that_is_gone_after_the_training_is_named(hub, small_dataset, tmp_path, monkeypatch):
+    def gone(*_: object, **__: object) -> None:
+        raise httpx.ConnectError("no route to host")
+
+    monkeypatch.setattr("huggingface_hub.HfApi.create_repo", gone)
+    config = tokenizer_config()
+    config.push_to_hub, config.repo_id = True, "somebody/tokenizer"
+    message = r"^model\.push_to_hub=true: .* the hub cannot be reached .*; the model is whole in .*run"
+    with pytest.raises(FieldError, match=message):
+        run_training(config, Path(small_dataset.root), tmp_path / "run", steps=1)
+
+
 def test_an_evaluation_without_a_login_is_not_begun(hub, small_dataset, tmp_path, monkeypatch):
-    monkeypatch.setattr("lerobot_wmrl.world_models.hub_card.get_token", lambda: None)
+    monkeypatch.setattr("lerobot_wmrl.common.hub.get_token", lambda: None)
     evaluation = EvalWorldModelConfig(
         model=Checkpoint("somebody/world_model"), dataset=ChosenEpisodes(root=str(small_dataset.root)),
         push_to_hub=True, output_dir=tmp_path / "check",
     )  # fmt: skip
-    with pytest.raises(FieldError, match=r"^push_to_hub=True: .*: nobody is logged in"):
+    with pytest.raises(FieldError, match=r"^push_to_hub=true: nobody is logged in"):
         eval_world_model(evaluation)
     assert not (tmp_path / "check").exists()
 

@@ -1,0 +1,49 @@
+"""Publishing on the Hugging Face hub: who is logged in, and what the hub's errors mean."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Final
+
+import httpx
+from huggingface_hub import get_token
+from huggingface_hub.errors import HfHubHTTPError, HFValidationError
+
+from lerobot_wmrl.common.errors import FieldError
+
+PUSH: Final = "push_to_hub"
+
+DENIED: Final = (401, 403, 404)
+"""HTTP statuses for a token that may not write. The hub answers 404 for what the token may not see."""
+
+
+def check_login() -> None:
+    """Raise FieldError about `push_to_hub` if nobody is logged in to the hub."""
+    if get_token() is None:
+        raise FieldError(PUSH, "true", "nobody is logged in to the hub here", "run hf auth login")
+
+
+@contextmanager
+def publishing(name: str, remedy: str) -> Iterator[None]:
+    """Turn the hub's errors that leave the block into a FieldError about `push_to_hub`.
+
+    Args:
+        name: what is published, by its name on the hub.
+        remedy: what to do then, and what is not lost.
+    """
+    try:
+        yield
+    except (httpx.HTTPError, OSError, RuntimeError, HFValidationError) as error:
+        raise FieldError(PUSH, "true", f"{name} is not published: {reason(error)}", remedy) from error
+
+
+def reason(error: Exception) -> str:
+    """Return why publishing failed, and what helps."""
+    if isinstance(error, (httpx.TransportError, ConnectionError)):
+        return f"the hub cannot be reached ({error})"
+    if not isinstance(error, HfHubHTTPError):
+        return f"the upload failed ({error})"
+    status = error.response.status_code
+    refusal = f"the hub refuses ({status}, {error.server_message or error.response.reason_phrase})"
+    if status in DENIED:
+        return f"{refusal}; log in with a token that may write there: `hf auth login`"
+    return refusal
