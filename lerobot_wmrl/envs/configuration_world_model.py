@@ -102,7 +102,8 @@ class WorldModelEnv(EnvConfig):
         done_threshold: predicted success probability θ at which a frame counts as done (eq. 7).
         done_frames: consecutive done frames k that make a success.
         fps: frames a second, those of the world model's dataset.
-        device: device of the models; by default the best one of this machine.
+        device: device of the models; by default the best one of this machine, and in lerobot-wmrl-train the
+            policy's.
     """
 
     task: str | None = "imagination"

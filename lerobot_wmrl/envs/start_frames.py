@@ -17,7 +17,7 @@ from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
 from lerobot_wmrl.common.constants import START_SCENE, START_TASK, TASKS
-from lerobot_wmrl.common.errors import FieldError, within
+from lerobot_wmrl.common.errors import FieldError, renamed, within
 from lerobot_wmrl.common.images import stretch, to_pixels
 from lerobot_wmrl.common.statistics import evenly_spaced
 from lerobot_wmrl.data.budget import Ledger
@@ -139,7 +139,8 @@ def chosen_episodes(table: EpisodeTable, source: StartFrames) -> np.ndarray:
             )
         wanted &= np.isin(column, values) if values else True
     episodes = max(1, source.max_starts // (1 + source.branches))
-    return choose_episodes(table, source.split, episodes, scene_splits(scene, source.split), wanted)
+    with renamed("split", "dataset.split"):
+        return choose_episodes(table, source.split, episodes, scene_splits(scene, source.split), wanted)
 
 
 def every_chosen_episode(table: EpisodeTable, source: StartFrames) -> np.ndarray:

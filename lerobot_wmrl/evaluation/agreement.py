@@ -20,7 +20,6 @@ from lerobot_wmrl.common.policies import load_policy, load_processors, read_poli
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter, StepCounter
 from lerobot_wmrl.envs.lerobot_env import runs_in_processes
-from lerobot_wmrl.evaluation.compare import check_imagined_units
 
 MIN_POLICIES = 3
 """Policies that a correlation needs."""
@@ -67,7 +66,6 @@ def evaluate_policy(
         seed: seed of the first episode; each further one adds one.
     """
     made: Any = make_env(env, min(num_envs, episodes), use_async_envs=runs_in_processes(env))
-    check_imagined_units(policy.config, processors[1], made)
     envs = {suite: {task: StepCounter(one) for task, one in tasks.items()} for suite, tasks in made.items()}
     info = eval_policy_all(
         envs, policy, *make_env_pre_post_processors(env, policy.config), *processors,

@@ -20,6 +20,7 @@ from lerobot.utils.random_utils import set_seed
 from lerobot_wmrl.common.checkpoints import resolve_checkpoint
 from lerobot_wmrl.common.errors import FieldError, first_line
 from lerobot_wmrl.common.policies import (
+    check_units,
     check_weights,
     fit_to_environment,
     load_policy,
@@ -28,8 +29,8 @@ from lerobot_wmrl.common.policies import (
 )
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.envs.lerobot_env import counts_resets, freeze_finished, is_own, runs_in_processes
-from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.evaluation.comparison import Comparison, Episode
+from lerobot_wmrl.world_models.checkpoint import load_model
 
 type Envs = dict[str, dict[int, gym.vector.VectorEnv]]
 """Suite → task → vector environment, as LeRobot's make_env returns them."""
@@ -61,14 +62,19 @@ def read_policies(paths: Sequence[str], env: EnvConfig) -> dict[str, PreTrainedC
         FieldError: there is no checkpoint, it is given twice, or it does not fit the environment.
     """
     configs: dict[str, PreTrainedConfig] = {}
+    imagined = isinstance(env, WorldModelEnv)
+    model = load_model(env.world_model_path, "action_world_model") if imagined else None
     for path in paths:
         name = resolved_name(path)
         if name in configs:
             raise FieldError("policies", path, "is given twice", "give every checkpoint once")
         with about_policy(path):
-            configs[name] = read_policy_config(name, [])
-            check_weights(configs[name])
-            _check_environment(configs[name], env)
+            configs[name] = config = read_policy_config(name, [])
+            check_weights(config)
+            check_environment(config, env)
+            if model is not None:
+                names = model.config.embodiment.action_names
+                check_units(config, load_processors(config)[1], names, *model.action_range())
     return configs
 
 
@@ -84,7 +90,7 @@ def about_policy(path: str) -> Iterator[None]:
         raise FieldError("policies", path, first_line(error)) from error
 
 
-def _check_environment(config: PreTrainedConfig, env: EnvConfig) -> None:
+def check_environment(config: PreTrainedConfig, env: EnvConfig) -> None:
     """Raise FieldError unless policy and environment fit; a policy without features takes the environment's.
 
     Only this project's environments are checked: LeRobot's own may show a policy more than they declare.
@@ -95,20 +101,6 @@ def _check_environment(config: PreTrainedConfig, env: EnvConfig) -> None:
     action = features.pop(ACTION)
     shown = {name: tuple(feature.shape) for name, feature in features.items()}
     fit_to_environment(config, shown, action.shape[0])
-
-
-def check_actions(configs: Mapping[str, PreTrainedConfig], envs: Envs) -> None:
-    """Raise FieldError if a policy's actions are in other units than those of a world model."""
-    for name, config in configs.items():
-        with about_policy(name):
-            check_imagined_units(config, load_processors(config)[1], envs)
-
-
-def check_imagined_units(config: PreTrainedConfig, postprocessor: Any, envs: Envs) -> None:
-    """Raise FieldError if the environments imagine, and the policy's actions are in other units."""
-    for adapter in _flat(envs)[:1]:  # all tasks share the world model
-        if isinstance(env := getattr(adapter, "env", None), WorldModelVectorEnv):
-            env.check_units(config, postprocessor)
 
 
 def load_policies(configs: Mapping[str, PreTrainedConfig]) -> list[LoadedPolicy]:

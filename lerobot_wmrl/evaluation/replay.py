@@ -42,8 +42,8 @@ class Recording:
 
     def rows(self, episode: int) -> slice:
         """Return the rows of an episode."""
-        start = int(self.table.start[episode])
-        return slice(start, start + int(self.table.length[episode]))
+        (rows,) = self.table.rows([episode])
+        return rows
 
     def compared_rows(self, episode: int) -> slice:
         """Return the rows whose frames are compared with imagined ones, the first `COMPARED_FRAMES`."""

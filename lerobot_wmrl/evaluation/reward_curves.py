@@ -19,7 +19,7 @@ from lerobot_wmrl.world_models.modeling_world_model import TextWorldModelRewardM
 @torch.no_grad()
 def reward_along_episode(
     text_model: TextWorldModelRewardModel, reward: GeneralConfig, recording: Recording,
-    replay: EpisodeReplay, *, threshold: float, frames: int,
+    replay: EpisodeReplay, *, threshold: float, frames: int, longest: int,
 ) -> dict[str, Any]:  # fmt: skip
     """Compute eqs. 5-8 for an episode: the similarity of recorded frames, and the success of imagined ones.
 
@@ -27,6 +27,7 @@ def reward_along_episode(
         replay: the same episode, imagined with its own actions.
         threshold: done probability that counts as done.
         frames: consecutive frames for which it must be reached.
+        longest: frames after which the environment ends an episode, which decide its discount.
 
     Returns:
         Lists over the frames after the first (done_probability, similarity, return), the imagined goal_frame
@@ -49,7 +50,7 @@ def reward_along_episode(
         paid[begin + frames - 1] = 1
     earned = general_reward(
         paid, similarity[1:], similarity[:-1],
-        alpha=reward.alpha, form=reward.form, gamma=potential_discount(reward, int(table.length.max())),
+        alpha=reward.alpha, form=reward.form, gamma=potential_discount(reward, longest),
     )  # fmt: skip
     return {
         "done_probability": probability.tolist(),

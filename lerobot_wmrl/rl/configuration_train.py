@@ -1,7 +1,7 @@
 """Configuration of lerobot-wmrl-train."""
 
 import logging
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -22,6 +22,9 @@ from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 
 PUBLISHING = ("push_to_hub", "repo_id", "private", "license", "tags")
 """Settings of the policy that only matter when it is published."""
+
+READ = ("input_features", "output_features", "use_peft", "pretrained_path")
+"""Settings of the policy that its checkpoint alone knows: the training may fill them in."""
 
 MAY_DIFFER = (
     "resume", "job_name", "log_freq", "wandb", "gate.action", "dyna.dataset",
@@ -135,19 +138,20 @@ def check_distillation(algorithm: DistillationConfig, env: EnvConfig) -> None:
 def load_config(cfg: TrainConfig) -> PreTrainedConfig:
     """Read the policy's configuration into `cfg` and return it.
 
-    Whether and where the policy is published comes from the command line or a resumed run's configuration.
-    The checkpoint's own settings are ignored, because they would overwrite the SFT policy on the hub.
+    A run that is resumed by its configuration has the policy's settings from there. Whether and where the
+    policy is published never comes from the checkpoint, as it would overwrite the SFT policy on the hub.
     """
     from lerobot_wmrl.common.policies import read_policy_config
 
-    path = parser.get_path_arg("policy") or (cfg.policy and cfg.policy.pretrained_path)
+    typed, stored = parser.get_path_arg("policy"), cfg.policy
+    path = typed or (stored and stored.pretrained_path)
     if not path:
         raise ValueError("--policy.path: give the checkpoint of the policy to train")
-    stored = cfg.policy
-    typed = parser.get_cli_overrides("policy") or []
-    cfg.policy = read_policy_config(str(path), ["--push_to_hub=false", "--repo_id=null", *typed])
+    overrides = parser.get_cli_overrides("policy") or []
+    cfg.policy = read_policy_config(str(path), ["--push_to_hub=false", "--repo_id=null", *overrides])
     if stored is not None:
-        for name in PUBLISHING:
+        settings = [each.name for each in fields(stored) if each.name not in READ]
+        for name in PUBLISHING if typed else settings:
             setattr(cfg.policy, name, getattr(stored, name))
     if cfg.policy.push_to_hub and not cfg.policy.repo_id:
         raise FieldError("policy.push_to_hub", True, "give its name on the hub, --policy.repo_id=user/name")

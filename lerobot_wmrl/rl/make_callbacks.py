@@ -36,6 +36,7 @@ def make_callbacks(
 ) -> list[Callback]:
     """Return the callbacks in the order in which they run: Dyna rounds, gate, selection."""
     callbacks: list[Callback] = []
+    refreshed = frozenset(round_iterations(settings.dyna.rounds, iterations))
     if isinstance(trained.env, WorldModelVectorEnv):
         recorder = make_recorder(settings, trained.env)
         if settings.dyna.rounds:
@@ -45,11 +46,10 @@ def make_callbacks(
                 settings.budget,
             ))  # fmt: skip
         if settings.gate.action != "off":
-            refreshed = frozenset(round_iterations(settings.dyna.rounds, iterations))
             callbacks.append(SuccessGate(settings.gate, trained.env, recorder, refreshed, iterations))
     if settings.selection.freq:
         measures = make_measures(settings, trained)
-        callbacks.append(Selection(settings.selection.freq, iterations, measures, output_dir))
+        callbacks.append(Selection(settings.selection.freq, iterations, measures, output_dir, refreshed))
     return callbacks
 
 

@@ -1,7 +1,7 @@
 """Selection of the best checkpoint by its success on seeds that neither training nor evaluation uses."""
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 
 from lerobot_wmrl.common.checkpoints import BEST_CHECKPOINT_LINK, link_checkpoint
@@ -27,12 +27,18 @@ class Selection:
         measures: functions that measure success, `real` (outside the world model) and `imagined`. `real`
             decides if it is given.
         output_dir: the training's output folder.
+        refreshed: iterations after which a Dyna round replaces the world model. Success in imagination is
+            compared within one world model alone.
     """
 
     name = "selection"
 
-    def __init__(self, freq: int, total: int, measures: Mapping[str, Measure], output_dir: Path) -> None:
+    def __init__(
+        self, freq: int, total: int, measures: Mapping[str, Measure], output_dir: Path,
+        refreshed: Collection[int] = (),
+    ) -> None:  # fmt: skip
         self.freq, self.total, self.measures, self.output_dir = freq, total, measures, output_dir
+        self.refreshed = refreshed
         self.judge = REAL if REAL in measures else IMAGINED
 
     def due(self, iteration: int) -> bool:
@@ -56,21 +62,25 @@ class Selection:
         Raises:
             TrainingStopped: real success has fallen while imagined success has not.
         """
-        best = best_iteration(records, self.judge)
+        latest = max(records)
+        since = max((each for each in self.refreshed if each <= latest), default=0)
+        comparable = {iteration: record for iteration, record in records.items() if iteration >= since}
+        best = best_iteration(records if self.judge == REAL else comparable, self.judge)
         checkpoint = checkpoint_dir(self.output_dir, best, self.total)
         if is_first_process():
             link_checkpoint(checkpoint, BEST_CHECKPOINT_LINK)
-        latest = max(records)
-        if diverged(records[best], records[latest]):
+        earlier = best_iteration(comparable, self.judge)
+        if diverged(records[earlier], records[latest]):
             before, now = (
                 " and ".join(f"{place} {success(records[at], place)}" for place in (IMAGINED, REAL))
-                for at in (best, latest)
+                for at in (earlier, latest)
             )
             raise TrainingStopped(
                 f"iteration {latest}: real success has fallen while imagined success has not: {now}, after "
-                f"{before} at iteration {best}. The policy exploits errors of the world model. {checkpoint} "
-                "is the best one; train the world model on what this policy does (`dyna.rounds`), keep the "
-                "policy nearer to the SFT policy (`algorithm.reference_coefficient`), or stop earlier "
+                f"{before} at iteration {earlier}. The policy exploits errors of the world model. "
+                f"{checkpoint} is the best one; train the world model on what this policy does "
+                "(`dyna.rounds`), keep the policy nearer to the SFT policy "
+                "(`algorithm.reference_coefficient`), or stop earlier "
                 "(`iterations`)"
             )
 

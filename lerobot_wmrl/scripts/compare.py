@@ -116,7 +116,6 @@ def may_differ(cfg: CompareConfig) -> list[str]:
 def run(cfg: CompareConfig, comparison: "Comparison", configs: "dict[str, PreTrainedConfig]") -> None:
     """Run the episodes that are missing; write the results after every batch."""
     from lerobot_wmrl.evaluation.compare import (
-        check_actions,
         load_policies,
         opened,
         require_new_starts,
@@ -136,7 +135,6 @@ def run(cfg: CompareConfig, comparison: "Comparison", configs: "dict[str, PreTra
         opened(cfg.env, cfg.batch_size, cfg.trust_remote_code, len(configs)) as envs,
     ):
         require_new_starts(envs[0], cfg.env, cfg.n_episodes)
-        check_actions(configs, envs[0])
         policies = load_policies(configs)
         claim_output_dir(cfg.output_dir, settings, may_differ(cfg))
         run_comparison(comparison, envs, cfg.env, policies, cfg.batch_size, cfg.seed, save)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_wmrl.common.command_line import RunConfig, run_command
-from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.errors import FieldError, renamed
 from lerobot_wmrl.common.files import foreign_files, whole_folder, writing
 
 DIRECTIONS = ("import", "export")
@@ -86,7 +86,8 @@ def exporter(source: str) -> Callable[[Path], None]:
     from lerobot_policy_openvla.modeling_openvla import OpenVLAPolicy
     from lerobot_wmrl.common.policies import load_with_adapters, read_policy_config
 
-    config = read_policy_config(source, [])
+    with renamed("policy.path", "source"):
+        config = read_policy_config(source, [])
     if config.type != OpenVLAPolicy.name:
         raise FieldError("source", source, f"a policy of type {config.type}, not {OpenVLAPolicy.name}")
     if config.use_peft:

@@ -122,10 +122,7 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     from lerobot_wmrl.common.constants import START_SCENE
     from lerobot_wmrl.common.files import write_json, write_text
     from lerobot_wmrl.common.hub import check_login
-    from lerobot_wmrl.common.policies import check_weights, read_policy_config
     from lerobot_wmrl.data.episodes import choose_episodes, read_episodes
-    from lerobot_wmrl.evaluation.agreement import policy_checkpoints
-    from lerobot_wmrl.evaluation.compare import about_policy
     from lerobot_wmrl.evaluation.reconstruction import reconstruction_metrics
     from lerobot_wmrl.evaluation.replay import Recording
     from lerobot_wmrl.evaluation.report import evaluate, report_action_model, report_agreement
@@ -140,9 +137,8 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     check_dataset(model.config, table.dataset.meta)
     text_model = load_text_model(cfg, model)
     imagination = policies_imagination(cfg, table) if cfg.policies else None
-    for path in policy_checkpoints(cfg.policies) if cfg.policies else []:
-        with about_policy(str(path)):
-            check_weights(read_policy_config(str(path), []))
+    if imagination is not None:
+        check_policies(cfg, imagination)
     scenes = scene_splits(table.column(START_SCENE), cfg.split)
     chosen = table.among(cfg.dataset.episodes)
     episodes = choose_episodes(table, cfg.split, cfg.max_episodes, scenes, chosen)
@@ -153,7 +149,8 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
         report_action_model(model, recording, evaluation, cfg.done_threshold, cfg.done_frames, cfg.output_dir)
     ]
     if text_model is not None:
-        reports.append(report_text_model(cfg, text_model, recording, evaluation))
+        longest = cfg.episode_length or model.config.clip_length  # as the environment has it
+        reports.append(report_text_model(cfg, text_model, recording, evaluation, longest))
     if imagination is not None:
         reports.append(report_agreement(policy_agreement(cfg, imagination), cfg.output_dir))
     metrics = {name: value for report in reports for name, value in report.metrics.items()}
@@ -272,6 +269,26 @@ def policies_imagination(cfg: EvalWorldModelConfig, table: "EpisodeTable") -> "W
     return imagination
 
 
+def check_policies(cfg: EvalWorldModelConfig, imagination: "WorldModelEnv") -> None:
+    """Raise FieldError unless every policy can act in the world model and in `real_env`, which is looked at.
+
+    Both are measured after the replay of all episodes, which takes long.
+    """
+    from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+    from lerobot_wmrl.envs.lerobot_env import check_real_env
+    from lerobot_wmrl.evaluation.agreement import policy_checkpoints
+    from lerobot_wmrl.evaluation.compare import about_policy, read_policies
+    from lerobot_wmrl.maniskill.backend import require_simulator
+
+    assert cfg.real_env is not None
+    if isinstance(cfg.real_env, WmrlManiSkillEnv):
+        require_simulator()
+    paths = [str(path) for path in policy_checkpoints(cfg.policies)]
+    for name, config in read_policies(paths, imagination).items():
+        with about_policy(name):
+            check_real_env(config, cfg.real_env)
+
+
 def policy_agreement(cfg: EvalWorldModelConfig, imagination: "WorldModelEnv") -> "Agreement":
     """Evaluate every policy in the world model and in `real_env`."""
     from lerobot_wmrl.evaluation.agreement import Agreement, policy_checkpoints, policy_outcomes
@@ -292,6 +309,7 @@ def report_text_model(
     text_model: "TextWorldModelRewardModel",
     recording: "Recording",
     evaluation: "Evaluation",
+    longest: int,
 ) -> "Report":
     """Report goal frames, and draw the reward along the shown episodes."""
     from lerobot_wmrl.evaluation.pictures import save_reward_curves
@@ -301,7 +319,7 @@ def report_text_model(
     curves = {
         name: reward_along_episode(
             text_model, cfg.reward, recording, replay,
-            threshold=cfg.done_threshold, frames=cfg.done_frames,
+            threshold=cfg.done_threshold, frames=cfg.done_frames, longest=longest,
         )
         for name, replay in evaluation.shown.items()
     }  # fmt: skip

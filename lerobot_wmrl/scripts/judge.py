@@ -135,10 +135,12 @@ class JudgeConfig(RunConfig):
 
     def imagination(self) -> WorldModelEnv:
         """Return the world model as the environment of the policies. FieldError if it cannot be one."""
-        own = replace(self.starts, **vars(self.dataset), split=self.split)
-        with renamed("world_model_path", "world_model.path"):
+        starts, group = replace(self.starts, **vars(self.dataset), split=self.split), "dataset"
+        if self.starts_given:
+            starts, group = self.starts, "starts"
+        with renamed("world_model_path", "world_model.path"), regrouped("dataset", group):
             return WorldModelEnv(
-                world_model_path=self.world_model.path, dataset=self.starts if self.starts_given else own,
+                world_model_path=self.world_model.path, dataset=starts,
                 reward=GeneralConfig(alpha=1.0), episode_length=self.episode_length,
                 done_threshold=self.done_threshold, done_frames=self.done_frames, device=self.device,
             )  # fmt: skip
@@ -235,7 +237,7 @@ def imagine(
     cfg: JudgeConfig, env: WorldModelEnv, judgement: "Judgement", configs: "Mapping[str, PreTrainedConfig]"
 ) -> None:
     """Imagine the episodes of the policies that have none yet; write the results after every policy."""
-    from lerobot_wmrl.evaluation.compare import about_policy, check_actions, load_policies, opened, run_block
+    from lerobot_wmrl.evaluation.compare import about_policy, load_policies, opened, run_block
     from lerobot_wmrl.evaluation.judgement import RESULTS
 
     def write() -> None:
@@ -250,7 +252,6 @@ def imagine(
     group = regrouped("dataset", "starts") if cfg.starts_given else nullcontext()
     with group, opened(env, size, False, 1) as (envs,):
         starts = starts_of_one_task(envs, cfg)
-        check_actions(missing, envs)
         claim_output_dir(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER)
         for name, config in tqdm(missing.items(), desc="Imagining", unit="policy"):
             with about_policy(name):

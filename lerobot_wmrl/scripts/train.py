@@ -27,7 +27,7 @@ import draccus
 from lerobot_wmrl.common.command_line import run_command
 from lerobot_wmrl.common.distributed import LONGEST_WAIT, is_first_process, rank_and_size, wait_for_all
 from lerobot_wmrl.common.errors import FieldError, within
-from lerobot_wmrl.common.output_folders import claim_output_dir
+from lerobot_wmrl.common.output_folders import claim_output_dir, require_free
 from lerobot_wmrl.common.precision import keep_freed_memory
 from lerobot_wmrl.common.presets import expand_preset
 from lerobot_wmrl.common.tracking import make_wandb
@@ -55,6 +55,11 @@ def train_policy(cfg: TrainConfig) -> None:
     check_config(cfg)
     check_data(cfg, cfg.env)
     config = load_config(cfg)
+    if isinstance(cfg.env, WorldModelEnv) and cfg.env.device not in (None, config.device):
+        raise FieldError(
+            "env.device", cfg.env.device, f"the policy is on {config.device}, and the world model too",
+            "set `policy.device` instead",
+        )  # fmt: skip
     if isinstance(cfg.algorithm, DistillationConfig):
         require_past_observations(config)
     PartialState(cpu=config.device == "cpu", timeout=LONGEST_WAIT)
@@ -67,6 +72,7 @@ def train_policy(cfg: TrainConfig) -> None:
         set_seed(cfg.seed)
         policy, processors = load_policy(config), load_processors(config)
         settings = draccus.encode(cfg)  # an environment of the hub tells its configuration of its actions
+        require_free(cfg.output_dir, settings, MAY_DIFFER)
         with within("env"):
             env = make_tensor_env(cfg.env, cfg.num_envs, config.device or "cpu")
         try:

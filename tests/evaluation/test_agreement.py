@@ -72,6 +72,24 @@ def test_the_evaluation_reports_policies_beside_reality(imagination, small_datas
     assert (cfg.output_dir / "policies.png").is_file()
 
 
+@pytest.mark.parametrize(("policy", "said"), [
+    ({"actions": 3}, "the policy has 3 action components, the environment 7"),
+    ({"actions": 7, "camera": "wrist"}, "wrist"),
+    ({"actions": 7, "constant": 1000.0}, "was trained on actions .* is 1000 on average"),
+])  # fmt: skip
+def test_a_policy_that_cannot_act_there_is_refused_before_anything_is_replayed(
+    imagination, small_dataset, tmp_path, policy, said
+):
+    cfg = EvalWorldModelConfig(
+        model=Checkpoint(imagination.world_model_path), dataset=ChosenEpisodes(str(Path(small_dataset.root))),
+        policies=[str(save_untrained_policy(tmp_path / "policy", **policy))], policy_episodes=4,
+        real_env=imagination, output_dir=tmp_path / "check", device="cpu",
+    )  # fmt: skip
+    with pytest.raises(ValueError, match=f"^policies=.*{said}"):
+        eval_world_model(cfg)
+    assert not cfg.output_dir.exists()
+
+
 def test_imagined_episodes_are_as_long_as_real_ones_and_none_is_repeated(imagination, small_dataset):
     """Those of a simulator's task, or of another environment."""
     for real in (WmrlManiSkillEnv(task="push"), imagination):

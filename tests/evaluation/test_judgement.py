@@ -344,6 +344,7 @@ def test_rollouts_count_within_the_length_of_an_episode_and_must_both_succeed_an
         ({"starts": StartFrames(branches=2)}, r"starts\.branches=2: from the middle"),
         ({"starts": StartFrames(split="train")}, r"starts\.root=.*is missing"),
         ({"starts": StartFrames(root="a", resets=5)}, r"starts\.root=.*starts are given by"),
+        ({"starts": StartFrames(root="a", tasks=["stir"])}, r"starts\.tasks=\['stir'\]: choose from"),
         ({"done_threshold": 1.5}, "done_threshold=1.5: must be a probability"),
         ({"world_model": Checkpoint("/nowhere")}, r"world_model\.path=/nowhere: no action_world_model there"),
     ],
@@ -351,6 +352,13 @@ def test_rollouts_count_within_the_length_of_an_episode_and_must_both_succeed_an
 def test_bad_settings_are_named_before_anything_is_made(config, changes, said):
     with pytest.raises(ValueError, match=f"^{said}"):
         judge(replace(config, **changes))
+    assert not config.output_dir.exists()
+
+
+def test_a_policy_in_other_units_is_not_judged(config, tmp_path):
+    degrees = str(save_untrained_policy(tmp_path / "degrees", actions=7, constant=1000.0))
+    with pytest.raises(ValueError, match=rf"policies={degrees}: .* is 1000 on average"):
+        judge(replace(config, policies=[*config.policies, degrees]))
     assert not config.output_dir.exists()
 
 

@@ -231,7 +231,7 @@ def test_success_is_paid_once_in_the_frame_that_completes_it(source, model, trai
     probability[[0, 3]] = 0.0  # the first run has two frames
     found = reward_along_episode(
         text_model, GeneralConfig(device="cpu", alpha=1.0), source,
-        replace(replay, done_probability=probability), threshold=0.5, frames=frames,
+        replace(replay, done_probability=probability), threshold=0.5, frames=frames, longest=8,
     )  # fmt: skip
     count = len(probability) - 1
     assert found["return"] == [0.0] * 6 + [1.0] * (count - 6)

@@ -64,6 +64,18 @@ def test_real_success_decides_and_of_equals_the_earlier(tmp_path: Path) -> None:
     assert best(tmp_path / "unreal") == "000010"
 
 
+def test_imagined_success_is_compared_within_one_world_model(tmp_path: Path) -> None:
+    """That of iteration 5 was exploited, and is replaced after iteration 10."""
+    for iteration in (5, 10, 12):
+        (tmp_path / "checkpoints" / f"{iteration:06d}").mkdir(parents=True)
+    records: dict[int, Any] = {5: record(0.53, 0.98), 10: record(0.50, 0.60)}
+    Selection(5, 12, {"imagined": measure(0)}, tmp_path, [10]).apply(records)
+    assert best(tmp_path) == "000010"
+    records[12] = record(0.20, 0.80)  # less than 98 %, and yet more than this world model said
+    with pytest.raises(TrainingStopped, match=r"50 % .* at iteration 10\. .*000005 is the best"):
+        Selection(5, 12, {"real": measure(0), "imagined": measure(0)}, tmp_path, [10]).apply(records)
+
+
 @pytest.mark.parametrize(("latest", "expected"), [
     (record(0.20, 0.80), True),  # as measured once: imagined 0.55 → 0.80, real 0.53 → 0.20
     (record(0.20, 0.55), True),

@@ -107,7 +107,7 @@ def test_selection_keeps_the_best_checkpoint(improve: Any) -> None:
 
 def test_a_run_is_resumed_as_lerobot_train_resumes(improve: Any, paths: dict[str, Any]) -> None:
     """By its configuration alone; what does not change the outcome may be another."""
-    out = improve(*POINT, *SHORT, "--save_freq=1", "--output_dir={out}")
+    out = improve(*POINT, *SHORT, "--save_freq=1", "--output_dir={out}", "--policy.optimizer_lr=1e-5")
     last = out / "checkpoints" / "000002"
     weights = load_file(last / WEIGHTS)
     last.rename(out / "checkpoints" / ".000002.lost")
@@ -172,6 +172,10 @@ def test_gate_and_selection_in_the_simulator(improve: Any) -> None:
     ([*PUSH, *SIMULATOR, "--real_env.cameras=[wrist]"], "which real_env does not have"),
     ([*PUSH, *SIMULATOR, "--dyna.rounds=2"], "--dyna.rounds=2: there is room for 1"),
     ([*PUSH, "--gate.action=off", "--dyna.rounds=1"], "give an environment to record in (--real_env.type"),
+    ([*PUSH, "--gate.action=off", "--dyna.rounds=1", "--dyna.dataset.roots=[]", "--dyna.learnt.root={out}"],
+     "rl: no LeRobotDataset there"),
+    ([*PUSH, "--env.dataset.split=known", "--gate.action=off"], "--env.dataset.split=known: choose one of"),
+    ([*PUSH, "--env.device=cuda", "--gate.action=off"], "--env.device=cuda: the policy is on cpu"),
     (["--policy.path={pointing}", *IMAGINED, "--gate.action=off"], "has 3 action components, the environ"),
     ([*POINT, "--dyna.rounds=1"], "no world model to refresh"),
     ([*POINT, "--selection.freq=-1"], "--selection.freq=-1: must be at least 0"),
