@@ -175,8 +175,17 @@ def run_comparison(
         envs: those of each policy.
         seed: seed of the first start of each task; each further one adds one.
         save: called after every block.
+
+    Raises:
+        FieldError: LIBERO has skipped starts, since an earlier call ended within a batch.
     """
-    if counts_resets(config):
+    if counts_resets(config) and not comparison.finished:
+        if comparison.starts_per_task % batch_size:
+            raise FieldError(
+                "n_episodes", comparison.n_episodes,
+                f"the {comparison.starts_per_task} starts so far end within a batch of {batch_size}, after "
+                f"which {config.type} skips some", "choose a new `output_dir`",
+            )  # fmt: skip
         for env in (each for own in envs for each in _flat(own)):
             for _ in range(ceil(comparison.starts_per_task / batch_size)):
                 env.reset(options={NEW_ROLLOUT_OPTION: True})

@@ -7,6 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from lerobot_wmrl.common.distributed import mean_and_variance
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.policy_gradient import Batch, PolicyGradient
 from lerobot_wmrl.rl.return_scale import ReturnScale
@@ -67,6 +68,12 @@ class PPO(PolicyGradient):
 
     def __init__(self, policy: Any, config: PPOConfig) -> None:
         super().__init__(policy, config)
+        if not any(parameter.requires_grad for parameter in self.value_parameters):
+            raise FieldError(
+                "peft.full_training_modules", None,
+                "adapters leave the value function as it is, and PPO trains it",
+                "name its module there (`critic` of a cnn policy, `value_head` of OpenVLA), or take grpo",
+            )  # fmt: skip
         self.return_scale = ReturnScale()
 
     def parameter_groups(self) -> dict[str, tuple[list[nn.Parameter], float]]:

@@ -93,6 +93,10 @@ class CnnPolicy(PreTrainedPolicy):
         """Return the critic's parameters, none of which the actor shares."""
         return self.critic.parameters()
 
+    def _get_default_peft_targets(self) -> dict[str, Any]:
+        """Return what is trained beside adapters: the critic. `target_modules` must be given."""
+        return {"modules_to_save": ["critic"]}
+
     def freeze_encoder(self) -> None:
         """Train actor and critic alone from now on, on what `encode` returns."""
         self.encoder.requires_grad_(False)

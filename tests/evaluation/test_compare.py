@@ -142,6 +142,16 @@ def test_policies_meet_the_same_starts_where_resets_choose_them(config, killed, 
         compare(replace(config, n_episodes=13, output_dir=config.output_dir / "more"))
 
 
+def test_no_start_comes_twice_after_a_call_that_ended_within_a_batch(config, monkeypatch):
+    monkeypatch.setattr(
+        running, "make_env_pre_post_processors", lambda *_: [PolicyProcessorPipeline(steps=[])] * 2
+    )
+    config.policies, config.env = config.policies[:2], CountingConfig()
+    assert len(results_of(replace(config, n_episodes=6))["episodes"]) == 6
+    with pytest.raises(ValueError, match=r"n_episodes=12: the 6 starts so far end within a batch of 4"):
+        compare(replace(config, n_episodes=12))
+
+
 @pytest.fixture
 def config(tmp_path: Path) -> CompareConfig:
     """Three policies with success rates of 60, 90 and 60 %; the first and the last are equal."""

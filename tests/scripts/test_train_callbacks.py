@@ -34,6 +34,7 @@ IMAGINED = [
     "--env.device=cpu",
 ]  # fmt: skip
 PUSH = ["--policy.path={pushing}", *IMAGINED]
+ADAPTERS = ["--peft.method_type=LORA", "--peft.target_modules=[actor.0]"]
 SIMULATOR = [
     "--real_env.type=wmrl_maniskill", "--real_env.image_size=32", "--real_env.episode_length=3",
     "--real_env.scenes=[0]", "--real_num_envs=1",
@@ -118,6 +119,16 @@ def test_a_run_is_resumed_as_lerobot_train_resumes(improve: Any, paths: dict[str
     assert [line["step"] for line in read_metrics(out)] == [1, 2]
 
 
+def test_adapters_of_a_cnn_are_trained_beside_its_value_function(improve: Any) -> None:
+    out = improve(*POINT, *SHORT, *ADAPTERS, "--save_freq=1", "--output_dir={out}")
+    first, last = (
+        load_file(out / "checkpoints" / step / "pretrained_model" / "adapter_model.safetensors")
+        for step in ("000001", "000002")
+    )
+    changed = {name for name, value in last.items() if not torch.equal(value, first[name])}
+    assert {"critic", "lora_B"} <= {part for name in changed for part in name.split(".")}
+
+
 def test_wandb_gets_what_the_metrics_file_gets(improve: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """LeRobot's logger, offline; a continued run goes on in the same one."""
     monkeypatch.setenv("WANDB_SILENT", "true")
@@ -182,6 +193,8 @@ def test_gate_and_selection_in_the_simulator(improve: Any) -> None:
     ([*POINT, "--resume=true"], "--resume=true: there is no checkpoint in"),
     ([*POINT, "--algorithm.clipp=0.3"], "there is no flag --algorithm.clipp: did you mean --algorithm.clip?"),
     ([*POINT, "--num_envs=0"], "--num_envs=0: must be at least 1"),
+    ([*POINT, *ADAPTERS, "--peft.full_training_modules=[encoder]"],
+     "--peft.full_training_modules: adapters leave the value function"),
 ])  # fmt: skip
 def test_bad_input_is_named_and_nothing_is_written(
     flags: list[str], message: str, improve: Any, paths: dict[str, Any], capsys: pytest.CaptureFixture[str]
