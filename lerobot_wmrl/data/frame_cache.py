@@ -1,18 +1,20 @@
 """Frames and depth decoded once, tokens encoded once, all in memory-mapped arrays.
 
 Reading random windows from video costs milliseconds an item; from these arrays it is a memory copy.
-The caches stand beside the dataset (`<root>.cache/`), never in it, and are rebuilt when absent. Depth is
-brought to the grid of the tokens: metres, 0 where nothing was measured, one camera's grid after the other.
+The caches stand beside the dataset (`<root>.cache/`), never in it, and are rebuilt when absent. What was
+stopped goes on where it was. Depth is brought to the grid of the tokens: metres, 0 where nothing was
+measured, one camera's grid after the other.
 """
 
 import hashlib
 import json
 import os
 import socket
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 import psutil
@@ -24,7 +26,7 @@ from lerobot.datasets.video_utils import decode_video_frames
 from lerobot.utils.constants import HF_LEROBOT_HOME
 from torch import Tensor
 from torch.nn import functional as F
-from tqdm import tqdm
+from tqdm import trange
 
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.files import NOT_WRITABLE
@@ -37,6 +39,10 @@ ENCODE_BATCH = 128
 
 DECODED = 256
 """Frames of a camera that are decoded at a time: those of a long episode would not fit into the memory."""
+
+
+NOTED_SECONDS: Final = 10
+"""Seconds of work on a cache that are lost at most when a process is killed."""
 
 
 class FrameEncoder(Protocol):
@@ -81,14 +87,14 @@ def cached_frames(dataset: LeRobotDataset, camera_keys: Sequence[str], side: int
     shape = (dataset.num_frames, len(camera_keys), side, side, 3)
     key = digest([dataset.num_episodes, dataset.num_frames, side, *camera_keys, *file_stamps(dataset)])
 
-    def fill(target: np.ndarray) -> None:
-        for episode in tqdm(range(dataset.num_episodes), desc="Decoding frames", unit="episode"):
-            for rows in parts_of(dataset, episode):
-                for camera, name in enumerate(camera_keys):
-                    frames = stretch(decode(dataset, episode, name, rows), side, side)
-                    target[rows, camera] = frames.permute(0, 2, 3, 1).numpy()
+    def write(target: np.ndarray, episode: int) -> None:
+        for rows in parts_of(dataset, episode):
+            for camera, name in enumerate(camera_keys):
+                frames = stretch(decode(dataset, episode, name, rows), side, side)
+                target[rows, camera] = frames.permute(0, 2, 3, 1).numpy()
 
-    return memory_map(cache_dir(dataset) / f"frames-{key}.npy", shape, np.uint8, fill)
+    units = Units(dataset.num_episodes, write, "Decoding frames")
+    return memory_map(cache_dir(dataset) / f"frames-{key}.npy", shape, np.uint8, units)
 
 
 def cached_tokens(dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer: FrameEncoder) -> np.ndarray:
@@ -100,17 +106,16 @@ def cached_tokens(dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer
     device = next(tokenizer.parameters()).device
     starts = first_rows(dataset)
 
-    def fill(target: np.ndarray) -> None:
-        for begin in tqdm(range(0, len(frames), ENCODE_BATCH), desc="Encoding tokens", unit="batch"):
-            part = slice(begin, begin + ENCODE_BATCH)
-            first, episode = np.unique(starts[part], return_inverse=True)
-            start, images = (frames_to_tensor(frames[rows]).to(device) for rows in (first, part))
-            with torch.no_grad():
-                context = tokenizer.context(start)[episode]
-                target[part] = tokenizer.encode(images, context).cpu().numpy()
+    def encode(part: slice) -> np.ndarray:
+        first, episode = np.unique(starts[part], return_inverse=True)
+        start, images = (frames_to_tensor(frames[rows]).to(device) for rows in (first, part))
+        with torch.no_grad():
+            context = tokenizer.context(start)[episode]
+            return tokenizer.encode(images, context).cpu().numpy()
 
     shape = (len(frames), tokenizer.tokens_per_frame)
-    return memory_map(encoded_path("tokens", dataset, camera_keys, tokenizer), shape, np.int32, fill)
+    path = encoded_path("tokens", dataset, camera_keys, tokenizer)
+    return memory_map(path, shape, np.int32, batches(len(frames), encode, "Encoding tokens"))
 
 
 def cached_context(
@@ -124,17 +129,14 @@ def cached_context(
     device = next(tokenizer.parameters()).device
     starts = np.asarray(dataset.meta.episodes["dataset_from_index"])
 
-    def features(rows: np.ndarray) -> np.ndarray:
+    def features(part: slice) -> np.ndarray:
         with torch.no_grad():
-            context = tokenizer.context(frames_to_tensor(frames[rows]).to(device))
+            context = tokenizer.context(frames_to_tensor(frames[starts[part]]).to(device))
         return context.features.cpu().numpy()
 
-    def fill(target: np.ndarray) -> None:
-        for begin in range(0, len(starts), ENCODE_BATCH):
-            target[begin : begin + ENCODE_BATCH] = features(starts[begin : begin + ENCODE_BATCH])
-
-    shape = (len(starts), *features(starts[:1]).shape[1:])
-    return memory_map(encoded_path("context", dataset, camera_keys, tokenizer), shape, np.float32, fill)
+    shape = (len(starts), *features(slice(0, 1)).shape[1:])
+    path = encoded_path("context", dataset, camera_keys, tokenizer)
+    return memory_map(path, shape, np.float32, batches(len(starts), features, "Encoding contexts"))
 
 
 def cached_features(
@@ -153,12 +155,9 @@ def cached_features(
         with torch.no_grad():
             return tokenizer.success_features(first, images).cpu().numpy()
 
-    def fill(target: np.ndarray) -> None:
-        for begin in tqdm(range(0, len(frames), ENCODE_BATCH), desc="Encoding features", unit="batch"):
-            target[begin : begin + ENCODE_BATCH] = features(slice(begin, begin + ENCODE_BATCH))
-
     shape = (len(frames), *features(slice(0, 1)).shape[1:])
-    return memory_map(encoded_path("features", dataset, camera_keys, tokenizer), shape, np.float32, fill)
+    path = encoded_path("features", dataset, camera_keys, tokenizer)
+    return memory_map(path, shape, np.float32, batches(len(frames), features, "Encoding features"))
 
 
 def first_rows(dataset: LeRobotDataset) -> np.ndarray:
@@ -236,30 +235,89 @@ def decode_video(dataset: LeRobotDataset, episode: int, key: str, rows: slice) -
         ) from error
 
 
-def memory_map(
-    path: Path, shape: tuple[int, ...], dtype: type, fill: Callable[[np.ndarray], None]
-) -> np.ndarray:
-    """Return the array at `path`, written by `fill` if missing; the file appears only once it is whole."""
+class Units(NamedTuple):
+    """What a cache is written in, one after another: `total` of them, `write(target, number)`, and what the
+    progress bar says meanwhile."""
+
+    total: int
+    write: Callable[[np.ndarray, int], None]
+    said: str
+
+
+def batches(rows: int, compute: Callable[[slice], np.ndarray], said: str) -> Units:
+    """Return units of `ENCODE_BATCH` rows, each of which is what `compute` returns for it."""
+
+    def write(target: np.ndarray, number: int) -> None:
+        part = slice(number * ENCODE_BATCH, (number + 1) * ENCODE_BATCH)
+        target[part] = compute(part)
+
+    return Units(-(-rows // ENCODE_BATCH), write, said)
+
+
+def memory_map(path: Path, shape: tuple[int, ...], dtype: type, units: Units) -> np.ndarray:
+    """Return the array at `path`, written if it is missing. The file appears only once it is whole.
+
+    A call that was stopped is continued: the name of its file says how many units are in it.
+    """
     if not path.is_file():
         with room_in(path.parent):
             path.parent.mkdir(parents=True, exist_ok=True)
-        host = socket.gethostname()  # others may share the folder, and their processes are not seen here
-        for torn in path.parent.glob(f"*.{host}+*.partial"):
-            if not psutil.pid_exists(int(torn.stem.rpartition("+")[2])):
-                torn.unlink(missing_ok=True)
-        partial = path.with_suffix(f".{host}+{os.getpid()}.partial")
+            partial, begun = begin_or_continue(path, shape, dtype)
+        target = np.lib.format.open_memmap(partial, mode="r+")
+        noted, done = time.monotonic(), begun
         try:
-            with room_in(path.parent):
-                target = np.lib.format.open_memmap(partial, mode="w+", dtype=dtype, shape=shape)
-                with partial.open("r+b") as file:  # a full disk says so now, and not by a bus error later
-                    if hasattr(os, "posix_fallocate"):
-                        os.posix_fallocate(file.fileno(), 0, partial.stat().st_size)
-            fill(target)
+            for number in trange(begun, units.total, desc=units.said, initial=begun, total=units.total):
+                units.write(target, number)
+                done = number + 1
+                if time.monotonic() - noted > NOTED_SECONDS:
+                    partial, noted = note(partial, path, target, done), time.monotonic()
             target.flush()
             partial.replace(path)
-        finally:
-            partial.unlink(missing_ok=True)
+        except BaseException:
+            if done:
+                note(partial, path, target, done)
+            else:
+                partial.unlink(missing_ok=True)
+            raise
     return np.load(path, mmap_mode="r")
+
+
+def begin_or_continue(path: Path, shape: tuple[int, ...], dtype: type) -> tuple[Path, int]:
+    """Return the file that becomes the cache at `path`, and how many units are in it already.
+
+    Files of processes that are gone are taken over, or removed where they belong to another cache.
+    """
+    host = socket.gethostname()  # others may share the folder, and their processes are not seen here
+    for torn in path.parent.glob(f"*.{host}+*.partial"):
+        process = int(torn.stem.rpartition("+")[2])
+        if process != os.getpid() and psutil.pid_exists(process):
+            continue
+        count = torn.name.removeprefix(f"{path.stem}.").partition(".")[0]
+        with suppress(FileNotFoundError):  # another process was faster
+            if count.isdecimal() and int(count):
+                return torn.rename(partial_path(path, int(count))), int(count)
+            torn.unlink()
+    partial = partial_path(path, 0)
+    try:
+        np.lib.format.open_memmap(partial, mode="w+", dtype=dtype, shape=shape)
+        with partial.open("r+b") as file:  # a full disk says so now, and not by a bus error later
+            if hasattr(os, "posix_fallocate"):
+                os.posix_fallocate(file.fileno(), 0, partial.stat().st_size)
+    except OSError:
+        partial.unlink(missing_ok=True)
+        raise
+    return partial, 0
+
+
+def note(partial: Path, path: Path, target: np.memmap, done: int) -> Path:
+    """Write what is in memory to the unfinished file, and let its name say how many units are in it."""
+    target.flush()
+    return partial.rename(partial_path(path, done))
+
+
+def partial_path(path: Path, done: int) -> Path:
+    """Return where this process writes the cache at `path` while so many units are done."""
+    return path.with_name(f"{path.stem}.{done}.{socket.gethostname()}+{os.getpid()}.partial")
 
 
 @contextmanager
@@ -304,14 +362,14 @@ def cached_depth(dataset: LeRobotDataset, camera_keys: Sequence[str], grid: int)
     keys = [depth_key(camera) for camera in camera_keys]
     key = digest([dataset.num_episodes, dataset.num_frames, grid, *keys, *file_stamps(dataset)])
 
-    def fill(target: np.ndarray) -> None:
-        for episode in tqdm(range(dataset.num_episodes), desc="Decoding depth", unit="episode"):
-            for rows in parts_of(dataset, episode):
-                cameras = [token_depth(decode_depth(dataset, episode, name, rows), grid) for name in keys]
-                target[rows] = torch.cat(cameras, 1).numpy()
+    def write(target: np.ndarray, episode: int) -> None:
+        for rows in parts_of(dataset, episode):
+            cameras = [token_depth(decode_depth(dataset, episode, name, rows), grid) for name in keys]
+            target[rows] = torch.cat(cameras, 1).numpy()
 
     shape = (dataset.num_frames, len(keys) * grid**2)
-    return memory_map(cache_dir(dataset) / f"depth-{key}.npy", shape, np.float32, fill)
+    units = Units(dataset.num_episodes, write, "Decoding depth")
+    return memory_map(cache_dir(dataset) / f"depth-{key}.npy", shape, np.float32, units)
 
 
 def decode_depth(dataset: LeRobotDataset, episode: int, key: str, rows: slice) -> Tensor:
