@@ -1,7 +1,8 @@
 """Checkpoints that are either whole or absent, in LeRobot's layout."""
 
+import hashlib
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
 from safetensors import SafetensorError
 from safetensors.torch import load_file
+from torch import Tensor
 
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.lerobot_compat import checkpoint_dir
@@ -78,6 +80,15 @@ def link_checkpoint(checkpoint: Path, name: str) -> None:
     partial.unlink(missing_ok=True)
     partial.symlink_to(checkpoint.name)
     partial.replace(checkpoint.with_name(name))
+
+
+def weights_digest(state: Mapping[str, Tensor]) -> str:
+    """Return a short digest of a model's weights, by name, equal only for equal weights."""
+    found = hashlib.sha256()
+    for name, tensor in sorted(state.items()):
+        found.update(name.encode())
+        found.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    return found.hexdigest()[:16]
 
 
 def read_weights(checkpoint: Path, folder: str = PRETRAINED_MODEL_DIR) -> dict[str, Any]:

@@ -28,6 +28,7 @@ from torch import Tensor
 from torch.nn import functional as F
 from tqdm import trange
 
+from lerobot_wmrl.common.checkpoints import weights_digest
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.files import NOT_WRITABLE
 from lerobot_wmrl.common.images import stretch
@@ -170,9 +171,7 @@ def encoded_path(
     name: str, dataset: LeRobotDataset, camera_keys: Sequence[str], tokenizer: FrameEncoder
 ) -> Path:
     """Return the path of the cache `name`, which is valid for these weights, cameras and files alone."""
-    state = tokenizer.state_dict().values()
-    weights = hashlib.sha256(b"".join(tensor.detach().cpu().numpy().tobytes() for tensor in state))
-    key = digest([weights.hexdigest(), *camera_keys, *file_stamps(dataset)])
+    key = digest([weights_digest(tokenizer.state_dict()), *camera_keys, *file_stamps(dataset)])
     return cache_dir(dataset) / f"{name}-{key}.npy"
 
 
@@ -257,7 +256,8 @@ def batches(rows: int, compute: Callable[[slice], np.ndarray], said: str) -> Uni
 def memory_map(path: Path, shape: tuple[int, ...], dtype: type, units: Units) -> np.ndarray:
     """Return the array at `path`, written if it is missing. The file appears only once it is whole.
 
-    A call that was stopped is continued: the name of its file says how many units are in it.
+    A call that was interrupted or killed is continued: the name of its file says how many units are in it. One
+    that failed leaves nothing.
     """
     if not path.is_file():
         with room_in(path.parent):
@@ -273,11 +273,11 @@ def memory_map(path: Path, shape: tuple[int, ...], dtype: type, units: Units) ->
                     partial, noted = note(partial, path, target, done), time.monotonic()
             target.flush()
             partial.replace(path)
-        except BaseException:
-            if done:
-                note(partial, path, target, done)
-            else:
-                partial.unlink(missing_ok=True)
+        except KeyboardInterrupt:
+            note(partial, path, target, done)
+            raise
+        except Exception:  # of a broken file, say, in whose place there will be another one
+            partial.unlink(missing_ok=True)
             raise
     return np.load(path, mmap_mode="r")
 

@@ -10,7 +10,7 @@ from typing import Any, Final
 from lerobot.configs.rewards import RewardModelConfig
 from lerobot.optim.optimizers import AdamWConfig
 
-from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
+from lerobot_wmrl.common.errors import require_at_least, require_choice, require_positive
 from lerobot_wmrl.common.images import camera_key
 from lerobot_wmrl.rewards.general import check_general_reward
 
@@ -64,8 +64,7 @@ class LearnedRewardConfig(RewardModelConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_at_least(self, 1, "hidden")
-        if self.learning_rate <= 0:
-            raise FieldError("learning_rate", self.learning_rate, "must be above 0")
+        require_positive(self, "learning_rate")
 
     def get_optimizer_preset(self) -> AdamWConfig:
         return AdamWConfig(lr=self.learning_rate, weight_decay=1e-4, grad_clip_norm=1.0)

@@ -1,6 +1,5 @@
 """The rewards as LeRobot reward models: trained by lerobot-train, asked by the environment."""
 
-import hashlib
 from typing import Any
 
 import torch
@@ -8,6 +7,7 @@ from lerobot.rewards.pretrained import PreTrainedRewardModel
 from lerobot.utils.constants import REWARD
 from torch import Tensor, nn
 
+from lerobot_wmrl.common.checkpoints import weights_digest
 from lerobot_wmrl.common.errors import FieldError, require_at_least
 from lerobot_wmrl.data.checks import check_cameras, frame_size
 from lerobot_wmrl.data.clips import take_steps, unpadded_rows
@@ -114,7 +114,7 @@ class EmbeddingRewardModel(HubCard, PreTrainedRewardModel):
         self.config: EmbeddingConfig = config
         self._world_model: list[ActionWorldModelRewardModel] = []  # in a list it is no submodule
         if not config.world_model:
-            config.world_model = weights_digest(self.world_model)
+            config.world_model = weights_digest(self.world_model.state_dict())
             config.hidden_size = self.world_model.config.dynamics.width
         self.head = nn.Sequential(
             nn.LayerNorm(config.hidden_size), nn.Linear(config.hidden_size, config.hidden), nn.SiLU(),
@@ -137,7 +137,7 @@ class EmbeddingRewardModel(HubCard, PreTrainedRewardModel):
 
     def check_world_model(self, model: ActionWorldModelRewardModel) -> None:
         """Raise FieldError unless the head was trained on the hidden states of this very model."""
-        if weights_digest(model) != self.config.world_model:
+        if weights_digest(model.state_dict()) != self.config.world_model:
             raise FieldError(
                 "reward.pretrained_path", self.config.pretrained_path,
                 "this embedding reward was trained on the hidden states of another world model",
@@ -178,12 +178,3 @@ def regression_loss(predicted: Tensor, reward: Tensor, known: Tensor) -> tuple[T
     """Return the mean squared error where `known`, and its root as a metric. All of one shape."""
     error = ((predicted - reward).square() * known).sum() / known.sum().clamp_min(1)
     return error, {"reward_error": error.sqrt().item()}
-
-
-def weights_digest(model: nn.Module) -> str:
-    """Return a short digest of the model's weights, equal only for equal weights."""
-    found = hashlib.sha256()
-    for name, tensor in sorted(model.state_dict().items()):
-        found.update(name.encode())
-        found.update(tensor.detach().cpu().contiguous().numpy().tobytes())
-    return found.hexdigest()[:16]

@@ -8,7 +8,7 @@ from lerobot.optim.optimizers import AdamWConfig
 from lerobot.optim.schedulers import LRSchedulerConfig
 from lerobot.utils.constants import OBS_STATE
 
-from lerobot_wmrl.common.errors import FieldError, require_at_least, require_share
+from lerobot_wmrl.common.errors import FieldError, require_at_least, require_share, within
 from lerobot_wmrl.data.embodiment import Embodiment
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 
@@ -35,8 +35,8 @@ class DynamicsConfig(ChoiceRegistry):
     predicts_success = False  # not a field: only anchored dynamics predict the success classifier's features
 
     def __post_init__(self) -> None:
-        for name in ("layers", "width", "heads", "patch", "code_width"):
-            self._require_at_least(name, 1)
+        with within("dynamics"):
+            require_at_least(self, 1, "layers", "width", "heads", "patch", "code_width")
         if self.width % (2 * self.heads):
             raise FieldError("dynamics.width", self.width, "must be a multiple of 2 x `dynamics.heads`")
 
@@ -49,10 +49,6 @@ class DynamicsConfig(ChoiceRegistry):
     def type(self) -> str:
         """The name by which `dynamics.type` chooses this kind."""
         return self.get_choice_name(type(self))
-
-    def _require_at_least(self, name: str, least: float) -> None:
-        if getattr(self, name) < least:
-            raise FieldError(f"dynamics.{name}", getattr(self, name), f"must be at least {least}")
 
 
 @DynamicsConfig.register_subclass("anchored")

@@ -8,10 +8,11 @@ import pytest
 import torch
 from lerobot.scripts import lerobot_train
 
+from lerobot_wmrl.common.checkpoints import weights_digest
 from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.rewards.configuration_rewards import EmbeddingConfig, ProxyConfig
-from lerobot_wmrl.rewards.modeling_rewards import EmbeddingRewardModel, ProxyRewardModel, weights_digest
+from lerobot_wmrl.rewards.modeling_rewards import EmbeddingRewardModel, ProxyRewardModel
 from lerobot_wmrl.world_models.checkpoint import load_model
 
 IMAGE = "observation.images.third_view"
@@ -117,7 +118,7 @@ def test_the_world_model_is_no_part_of_the_heads_checkpoint(embedding, trained_m
     reward = load_model(embedding, "embedding")
     assert all(name.startswith("head.") for name in reward.state_dict())
     assert reward.config.world_model == weights_digest(
-        load_model(trained_models["action_world_model"], "action_world_model")
+        load_model(trained_models["action_world_model"], "action_world_model").state_dict()
     )
 
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Final
 
-from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.errors import require_at_least, require_choice, require_share, within
 from lerobot_wmrl.world_models.configuration_world_model import DynamicsConfig
 
 CONDITIONINGS: Final = ("adaln", "cross_attention", "additive")
@@ -40,13 +40,8 @@ class AutoregressiveConfig(DynamicsConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.conditioning not in CONDITIONINGS:
-            raise FieldError(
-                "dynamics.conditioning", self.conditioning, f"choose one of {', '.join(CONDITIONINGS)}"
-            )
-        self._require_at_least("window", 1)
-        self._require_at_least("maskgit_steps", 0)
-        self._require_at_least("keypoint_weight", 0)
-        for name in ("self_forcing", "self_rollout"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise FieldError(f"dynamics.{name}", getattr(self, name), "must be between 0 and 1")
+        with within("dynamics"):
+            require_choice(self, "conditioning", CONDITIONINGS)
+            require_at_least(self, 1, "window")
+            require_at_least(self, 0, "maskgit_steps", "keypoint_weight")
+            require_share(self, "self_forcing", "self_rollout")
