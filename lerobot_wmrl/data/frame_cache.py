@@ -256,8 +256,8 @@ def batches(rows: int, compute: Callable[[slice], np.ndarray], said: str) -> Uni
 def memory_map(path: Path, shape: tuple[int, ...], dtype: type, units: Units) -> np.ndarray:
     """Return the array at `path`, written if it is missing. The file appears only once it is whole.
 
-    A call that was interrupted or killed is continued: the name of its file says how many units are in it. One
-    that failed leaves nothing.
+    A call that was interrupted or killed is continued: the name of its file says how many units are in it.
+    One that failed leaves nothing.
     """
     if not path.is_file():
         with room_in(path.parent):
