@@ -303,8 +303,13 @@ class RecordConfig(RunConfig):
 
     def _policy_content(self) -> dict[str, Any]:
         """Return what decides a policy's actions: its checkpoint, or its own settings if it has none."""
-        if self.policy is None or self.policy.pretrained_path:
-            return {"policy": None if self.policy is None else str(self.policy.pretrained_path)}
+        if self.policy is None:
+            return {"policy": None}
+        if self.policy.pretrained_path:
+            from lerobot_wmrl.common.checkpoints import resolved_name
+
+            changed = parser.get_cli_overrides("policy") or []
+            return {"policy": resolved_name(str(self.policy.pretrained_path)), "policy_settings": changed}
         own = {each.name for each in fields(self.policy)} - {each.name for each in fields(PreTrainedConfig)}
         settings = draccus.encode(self.policy)
         return {"policy": self.policy.type, **{f"policy.{name}": settings[name] for name in sorted(own)}}

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -25,6 +25,9 @@ from lerobot_wmrl.maniskill.tasks import task_of
 from lerobot_wmrl.rl.policy_adapters import make_pipeline
 
 Row = tuple[Frame, np.ndarray, Outcome]
+
+VISIT_SEEDS: Final = 10_000_000
+"""Random seeds of one visit of all starts, more than a start's own seed can be."""
 
 
 class ImaginedPartRecorder:
@@ -60,7 +63,7 @@ class ImaginedPartRecorder:
                 for before, action, outcome in rows:
                     add_step(dataset, start, before, action, outcome)
                 dataset.save_episode()
-                report(EpisodeResult(part.index, plan.kind, not rows[-1][-1].truncated, clipped))
+                report(EpisodeResult(plan.kind, not rows[-1][-1].truncated, clipped))
 
     @torch.no_grad()
     def _imagine(self, plans: Sequence[EpisodePlan]) -> list[tuple[str, list[Row], list[float]]]:
@@ -68,7 +71,7 @@ class ImaginedPartRecorder:
         count = self.env.num_envs
         largest = self.config.exploration
         noises = [ExplorationNoise(largest, plan.seed, TRANSLATION, plan.visit) for plan in plans]
-        torch.manual_seed(plans[0].seed)
+        torch.manual_seed(plans[0].seed + VISIT_SEEDS * plans[0].visit)
         for part in (self.policy, *self.processors):
             part.reset()
         spare = [0] * (count - len(plans))

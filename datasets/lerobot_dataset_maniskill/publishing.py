@@ -11,8 +11,7 @@ from huggingface_hub.errors import RevisionNotFoundError
 from lerobot.datasets.dataset_metadata import CODEBASE_VERSION
 
 from lerobot_dataset_maniskill.card import CARD_FILE, MEDIA, name_card
-from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.hub import publishing
+from lerobot_wmrl.common.hub import create_repo, publishing
 
 PUBLISHED: Final = [str(CARD_FILE), *(f"{folder}/*" for folder in ("data", "meta", "videos", MEDIA))]
 """The files of a dataset: they are uploaded, and removed from the hub where the recording has them not."""
@@ -34,28 +33,13 @@ def publish(api: HfApi, root: Path, repo_id: str, private: bool) -> None:
     """
     name_card(root, repo_id)
     with publishing(repo_id, ONLY_PUBLISHES.format(root=root)):
-        create(api, repo_id, private)
+        create_repo(api, repo_id, private, REPO_TYPE_DATASET)
         api.upload_folder(
             repo_id=repo_id, repo_type=REPO_TYPE_DATASET, folder_path=root,
             allow_patterns=PUBLISHED, delete_patterns=PUBLISHED,
         )  # fmt: skip
         tag_version(api, repo_id)
     print(f"published: {api.endpoint}/datasets/{repo_id}")
-
-
-def create(api: HfApi, repo_id: str, private: bool) -> None:
-    """Create the repository unless it exists. Raises FieldError if it is public and must be private.
-
-    Without `private`, a new repository gets the visibility that its organisation gives new ones.
-    """
-    api.create_repo(repo_id, repo_type=REPO_TYPE_DATASET, private=private or None, exist_ok=True)
-    if private and not api.dataset_info(repo_id).private:
-        raise FieldError(
-            "private",
-            "true",
-            f"{repo_id} is public on the hub already",
-            "make it private there, or choose another `repo_id`",
-        )
 
 
 def tag_version(api: HfApi, repo_id: str) -> None:

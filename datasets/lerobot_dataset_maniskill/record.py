@@ -80,7 +80,7 @@ def run(config: RecordConfig) -> None:
     from lerobot_dataset_maniskill.publishing import ONLY_PUBLISHES, publish
     from lerobot_dataset_maniskill.recorder import record
     from lerobot_dataset_maniskill.worker import silence_libraries
-    from lerobot_wmrl.common.hub import publishing
+    from lerobot_wmrl.common.hub import create_repo, publishing
     from lerobot_wmrl.data.dataset import open_dataset
 
     silence_libraries()
@@ -93,6 +93,7 @@ def run(config: RecordConfig) -> None:
         record(config)
     if config.push_to_hub and config.elsewhere:
         with publishing(config.dataset_id, ONLY_PUBLISHES.format(root=config.root)):
+            create_repo(HfApi(), config.dataset_id, config.private, "dataset")
             open_dataset(config.root, config.dataset_id).push_to_hub(private=config.private)
     elif config.push_to_hub:
         publish(HfApi(), config.root, config.dataset_id, config.private)

@@ -117,14 +117,12 @@ class EpisodeResult:
     """What the command says of an episode.
 
     Args:
-        part: index of the part that it belongs to.
         kind: what it was recorded as.
         success: whether it succeeds.
         clipped: of each step, the share of the components of a policy's action that were out of range;
             nothing where a planner acts.
     """
 
-    part: int
     kind: str
     success: bool
     clipped: Sequence[float] = ()
@@ -165,7 +163,7 @@ class PartRecorder:
         with whole_part(self.config, self.folder, part, env.cameras, env.image_size) as dataset:
             for plan in part.episodes:
                 success = self._record_episode(dataset, plan)
-                report(EpisodeResult(part.index, plan.kind, success, self.driver.clipped))
+                report(EpisodeResult(plan.kind, success, self.driver.clipped))
 
     def _steps(self, plan: EpisodePlan) -> int:
         """Return the largest number of rows of an episode."""

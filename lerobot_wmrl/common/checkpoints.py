@@ -5,7 +5,7 @@ import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from huggingface_hub import snapshot_download
 from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
@@ -21,6 +21,9 @@ ADAPTERS_FILE = "adapter_model.safetensors"
 """PEFT's: where a policy has adapters, its checkpoints hold them alone."""
 
 LAST_CHECKPOINT = f"{CHECKPOINTS_DIR}/{LAST_CHECKPOINT_LINK}"
+
+UNPUBLISHED: Final = ("--push_to_hub=false", "--repo_id=null")
+"""Flags of a model that is trained further: the one before would be overwritten where it was published."""
 
 BEST_CHECKPOINT_LINK = "best"
 """Beside LeRobot's `last`: the checkpoint of a policy that succeeded most often on the selection seeds."""
@@ -44,6 +47,17 @@ def resolve_checkpoint(path: str | Path) -> Path:
         if (candidate / "config.json").is_file():
             return candidate
     return root
+
+
+def resolved_name(path: str) -> str:
+    """Return the checkpoint behind a training's output folder or its link `last`, which a longer training
+    moves on. A path that is no folder is returned as it is: it may be a hub id."""
+    folder = resolve_checkpoint(path)
+    if not folder.is_dir():
+        return path
+    folder = folder.resolve()
+    folder = folder.parent if folder.name == PRETRAINED_MODEL_DIR else folder
+    return str(folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder)
 
 
 def local_checkpoint(path: str | Path) -> Path:

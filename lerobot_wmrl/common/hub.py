@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from typing import Final
 
 import httpx
-from huggingface_hub import get_token
+from huggingface_hub import HfApi, get_token
 from huggingface_hub.errors import HfHubHTTPError, HFValidationError
 
 from lerobot_wmrl.common.errors import FieldError
@@ -34,6 +34,28 @@ def publishing(name: str, remedy: str) -> Iterator[None]:
         yield
     except (httpx.HTTPError, OSError, RuntimeError, HFValidationError) as error:
         raise FieldError(PUSH, "true", f"{name} is not published: {reason(error)}", remedy) from error
+
+
+def create_repo(api: HfApi, name: str, private: bool | None, kind: str | None = None) -> str:
+    """Create a repository unless it exists, and return its full name.
+
+    Args:
+        api: the client.
+        name: its name on the hub.
+        private: whether it must be private. Otherwise a new one gets the visibility that its organisation
+            gives new ones.
+        kind: of repository, `dataset` or a model's by default.
+
+    Raises:
+        FieldError: it is public, and must be private.
+    """
+    name = api.create_repo(name, repo_type=kind, private=private or None, exist_ok=True).repo_id
+    if private and not api.repo_info(name, repo_type=kind).private:
+        raise FieldError(
+            "private", "true", f"{name} is public on the hub already",
+            "make it private there, or choose another `repo_id`",
+        )  # fmt: skip
+    return name
 
 
 def reason(error: Exception) -> str:

@@ -60,9 +60,14 @@ class DatasetSource:
         Raises:
             FieldError: there is none, it is not whole, or it cannot be downloaded.
         """
-        if self.repo_id and not (self.root and is_whole(Path(self.root))):
+        if not self.repo_id or (self.root and is_whole(Path(self.root))):
+            return open_dataset(self.root, self.repo_id)
+        try:
             return download_dataset(self.repo_id, self.revision, self.root or None)
-        return open_dataset(self.root, self.repo_id)
+        except FieldError:
+            if not self.root or not (Path(self.root) / "meta" / "info.json").is_file():
+                raise
+        return open_dataset(self.root, self.repo_id)  # which says what is missing there
 
 
 @dataclass
@@ -160,7 +165,12 @@ def fingerprint(root: Path) -> str:
 
 def is_whole(root: Path) -> bool:
     """Return whether a dataset's folder has all its files, which a download that was stopped has not."""
-    return (root / "meta" / "info.json").is_file() and not missing_files(root)
+    if not (root / "meta" / "info.json").is_file() or not any((root / EPISODES_DIR).glob("*/*.parquet")):
+        return False
+    try:
+        return not missing_files(root)
+    except (OSError, ValueError):  # a table that is torn, or one of several
+        return False
 
 
 def missing_files(root: Path) -> list[Path]:

@@ -21,6 +21,7 @@ from lerobot_wmrl.common.policies import check_fit, seen_shape
 from lerobot_wmrl.envs.configuration_hub import HubEnv
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.tensor_env import TensorEnv
+from lerobot_wmrl.maniskill.backend import render_backend
 
 FRAME_LIMIT: Final = "_max_episode_steps"
 """Attribute of an environment that ends LeRobot's rollouts."""
@@ -84,13 +85,15 @@ def shapes_of(observation: Observation) -> dict[str, tuple[int, ...]]:
 def check_real_env(policy: PreTrainedConfig, config: EnvConfig, starts: int = 0) -> None:
     """Raise FieldError unless a policy can act in `real_env`, of which one is made to look at it.
 
-    ManiSkill says what it shows without its simulator. The pictures of other environments may have any size:
-    LeRobot leaves it to policies to make them fit. LIBERO must have at least `starts` starts for a task.
+    ManiSkill says what it shows without its simulator, which must be there and able to render. The pictures
+    of other environments may have any size: LeRobot leaves it to policies to make them fit. LIBERO must have
+    at least `starts` starts for a task.
     """
     if isinstance(config, WmrlManiSkillEnv):
         with within("real_env"):
             config.selected_scenes()
             config.runs_batched("cuda")
+        render_backend()
         check_fit(policy, config.observation_shapes(), config.features[ACTION].shape[0], "real_env")
         return
     with within("real_env"):

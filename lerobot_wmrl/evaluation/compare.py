@@ -4,7 +4,6 @@ import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from math import ceil
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -14,10 +13,10 @@ from lerobot.envs import close_envs, make_env, make_env_pre_post_processors
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION, env_to_policy_features
 from lerobot.scripts.lerobot_eval import eval_policy
-from lerobot.utils.constants import ACTION, PRETRAINED_MODEL_DIR
+from lerobot.utils.constants import ACTION
 from lerobot.utils.random_utils import set_seed
 
-from lerobot_wmrl.common.checkpoints import resolve_checkpoint
+from lerobot_wmrl.common.checkpoints import resolved_name
 from lerobot_wmrl.common.errors import FieldError, first_line
 from lerobot_wmrl.common.policies import (
     check_units,
@@ -42,17 +41,6 @@ class LoadedPolicy(NamedTuple):
     config: PreTrainedConfig
     policy: Any
     processors: tuple[Any, Any]
-
-
-def resolved_name(path: str) -> str:
-    """Return the checkpoint behind a training's output folder or its link `last`, which a longer training
-    moves on. A path that is no folder is returned as it is: it may be a hub id."""
-    folder = resolve_checkpoint(path)
-    if not folder.is_dir():
-        return path
-    folder = folder.resolve()
-    folder = folder.parent if folder.name == PRETRAINED_MODEL_DIR else folder
-    return str(folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder)
 
 
 def read_policies(paths: Sequence[str], env: EnvConfig) -> dict[str, PreTrainedConfig]:

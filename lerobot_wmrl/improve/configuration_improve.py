@@ -10,7 +10,7 @@ from lerobot.envs.configs import EnvConfig
 
 from lerobot_wmrl.common.command_line import RunConfig
 from lerobot_wmrl.common.constants import EVALUATION_SEED
-from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
+from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice, require_share
 from lerobot_wmrl.common.policies import (
     read_policy_config,
     require_chunks,
@@ -115,10 +115,19 @@ class ImproveConfig(RunConfig):
         require_choice(self, "size", SIZES)
         require_at_least(self, 0, "rollouts", "selection_episodes")
         require_at_least(self, 1, "eval_episodes")
+        require_share(self, "exploration")
+        if self.iterations is not None:
+            require_at_least(self, 1, "iterations")
         if self.rollouts and self.real_env is None:
             raise FieldError(
                 "rollouts", self.rollouts, "are recorded in a real environment", "give `real_env.type`"
             )
+        if self.rollouts and isinstance(self.real_env, WmrlManiSkillEnv) and self.real_env.split == "ood":
+            raise FieldError(
+                "real_env.split", "ood",
+                "results are reported on unseen scenes: nothing may be learnt in them",
+                "choose ind, or leave `rollouts` out",
+            )  # fmt: skip
         if self.max_frames is not None:
             self._check_max_frames()
         last = EVALUATION_SEED - (self.rollouts + ROLLOUT_SEED_OFFSET if self.rollouts else 1)

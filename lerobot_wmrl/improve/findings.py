@@ -6,14 +6,17 @@ from pathlib import Path
 
 import numpy as np
 from lerobot.configs import PreTrainedConfig
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import ACTION, DONE, OBS_IMAGE, OBS_STATE
 
-from lerobot_wmrl.common.constants import START_TASK
+from lerobot_wmrl.common.constants import START_COLUMNS, START_TASK
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.images import camera_key
 from lerobot_wmrl.common.policies import check_fit
-from lerobot_wmrl.data.checks import camera_names, frame_size, require_shown
+from lerobot_wmrl.data.checks import camera_names, frame_size, require_shown, shows_colours
 from lerobot_wmrl.data.embodiment import component_names
 from lerobot_wmrl.data.episodes import EpisodeTable, success_column
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 
 LONGEST_IMAGINATION = 98
 """Frames of an imagined episode at most. Where recorded episodes are longer, imagination also begins in their
@@ -36,7 +39,6 @@ class Findings:
         cameras: names of the cameras that the policy looks at.
         frame_side: the shorter side of their frames in pixels.
         pixels: pixels of all these cameras' frames.
-        episodes: how many there are.
         held_out: how many of them are held out from training.
         fewest: how many there are of the task that has the fewest.
         longest: frames of the longest episode.
@@ -54,7 +56,6 @@ class Findings:
     cameras: list[str]
     frame_side: int
     pixels: int
-    episodes: int
     held_out: int
     fewest: int
     longest: int
@@ -68,6 +69,30 @@ class Findings:
 
     def __str__(self) -> str:
         return "\n".join([*(f"  {line}" for line in self.lines), *(f"  ! {line}" for line in self.missing)])
+
+
+def require_mergeable(dataset: LeRobotDataset, env: WmrlManiSkillEnv) -> None:
+    """Raise FieldError unless rollouts in ManiSkill can be merged with the dataset: have its columns."""
+    features, shown = dataset.features, [camera_key(name) for name in env.cameras]
+    colours = [name for name, feature in features.items() if shows_colours(feature)]
+    if lacking := [name for name in (*START_COLUMNS, "next.truncated") if name not in features]:
+        raise FieldError(
+            "dataset.root", dataset.root,
+            f"lacks {', '.join(lacking)}, which rollouts in ManiSkill have: they could not be merged",
+            "record it with lerobot-wmrl-record, or leave `rollouts` out",
+        )  # fmt: skip
+    if {*colours} != {*shown}:
+        raise FieldError(
+            "real_env.cameras", list(env.cameras),
+            f"rollouts would have these, the dataset has {', '.join(camera_names(colours))}: they could not "
+            "be merged", f"set `real_env.cameras` to [{','.join(camera_names(colours))}]",
+        )  # fmt: skip
+    if depth := dataset.meta.depth_keys:
+        raise FieldError(
+            "dataset.root", dataset.root, f"has {', '.join(depth)}, which the rollouts lack",
+            "remove these columns: lerobot-edit-dataset --operation.type=remove_feature "
+            f"--operation.feature_names=[{','.join(depth)}]",
+        )  # fmt: skip
 
 
 def look(
@@ -120,7 +145,6 @@ def look(
         ],
         cameras=camera_names(keys),
         frame_side=min(map(min, sizes.values())), pixels=sum(h * w for h, w in sizes.values()),
-        episodes=len(success),
         held_out=held_out, fewest=int(tasks.min()), longest=int(table.length.max()),
         usual=usual_length(table),
         success_frames=int(table.length[success].sum()), failures=int((~success).sum()),

@@ -10,7 +10,7 @@ import torch
 from lerobot.envs.utils import env_to_policy_features
 from lerobot.utils.constants import ACTION, DEFAULT_FEATURES, DONE, REWARD
 
-from lerobot_wmrl.common.checkpoints import best_checkpoint, last_checkpoint
+from lerobot_wmrl.common.checkpoints import best_checkpoint, last_checkpoint, resolved_name
 from lerobot_wmrl.common.constants import START_KIND, START_SEED, START_TASK
 from lerobot_wmrl.common.policies import check_units, copy_checkpoint, load_processors
 from lerobot_wmrl.common.presets import Flags
@@ -24,8 +24,9 @@ from lerobot_wmrl.envs.lerobot_env import check_real_env
 from lerobot_wmrl.envs.start_frames import chosen_episodes
 from lerobot_wmrl.evaluation.comparison import RESULTS, chosen_policy, most_successful
 from lerobot_wmrl.improve.configuration_improve import ImproveConfig
-from lerobot_wmrl.improve.findings import LONGEST_IMAGINATION, Findings, look, usual_length
+from lerobot_wmrl.improve.findings import LONGEST_IMAGINATION, Findings, look, require_mergeable, usual_length
 from lerobot_wmrl.improve.sizes import Sizes
+from lerobot_wmrl.maniskill.recordings import require_unreported
 from lerobot_wmrl.rewards.general import default_discount
 
 SFT: Final = "SFT policy"
@@ -79,6 +80,10 @@ class Improvement:
         assert config.policy is not None
         table = read_episodes(config.dataset.open())
         found = look(table, config.policy, config.dataset.episodes, config.rollouts)
+        learnt = table.among(config.dataset.episodes) & ~table.validation
+        require_unreported(table, np.flatnonzero(learnt), "choose others with `dataset.episodes`")
+        if config.rollouts and isinstance(config.real_env, WmrlManiSkillEnv):
+            require_mergeable(table.dataset, config.real_env)
         robot = read_embodiment(table.dataset.meta, Embodiment())
         check_units(
             config.policy, load_processors(config.policy)[1], robot.action_names,
@@ -103,9 +108,14 @@ class Improvement:
 
     @property
     def policy(self) -> str:
-        """Path or name of the policy that is improved: with settings of the command line, that of a copy."""
+        """Path or name of the policy that is improved: with settings of the command line, that of a copy.
+
+        It is a checkpoint's, and not the link `last`, which a longer training moves on.
+        """
         assert self.config.policy is not None
-        return str(self.out / "policy" if self.config.policy_flags else self.config.policy.pretrained_path)
+        if self.config.policy_flags:
+            return str(self.out / "policy")
+        return resolved_name(str(self.config.policy.pretrained_path))
 
     def copy_policy(self) -> None:
         """Make the copy of the policy that every stage reads, if the command line changes its settings."""

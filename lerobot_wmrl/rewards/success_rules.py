@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from draccus import ChoiceRegistry
 
-from lerobot_wmrl.common.errors import FieldError, first_line, require_at_least
+from lerobot_wmrl.common.errors import FieldError, first_line, renamed, require_at_least
 
 if TYPE_CHECKING:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -221,7 +221,9 @@ def rewards_of(rule: RewardModelRule, dataset: "LeRobotDataset") -> np.ndarray:
         dataset.repo_id, root=dataset.root, delta_timestamps=resolve_delta_timestamps(config, dataset.meta),
         video_backend=VIDEO_BACKEND,
     )  # fmt: skip
-    model, prepare = make_reward_model(config).eval(), load_preprocessor(config)
+    with renamed("reward.pretrained_path", "path"):
+        prepare = load_preprocessor(config)
+    model = make_reward_model(config).eval()
     batches = torch.utils.data.DataLoader(shown, BATCH)
     with torch.no_grad():
         found = [

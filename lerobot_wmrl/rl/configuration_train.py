@@ -141,6 +141,7 @@ def load_config(cfg: TrainConfig) -> PreTrainedConfig:
     A run that is resumed by its configuration has the policy's settings from there. Whether and where the
     policy is published never comes from the checkpoint, as it would overwrite the SFT policy on the hub.
     """
+    from lerobot_wmrl.common.checkpoints import UNPUBLISHED
     from lerobot_wmrl.common.policies import read_policy_config
 
     typed, stored = parser.get_path_arg("policy"), cfg.policy
@@ -148,10 +149,10 @@ def load_config(cfg: TrainConfig) -> PreTrainedConfig:
     if not path:
         raise ValueError("--policy.path: give the checkpoint of the policy to train")
     overrides = parser.get_cli_overrides("policy") or []
-    cfg.policy = read_policy_config(str(path), ["--push_to_hub=false", "--repo_id=null", *overrides])
+    cfg.policy = read_policy_config(str(path), [*UNPUBLISHED, *overrides])
     if stored is not None:
         settings = [each.name for each in fields(stored) if each.name not in READ]
-        for name in PUBLISHING if typed else settings:
+        for name in settings if cfg.resume and not typed else PUBLISHING:
             setattr(cfg.policy, name, getattr(stored, name))
     if cfg.policy.push_to_hub and not cfg.policy.repo_id:
         raise FieldError("policy.push_to_hub", True, "give its name on the hub, --policy.repo_id=user/name")

@@ -95,7 +95,7 @@ def publish(cfg: TrainConfig, lines: list[str]) -> None:
         return
     from huggingface_hub import HfApi
 
-    from lerobot_wmrl.common.hub import publishing
+    from lerobot_wmrl.common.hub import create_repo, publishing
     from lerobot_wmrl.world_models.hub_card import card_metadata
 
     api = HfApi()
@@ -103,7 +103,7 @@ def publish(cfg: TrainConfig, lines: list[str]) -> None:
     description, start = "\n".join(f"- {line}" for line in described), str(config.pretrained_path)
     kept = f"the policy is whole in {cfg.output_dir}, the same command again only publishes it"
     with within("policy"), publishing(config.repo_id, kept), TemporaryDirectory() as temporary:
-        name = api.create_repo(config.repo_id, private=config.private, exist_ok=True).repo_id
+        name = create_repo(api, config.repo_id, config.private)
         card = CARD.format(
             metadata=card_metadata(config, model_name=name).to_yaml(), name=name, type=config.type,
             description=description,

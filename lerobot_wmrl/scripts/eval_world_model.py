@@ -25,7 +25,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.constants import EVALUATION_SEED
-from lerobot_wmrl.common.errors import FieldError, require_at_least
+from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least
 from lerobot_wmrl.common.output_folders import claim_output_dir
 from lerobot_wmrl.common.presets import expand_preset
 from lerobot_wmrl.data.dataset import ChosenEpisodes
@@ -259,7 +259,8 @@ def policies_imagination(cfg: EvalWorldModelConfig, table: "EpisodeTable") -> "W
     except FieldError as error:
         field = "model.path" if error.field == "world_model_path" else error.field
         raise FieldError(field, error.value, error.problem, error.remedy) from error
-    found = len(chosen_episodes(table, starts))
+    with renamed("dataset.split", "split"):
+        found = len(chosen_episodes(table, starts))
     if found < cfg.policy_episodes:
         raise FieldError(
             "policy_episodes", cfg.policy_episodes,
@@ -274,15 +275,11 @@ def check_policies(cfg: EvalWorldModelConfig, imagination: "WorldModelEnv") -> N
 
     Both are measured after the replay of all episodes, which takes long.
     """
-    from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
     from lerobot_wmrl.envs.lerobot_env import check_real_env
     from lerobot_wmrl.evaluation.agreement import policy_checkpoints
     from lerobot_wmrl.evaluation.compare import about_policy, read_policies
-    from lerobot_wmrl.maniskill.backend import require_simulator
 
     assert cfg.real_env is not None
-    if isinstance(cfg.real_env, WmrlManiSkillEnv):
-        require_simulator()
     paths = [str(path) for path in policy_checkpoints(cfg.policies)]
     for name, config in read_policies(paths, imagination).items():
         with about_policy(name):

@@ -51,12 +51,15 @@ def improve(cfg: ImproveConfig) -> None:
 
 def settings(cfg: ImproveConfig, stages: "list[Stage]") -> dict[str, object]:
     """Return what decides the result, as JSON."""
+    from lerobot_wmrl.common.checkpoints import resolved_name
+
     assert cfg.policy is not None
     given = {name: value for name, value in draccus.encode(cfg).items() if name != "policy"}
     if cfg.policy_flags:
         given["policy_flags"] = cfg.policy_flags
     return given | {
-        "policy": str(cfg.policy.pretrained_path), "size": cfg.preset, "output_dir": str(cfg.output_dir),
+        "policy": resolved_name(str(cfg.policy.pretrained_path)), "size": cfg.preset,
+        "output_dir": str(cfg.output_dir),
         "selection_episodes": cfg.selection_episodes if cfg.selects else 0,
         "stages": [stage.name for stage in stages],
     }  # fmt: skip

@@ -152,7 +152,7 @@ MAY_DIFFER = ("policies", "references", "coverage", "batch_size", "device")
 
 def judge(cfg: JudgeConfig) -> None:
     """Replay the rollouts and imagine what is missing of the episodes; write the results."""
-    from lerobot_wmrl.evaluation.compare import resolved_name
+    from lerobot_wmrl.common.checkpoints import resolved_name
     from lerobot_wmrl.evaluation.evidence import (
         confusion_of,
         learnt_from,

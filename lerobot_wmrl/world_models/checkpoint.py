@@ -12,7 +12,7 @@ from lerobot.rewards.factory import get_reward_model_class
 from lerobot.utils.constants import ACTION, OBS_STATE
 from safetensors import SafetensorError
 
-from lerobot_wmrl.common.checkpoints import resolve_checkpoint
+from lerobot_wmrl.common.checkpoints import UNPUBLISHED, resolve_checkpoint
 from lerobot_wmrl.common.errors import FieldError, first_line
 from lerobot_wmrl.data.checks import check_cameras, check_depth, check_widths
 from lerobot_wmrl.data.embodiment import check_same_robot
@@ -73,10 +73,13 @@ def read_config(
 
 
 def config_to_continue(path: str, overrides: Sequence[str]) -> RewardModelConfig:
-    """Read the settings of a trained model, `overrides` on top, to train it further. FieldError if none."""
+    """Read the settings of a trained model, `overrides` on top, to train it further. FieldError if none.
+
+    It is not published where that model was, unless they say so.
+    """
     folder = resolve_checkpoint(path)
     try:
-        config = RewardModelConfig.from_pretrained(str(folder), cli_overrides=list(overrides))
+        config = RewardModelConfig.from_pretrained(str(folder), cli_overrides=[*UNPUBLISHED, *overrides])
     except Exception as error:  # draccus, the hub and json each raise their own
         raise FieldError(
             "model.path", path, f"no model can be loaded from it ({first_line(error)})",

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Final
 
 from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, ModelCard, ModelCardData
 
-from lerobot_wmrl.common.hub import publishing
+from lerobot_wmrl.common.hub import create_repo, publishing
 
 CARD = """---
 {metadata}
@@ -53,9 +53,7 @@ class HubCard:
         api = HfApi()
         kept = f"the model is whole in {cfg.output_dir}"
         with publishing(model.config.repo_id, kept), TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-            repo_id = api.create_repo(
-                model.config.repo_id, private=model.config.private, exist_ok=True
-            ).repo_id
+            repo_id = create_repo(api, model.config.repo_id, model.config.private)
             model.save_pretrained(folder)
             cfg.save_pretrained(Path(folder))
             self.generate_model_card(cfg.dataset.repo_id).save(Path(folder) / "README.md")

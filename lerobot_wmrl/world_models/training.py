@@ -134,7 +134,7 @@ def make_sampler(
     elif not table.done_known:
         logging.warning(
             "dataset.root=%s: has neither next.success nor next.done: the model cannot learn from it what "
-            "success is, and keeps what it knows of it",
+            "success is. Check it afterwards (lerobot-wmrl-eval-world-model)",
             table.dataset.root,
         )
     return make_clip_sampler(model, table, episodes.nonzero()[0], batch_size, seed)

@@ -50,7 +50,17 @@ def test_it_is_downloaded_to_a_new_folder(published: LeRobotDataset, hub: Hub, t
     source.open()
     assert not hub.requests, "it is there"
     next((tmp_path / "mine" / "data").rglob("*.parquet")).unlink()  # as a download that was stopped leaves it
+    next((tmp_path / "mine" / "meta" / "episodes").rglob("*.parquet")).unlink()
     assert read_episodes(source.open()).action.shape == read_episodes(published).action.shape
+
+
+def test_a_folder_that_lacks_files_and_is_on_no_hub_says_what_it_lacks(
+    published: LeRobotDataset, tmp_path: Path
+) -> None:
+    shutil.copytree(published.root, tmp_path / "torn")
+    next((tmp_path / "torn" / "data").rglob("*.parquet")).unlink()
+    with pytest.raises(ValueError, match=r"1 files are missing, the first is data/"):
+        DatasetSource(str(tmp_path / "torn"), "somebody/nothing").open()
 
 
 def test_a_tokenizer_trains_on_it(published: LeRobotDataset, tmp_path: Path) -> None:

@@ -24,14 +24,14 @@ from lerobot.processor import PolicyProcessorPipeline
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
 from lerobot_policy_wm_mpc.modeling_wm_mpc import WmMpcPolicy
-from lerobot_wmrl.common.checkpoints import link_checkpoint
+from lerobot_wmrl.common.checkpoints import link_checkpoint, resolved_name
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.lerobot_env import runs_in_processes
 from lerobot_wmrl.evaluation import compare as running
-from lerobot_wmrl.evaluation.compare import opened, resolved_name
+from lerobot_wmrl.evaluation.compare import opened
 from lerobot_wmrl.evaluation.comparison import Comparison, Episode
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.scripts.compare import CompareConfig, compare

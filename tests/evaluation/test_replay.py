@@ -236,6 +236,14 @@ def test_success_is_paid_once_in_the_frame_that_completes_it(source, model, trai
     count = len(probability) - 1
     assert found["return"] == [0.0] * 6 + [1.0] * (count - 6)
     assert found["done_probability"] == probability[:-1].tolist()
+    returns = [
+        reward_along_episode(
+            text_model, GeneralConfig(device="cpu", alpha=0.9), source,
+            replace(replay, done_probability=probability), threshold=0.5, frames=frames, longest=longest,
+        )["return"][-1]
+        for longest in (2, 200)
+    ]  # fmt: skip
+    assert returns[0] != returns[1], "progress is rewarded with the discount of the environment"
     assert len(found["similarity"]) == count
 
 

@@ -304,8 +304,9 @@ def test_curve_from_lerobots_log_lines(tmp_path: Path) -> None:
     log.write_text(
         "INFO ot_train.py:1 step:200 smpl:2K ep:3 epch:0.10 loss:0.250 grdn:1.2 lr:1.0e-04\n"
         "Training:  10%|\rINFO step:1K smpl:9K ep:9 epch:0.20 loss:1.5e-02 grdn:1.1 lr:1.0e-04\n"
+        "Training:  10%|\rINFO step:1K smpl:9K ep:9 epch:0.20 loss:0.5e-02 grdn:1.1 lr:1.0e-04\n"
     )
-    assert lerobot_train_curve(log) == ([200.0, 1000.0], [0.25, 0.015], "step")
+    assert lerobot_train_curve(log) == ([200.0, 1000.0], [0.25, 0.01], "step")
 
 
 def test_curves_skip_rows_that_lack_the_column() -> None:

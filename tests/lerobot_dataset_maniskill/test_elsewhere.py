@@ -202,6 +202,33 @@ def test_an_interrupted_recording_continues_and_a_whole_one_is_left_alone(
         record(config)
 
 
+def test_a_recording_goes_on_with_the_policy_that_it_was_begun_with_alone(
+    config: RecordConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither with other settings of it, nor with what a longer training has made of it."""
+    record(config)
+    with monkeypatch.context() as typed:
+        typed.setattr("sys.argv", ["record", "--policy.path=policy", "--policy.optimizer_lr=1"])
+        with pytest.raises(ValueError, match=r"\(policy_settings \[\] → \['--optimizer_lr=1'\]\)"):
+            record(config)
+    assert config.policy is not None
+    config.policy.pretrained_path = save_untrained_policy(
+        config.root.with_name("longer"), OBS_IMAGE, size=96, actions=2, constant=250.0
+    )
+    with pytest.raises(ValueError, match=r"other settings \(policy '.*policy' → '.*longer'\)"):
+        record(config)
+
+
+def test_rollouts_are_charged_as_such_although_their_columns_do_not_say_it(
+    config: RecordConfig, tmp_path: Path
+) -> None:
+    ledger = Ledger.create(tmp_path / "budget.json", Limits(rollouts=3))
+    config.budget, config.exploration = ledger.path, 0.5
+    record(config)
+    assert "start.kind" not in open_dataset(config.root).features
+    assert ledger.read().spent()["rollouts"] == 3
+
+
 def test_under_a_budget_no_seed_of_evaluation_selection_or_gate_is_recorded(
     config: RecordConfig, tmp_path: Path
 ) -> None:

@@ -13,6 +13,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.recorder import record
 from lerobot_policy_cnn.configuration_cnn import CnnConfig
+from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
 from lerobot_wmrl.common.constants import KINDS
 from lerobot_wmrl.common.policies import read_policy_config
@@ -121,6 +122,18 @@ def test_a_start_that_comes_again_gets_other_noise(config, caplog):
     for root, alike in ((config.root.with_name("imagined"), True), (config.root, False)):
         actions = open_dataset(root).hf_dataset.with_format("numpy")["action"][:]
         assert (actions[:LENGTH] == actions[6 * LENGTH :]).all() == alike
+
+
+def test_a_random_policy_does_something_else_when_a_start_comes_again(config, monkeypatch):
+    """Each part has all six starts."""
+    config.num_episodes, config.part_episodes = 12, 6
+    monkeypatch.setattr(
+        CnnPolicy, "select_action", lambda _, observation: 0.02 * torch.randn(len(observation[IMAGE]), 7)
+    )
+    record(config)
+    actions = open_dataset(config.root).hf_dataset.with_format("numpy")["action"][:]
+    first, second = np.split(np.asarray(actions), 2)
+    assert not (first == second).all(1).any()
 
 
 def test_a_planner_acts_as_a_policy(config, trained_models):

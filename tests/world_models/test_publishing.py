@@ -6,13 +6,14 @@ from pathlib import Path
 import httpx
 import pytest
 import torch
+from huggingface_hub import HfApi
 from lerobot.rewards.factory import get_reward_model_class
 
 from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.scripts.eval_world_model import EvalWorldModelConfig, eval_world_model
-from lerobot_wmrl.world_models.checkpoint import load_model, read_config
+from lerobot_wmrl.world_models.checkpoint import config_to_continue, load_model, read_config
 from tests.trained import action_config, run_training, text_config, tokenizer_config
 
 
@@ -95,6 +96,22 @@ def test_an_evaluation_is_put_on_the_card_and_replaced_by_the_next(
         assert str(tmp_path) not in found + repo.head["evaluation/metrics.json"].decode()
     assert "(evaluation/comparison_success.gif)" in found
     assert repo.head["model.safetensors"] == weights
+
+
+def test_what_is_public_already_is_not_called_private(hub, small_dataset, tmp_path):
+    config = tokenizer_config()
+    config.push_to_hub, config.repo_id, config.private = True, "somebody/tokenizer", True
+    HfApi().create_repo("somebody/tokenizer")
+    with pytest.raises(FieldError, match=r"^model\.private=true: somebody/tokenizer is public"):
+        run_training(config, Path(small_dataset.root), tmp_path / "run", steps=1)
+
+
+def test_a_model_that_is_trained_further_is_not_published_over_the_first(hub, small_dataset, tmp_path):
+    config = tokenizer_config()
+    config.push_to_hub, config.repo_id = True, "somebody/tokenizer"
+    folder = run_training(config, Path(small_dataset.root), tmp_path / "run", steps=1)
+    assert config_to_continue(str(folder), []).push_to_hub is False
+    assert config_to_continue(str(folder), ["--push_to_hub=true", "--repo_id=a/b"]).repo_id == "a/b"
 
 
 def test_a_training_without_a_login_is_not_begun(hub, small_dataset, tmp_path, monkeypatch):

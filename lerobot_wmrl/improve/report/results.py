@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.evaluation.comparison import RESULTS, Comparison, read_episodes
@@ -124,12 +126,13 @@ def curve(metrics: Sequence[Mapping[str, Any]], name: str, unit: str = STEP) -> 
 def lerobot_train_curve(log: Path, name: str = "loss") -> Curve:
     """Read the log lines of lerobot-train, `… step:200 … loss:0.123 …`: it keeps its numbers nowhere else.
 
-    After a resume the later line of a step wins.
+    It writes steps from 1,000 on as thousands (`1K`): the values of each are averaged.
     """
-    found: dict[float, float] = {}
+    found: dict[float, list[float]] = {}
     for step, value in re.findall(rf"step:(\d+K?)\b.*?\b{name}:([-\d.e]+)", log.read_text(errors="replace")):
-        found[float(step.rstrip("K")) * (1000 if step.endswith("K") else 1)] = float(value)
-    return Curve(sorted(found), [found[step] for step in sorted(found)])
+        at = float(step.rstrip("K")) * (1000 if step.endswith("K") else 1)
+        found.setdefault(at, []).append(float(value))
+    return Curve(sorted(found), [float(np.mean(found[step])) for step in sorted(found)])
 
 
 def read_json(path: Path) -> dict[str, Any]:
