@@ -160,6 +160,10 @@ class RecordConfig(RunConfig):
         if self.shard_of[1] > -(-self.num_episodes // self.part_episodes):
             raise FieldError("shard", self.shard, "there are fewer sub-datasets than shards")
         require_choice(self, "planner", MOTIONS)
+        if isinstance(self.env, WmrlManiSkillEnv) and self.env.batched:
+            raise FieldError(
+                "env.batched", True, "a recording has a simulation in each process", "leave it out"
+            )
         if self.policy is not None:
             require_trained(self.policy)
         self._validate_kinds()

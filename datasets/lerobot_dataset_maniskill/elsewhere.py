@@ -67,8 +67,11 @@ class Rollouts:
                 bar.set_postfix(success=f"{sum(won) / len(won):.0%}", refresh=False)
                 bar.update()
 
-            for name in missing:
-                recorder.record(work / name, self.seeds[name], report)
+            for name, seeds in self.seeds.items():
+                if name in missing:
+                    recorder.record(work / name, seeds, report)
+                else:
+                    recorder.skip(seeds)
 
     def describe(self, merged: Path) -> str:
         """Describe the columns as `like` does, keep the settings, and say what was recorded."""

@@ -72,7 +72,8 @@ class ImproveConfig(RunConfig):
         selection_episodes: starts in `real_env` on which every policy is measured, to choose the one to use.
             RL's checkpoint is chosen among at most five on half as many others. 0: take the last policy and
             checkpoint. Nothing is trained on these episodes.
-        eval_episodes: starts of the comparison that is reported. No choice is made on them.
+        eval_episodes: starts of the comparison that is reported. No choice is made on them, except in LIBERO,
+            where the number of resets decides the start.
         seed: of recording and training. Evaluation has seeds of its own, from 1,000,000 on, selection from
             2,000,000, the gate from 3,000,000.
         output_dir: folder of everything.

@@ -12,6 +12,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs import make_env, make_env_pre_post_processors
 from lerobot.envs.configs import EnvConfig
+from lerobot.envs.utils import NEW_ROLLOUT_OPTION
 from lerobot.scripts.lerobot_eval import rollout
 from lerobot.utils.constants import ACTION, OBS_IMAGE
 from torch import Tensor
@@ -32,7 +33,7 @@ from lerobot_wmrl.data.embodiment import (
 )
 from lerobot_wmrl.data.features import encoder_of, episode_features, matched, observation_row
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
-from lerobot_wmrl.envs.lerobot_env import FRAME_LIMIT, freeze_finished
+from lerobot_wmrl.envs.lerobot_env import FRAME_LIMIT, counts_resets, freeze_finished
 
 IMAGE_WRITERS = 4
 """Threads that compress the frames of rollouts in a LeRobot environment."""
@@ -110,6 +111,12 @@ class RolloutRecorder:
                 "the range is that of the action space of %s; if the environment takes more, record again "
                 "with `like.root`, a dataset of the same robot whose actions show it", self.config.type,
             )  # fmt: skip
+
+    def skip(self, seeds: Sequence[int]) -> None:
+        """Pass over the starts of these seeds' episodes, which are recorded already, where resets count."""
+        if counts_resets(self.config):
+            for env, _ in self._batches(seeds):
+                env.reset(options={NEW_ROLLOUT_OPTION: True})
 
     def _batches(self, seeds: Sequence[int]) -> Iterator[tuple[Any, Sequence[int]]]:
         """Yield the environments of a task, and the seeds of the next episodes in them."""

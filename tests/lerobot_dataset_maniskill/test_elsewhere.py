@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium.vector import SyncVectorEnv
 from lerobot.configs import RGBEncoderConfig
 from lerobot.datasets.dataset_tools import remove_feature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -16,6 +17,7 @@ from lerobot.envs.configs import PushtEnv
 from lerobot.utils.constants import DEFAULT_FEATURES, OBS_IMAGE
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
+from lerobot_dataset_maniskill.elsewhere import Rollouts
 from lerobot_dataset_maniskill.merging import merge_folders
 from lerobot_dataset_maniskill.recorder import record
 from lerobot_wmrl.common.constants import EVALUATION_SEED, GATE_SEED, START_SEED
@@ -200,6 +202,24 @@ def test_an_interrupted_recording_continues_and_a_whole_one_is_left_alone(
     config.exploration = 0.5
     with pytest.raises(ValueError, match=r"other settings \(exploration 0\.0 → 0\.5\)"):
         record(config)
+
+
+def test_where_resets_choose_the_start_none_comes_twice(
+    config: RecordConfig, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Here the first of two parts is recorded already."""
+    monkeypatch.setattr("lerobot_wmrl.rl.rollout_recorder.counts_resets", lambda _: True)
+    reset, seeds = SyncVectorEnv.reset, []
+
+    def noted(self: SyncVectorEnv, *, seed: Any = None, options: Any = None) -> Any:
+        seeds.append(seed)
+        return reset(self, seed=seed, options=options)
+
+    source = Rollouts(config, {})
+    monkeypatch.setattr(SyncVectorEnv, "reset", noted)
+    source.record(tmp_path, ["part-00001"])
+    begun = [each[0] if isinstance(each, list) else each for each in seeds]
+    assert begun[-3:] == [None, None, 2], "the starts of two episodes are passed over"
 
 
 def test_a_recording_goes_on_with_the_policy_that_it_was_begun_with_alone(

@@ -33,6 +33,10 @@ ROLL_OUT = ["--policy.path={policy}", *SIMULATOR, "--num_episodes=1"]
 
 
 @pytest.mark.parametrize(("command", "flags", "message"), [
+    (
+        record, ["--env.type=wmrl_maniskill", "--env.batched=true", "--output_dir=out"],
+        "--env.batched=true: a recording has",
+    ),
     (record, [*SIMULATOR, "--env.task=juggle"], "--env.task=juggle: unknown; choose one of push"),
     (record, ["--preset=huge"], "--preset=huge: unknown preset; choose one of cpu, demo"),
     (

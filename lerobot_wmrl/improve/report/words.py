@@ -6,6 +6,7 @@ from typing import Any
 
 from lerobot_wmrl.common.stages import FAILED, read_record
 from lerobot_wmrl.common.statistics import Proportion
+from lerobot_wmrl.envs.lerobot_env import counts_resets
 from lerobot_wmrl.evaluation.comparison import Pair
 from lerobot_wmrl.evaluation.gate import DOUBTFUL_AUC
 from lerobot_wmrl.evaluation.report import seen_line
@@ -73,9 +74,17 @@ def choice_line(improvement: Improvement) -> str:
         )
     shown = ", ".join(f"{title} {rate}" for title, rate in found.rates.items())
     return (
-        f"Policy to use: {chosen}, {path}. None succeeded more often {found.name}, on starts set aside for "
-        f"this choice: {shown}. Of equally good ones it is the earliest."
+        f"Policy to use: {chosen}, {path}. None succeeded more often {found.name}, {set_aside(improvement)}: "
+        f"{shown}. Of equally good ones it is the earliest."
     )
+
+
+def set_aside(improvement: Improvement) -> str:
+    """Say on which starts a choice was made."""
+    real = improvement.config.real_env
+    if real is not None and counts_resets(real):
+        return f"on the first starts of {real.type}, on which the policies are compared too"
+    return "on starts set aside for this"
 
 
 def rl_line(improvement: Improvement) -> list[str]:
@@ -88,7 +97,7 @@ def rl_line(improvement: Improvement) -> list[str]:
     which = f"that of iteration {best}" if best else "iteration 0, the policy that RL began with"
     return [
         f"RL's checkpoint is {which}: none succeeded more often in the real environment. Success by "
-        f"iteration, on starts set aside for this: {shown}."
+        f"iteration, {set_aside(improvement)}: {shown}."
     ]
 
 
