@@ -33,14 +33,13 @@ TASKS_ROWS: Final = partial(value.rows_above, study=value_cells.TASKS_STUDY, par
 SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     "value_push": ("Policies", value.value_push),
     "value_pick_place": ("Policies", value.value_pick_place),
-    "value_pick_place_longer": ("Policies", partial(SECOND_ROWS, ["longer_filtered"])),
     "value_pick_place_longer_imagined": (
         "Policies",
         partial(SECOND_ROWS, ["longer_filtered", "longer_imagined_ppo"]),
     ),
     "value_pick_place_discount": (
         "Policies",
-        partial(SECOND_ROWS, ["discounted_ppo", "longer_discounted_ppo"]),
+        partial(SECOND_ROWS, ["longer_filtered", "longer_discounted_ppo", "discounted_ppo"]),
     ),
     "value_pick_place_simulator": ("Policies", partial(SECOND_ROWS, ["simulated_ppo"])),
     "value_pick_place_dyna": ("Policies", partial(SECOND_ROWS, ["dyna"])),

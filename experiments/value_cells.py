@@ -63,7 +63,6 @@ PARTS: Final = (
 
 SECOND_STUDY: Final = "value_pick_place"
 SECOND_PARTS: Final = (
-    "value_pick_place_longer",
     "value_pick_place_longer_imagined",
     "value_pick_place_discount",
     "value_pick_place_simulator",
@@ -90,6 +89,9 @@ def groups(
 
     `recorded_anew` tells of each method that learnt from a recording of its own, of the same budget, how many
     episodes of that succeed. Recordings with as many successes are taken for the same.
+
+    Raises:
+        ValueError: two studies have the same method in a cell.
     """
     found: Groups = {}
     for each in read_cells(ROOT / "experiments" / f"{study}.yaml"):
@@ -99,6 +101,8 @@ def groups(
             for part in (part for part in others if part):
                 own = part.get("real_successes")
                 for method, row in part["methods"].items():
+                    if method in whole["methods"]:
+                        raise ValueError(f"{each.variables['cell']}: two studies have {method}")
                     whole["methods"][method] = row
                     whole["recorded_anew"][method] = None if own == cell["real_successes"] else own
             found.setdefault(tuple(cell[name] for name in by), []).append(whole)

@@ -275,26 +275,36 @@ often, by {100 * min(rises):.0f} to {100 * max(rises):.0f} points. What is left 
 
 {best_gains(longer, REAL_EPISODES)}
 
-The longer BC learnt from a recording of its own, of the same budget, in these cells:
-{recorded_anew(longer, "longer_filtered")}. {from_longer(longer)}"""
+{own_recordings(longer, "longer_filtered")}
+
+{from_longer(longer)}"""
+
+
+def own_recordings(found: Groups, method: str) -> str:
+    """Say in which cells longer BC learnt from other episodes of the same budget than other rows."""
+    if not any(cell["recorded_anew"].get(method) for cells in found.values() for cell in cells):
+        return "The longer BC learnt from the same episodes as the other rows."
+    return f"""The longer BC learnt from a recording of its own, of the same budget, in these cells:
+{recorded_anew(found, method)}."""
 
 
 def from_longer(found: Groups) -> str:
-    """Return the success of what begins from longer BC in imagination."""
+    """Return a table of what methods in imagination make of longer BC, from which they begin."""
     begun = ("longer_imagined_ppo", "longer_ppo_distilled", "longer_discounted_ppo")
-    said = []
-    for group, cells in having(found, "longer_imagined_ppo").items():
-        before, *after = (
-            f'"{TITLES[method]}" '
-            + " and ".join(f"{100 * mean(cells, method, domain):.0f}" for domain in SCENES)
-            for method in measured(cells, ("longer_filtered", *begun))
-        )
-        seeds = ", ".join(str(cell["seed"]) for cell in cells)
-        said.append(
-            f"With {spoken(group)} (seed {seeds}): {before} % (known, unseen scenes), and from there "
-            f"{', '.join(f'{each} %' for each in after)}."
-        )
-    return " ".join(said) or "PPO and the planner have not begun from it yet."
+    rows = [
+        [
+            *group, DOMAINS[domain], TITLES[method], shares(own, "longer_filtered", domain),
+            shares(own, method, domain), points(asdict(gain(own, method, "longer_filtered", domain))),
+        ]
+        for group, cells in having(found, "longer_filtered").items()
+        for method in measured(cells, begun)
+        for own in [[cell for cell in cells if method in cell["methods"]]]
+        for domain in SCENES
+    ]  # fmt: skip
+    if not rows:
+        return "PPO and the planner have not begun from it yet."
+    columns = [*REAL_EPISODES, "scenes", "method", "longer BC", "after the method", "gain"]
+    return f"What begins from it in imagination:\n\n{table(columns, rows)}"
 
 
 def beyond_seeds(found: Groups) -> str:
