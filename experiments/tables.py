@@ -35,7 +35,7 @@ SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     "value_pick_place": ("Policies", value.value_pick_place),
     "value_pick_place_longer_imagined": (
         "Policies",
-        partial(SECOND_ROWS, ["longer_filtered", "longer_imagined_ppo"]),
+        partial(SECOND_ROWS, ["longer_imagined_ppo"]),
     ),
     "value_pick_place_discount": (
         "Policies",

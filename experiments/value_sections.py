@@ -269,11 +269,13 @@ def trained_longer(found: Groups) -> str:
         for cells in longer.values() for domain in SCENES
         for rise in gains(cells, "longer_filtered", "filtered", domain)
     ]  # fmt: skip
+    left = ""
+    if longer != found:
+        left = f" What is left of the gains there:\n\n{best_gains(longer, REAL_EPISODES)}"
+    alone = "in all cells" if longer == found else f"in some cells alone: {which}"
     return f"""**Was BC stopped too early?** Filtered BC for three times as many steps was run last,
-and in some cells alone: {which}. In {sum(rise > 0 for rise in rises)} of {len(rises)} rates it succeeds more
-often, by {100 * min(rises):.0f} to {100 * max(rises):.0f} points. What is left of the gains there:
-
-{best_gains(longer, REAL_EPISODES)}
+{alone}. In {sum(rise > 0 for rise in rises)} of {len(rises)} rates it succeeds more
+often, by {100 * min(rises):.0f} to {100 * max(rises):.0f} points.{left}
 
 {own_recordings(longer, "longer_filtered")}
 

@@ -49,15 +49,23 @@ def resolve_checkpoint(path: str | Path) -> Path:
     return root
 
 
-def resolved_name(path: str) -> str:
-    """Return the checkpoint behind a training's output folder or its link `last`, which a longer training
-    moves on. A path that is no folder is returned as it is: it may be a hub id."""
+def resolved_path(path: str) -> str:
+    """Return the folder of a checkpoint's model, with `config.json` in it, as LeRobot's commands take it.
+
+    A training's output folder and its link `last` become the checkpoint behind them: a longer training moves
+    the link on. A path that is no folder is returned as it is: it may be a hub id.
+    """
     folder = resolve_checkpoint(path)
     if not folder.is_dir():
         return path
     folder = folder.resolve()
-    folder = folder.parent if folder.name == PRETRAINED_MODEL_DIR else folder
     return str(folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder)
+
+
+def resolved_name(path: str) -> str:
+    """Return the same as a name: without LeRobot's folder `pretrained_model`, in which the model is."""
+    folder = Path(resolved_path(path))
+    return str(folder.parent if folder.name == PRETRAINED_MODEL_DIR else folder)
 
 
 def local_checkpoint(path: str | Path) -> Path:

@@ -93,8 +93,8 @@ def check_real_env(policy: PreTrainedConfig, config: EnvConfig, starts: int = 0)
         with within("real_env"):
             config.selected_scenes()
             config.runs_batched("cuda")
-        render_backend()
         check_fit(policy, config.observation_shapes(), config.features[ACTION].shape[0], "real_env")
+        render_backend()
         return
     with within("real_env"):
         env = make_tensor_env(config, 1, "cpu")

@@ -69,8 +69,9 @@ def columns(improvement: Improvement) -> list[str]:
 def rollouts(improvement: Improvement) -> list[str]:
     config = improvement.config
     like: Flags = {"like.root": str(improvement.mergeable), "max_frames": improvement.frame_limit}
+    env = {name: value for name, value in real_env(improvement, "env").items() if name != "env.batched"}
     return ["lerobot-wmrl-record", *format_flags({
-        "policy.path": improvement.policy, **real_env(improvement, "env"),
+        "policy.path": improvement.policy, **env,
         **({} if improvement.in_maniskill else like),
         "video": "video" in improvement.found.columns.values(), "num_episodes": config.rollouts,
         "exploration": config.exploration, "seed": config.seed + ROLLOUT_SEED_OFFSET,

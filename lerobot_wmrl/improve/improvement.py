@@ -10,7 +10,7 @@ import torch
 from lerobot.envs.utils import env_to_policy_features
 from lerobot.utils.constants import ACTION, DEFAULT_FEATURES, DONE, REWARD
 
-from lerobot_wmrl.common.checkpoints import best_checkpoint, last_checkpoint, resolved_name
+from lerobot_wmrl.common.checkpoints import best_checkpoint, last_checkpoint, resolved_path
 from lerobot_wmrl.common.constants import START_KIND, START_SEED, START_TASK
 from lerobot_wmrl.common.policies import check_units, copy_checkpoint, load_processors
 from lerobot_wmrl.common.presets import Flags
@@ -80,8 +80,8 @@ class Improvement:
         assert config.policy is not None
         table = read_episodes(config.dataset.open())
         found = look(table, config.policy, config.dataset.episodes, config.rollouts)
-        learnt = table.among(config.dataset.episodes) & ~table.validation
-        require_unreported(table, np.flatnonzero(learnt), "choose others with `dataset.episodes`")
+        chosen = np.flatnonzero(table.among(config.dataset.episodes))
+        require_unreported(table, chosen, "choose others with `dataset.episodes`")
         if config.rollouts and isinstance(config.real_env, WmrlManiSkillEnv):
             require_mergeable(table.dataset, config.real_env)
         robot = read_embodiment(table.dataset.meta, Embodiment())
@@ -115,7 +115,7 @@ class Improvement:
         assert self.config.policy is not None
         if self.config.policy_flags:
             return str(self.out / "policy")
-        return resolved_name(str(self.config.policy.pretrained_path))
+        return resolved_path(str(self.config.policy.pretrained_path))
 
     def copy_policy(self) -> None:
         """Make the copy of the policy that every stage reads, if the command line changes its settings."""

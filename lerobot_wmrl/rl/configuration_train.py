@@ -138,10 +138,11 @@ def check_distillation(algorithm: DistillationConfig, env: EnvConfig) -> None:
 def load_config(cfg: TrainConfig) -> PreTrainedConfig:
     """Read the policy's configuration into `cfg` and return it.
 
-    A run that is resumed by its configuration has the policy's settings from there. Whether and where the
-    policy is published never comes from the checkpoint, as it would overwrite the SFT policy on the hub.
+    A run that is continued by its stored configuration has the policy's settings from there. Whether and
+    where the policy is published never comes from the checkpoint, as it would overwrite the SFT policy.
     """
     from lerobot_wmrl.common.checkpoints import UNPUBLISHED
+    from lerobot_wmrl.common.output_folders import CONFIG_FILE
     from lerobot_wmrl.common.policies import read_policy_config
 
     typed, stored = parser.get_path_arg("policy"), cfg.policy
@@ -152,7 +153,8 @@ def load_config(cfg: TrainConfig) -> PreTrainedConfig:
     cfg.policy = read_policy_config(str(path), [*UNPUBLISHED, *overrides])
     if stored is not None:
         settings = [each.name for each in fields(stored) if each.name not in READ]
-        for name in settings if cfg.resume and not typed else PUBLISHING:
+        stored_run = Path(parser.parse_arg("config_path") or "").name == CONFIG_FILE
+        for name in settings if stored_run and not typed else PUBLISHING:
             setattr(cfg.policy, name, getattr(stored, name))
     if cfg.policy.push_to_hub and not cfg.policy.repo_id:
         raise FieldError("policy.push_to_hub", True, "give its name on the hub, --policy.repo_id=user/name")

@@ -14,6 +14,7 @@ from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
 
 from lerobot_policy_cnn.configuration_cnn import CnnConfig
+from lerobot_wmrl.common.checkpoints import link_checkpoint
 from lerobot_wmrl.common.errors import STOPPED
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.presets import preset_settings
@@ -29,6 +30,7 @@ from lerobot_wmrl.scripts.improve import settings
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 from lerobot_wmrl.world_models.configuration_world_model import AnchoredConfig
 from tests.improve.made_up import commands_of, improvement_of, made_commands
+from tests.rl.checkpoints import save_untrained_policy
 
 
 @pytest.mark.parametrize(("longest", "clip", "length", "branches"), [(40, 42, 40, 0), (300, 100, 98, 2)])
@@ -230,6 +232,21 @@ def test_the_discount_leaves_a_late_success_its_worth(
     if not rollouts:
         rl = commands_of(improvement, "rl")["rl"]
         assert f"--algorithm.gamma={discount}" in rl
+
+
+def test_commands_name_the_checkpoint_that_is_there_now_as_lerobots_take_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for step in ("000002", "000004"):
+        save_untrained_policy(tmp_path / "cloned" / "checkpoints" / step / "pretrained_model")
+    link_checkpoint(tmp_path / "cloned" / "checkpoints" / "000002", "last")
+    for given in ("cloned", "cloned/checkpoints/last", "cloned/checkpoints/last/pretrained_model"):
+        policy = CnnConfig(device="cpu", pretrained_path=Path(given))
+        improvement = improvement_of(tmp_path, policy=policy)
+        assert improvement.policy == "cloned/checkpoints/000002/pretrained_model"
+    link_checkpoint(tmp_path / "cloned" / "checkpoints" / "000004", "last")
+    assert improvement.policy == "cloned/checkpoints/000004/pretrained_model"
 
 
 def test_without_starts_to_select_on_the_last_checkpoint_and_policy_are_taken(tmp_path: Path) -> None:
