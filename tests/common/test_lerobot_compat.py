@@ -37,7 +37,7 @@ UNDOCUMENTED = {
     },
     "lerobot.datasets.aggregate": {"aggregate_datasets"},
     "lerobot.datasets.dataset_metadata": {"CODEBASE_VERSION"},
-    "lerobot.datasets.dataset_tools": {"add_features"},
+    "lerobot.datasets.dataset_tools": {"add_features", "remove_feature"},
     "lerobot.datasets.depth_utils": {"MM_PER_METRE", "dequantize_depth"},
     "lerobot.datasets.factory": {"resolve_delta_timestamps"},
     "lerobot.datasets.io_utils": {"load_info", "write_info"},
