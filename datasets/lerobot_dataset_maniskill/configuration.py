@@ -14,6 +14,7 @@ from lerobot.configs.rewards import RewardModelConfig
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_dataset_maniskill.planners import MOTIONS
+from lerobot_wmrl.common.checkpoints import resolved_name
 from lerobot_wmrl.common.command_line import RunConfig
 from lerobot_wmrl.common.constants import EVALUATION_SEED, KINDS, POLICY
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
@@ -310,8 +311,6 @@ class RecordConfig(RunConfig):
         if self.policy is None:
             return {"policy": None}
         if self.policy.pretrained_path:
-            from lerobot_wmrl.common.checkpoints import resolved_name
-
             changed = parser.get_cli_overrides("policy") or []
             return {"policy": resolved_name(str(self.policy.pretrained_path)), "policy_settings": changed}
         own = {each.name for each in fields(self.policy)} - {each.name for each in fields(PreTrainedConfig)}

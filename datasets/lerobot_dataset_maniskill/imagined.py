@@ -50,7 +50,7 @@ class ImaginedPartRecorder:
         fit_to_environment(config.policy, shown, len(ACTION_NAMES))
         self.policy: Any = load_policy(config.policy).eval()
         self.processors = load_processors(config.policy)
-        self.env.check_units(config.policy, self.processors[1])
+        self.env.model.check_units(config.policy, self.processors[1])
         self.pipeline = make_pipeline(config.policy, *self.processors)
 
     def record(self, part: Part, report: Report) -> None:

@@ -147,9 +147,8 @@ def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
         if not finite.all():
             row = int(np.argmin(finite))
             raise bad_row(dataset, column, row, np.asarray(rows[column][row]).tolist())
-    frames, done = len(rows["episode_index"]), np.zeros(len(rows["episode_index"]), bool)
-    if success is not None:
-        done = truth_of(dataset, success, rows[success])
+    frames = len(rows["episode_index"])
+    done = np.zeros(frames, bool) if success is None else truth_of(dataset, success, rows[success])
     _, start, length = np.unique(rows["episode_index"], return_index=True, return_counts=True)
     inferred, ending = None, end_at_success(done, start, length)
     # next.done may say no more than that episodes end

@@ -42,7 +42,7 @@ DECODED = 256
 """Frames of a camera that are decoded at a time: those of a long episode would not fit into the memory."""
 
 
-NOTED_SECONDS: Final = 10
+PROGRESS_SECONDS: Final = 10
 """Seconds of work on a cache that are lost at most when a process is killed."""
 
 
@@ -235,22 +235,22 @@ def decode_video(dataset: LeRobotDataset, episode: int, key: str, rows: slice) -
 
 
 class Units(NamedTuple):
-    """What a cache is written in, one after another: `total` of them, `write(target, number)`, and what the
-    progress bar says meanwhile."""
+    """What a cache is written in, one after another: `total` of them, `write(target, number)`, and the
+    progress bar's description."""
 
     total: int
     write: Callable[[np.ndarray, int], None]
-    said: str
+    description: str
 
 
-def batches(rows: int, compute: Callable[[slice], np.ndarray], said: str) -> Units:
+def batches(rows: int, compute: Callable[[slice], np.ndarray], description: str) -> Units:
     """Return units of `ENCODE_BATCH` rows, each of which is what `compute` returns for it."""
 
     def write(target: np.ndarray, number: int) -> None:
         part = slice(number * ENCODE_BATCH, (number + 1) * ENCODE_BATCH)
         target[part] = compute(part)
 
-    return Units(-(-rows // ENCODE_BATCH), write, said)
+    return Units(-(-rows // ENCODE_BATCH), write, description)
 
 
 def memory_map(path: Path, shape: tuple[int, ...], dtype: type, units: Units) -> np.ndarray:
@@ -264,17 +264,19 @@ def memory_map(path: Path, shape: tuple[int, ...], dtype: type, units: Units) ->
             path.parent.mkdir(parents=True, exist_ok=True)
             partial, begun = begin_or_continue(path, shape, dtype)
         target = np.lib.format.open_memmap(partial, mode="r+")
-        noted, done = time.monotonic(), begun
+        recorded, done = time.monotonic(), begun
         try:
-            for number in trange(begun, units.total, desc=units.said, initial=begun, total=units.total):
+            for number in trange(
+                begun, units.total, desc=units.description, initial=begun, total=units.total
+            ):
                 units.write(target, number)
                 done = number + 1
-                if time.monotonic() - noted > NOTED_SECONDS:
-                    partial, noted = note(partial, path, target, done), time.monotonic()
+                if time.monotonic() - recorded > PROGRESS_SECONDS:
+                    partial, recorded = record_progress(partial, path, target, done), time.monotonic()
             target.flush()
             partial.replace(path)
         except KeyboardInterrupt:
-            note(partial, path, target, done)
+            record_progress(partial, path, target, done)
             raise
         except Exception:  # of a broken file, say, in whose place there will be another one
             partial.unlink(missing_ok=True)
@@ -309,7 +311,7 @@ def begin_or_continue(path: Path, shape: tuple[int, ...], dtype: type) -> tuple[
     return partial, 0
 
 
-def note(partial: Path, path: Path, target: np.memmap, done: int) -> Path:
+def record_progress(partial: Path, path: Path, target: np.memmap, done: int) -> Path:
     """Write what is in memory to the unfinished file, and let its name say how many units are in it."""
     target.flush()
     return partial.rename(partial_path(path, done))

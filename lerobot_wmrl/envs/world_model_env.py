@@ -8,7 +8,6 @@ import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode
-from lerobot.configs import PreTrainedConfig
 from lerobot.rewards.factory import make_reward_model
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
@@ -16,7 +15,6 @@ from torch.distributions import Bernoulli
 
 from lerobot_wmrl.common.actions import clip_actions
 from lerobot_wmrl.common.constants import Observation
-from lerobot_wmrl.common.policies import check_units
 from lerobot_wmrl.common.statistics import evenly_spaced
 from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
@@ -67,11 +65,6 @@ class WorldModelVectorEnv(TensorEnv):
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, n_envs)
         self.generator = torch.Generator(self.device)
         self.generator.seed()
-
-    def check_units(self, config: PreTrainedConfig, postprocessor: Any) -> None:
-        """Raise FieldError if a policy's actions are in other units than the world model's."""
-        names = self.model.config.embodiment.action_names
-        check_units(config, postprocessor, names, self.action_low, self.action_high)
 
     def _observation_space(self) -> gym.spaces.Dict:
         def box(key: str, shape: tuple[int, ...]) -> gym.spaces.Box:

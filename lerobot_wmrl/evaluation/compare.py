@@ -19,7 +19,6 @@ from lerobot.utils.random_utils import set_seed
 from lerobot_wmrl.common.checkpoints import resolved_name
 from lerobot_wmrl.common.errors import FieldError, first_line
 from lerobot_wmrl.common.policies import (
-    check_units,
     check_weights,
     fit_to_environment,
     load_policy,
@@ -59,10 +58,9 @@ def read_policies(paths: Sequence[str], env: EnvConfig) -> dict[str, PreTrainedC
         with about_policy(path):
             configs[name] = config = read_policy_config(name, [])
             check_weights(config)
-            check_environment(config, env)
+            _check_environment(config, env)
             if model is not None:
-                names = model.config.embodiment.action_names
-                check_units(config, load_processors(config)[1], names, *model.action_range())
+                model.check_units(config, load_processors(config)[1])
     return configs
 
 
@@ -78,7 +76,7 @@ def about_policy(path: str) -> Iterator[None]:
         raise FieldError("policies", path, first_line(error)) from error
 
 
-def check_environment(config: PreTrainedConfig, env: EnvConfig) -> None:
+def _check_environment(config: PreTrainedConfig, env: EnvConfig) -> None:
     """Raise FieldError unless policy and environment fit; a policy without features takes the environment's.
 
     Only this project's environments are checked: LeRobot's own may show a policy more than they declare.

@@ -125,7 +125,7 @@ def train_in(
     adopt_features(config, shown)
     check_fit(config, shown, env.single_action_space.shape[-1])
     if isinstance(cfg.env, WorldModelEnv):
-        env.check_units(config, processors[1])
+        env.model.check_units(config, processors[1])
     if cfg.real_env is not None:
         check_real_env(config, cfg.real_env)
     if cfg.peft is not None:

@@ -244,9 +244,8 @@ def quality(cfg: TrainWorldModelConfig, model: Any, table: EpisodeTable) -> str:
         write_json(cfg.output_dir / HELD_OUT_FILE, measured)
     where = "held-out episodes" if measured else "the last training batch (no episode is held out)"
     measured = measured or read_metrics(cfg.output_dir)[-1]
-    shown = ["loss", "token_accuracy", "moving_token_accuracy", "state_loss"]
-    if table.done_known:
-        shown.insert(-1, "done_loss")
+    done = ("done_loss",) if table.done_known else ()
+    shown = ("loss", "token_accuracy", "moving_token_accuracy", *done, "state_loss")
     said = ", ".join(f"{name.replace('_', ' ')} {measured[name]:.3f}" for name in shown if name in measured)
     return f"On {where}: {said}."
 

@@ -10,12 +10,14 @@ from pathlib import Path
 from typing import Any, Final
 
 import torch
+from lerobot.configs import PreTrainedConfig
 from lerobot.configs.rewards import RewardModelConfig
 from lerobot.rewards.pretrained import PreTrainedRewardModel
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.policies import check_units
 from lerobot_wmrl.data.checks import check_cameras, check_depth, check_episode_lengths, check_statistics
 from lerobot_wmrl.data.clips import Clip, clip_from_windows
 from lerobot_wmrl.data.embodiment import read_embodiment
@@ -239,6 +241,10 @@ class ActionWorldModelRewardModel(WorldModelRewardModel):
         self.config.action_size = meta.features[ACTION]["shape"][0]
         if not self.config.pretrained_path:
             self.config.embodiment = read_embodiment(meta, self.config.embodiment)
+
+    def check_units(self, policy: PreTrainedConfig, postprocessor: Any) -> None:
+        """Raise FieldError if a policy's actions are in other units than those that the model learnt from."""
+        check_units(policy, postprocessor, self.config.embodiment.action_names, *self.action_range())
 
     def action_range(self) -> tuple[Tensor, Tensor]:
         """Return the least and the greatest value of each component of an action. (A,), (A,)

@@ -12,7 +12,6 @@ from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.policies import (
     check_fit,
-    check_units,
     load_policy,
     load_processors,
     read_policy_config,
@@ -112,8 +111,7 @@ class Proposal:
             policy_config = read_policy_config(path, [f"--device={config.device}"])
             check_fit(policy_config, model.config.observation_shapes, len(low))
             self.preprocess, self.postprocess = load_processors(policy_config)
-            names = model.config.embodiment.action_names
-            check_units(policy_config, self.postprocess, names, low, high)
+            model.check_units(policy_config, self.postprocess)
             self.policy = load_policy(policy_config)
         except FieldError as error:
             raise FieldError("proposal_path", path, error.problem, error.remedy) from error

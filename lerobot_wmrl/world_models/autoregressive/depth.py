@@ -18,7 +18,7 @@ from lerobot_wmrl.world_models.layers import Condition, FrameEmbedding, FrameHea
 from lerobot_wmrl.world_models.losses import masked_mean
 
 FAR: Final = 2.5
-"""Metres: what is further away counts as that far. The simulator's cameras see nothing beyond it."""
+"""Metres: what is further away counts as that far, as in the recorder's depth maps."""
 
 
 def normalize_depth(depth: Tensor | None, tokens: Tensor) -> Tensor:
