@@ -229,9 +229,9 @@ def clip_from_windows(
 
     Args:
         tokens: (B, T, S), of the windows' frames.
-        batch: action (B, T, A), or (B, 1 + T, A) with the one before the window; observation.state (B, T, P);
-            either without its last axis where it has one component; next.done (B,) or (B, 1), task,
-            `*_is_pad` of the same length; all but the action may be missing.
+        batch: action (B, T, A), or (B, 1 + T, A) with the action before the window; observation.state
+            (B, T, P). Both may lack the last axis if A or P is 1. Further next.done (B,) or (B, 1), task, and
+            `*_is_pad`, (B, T) or (B, 1 + T) as what it is about. All but the action may be missing.
         camera_key: the camera whose padding counts.
         state_size: P, 0 for a model without `observation.state`.
         depth: (B, T, S) metres, of the windows' frames.
