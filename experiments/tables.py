@@ -58,7 +58,10 @@ SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
         partial(value.rows_above, ["longer_imagined_ppo", "longer_ppo_distilled"]),
     ),
     "value_others": ("Policies", value.value_others),
-    "value_iterated": ("Policies", partial(value.rows_above, ["iterated", "iterated_ppo"])),
+    "value_iterated": (
+        "Policies",
+        partial(value.rows_above, ["iterated", "iterated_ppo", "iterated_ppo_distilled"]),
+    ),
     "value_simulator": ("Policies", partial(value.rows_above, ["simulated_ppo"])),
     "value_dyna": ("Policies", partial(value.rows_above, ["dyna"])),
     "value_imagined": ("Policies", partial(value.rows_above, ["imagined_cloning"])),

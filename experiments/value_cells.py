@@ -14,7 +14,7 @@ TITLES: Final = {
     "longer": "BC of the demonstrations, three times as many steps",
     "filtered": "filtered BC: demonstrations and successful rollouts",
     "longer_filtered": "filtered BC, three times as many steps",
-    "iterated": "filtered BC, rollouts in three rounds",
+    "iterated": "filtered BC, rollouts in three rounds, last policy three times as many steps",
     "weighted": "advantage-weighted BC (RA-BC)",
     "conditioned": "advantage-conditioned BC (RECAP)",
     "simulated_ppo": "PPO in ManiSkill, as many episodes of full length as rollouts",
@@ -22,6 +22,7 @@ TITLES: Final = {
     "planned": "PPO in imagination, then planning in it at test time",
     "dyna": "PPO in imagination, with rollouts in three rounds (Dyna)",
     "iterated_ppo": "filtered BC, rollouts in three rounds, then PPO in imagination",
+    "iterated_ppo_distilled": "filtered BC, rollouts in three rounds, PPO in imagination, planner distilled",
     "imagined_cloning": "BC of recorded and imagined successes",
     "distilled": "planner distilled in imagination",
     "distilled_ppo": "planner distilled, then PPO in imagination",
@@ -34,8 +35,8 @@ TITLES: Final = {
 """Methods in the order of the table."""
 
 IMAGINED: Final = (
-    "imagined_ppo", "planned", "dyna", "iterated_ppo", "imagined_cloning", "distilled", "distilled_ppo",
-    "ppo_distilled", "longer_imagined_ppo", "longer_ppo_distilled", "discounted_ppo", "longer_discounted_ppo",
+    "imagined_ppo", "planned", "dyna", "iterated_ppo", "iterated_ppo_distilled", "imagined_cloning",
+    "distilled", "distilled_ppo", "ppo_distilled", "longer_imagined_ppo", "longer_ppo_distilled", "discounted_ppo", "longer_discounted_ppo",
 )  # fmt: skip
 """Methods that use a world model."""
 
