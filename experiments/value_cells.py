@@ -36,7 +36,8 @@ TITLES: Final = {
 
 IMAGINED: Final = (
     "imagined_ppo", "planned", "dyna", "iterated_ppo", "iterated_ppo_distilled", "imagined_cloning",
-    "distilled", "distilled_ppo", "ppo_distilled", "longer_imagined_ppo", "longer_ppo_distilled", "discounted_ppo", "longer_discounted_ppo",
+    "distilled", "distilled_ppo", "ppo_distilled", "longer_imagined_ppo", "longer_ppo_distilled",
+    "discounted_ppo", "longer_discounted_ppo",
 )  # fmt: skip
 """Methods that use a world model."""
 
