@@ -231,26 +231,31 @@ def truth_of(dataset: LeRobotDataset, column: str, values: ArrayLike) -> np.ndar
     values = np.asarray(values).reshape(-1)
     other = ~np.isin(values, (0, 1))
     if other.any():
-        raise FieldError(
-            "dataset.root", dataset.root,
-            f"{column} is {values[int(np.argmax(other))]} in row {int(np.argmax(other))}, where it should be "
-            "true or false",
+        row = int(np.argmax(other))
+        raise bad_row(
+            dataset, column, row, f"{values[row]}, neither true nor false",
             f"take numbers from a threshold on for true: lerobot-wmrl-label --dataset.root={dataset.root} "
             f"--success.type=column --success.column={column} --success.threshold=…",
         )  # fmt: skip
     return values.astype(bool)
 
 
-def bad_row(dataset: LeRobotDataset, column: str, row: int, found: object) -> FieldError:
-    """Return the error for a row of a column, N rows in all, at which `found` is no value to learn from."""
-    episode = np.asarray(
-        dataset.hf_dataset.with_format("numpy", columns=["episode_index"])[:]["episode_index"]
-    )
-    frame = row - int(np.argmax(episode == episode[row]))
+def bad_row(
+    dataset: LeRobotDataset, column: str, row: int, found: object, remedy: str | None = None
+) -> FieldError:
+    """Return the error for a row of a column, N rows in all, at which `found` is no value to learn from.
+
+    Args:
+        remedy: what to do about it; None: remove the episode.
+    """
+    episodes = dataset.hf_dataset.with_format("numpy", columns=["episode_index"])[:]["episode_index"]
+    episode = int(episodes[row])
+    frame = row - int(np.argmax(np.asarray(episodes) == episode))
     return FieldError(
-        "dataset.root", dataset.root, f"{column} of episode {episode[row]}, frame {frame}, is {found}",
-        "remove the episode with lerobot-edit-dataset --operation.type=delete_episodes "
-        f"--operation.episode_indices=[{episode[row]}]",
+        "dataset.root", dataset.root, f"{column} of episode {episode}, frame {frame}, is {found}",
+        remedy
+        or "remove the episode with lerobot-edit-dataset --operation.type=delete_episodes "
+        f"--operation.episode_indices=[{episode}]",
     )  # fmt: skip
 
 

@@ -64,8 +64,11 @@ def test_numbers_in_the_place_of_labels_are_named_and_become_labels(
     numbers = np.linspace(0, 1, small_dataset.num_frames, dtype=np.float32)[:, None]
     column = {"next.success": (numbers, {"dtype": "float32", "shape": (1,), "names": None})}
     add_features(open_dataset(unlabelled), column, output_dir=tmp_path / "numbers", repo_id="local/numbers")
-    message = r"next\.success is 0\.\d+ in row 1, .*--success\.type=column --success\.column=next\.success"
-    with pytest.raises(FieldError, match=message):
+    where, remedy = (
+        r"next\.success of episode 0, frame 1, is 0\.\d+",
+        r"--success\.type=column --success\.column=",
+    )
+    with pytest.raises(FieldError, match=rf"{where}, neither .*{remedy}next\.success"):
         read_episodes(open_dataset(tmp_path / "numbers"))
     flags = ["--success.type=column", "--success.column=next.success", "--success.threshold=0.5"]
     found = label(monkeypatch, tmp_path / "numbers", tmp_path / "labelled", *flags)
