@@ -10,6 +10,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import OBS_STATE
 from PIL import Image, ImageOps
+from torchvision.transforms.v2.functional import pil_to_tensor
 
 from lerobot_wmrl.common.errors import FieldError, within
 from lerobot_wmrl.data.dataset import DatasetSource
@@ -198,21 +199,15 @@ class World:
                 f"must be {count} finite numbers: {', '.join(self.model.embodiment.state_names)}",
             )
         try:
-            squares = [self._square(images[camera]) for camera in sizes.cameras]
+            pictures = [images[camera] for camera in sizes.cameras]
+            shown = {
+                key: pil_to_tensor(ImageOps.exif_transpose(picture).convert("RGB"))[None]
+                for key, picture in zip(sizes.camera_keys, pictures, strict=True)
+            }
         except OSError as error:
             raise FieldError("picture", sorted(images), f"cannot be decoded ({error})") from error
-        shown = {
-            key: torch.from_numpy(square).permute(2, 0, 1)[None] / 255
-            for key, square in zip(sizes.camera_keys, squares, strict=True)
-        }
         shown[OBS_STATE] = torch.tensor([values], dtype=torch.float32).reshape(1, count)
         self.uploads[name] = observed_frame({**shown, "task": [task]}, sizes)
-
-    def _square(self, image: Image.Image) -> np.ndarray:
-        """Decode a picture, upright, and stretch it to what the tokenizer sees. → (S, S, 3) uint8"""
-        side = self.sizes.image_size
-        upright = ImageOps.exif_transpose(image).convert("RGB")
-        return np.asarray(upright.resize((side, side), Image.Resampling.BILINEAR))
 
     def _recorded(self, place: Mapping[str, Any]) -> tuple[StartImages, Recorded]:
         """Return a frame of the dataset, and what followed it."""
