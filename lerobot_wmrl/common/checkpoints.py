@@ -15,7 +15,6 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.lerobot_compat import checkpoint_dir
 
 ADAPTERS_FILE = "adapter_model.safetensors"
 """PEFT's: where a policy has adapters, its checkpoints hold them alone."""
@@ -84,9 +83,24 @@ def best_checkpoint(folder: Path) -> Path:
     return folder / CHECKPOINTS_DIR / BEST_CHECKPOINT_LINK / PRETRAINED_MODEL_DIR
 
 
+def checkpoint_name(total_steps: int, step: int) -> str:
+    """Return the name of a step's checkpoint folder: `000500`, wider only where steps have more digits."""
+    return f"{step:0{max(6, len(str(total_steps)))}d}"
+
+
+def checkpoint_dir(output_dir: Path, total_steps: int, step: int) -> Path:
+    """Return the folder of a step's checkpoint."""
+    return output_dir / CHECKPOINTS_DIR / checkpoint_name(total_steps, step)
+
+
+def should_save_checkpoint(step: int, save_freq: int, total_steps: int) -> bool:
+    """Return whether a step is the last one or one of every `save_freq`."""
+    return step % save_freq == 0 or step == total_steps
+
+
 def write_checkpoint(output_dir: Path, total_steps: int, step: int, write: Callable[[Path], None]) -> Path:
     """Let `write` fill a temporary folder, then move it to `checkpoints/<step>` and point `last` at it."""
-    target = checkpoint_dir(output_dir, step, total_steps)
+    target = checkpoint_dir(output_dir, total_steps, step)
     partial = target.with_name(f".{target.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     write(partial)

@@ -12,9 +12,9 @@ from typing import Any, Protocol
 
 from lerobot.utils.utils import flatten_dict
 
+from lerobot_wmrl.common.checkpoints import checkpoint_name
 from lerobot_wmrl.common.distributed import is_first_process, wait_for_all
 from lerobot_wmrl.common.files import write_json
-from lerobot_wmrl.common.lerobot_compat import checkpoint_name
 from lerobot_wmrl.common.tracking import Tracker
 from lerobot_wmrl.rl.seeds import preserved_randomness
 
@@ -117,7 +117,7 @@ class Callbacks:
 
 def record_folder(output_dir: Path, name: str, iteration: int, total: int) -> Path:
     """Return the folder of a callback's record. Its name is that of the iteration's checkpoint."""
-    return output_dir / name / checkpoint_name(iteration, total)
+    return output_dir / name / checkpoint_name(total, iteration)
 
 
 def has_record(output_dir: Path, name: str, iteration: int, total: int) -> bool:

@@ -4,9 +4,8 @@ import logging
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 
-from lerobot_wmrl.common.checkpoints import BEST_CHECKPOINT_LINK, link_checkpoint
+from lerobot_wmrl.common.checkpoints import BEST_CHECKPOINT_LINK, checkpoint_dir, link_checkpoint
 from lerobot_wmrl.common.distributed import is_first_process
-from lerobot_wmrl.common.lerobot_compat import checkpoint_dir
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.evaluation.agreement import Evaluated
 from lerobot_wmrl.rl.algorithm import TrainingStopped
@@ -66,7 +65,7 @@ class Selection:
         since = max((each for each in self.refreshed if each <= latest), default=0)
         comparable = {iteration: record for iteration, record in records.items() if iteration >= since}
         best = best_iteration(records if self.judge == REAL else comparable, self.judge)
-        checkpoint = checkpoint_dir(self.output_dir, best, self.total)
+        checkpoint = checkpoint_dir(self.output_dir, self.total, best)
         if is_first_process():
             link_checkpoint(checkpoint, BEST_CHECKPOINT_LINK)
         earlier = best_iteration(comparable, self.judge)

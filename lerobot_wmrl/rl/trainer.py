@@ -11,16 +11,16 @@ from lerobot.utils.constants import ALGORITHM_DIR, PRETRAINED_MODEL_DIR
 from lerobot.utils.logging_utils import MetricsTracker
 from tqdm import tqdm
 
-from lerobot_wmrl.common.checkpoints import latest_checkpoint, read_weights, write_checkpoint
-from lerobot_wmrl.common.distributed import is_first_process, rank_and_size, wait_for_all
-from lerobot_wmrl.common.lerobot_compat import (
+from lerobot_wmrl.common.checkpoints import (
     checkpoint_dir,
-    gather_random_states,
-    load_training_state,
-    save_training_state,
+    latest_checkpoint,
+    read_weights,
     should_save_checkpoint,
+    write_checkpoint,
 )
+from lerobot_wmrl.common.distributed import is_first_process, rank_and_size, wait_for_all
 from lerobot_wmrl.common.tracking import Tracker
+from lerobot_wmrl.common.training_state import gather_random_states, load_training_state, save_training_state
 from lerobot_wmrl.envs.tensor_env import TensorEnv
 from lerobot_wmrl.rl.callbacks import Callback, Callbacks
 from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
@@ -157,7 +157,7 @@ def save(
     if is_first_process():
         write_checkpoint(output_dir, total, algorithm.iteration, write)
     wait_for_all()
-    return checkpoint_dir(output_dir, algorithm.iteration, total)
+    return checkpoint_dir(output_dir, total, algorithm.iteration)
 
 
 def resume(algorithm: TrainableAlgorithm, output_dir: Path) -> Path | None:

@@ -24,19 +24,14 @@ from torch.nn.parallel import DistributedDataParallel
 from torch.optim import Optimizer
 from tqdm import tqdm
 
-from lerobot_wmrl.common.checkpoints import latest_checkpoint, write_checkpoint
+from lerobot_wmrl.common.checkpoints import latest_checkpoint, should_save_checkpoint, write_checkpoint
 from lerobot_wmrl.common.constants import HUMAN_LIKE, KINDS, START_KIND
 from lerobot_wmrl.common.cuda_graphs import cuda_graphs
 from lerobot_wmrl.common.distributed import is_first_process, mean_over_processes
 from lerobot_wmrl.common.errors import FieldError, renamed
-from lerobot_wmrl.common.lerobot_compat import (
-    gather_random_states,
-    load_training_state,
-    save_training_state,
-    should_save_checkpoint,
-)
 from lerobot_wmrl.common.precision import compute_in, training_dtype
 from lerobot_wmrl.common.tracking import append_metrics
+from lerobot_wmrl.common.training_state import gather_random_states, load_training_state, save_training_state
 from lerobot_wmrl.data.checks import require_shown
 from lerobot_wmrl.data.clips import ClipSampler, FrameSampler, InTurn
 from lerobot_wmrl.data.dataset import TrainingData

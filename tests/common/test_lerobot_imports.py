@@ -1,21 +1,8 @@
-"""Training states that are ours, and what this project imports from LeRobot outside its documented API."""
+"""What this project imports from LeRobot outside its documented API."""
 
 import ast
 import importlib
 from pathlib import Path
-
-import pytest
-import torch
-from lerobot.utils.random_utils import set_seed
-
-from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.lerobot_compat import (
-    checkpoint_dir,
-    gather_random_states,
-    load_training_state,
-    save_training_state,
-    should_save_checkpoint,
-)
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("lerobot_wmrl", "policies", "datasets", "robots")
@@ -83,51 +70,3 @@ def test_what_is_imported_from_lerobot_outside_its_documented_api_is_listed() ->
     for module, names in UNDOCUMENTED.items():
         for name in names:
             assert hasattr(importlib.import_module(module), name), f"{module}.{name}"
-
-
-def learn(
-    model: torch.nn.Module, optimizer: torch.optim.Optimizer, scheduler: torch.optim.lr_scheduler.LRScheduler
-) -> None:
-    optimizer.zero_grad()
-    model(torch.randn(4, 3)).square().sum().backward()
-    optimizer.step()
-    scheduler.step()
-
-
-def make() -> tuple[torch.nn.Module, torch.optim.Optimizer, torch.optim.lr_scheduler.LRScheduler]:
-    set_seed(0)
-    model = torch.nn.Linear(3, 2)
-    optimizer = torch.optim.AdamW(model.parameters(), lr=0.1)
-    return model, optimizer, torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: 0.9**step)
-
-
-def test_a_training_continues_bit_for_bit(tmp_path: Path) -> None:
-    model, optimizer, scheduler = make()
-    for _ in range(3):
-        learn(model, optimizer, scheduler)
-    save_training_state(tmp_path, 3, gather_random_states(), optimizer, scheduler)
-    weights = {name: value.clone() for name, value in model.state_dict().items()}
-    learn(model, optimizer, scheduler)
-    again, optimizer_again, scheduler_again = make()
-    again.load_state_dict(weights)
-    set_seed(5)
-    assert load_training_state(tmp_path, optimizer_again, scheduler_again) == 3
-    learn(again, optimizer_again, scheduler_again)
-    assert torch.equal(again.weight, model.weight)
-    assert scheduler_again.get_last_lr() == scheduler.get_last_lr()
-
-
-def test_another_number_of_processes_and_a_missing_state_are_named(tmp_path: Path) -> None:
-    _, optimizer, _ = make()
-    folder = tmp_path / "checkpoints" / "000001"
-    with pytest.raises(ValueError, match=r"training_state\.pt: cannot be read .*an earlier version"):
-        load_training_state(folder, optimizer)
-    save_training_state(folder, 1, 2 * gather_random_states(), optimizer)
-    with pytest.raises(FieldError, match=r"began with 2 processes, here are 1; .*--nproc_per_node=2"):
-        load_training_state(folder, optimizer)
-
-
-def test_checkpoints_are_named_and_due_as_lerobots() -> None:
-    assert checkpoint_dir(Path("run"), 500, 20_000) == Path("run/checkpoints/000500")
-    assert checkpoint_dir(Path("run"), 500, 10**7).name == "00000500"
-    assert [step for step in range(1, 8) if should_save_checkpoint(step, 3, 7)] == [3, 6, 7]

@@ -1,14 +1,13 @@
-"""What LeRobot has under names that change from one release to the next, kept here as our own.
+"""What a training needs beside its weights in order to continue: `training_state` of a checkpoint.
 
-Checkpoints have LeRobot's layout, `checkpoints/<step>/{pretrained_model,training_state}`. What is inside
-`training_state` is ours, so that LeRobot 0.6.1 and 0.6.2 read and write the same.
+The file is ours, so that LeRobot 0.6.1 and 0.6.2 read and write the same.
 """
 
 from pathlib import Path
 from typing import Any, Final
 
 import torch
-from lerobot.utils.constants import CHECKPOINTS_DIR, TRAINING_STATE_DIR
+from lerobot.utils.constants import TRAINING_STATE_DIR
 from lerobot.utils.random_utils import deserialize_rng_state, serialize_rng_state
 from torch import distributed as dist
 from torch.optim import Optimizer
@@ -18,21 +17,6 @@ from lerobot_wmrl.common.distributed import rank_and_size
 from lerobot_wmrl.common.errors import FieldError
 
 TRAINING_STATE_FILE: Final = "training_state.pt"
-
-
-def checkpoint_name(step: int, total_steps: int) -> str:
-    """Return the name of a step's checkpoint folder: `000500`, wider only where steps have more digits."""
-    return f"{step:0{max(6, len(str(total_steps)))}d}"
-
-
-def checkpoint_dir(output_dir: Path, step: int, total_steps: int) -> Path:
-    """Return the folder of a step's checkpoint."""
-    return output_dir / CHECKPOINTS_DIR / checkpoint_name(step, total_steps)
-
-
-def should_save_checkpoint(step: int, save_freq: int, total_steps: int) -> bool:
-    """Return whether a step is the last one or one of every `save_freq`."""
-    return step % save_freq == 0 or step == total_steps
 
 
 def gather_random_states() -> list[dict[str, Any]]:
