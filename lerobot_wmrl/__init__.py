@@ -3,9 +3,10 @@
 Importing any part of this package registers its policies, reward models, environments and algorithms with
 LeRobot. Only their configurations are imported for that: models and the simulator load when one is built.
 
-Notation used as tensor suffixes across the package:
-B batch (environments), T time (frames), S tokens a frame, C channels or code factors, D model width,
-H image height, W image width, A action size, P proprioceptive state size, V code levels of one factor.
+Letters in the shapes that docstrings give:
+B batch (environments), T time (frames), N cameras, S tokens a frame, C channels or code factors,
+D model width, H image height, W image width, A action size, P size of the robot's state, V logits of a token
+(the levels of all its factors).
 """
 
 from importlib import import_module

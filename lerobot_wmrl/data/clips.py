@@ -36,9 +36,9 @@ class Clip(NamedTuple):
         valid: (B, T), False where the episode is padded.
         done_known: (B, T), False where `done` is unknown.
         instructions: B of them.
-        features: (B, T, F) of the frames, by the tokenizer's success classifier, if it has one.
         depth: (B, T, S) metres of each token, for models that look at depth.
         context: context of the B episodes' first frames, for models that look at it.
+        features: (B, T, F) of the frames, by the tokenizer's success classifier, if it has one.
         success_weight: of a frame with success in the loss of done.
     """
 
@@ -130,17 +130,17 @@ class ClipSampler:
         known = valid & self.table.done_known & (shows_start | (offsets == 0))[:, None]
         context = NO_CONTEXT if self.context is None else Context((self._tensor(self.context[episodes]),))
         return Clip(
-            self._tensor(self.tokens[rows]).long(),
-            self._tensor(self.table.state[rows]),
-            self._tensor(self.table.action[rows]),
-            self._tensor(self.table.success_target[rows]).float(),
-            self._tensor(valid),
-            self._tensor(known),
-            [self.table.instructions[episode] for episode in episodes],
-            None if self.depth is None else self._tensor(self.depth[rows]),
-            context,
-            None if self.features is None else self._tensor(self.features[rows]),
-            self.success_weight,
+            tokens=self._tensor(self.tokens[rows]).long(),
+            state=self._tensor(self.table.state[rows]),
+            action=self._tensor(self.table.action[rows]),
+            done=self._tensor(self.table.success_target[rows]).float(),
+            valid=self._tensor(valid),
+            done_known=self._tensor(known),
+            instructions=[self.table.instructions[episode] for episode in episodes],
+            depth=None if self.depth is None else self._tensor(self.depth[rows]),
+            context=context,
+            features=None if self.features is None else self._tensor(self.features[rows]),
+            success_weight=self.success_weight,
         )
 
     def _tensor(self, array: np.ndarray) -> Tensor:
@@ -266,8 +266,17 @@ def clip_from_windows(
         done, known = last * batch[DONE].reshape(rows, 1).float(), last & begins
     tokens, state, action = (take_steps(values, index) for values in (tokens, state, action))
     depth, features = (each if each is None else take_steps(each, index) for each in (depth, features))
-    clip = Clip(tokens, state, action, done, valid, known, list(batch.get("task", [""] * rows)), depth)
-    return clip._replace(features=features)
+    return Clip(
+        tokens=tokens,
+        state=state,
+        action=action,
+        done=done,
+        valid=valid,
+        done_known=known,
+        instructions=list(batch.get("task", [""] * rows)),
+        depth=depth,
+        features=features,
+    )
 
 
 def unpadded_rows(padded: Tensor) -> Tensor:

@@ -77,12 +77,12 @@ class StartImages(NamedTuple):
 
         instructions = [self.instructions[row] for row in rows]
         return StartImages(
-            self.images[rows],
-            self.first_images[rows],
-            self.state[rows],
-            instructions,
-            self.tasks[rows],
-            depth,
+            images=self.images[rows],
+            first_images=self.first_images[rows],
+            state=self.state[rows],
+            instructions=instructions,
+            tasks=self.tasks[rows],
+            depth=depth,
         )
 
 
@@ -196,8 +196,7 @@ def branch_frames(table: EpisodeTable, episodes: np.ndarray, branches: int) -> n
 
 def read_dataset_frames(source: StartFrames, config: WorldModelConfig) -> StartImages:
     """Read frames of a LeRobotDataset's episodes: the first ones, and those of the branches."""
-    sizes = config.tokenizer
-    assert sizes is not None, "a trained world model knows its tokenizer"
+    sizes = config.trained_tokenizer
     table = read_episodes(source.open())
     check_dataset(config, table.dataset.meta)
     if source.branches and not sizes.context:
@@ -221,12 +220,12 @@ def recorded_frames(table: EpisodeTable, rows: np.ndarray, sizes: TokenizerConfi
         return model.recorded_depth(table.dataset, rows)
 
     return StartImages(
-        images[rows],
-        images[table.start[episodes]],
-        table.state[rows],
-        [table.instructions[episode] for episode in episodes],
-        table.column(START_TASK)[episodes],
-        depth,
+        images=images[rows],
+        first_images=images[table.start[episodes]],
+        state=table.state[rows],
+        instructions=[table.instructions[episode] for episode in episodes],
+        tasks=table.column(START_TASK)[episodes],
+        depth=depth,
     )
 
 
@@ -255,9 +254,8 @@ def read_saved_frames(path: Path, max_starts: int, config: WorldModelConfig) -> 
     Raises:
         FieldError: the file lacks one of these, or has it in another shape.
     """
-    assert config.tokenizer is not None, "a trained world model knows its tokenizer"
     found = read_arrays(path)
-    side, shapes = config.tokenizer.image_size, config.tokenizer.frame_shapes
+    side, shapes = config.trained_tokenizer.image_size, config.trained_tokenizer.frame_shapes
     images = {key: (height, width, 3) for key, (_, height, width) in shapes.items()}
     states = {OBS_STATE: (config.state_size,)} if config.state_size else {}
     wanted = {**images, **states, INSTRUCTION: ()}
@@ -304,8 +302,7 @@ def simulate_first_frames(source: StartFrames, config: WorldModelConfig) -> Star
     Raises:
         FieldError: the dataset's frames, which they have to be like, are no squares of one size.
     """
-    tasks, sizes = source.tasks or TASKS[:1], config.tokenizer
-    assert sizes is not None, "a trained world model knows its tokenizer"
+    tasks, sizes = source.tasks or TASKS[:1], config.trained_tokenizer
     remedy = "start in the dataset's episodes (`dataset.root`)"
     side = maniskill_side(sizes, "dataset.resets", source.resets, remedy)
     env = WmrlManiSkillEnv(

@@ -281,13 +281,13 @@ def gate_at(outcomes: Outcomes, threshold: float, frames: int) -> Gate:
     """Count false positives and recall at one operating point."""
     predicted, success = outcomes.first_predicted_success(threshold, frames) >= 0, outcomes.success
     return Gate(
-        threshold,
-        frames,
-        Proportion(int((predicted & ~success).sum()), int((~success).sum())),
-        Proportion(int((predicted & success).sum()), int(success.sum())),
-        int(outcomes.cut_short(frames).sum()),
-        outcomes.ends_at_success(frames),
-        outcomes.auc(frames),
+        threshold=threshold,
+        frames=frames,
+        false_positives=Proportion(int((predicted & ~success).sum()), int((~success).sum())),
+        recall=Proportion(int((predicted & success).sum()), int(success.sum())),
+        cut_short=int(outcomes.cut_short(frames).sum()),
+        repeats_last=outcomes.ends_at_success(frames),
+        auc=outcomes.auc(frames),
     )
 
 

@@ -70,9 +70,7 @@ class World:
     @property
     def sizes(self) -> TokenizerConfig:
         """Cameras of the world model and sizes of their images."""
-        found = self.model.tokenizer
-        assert found is not None, "a trained world model knows its tokenizer"
-        return found
+        return self.model.trained_tokenizer
 
     def description(self) -> dict[str, Any]:
         """Return what the page needs to know, as JSON."""

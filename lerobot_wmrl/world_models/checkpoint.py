@@ -125,8 +125,7 @@ def check_dataset(config: FrameTokenizerConfig | WorldModelConfig, meta: Any) ->
     meta: the dataset's metadata, a LeRobotDatasetMetadata.
     """
     features = meta.features
-    sizes = config.tokenizer
-    assert sizes is not None, "a trained model knows its tokenizer"
+    sizes = config.trained_tokenizer if isinstance(config, WorldModelConfig) else config.tokenizer
     check_cameras(features, sizes.camera_keys)
     if isinstance(config, WorldModelConfig):
         if config.depth:

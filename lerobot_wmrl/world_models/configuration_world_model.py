@@ -1,6 +1,7 @@
 """Configurations of the action-conditioned and the text-conditioned world model, and of their dynamics."""
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 from draccus import ChoiceRegistry
 from lerobot.configs.rewards import RewardModelConfig
@@ -30,15 +31,21 @@ class DynamicsConfig(ChoiceRegistry):
     heads: int = 4
     patch: int = 2
     code_width: int = 48
-    depth = False  # not a field: only autoregressive dynamics can look at depth
-    sees_context = False  # not a field: only anchored dynamics look at the tokenizer's context
-    predicts_success = False  # not a field: only anchored dynamics predict the success classifier's features
+    uses_context: ClassVar[bool] = False
+    """Whether it looks at the tokenizer's context."""
+    predicts_success: ClassVar[bool] = False
+    """Whether it predicts the features of the tokenizer's success classifier."""
 
     def __post_init__(self) -> None:
         with within("dynamics"):
             require_at_least(self, 1, "layers", "width", "heads", "patch", "code_width")
         if self.width % (2 * self.heads):
             raise FieldError("dynamics.width", self.width, "must be a multiple of 2 x `dynamics.heads`")
+
+    @property
+    def looks_at_depth(self) -> bool:
+        """Whether it predicts from depth too, and predicts it."""
+        return False
 
     @classmethod
     def default_choice_name(cls) -> str:
@@ -63,8 +70,8 @@ class AnchoredConfig(DynamicsConfig):
     """
 
     dropout: float = 0.0
-    sees_context = True
-    predicts_success = True
+    uses_context: ClassVar[bool] = True
+    predicts_success: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -108,16 +115,22 @@ class WorldModelConfig(RewardModelConfig):
         return None
 
     @property
+    def trained_tokenizer(self) -> TokenizerConfig:
+        """The tokenizer's settings, which every trained world model has."""
+        assert self.tokenizer is not None, "filled in before the training"
+        return self.tokenizer
+
+    @property
     def depth(self) -> bool:
         """Whether the dynamics look at depth."""
-        return self.dynamics.depth
+        return self.dynamics.looks_at_depth
 
     @property
     def context_channels(self) -> int:
         """Channels of the tokenizer's context, as far as the dynamics look at it; 0 if they do not."""
         if self.tokenizer is None or not self.tokenizer.context:
             return 0
-        return self.tokenizer.widths[-1] if self.dynamics.sees_context else 0
+        return self.tokenizer.widths[-1] if self.dynamics.uses_context else 0
 
     @property
     def predicts_success(self) -> bool:
@@ -155,9 +168,8 @@ class ActionWorldModelConfig(WorldModelConfig):
     def observation_shapes(self) -> dict[str, tuple[int, ...]]:
         """Shapes of what a policy sees in imagination: images (3, H, W), and the state (P,) if it is
         predicted."""
-        assert self.tokenizer is not None, "a trained world model knows its tokenizer"
         state = {OBS_STATE: (self.state_size,)} if self.state_size else {}
-        return {**self.tokenizer.frame_shapes, **state}
+        return {**self.trained_tokenizer.frame_shapes, **state}
 
 
 @RewardModelConfig.register_subclass("text_world_model")

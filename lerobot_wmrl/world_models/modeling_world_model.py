@@ -67,14 +67,19 @@ probability of one half imaginations would end in success."""
 
 def make_dynamics(config: WorldModelConfig, grid: int) -> Dynamics:
     """Make the dynamics that the configuration chooses, untrained, for a tokenizer with this grid."""
-    tokenizer, chosen = config.tokenizer, config.dynamics
-    assert tokenizer is not None
+    tokenizer, chosen = config.trained_tokenizer, config.dynamics
     if grid % chosen.patch:
         raise FieldError("dynamics.patch", chosen.patch, f"must divide the tokenizer's grid, {grid}")
     sizes = FrameSizes(
-        tokenizer.levels, tokenizer.quantizer, grid, len(tokenizer.cameras), config.state_size,
-        config.clip_length, config.context_channels, config.predicts_success,
-    )  # fmt: skip
+        levels=tokenizer.levels,
+        quantizer=tokenizer.quantizer,
+        grid=grid,
+        num_cameras=len(tokenizer.cameras),
+        state_size=config.state_size,
+        clip_length=config.clip_length,
+        context_channels=config.context_channels,
+        success=config.predicts_success,
+    )
     if isinstance(chosen, AnchoredConfig):
         return AnchoredDynamics(chosen, sizes)
     assert isinstance(chosen, AutoregressiveConfig)
@@ -271,8 +276,7 @@ class ActionWorldModelRewardModel(WorldModelRewardModel):
             state: (B, P); left out if it is not predicted.
             instructions: B of them, `task`.
         """
-        assert self.config.tokenizer is not None, "a trained world model knows its tokenizer"
-        shown = {**split_cameras(images, self.config.tokenizer.frame_shapes)}
+        shown = {**split_cameras(images, self.config.trained_tokenizer.frame_shapes)}
         if self.config.state_size:
             shown[OBS_STATE] = state
         return {**shown, "task": list(instructions)}

@@ -38,6 +38,10 @@ class AutoregressiveConfig(DynamicsConfig):
     self_rollout: float = 0.0
     keypoint_weight: float = 0.0
 
+    @property
+    def looks_at_depth(self) -> bool:
+        return self.depth
+
     def __post_init__(self) -> None:
         super().__post_init__()
         with within("dynamics"):
