@@ -5,6 +5,9 @@ from typing import Any, Final
 Observation = dict[str, Any]
 """Tensors by LeRobot's names, batch first, and `task`: a list of instructions."""
 
+INSTRUCTIONS: Final = "task"
+"""LeRobot's name of the instructions in an observation."""
+
 TASKS: Final = ("push", "pull", "pick_place", "move_to_aim")
 """Vocabulary of the column `start.task`."""
 

@@ -16,7 +16,7 @@ import torch
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from lerobot_wmrl.common.constants import START_SCENE, START_TASK, TASKS
+from lerobot_wmrl.common.constants import INSTRUCTIONS, START_SCENE, START_TASK, TASKS
 from lerobot_wmrl.common.errors import FieldError, renamed, within
 from lerobot_wmrl.common.images import stretch, to_pixels
 from lerobot_wmrl.common.statistics import evenly_spaced
@@ -43,9 +43,6 @@ from lerobot_wmrl.world_models.modeling_world_model import (
 
 GOAL_BATCH = 64
 """Goal frames that are imagined at once."""
-
-INSTRUCTION = "task"
-"""Name of the instructions in a file of saved frames."""
 
 
 class StartImages(NamedTuple):
@@ -258,7 +255,7 @@ def read_saved_frames(path: Path, max_starts: int, config: WorldModelConfig) -> 
     side, shapes = config.trained_tokenizer.image_size, config.trained_tokenizer.frame_shapes
     images = {key: (height, width, 3) for key, (_, height, width) in shapes.items()}
     states = {OBS_STATE: (config.state_size,)} if config.state_size else {}
-    wanted = {**images, **states, INSTRUCTION: ()}
+    wanted = {**images, **states, INSTRUCTIONS: ()}
     count = max((len(found[name]) for name in wanted if name in found and found[name].ndim), default=0)
     for name, size in wanted.items():
         if name not in found or not count or found[name].shape != (count, *size):
@@ -273,7 +270,7 @@ def read_saved_frames(path: Path, max_starts: int, config: WorldModelConfig) -> 
     state = found[OBS_STATE][rows].astype(np.float32) if states else np.zeros((len(rows), 0), np.float32)
     if not np.isfinite(state).all():
         raise FieldError("dataset.frames", path, f"{OBS_STATE} contains NaN or infinity")
-    instructions = [str(text) for text in found[INSTRUCTION][rows]]
+    instructions = [str(text) for text in found[INSTRUCTIONS][rows]]
     squares = np.stack([_squares(found[name][rows], side) for name in shapes], 1)
     return StartImages(squares, squares, state, instructions, np.full(len(rows), -1), without_depth)
 

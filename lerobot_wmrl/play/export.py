@@ -32,7 +32,7 @@ RUNTIME_FILES: Final = {
 }
 """Name in the page → in the package. Not every host of files knows that `.mjs` is JavaScript."""
 
-POLICY: Final = (
+CONTENT_SECURITY_POLICY: Final = (
     "default-src 'self'; script-src 'self' 'wasm-unsafe-eval'; img-src 'self' data: blob:; "
     "connect-src 'self' data:; worker-src 'self' blob:"
 )
@@ -88,7 +88,7 @@ def export_page(world: World, folder: Path, starts: int) -> str:
 def index_page() -> str:
     """Return the served page, but with the world model in the browser."""
     served = (PAGES / "index.html").read_text()
-    guard = f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'
+    guard = f'<meta http-equiv="Content-Security-Policy" content="{CONTENT_SECURITY_POLICY}">'
     return served.replace("<head>", f"<head>\n{guard}").replace("./server.js", "./local.js")
 
 

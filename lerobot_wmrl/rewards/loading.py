@@ -13,6 +13,7 @@ from lerobot.utils.constants import OBS_IMAGE
 from torch import Tensor
 
 from lerobot_wmrl.common.checkpoints import local_checkpoint
+from lerobot_wmrl.common.constants import INSTRUCTIONS
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig, LearnedRewardConfig
 from lerobot_wmrl.rewards.general import potential_discount
@@ -20,7 +21,6 @@ from lerobot_wmrl.rewards.modeling_rewards import EmbeddingRewardModel, ProxyRew
 from lerobot_wmrl.world_models.checkpoint import load_model, read_config
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 
-TASK: Final = "task"
 PREPROCESSORS: Final = "*preprocessor.json"
 """Each type of reward model saves its preprocessor under a name of its own."""
 
@@ -67,7 +67,7 @@ class LeRobotReward:
 
         The reward is shown its input features alone.
         """
-        known = {*(self.reward.config.input_features or batch), TASK}
+        known = {*(self.reward.config.input_features or batch), INSTRUCTIONS}
         device = batch["success"].device
         prepared = self.preprocessor({name: value for name, value in batch.items() if name in known})
         return self.reward.compute_reward(prepared).float().to(device)

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 from tqdm import tqdm
 
+from lerobot_wmrl.common.constants import INSTRUCTIONS
 from lerobot_wmrl.common.distributed import (
     average_gradients,
     gather_counts,
@@ -26,7 +27,7 @@ from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
 from lerobot_wmrl.rl.labels import Labels, Windows, imagined_labels, recorded_successes
-from lerobot_wmrl.rl.observations import TASK, as_read_back
+from lerobot_wmrl.rl.observations import as_read_back
 from lerobot_wmrl.rl.protocol import Observation, Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer
 from lerobot_wmrl.rl.seeds import seeded_noise
@@ -169,7 +170,7 @@ class Distillation(RLAlgorithm):
                     ahead = (step - lead) % self.config.planner.execute
                     if not ahead:
                         planned = planned[alive[planned]]
-                        tasks = [observation[TASK][row] for row in planned.tolist()]
+                        tasks = [observation[INSTRUCTIONS][row] for row in planned.tolist()]
                         policy.reset()
                         proposed = env.policy_actions(act, planned, horizon)
                         chunk = planner.plan(env.newest_frames()[planned], tasks, proposed)

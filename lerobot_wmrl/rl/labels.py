@@ -13,11 +13,12 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from lerobot_wmrl.common.constants import INSTRUCTIONS
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.frame_cache import decode_episode
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.envs.start_frames import every_chosen_episode
-from lerobot_wmrl.rl.observations import TASK, ObservationBuffer, decoded
+from lerobot_wmrl.rl.observations import ObservationBuffer, decoded
 from lerobot_wmrl.rl.policy_adapters import ACTION_IS_PAD
 
 ROWS = "rows"
@@ -67,7 +68,9 @@ class Part:
         """Return some of the labels, as LeRobot's datasets would give them: images in [0, 1]."""
         rows = self.rows[labels]
         own = rows if rows.ndim == 1 else rows[:, -1]
-        seen = {name: value[own if name == TASK else rows] for name, value in self.observations.items()}
+        seen = {
+            name: value[own if name == INSTRUCTIONS else rows] for name, value in self.observations.items()
+        }
         actions = {name: value[labels] for name, value in self.actions.items()}
         return decoded(seen | actions, self.instructions)
 
@@ -125,7 +128,7 @@ class Labels:
             part, begin = parts[index], int(ends[index - 1]) if index else 0
             taken.append(part.batch(drawn[part_of == index] - begin))
         return {
-            name: [text for batch in taken for text in batch[name]] if name == TASK
+            name: [text for batch in taken for text in batch[name]] if name == INSTRUCTIONS
             else torch.cat([batch[name] for batch in taken])
             for name in taken[0]
         }  # fmt: skip
@@ -171,7 +174,8 @@ def recorded_successes(
         observations[OBS_STATE] = torch.from_numpy(table.state[rows.numpy()])
     step, labelled = acting.nonzero(as_tuple=True)
     return [Part(
-        observations | {TASK: episode}, actions, observed_rows(begin[labelled], step, windows.observations),
+        observations | {INSTRUCTIONS: episode}, actions,
+        observed_rows(begin[labelled], step, windows.observations),
         [table.instructions[each] for each in episodes],
     )]  # fmt: skip
 

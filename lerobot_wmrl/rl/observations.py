@@ -6,10 +6,9 @@ import torch
 from lerobot.utils.constants import OBS_IMAGE
 from torch import Tensor
 
+from lerobot_wmrl.common.constants import INSTRUCTIONS
 from lerobot_wmrl.common.images import to_bytes
 from lerobot_wmrl.rl.protocol import Observation
-
-TASK = "task"
 
 
 class ObservationBuffer:
@@ -31,9 +30,9 @@ class ObservationBuffer:
             for name, value in observation.items()
             if isinstance(value, Tensor)
         }
-        if texts := observation.get(TASK):
+        if texts := observation.get(INSTRUCTIONS):
             indices = [self.instructions.setdefault(text, len(self.instructions)) for text in texts]
-            encoded[TASK] = torch.tensor(indices)  # on the CPU, where the texts are
+            encoded[INSTRUCTIONS] = torch.tensor(indices)  # on the CPU, where the texts are
         for name, value in encoded.items():
             if name not in self.tensors:
                 self.tensors[name] = value.new_empty((self.steps, self.num_envs, *value.shape[1:]))
@@ -61,7 +60,7 @@ def decoded(stored: dict[str, Tensor], instructions: Sequence[str]) -> Observati
     """Return stored observations as the policy sees them: images in [0, 1], instructions as texts."""
     return {
         name: value.float() / 255 if name.startswith(OBS_IMAGE)
-        else [instructions[index] for index in value.tolist()] if name == TASK
+        else [instructions[index] for index in value.tolist()] if name == INSTRUCTIONS
         else value
         for name, value in stored.items()
     }  # fmt: skip

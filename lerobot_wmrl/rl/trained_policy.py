@@ -18,7 +18,7 @@ from lerobot_wmrl.rl.configuration_train import TrainConfig
 PATHS: Final = ("path", "root", "frames", "assets")
 """Ends of the names of settings that may be folders or files of this machine."""
 
-UNPUBLISHED: Final = "FOLDER"
+LOCAL_FOLDER: Final = "FOLDER"
 """On a card, what stands for a folder of the machine on which the policy was trained."""
 
 CARD: Final = """---
@@ -83,7 +83,7 @@ def evaluation(cfg: TrainConfig, path: str, shared: bool = False) -> str:
     for name in settings if shared else ():
         place = Path(str(settings[name]))
         if name.endswith(PATHS) and (place.is_absolute() or place.exists()):
-            settings[name] = UNPUBLISHED
+            settings[name] = LOCAL_FOLDER
     flags = {"policy.path": path, **settings, "eval.n_episodes": 100, "seed": EVALUATION_SEED}
     return shlex.join(["lerobot-eval", *format_flags(flags)])
 

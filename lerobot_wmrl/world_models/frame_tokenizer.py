@@ -21,7 +21,7 @@ from lerobot_wmrl.world_models.success import SuccessClassifier
 MOTION_THRESHOLD = 0.08
 """A pixel has moved when a colour, in [0, 1], differs by more from the episode's first frame."""
 
-MOTION_WEIGHT = 4.0
+MOVED_PIXEL_WEIGHT = 4.0
 """How much more a pixel counts in the loss once it has moved."""
 
 ImageLoss = Callable[[Tensor, Tensor], Tensor]
@@ -187,7 +187,7 @@ class FrameTokenizer(nn.Module):
 
 
 def motion_weight(images: Tensor, reference: Tensor) -> Tensor:
-    """Weigh pixels by 1 on the static background and by 1 + MOTION_WEIGHT where something has moved.
+    """Weigh pixels by 1 on the static background and by 1 + MOVED_PIXEL_WEIGHT where something has moved.
 
     A static background otherwise dominates the mean error and hides what decides success.
 
@@ -200,7 +200,7 @@ def motion_weight(images: Tensor, reference: Tensor) -> Tensor:
     """
     change = (images - reference).abs().amax(dim=2, keepdim=True)
     moved = F.max_pool2d((change.flatten(0, 1) > MOTION_THRESHOLD).float(), 5, stride=1, padding=2)
-    return 1 + MOTION_WEIGHT * moved.reshape(change.shape)
+    return 1 + MOVED_PIXEL_WEIGHT * moved.reshape(change.shape)
 
 
 def feature_distance(features: Sequence[Tensor], goal: Sequence[Tensor]) -> Tensor:

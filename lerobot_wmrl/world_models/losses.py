@@ -13,7 +13,7 @@ from lerobot_wmrl.world_models.layers import STATE_STEP, Prediction
 STATE_WEIGHT: Final = 4.0
 """Weight of the state's loss beside those of tokens and done, which count 1."""
 
-MOTION_WEIGHT: Final = 1.0
+MOVING_TOKEN_WEIGHT: Final = 1.0
 """Extra weight of a token that moves. If it is high, the model imagines motion that does not happen, such as
 objects that move although the hand misses them."""
 
@@ -72,7 +72,7 @@ def weighted_frames(codebook: CodeBook, target: Tensor, reference: Tensor, known
         known: (B, K), False for frames that do not count.
     """
     moved = known[..., None] & (codebook.distance(target, reference) >= MOTION_LEVELS)
-    return TargetFrames(target, (1 + MOTION_WEIGHT * moved) * known[..., None].float(), moved)
+    return TargetFrames(target, (1 + MOVING_TOKEN_WEIGHT * moved) * known[..., None].float(), moved)
 
 
 def next_frame_loss(

@@ -23,9 +23,9 @@ from torch import Tensor
 
 from lerobot_policy_openvla.actions import BINS
 from lerobot_policy_openvla.configuration_openvla import OpenVLAConfig
+from lerobot_wmrl.common.constants import INSTRUCTIONS
 from lerobot_wmrl.common.errors import FieldError
 
-TASK = "task"
 PROMPT: Final = "In: What action should the robot take to {instruction}?\nOut:"
 SPACE: Final = "▁"
 UNKNOWN, BEGIN, END, PAD = "<unk>", "<s>", "</s>", "<PAD>"
@@ -142,7 +142,7 @@ def select_inputs(config: OpenVLAConfig, observation: dict[str, Any]) -> tuple[T
     """Return images (B, 3, H, W) and instructions. Raises ValueError if the observation lacks them."""
     camera = camera_name(config, observation)
     images = observation[camera]
-    instructions = observation.get(TASK)
+    instructions = observation.get(INSTRUCTIONS)
     if isinstance(instructions, str):
         instructions = [instructions] * len(images)
     if instructions is None or len(instructions) != len(images):

@@ -231,7 +231,7 @@ def test_steps_are_sampled_among_those_with_a_valid_next_one():
 
 
 def test_tokens_that_are_not_as_at_the_start_count_more_and_padding_nothing(monkeypatch):
-    monkeypatch.setattr(losses, "MOTION_WEIGHT", 2.0)
+    monkeypatch.setattr(losses, "MOVING_TOKEN_WEIGHT", 2.0)
     codebook, clip = CodeBook([5, 4]), random_clip()
     valid = clip.valid.clone()
     valid[1, 2:] = False

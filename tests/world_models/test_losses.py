@@ -32,7 +32,7 @@ def loss_of(prediction: Prediction, codes: torch.Tensor, clip: Clip) -> tuple[to
 
 @pytest.fixture(autouse=True)
 def moving_tokens_count_more(monkeypatch):
-    monkeypatch.setattr(losses, "MOTION_WEIGHT", 3.0)
+    monkeypatch.setattr(losses, "MOVING_TOKEN_WEIGHT", 3.0)
 
 
 def test_padding_does_not_count():
