@@ -31,9 +31,9 @@ from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_policy_cnn.processor_cnn import make_cnn_pre_post_processors
 from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.common.pipeline import make_pipeline
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
-from lerobot_wmrl.rl.policy_adapters import make_pipeline
 from lerobot_wmrl.rl.ppo import PPO
 from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
 from lerobot_wmrl.world_models.checkpoint import read_config

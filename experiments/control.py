@@ -24,12 +24,12 @@ from gymnasium.vector import AutoresetMode
 from torch import Tensor, nn
 from torch.distributions import Categorical, Distribution, Normal
 
-from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.constants import EVALUATION_SEED, Observation
 from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.common.pipeline import Pipeline
 from lerobot_wmrl.envs.tensor_env import TensorEnv
 from lerobot_wmrl.rl.configuration_algorithms import PolicyGradientConfig, PPOConfig
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
-from lerobot_wmrl.rl.protocol import Observation, Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer
 from lerobot_wmrl.rl.trainer import Schedule, make_algorithm, train
 

@@ -18,7 +18,7 @@ from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.features import describe_alike
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
-from lerobot_wmrl.rl.rollout_recorder import RolloutRecorder
+from lerobot_wmrl.envs.rollout_recorder import RolloutRecorder
 
 SETTINGS_FILE: Final = Path("meta/rollouts.json")
 """The settings that decide the episodes."""

@@ -16,13 +16,13 @@ from lerobot_dataset_maniskill.worker import EpisodeResult, Report, out_of_range
 from lerobot_dataset_maniskill.writer import Outcome, StartColumns, add_step
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.exploration import ExplorationNoise
+from lerobot_wmrl.common.pipeline import make_pipeline
 from lerobot_wmrl.common.policies import fit_to_environment, load_policy, load_processors
 from lerobot_wmrl.envs.evaluation_adapter import images_to_numpy
 from lerobot_wmrl.envs.start_frames import maniskill_side
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW, ACTION_NAMES, STATE_NAMES, TRANSLATION
 from lerobot_wmrl.maniskill.episode import Frame
 from lerobot_wmrl.maniskill.tasks import task_of
-from lerobot_wmrl.rl.policy_adapters import make_pipeline
 
 Row = tuple[Frame, np.ndarray, Outcome]
 

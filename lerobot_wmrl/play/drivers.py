@@ -8,10 +8,10 @@ from lerobot.configs import PreTrainedConfig
 from torch import Tensor
 
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.pipeline import make_pipeline
 from lerobot_wmrl.common.policies import check_units, fit_to_environment, load_policy, load_processors
 from lerobot_wmrl.envs.world_model_env import Observation
 from lerobot_wmrl.play.drive import Drive
-from lerobot_wmrl.rl.policy_adapters import make_pipeline
 from lerobot_wmrl.world_models.configuration_planner import PlannerSettings
 from lerobot_wmrl.world_models.planning import Planner
 

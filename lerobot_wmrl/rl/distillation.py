@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 from tqdm import tqdm
 
-from lerobot_wmrl.common.constants import INSTRUCTIONS
+from lerobot_wmrl.common.constants import INSTRUCTIONS, Observation
 from lerobot_wmrl.common.distributed import (
     average_gradients,
     gather_counts,
@@ -22,13 +22,13 @@ from lerobot_wmrl.common.distributed import (
     rank_and_size,
 )
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.pipeline import Pipeline
 from lerobot_wmrl.common.policies import load_trained_weights
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
 from lerobot_wmrl.rl.labels import Labels, Windows, imagined_labels, recorded_successes
 from lerobot_wmrl.rl.observations import as_read_back
-from lerobot_wmrl.rl.protocol import Observation, Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer
 from lerobot_wmrl.rl.seeds import seeded_noise
 from lerobot_wmrl.world_models.planning import Planner

@@ -14,12 +14,12 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from lerobot_wmrl.common.constants import INSTRUCTIONS
+from lerobot_wmrl.common.pipeline import ACTION_IS_PAD
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.frame_cache import decode_episode
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.envs.start_frames import every_chosen_episode
 from lerobot_wmrl.rl.observations import ObservationBuffer, decoded
-from lerobot_wmrl.rl.policy_adapters import ACTION_IS_PAD
 
 ROWS = "rows"
 """Name of `Part.rows` in a file of labels."""

@@ -6,9 +6,8 @@ import torch
 from lerobot.utils.constants import OBS_IMAGE
 from torch import Tensor
 
-from lerobot_wmrl.common.constants import INSTRUCTIONS
+from lerobot_wmrl.common.constants import INSTRUCTIONS, Observation
 from lerobot_wmrl.common.images import to_bytes
-from lerobot_wmrl.rl.protocol import Observation
 
 
 class ObservationBuffer:

@@ -1,26 +1,21 @@
-"""Adapters that make LeRobot's policies stochastic without a change to their code, and their processors.
+"""Adapters that make LeRobot's policies stochastic without a change to their code.
 
 B environments, n steps of a decision, K action components, D width of ACT's decoder.
 """
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
-from lerobot.configs import PreTrainedConfig
-from lerobot.processor import DeviceProcessorStep
-from lerobot.utils.constants import ACTION, OBS_IMAGES
+from lerobot.utils.constants import OBS_IMAGES
 from torch import Tensor, nn
 from torch.distributions import Normal
 
+from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.policies import require_chunks, unwrapped
-from lerobot_wmrl.rl.protocol import Observation, Pipeline, StochasticPolicy
-
-ACTION_IS_PAD = f"{ACTION}_is_pad"
-"""Marks the actions of a chunk beyond the end of the episode, in LeRobot's batches. (B, n) bool"""
+from lerobot_wmrl.rl.protocol import StochasticPolicy
 
 INITIAL_STD = 0.1
 """Standard deviation that exploration starts from, in normalised actions: ACT's L1 loss learns none."""
@@ -117,22 +112,3 @@ def as_stochastic(policy: Any) -> Any:
             f"take one that has them, for example cnn, or one of {', '.join(ADAPTERS)}",
         )  # fmt: skip
     return ADAPTERS[policy.config.type](policy)
-
-
-def make_pipeline(config: PreTrainedConfig, preprocessor: Any, postprocessor: Any) -> Pipeline:
-    """Wrap a policy's processors. Observations that the policy has no input for are left out. Actions stay on
-    the policy's device, where LeRobot's postprocessors would move them to the CPU."""
-    known = {*(config.input_features or {}), "task", ACTION, ACTION_IS_PAD}
-    steps = [
-        replace(step, device=config.device) if isinstance(step, DeviceProcessorStep) else step
-        for step in postprocessor.steps
-    ]
-    on_device = replace(postprocessor, steps=steps)
-
-    def prepare(observation: Observation) -> Observation:
-        return preprocessor({name: value for name, value in observation.items() if name in known})
-
-    def to_action(raw_action: Tensor) -> Tensor:
-        return on_device(raw_action)
-
-    return Pipeline(prepare, to_action)

@@ -18,6 +18,7 @@ from lerobot.rl.algorithms.configs import TrainingStats
 from torch import Tensor, nn
 from tqdm import tqdm
 
+from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.distributed import (
     average_gradients,
     gather_counts,
@@ -26,10 +27,10 @@ from lerobot_wmrl.common.distributed import (
     mean_and_variance,
     mean_over_processes,
 )
+from lerobot_wmrl.common.pipeline import Pipeline, unchanged
 from lerobot_wmrl.rl.algorithm import NORM, RATIO_ERROR, Algorithm, training_stats
 from lerobot_wmrl.rl.configuration_algorithms import PolicyGradientConfig
 from lerobot_wmrl.rl.observations import as_read_back
-from lerobot_wmrl.rl.protocol import Observation, Pipeline, unchanged
 from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
 
 GRAD_CLIP_NORM = 1.0

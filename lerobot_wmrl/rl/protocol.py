@@ -5,8 +5,7 @@ A policy may decide on n steps at once (an action chunk). Its raw actions and lo
 steps or when a new episode begins.
 """
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable
 from typing import Protocol, runtime_checkable
 
 from torch import Tensor, nn
@@ -56,22 +55,3 @@ class EncodingPolicy(Protocol):
 
     def encode(self, observation: Observation) -> Observation:
         """Return what the encoder makes of an observation; the policy's methods take it in its place."""
-
-
-def unchanged(observation: Observation) -> Observation:
-    return observation
-
-
-@dataclass(frozen=True)
-class Pipeline:
-    """A policy's processors as functions.
-
-    Args:
-        prepare: turns a stored observation into the policy's.
-        to_action: turns raw actions into the environment's.
-        store: turns the environment's observation into the stored one.
-    """
-
-    prepare: Callable[[Observation], Observation]
-    to_action: Callable[[Tensor], Tensor]
-    store: Callable[[Observation], Observation] = unchanged

@@ -19,7 +19,7 @@ from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.embodiment import Embodiment
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
-from lerobot_wmrl.rl.rollout_recorder import RolloutRecorder
+from lerobot_wmrl.envs.rollout_recorder import RolloutRecorder
 
 
 class Recorder(Protocol):

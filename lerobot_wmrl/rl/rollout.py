@@ -7,10 +7,12 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.distributed import hidden_progress, mean_over_processes
+from lerobot_wmrl.common.pipeline import Pipeline
 from lerobot_wmrl.envs.tensor_env import TensorEnv
 from lerobot_wmrl.rl.observations import ObservationBuffer, as_read_back
-from lerobot_wmrl.rl.protocol import ActionSample, Observation, Pipeline, StochasticPolicy
+from lerobot_wmrl.rl.protocol import ActionSample, StochasticPolicy
 from lerobot_wmrl.rl.seeds import seeded_noise, start_seeds
 
 

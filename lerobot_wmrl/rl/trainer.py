@@ -19,6 +19,7 @@ from lerobot_wmrl.common.checkpoints import (
     write_checkpoint,
 )
 from lerobot_wmrl.common.distributed import is_first_process, rank_and_size, wait_for_all
+from lerobot_wmrl.common.pipeline import Pipeline
 from lerobot_wmrl.common.tracking import Tracker
 from lerobot_wmrl.common.training_state import gather_random_states, load_training_state, save_training_state
 from lerobot_wmrl.envs.tensor_env import TensorEnv
@@ -29,7 +30,6 @@ from lerobot_wmrl.rl.distillation import Distillation
 from lerobot_wmrl.rl.grpo import GRPO
 from lerobot_wmrl.rl.policy_gradient import PolicyGradient
 from lerobot_wmrl.rl.ppo import PPO
-from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer
 from lerobot_wmrl.rl.seeds import first_seed
 

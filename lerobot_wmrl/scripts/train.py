@@ -109,11 +109,11 @@ def train_in(
     processors: tuple[Any, Any],
 ) -> None:
     """Check that policy and environment fit, then train. `settings` are the configuration's, as JSON."""
+    from lerobot_wmrl.common.pipeline import make_pipeline
     from lerobot_wmrl.common.policies import adopt_features, check_fit, with_new_adapters
     from lerobot_wmrl.envs.lerobot_env import check_real_env, shapes_of
     from lerobot_wmrl.rl.budget import charge_steps
     from lerobot_wmrl.rl.make_callbacks import Trained, make_callbacks
-    from lerobot_wmrl.rl.policy_adapters import make_pipeline
     from lerobot_wmrl.rl.rollout import RolloutBuffer
     from lerobot_wmrl.rl.trainer import Schedule, make_algorithm, train
 

@@ -28,7 +28,7 @@ from lerobot_wmrl.data.budget import Ledger, Limits
 from lerobot_wmrl.data.dataset import DatasetSource, open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.features import matched
-from lerobot_wmrl.rl.rollout_recorder import RolloutRecorder
+from lerobot_wmrl.envs.rollout_recorder import RolloutRecorder
 from tests.pusht import record_pusht
 from tests.rl.checkpoints import save_untrained_policy
 
@@ -208,7 +208,7 @@ def test_where_resets_choose_the_start_none_comes_twice(
     config: RecordConfig, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Here the first of two parts is recorded already."""
-    monkeypatch.setattr("lerobot_wmrl.rl.rollout_recorder.counts_resets", lambda _: True)
+    monkeypatch.setattr("lerobot_wmrl.envs.rollout_recorder.counts_resets", lambda _: True)
     reset, seeds = SyncVectorEnv.reset, []
 
     def noted(self: SyncVectorEnv, *, seed: Any = None, options: Any = None) -> Any:

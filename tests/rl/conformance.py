@@ -4,7 +4,7 @@ from typing import Any
 
 import torch
 
-from lerobot_wmrl.rl.protocol import Observation
+from lerobot_wmrl.common.constants import Observation
 
 DRAWS = 4000
 

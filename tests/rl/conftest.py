@@ -8,7 +8,7 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 
 from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
-from lerobot_wmrl.rl.protocol import Pipeline
+from lerobot_wmrl.common.pipeline import Pipeline
 
 ACTION_SCALE = 0.1
 """Metres a normalised action: the point environment's largest step."""

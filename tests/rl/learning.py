@@ -3,8 +3,8 @@
 import gymnasium as gym
 from lerobot.rl.algorithms.configs import TrainingStats
 
+from lerobot_wmrl.common.pipeline import Pipeline
 from lerobot_wmrl.rl.policy_gradient import PolicyGradient
-from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
 
 

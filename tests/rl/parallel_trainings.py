@@ -20,10 +20,10 @@ from chunk_policy import ACTIONS, ChunkPolicy, Sample
 from point_env import PointEnv
 
 from lerobot_wmrl.common.distributed import rank_and_size
+from lerobot_wmrl.common.pipeline import Pipeline
 from lerobot_wmrl.rl.callbacks import Record
 from lerobot_wmrl.rl.configuration_algorithms import PolicyGradientConfig, PPOConfig
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
-from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer
 from lerobot_wmrl.rl.trainer import Schedule, make_algorithm, train
 

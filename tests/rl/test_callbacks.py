@@ -15,6 +15,7 @@ from lerobot.processor import PolicyProcessorPipeline
 
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_wmrl.common.constants import EVALUATION_SEED, GATE_SEED, SELECTION_SEED
+from lerobot_wmrl.common.pipeline import Pipeline
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.evaluation.agreement import evaluate_within
@@ -24,7 +25,6 @@ from lerobot_wmrl.rl.callbacks import Callback, Record
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.configuration_callbacks import DYNA_SEEDS
 from lerobot_wmrl.rl.ppo import PPO
-from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer
 from lerobot_wmrl.rl.seeds import first_seed
 from lerobot_wmrl.rl.selection import Selection

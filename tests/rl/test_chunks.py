@@ -3,10 +3,10 @@
 import pytest
 import torch
 
+from lerobot_wmrl.common.pipeline import Pipeline
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.policy_gradient import read_batch
 from lerobot_wmrl.rl.ppo import PPO, generalised_advantages
-from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
 from tests.rl.chunk_policy import ChunkPolicy
 from tests.rl.learning import assert_it_learns

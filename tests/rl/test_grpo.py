@@ -10,10 +10,10 @@ import torch
 
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.pipeline import Pipeline
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 from lerobot_wmrl.rl.grpo import GRPO
-from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
 from lerobot_wmrl.rl.seeds import start_seeds
 from lerobot_wmrl.rl.trainer import Schedule, train

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import torch
 
+from lerobot_wmrl.common.pipeline import make_pipeline
 from lerobot_wmrl.common.policies import load_processors, read_policy_config
-from lerobot_wmrl.rl.policy_adapters import make_pipeline
 from tests.rl.checkpoints import save_untrained_policy
 
 IMAGE = "observation.images.third_view"

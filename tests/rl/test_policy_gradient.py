@@ -11,10 +11,10 @@ from torch import nn
 
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.pipeline import Pipeline
 from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.ppo import PPO
-from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
 from tests.rl.chunk_policy import ChunkPolicy
 from tests.rl.learning import update

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
+from lerobot_wmrl.common.pipeline import Pipeline
 from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.policy_gradient import (
@@ -20,7 +21,6 @@ from lerobot_wmrl.rl.policy_gradient import (
     reference_penalty,
 )
 from lerobot_wmrl.rl.ppo import PPO
-from lerobot_wmrl.rl.protocol import Pipeline
 from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
 from tests.rl.learning import assert_it_learns, update
 from tests.rl.point_env import PointEnv

@@ -21,10 +21,10 @@ from lerobot_wmrl.common.constants import KINDS, POLICY, START_KIND
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.embodiment import Embodiment, check_same_robot
 from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
+from lerobot_wmrl.envs import rollout_recorder
+from lerobot_wmrl.envs.rollout_recorder import robot_of
 from lerobot_wmrl.evaluation.agreement import policy_outcomes
-from lerobot_wmrl.rl import rollout_recorder
 from lerobot_wmrl.rl.recorders import EnvRecorder
-from lerobot_wmrl.rl.rollout_recorder import robot_of
 from tests.rl.checkpoints import save_untrained_policy
 
 STEPS, AIM = 5, 250.0
