@@ -10,7 +10,7 @@ between counts. A policy for the new rate has to be trained on the copy, and act
 """
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -135,38 +135,50 @@ def scaled_features(features: Mapping[str, Any], summed: np.ndarray, every: int)
 
 def episode_rows(
     dataset: "LeRobotDataset", episode: int, features: Mapping[str, Any], every: int, summed: np.ndarray
-) -> list[dict[str, Any]]:
-    """Return the rows of an episode's copy, as LeRobotDataset's `add_frame` takes them."""
+) -> Iterator[dict[str, Any]]:
+    """Yield the rows of an episode's copy, as LeRobotDataset's `add_frame` takes them."""
+    from lerobot_wmrl.data.frame_cache import decode, parts_of, rows_of
+
+    columns = kept_values(dataset, episode, features, every, summed)
+    begin = rows_of(dataset, episode).start
+    for part in parts_of(dataset, episode):  # the frames of a long episode would not fit into the memory
+        kept = [row for row in range(part.start, part.stop) if (row - begin) % every == 0]
+        frames = {key: decode(dataset, episode, key, part) for key in dataset.meta.camera_keys}
+        for row in kept:
+            images = {key: each[row - part.start].permute(1, 2, 0).numpy() for key, each in frames.items()}
+            yield images | {key: values[(row - begin) // every] for key, values in columns.items()}
+
+
+def kept_values(
+    dataset: "LeRobotDataset", episode: int, features: Mapping[str, Any], every: int, summed: np.ndarray
+) -> dict[str, Any]:
+    """Return an episode's columns but for its pictures, and `task`, at the T rows that are kept. (T, …)"""
     from lerobot.utils.constants import ACTION, DEFAULT_FEATURES, REWARD
 
-    from lerobot_wmrl.data.frame_cache import decode_episode
+    from lerobot_wmrl.data.frame_cache import rows_of
 
-    begin, end = (dataset.meta.episodes[episode][f"dataset_{edge}_index"] for edge in ("from", "to"))
-    kept, names = np.arange(0, end - begin, every), [key for key in features if key not in DEFAULT_FEATURES]
-    pictures = {key: decode_episode(dataset, episode, key)[kept] for key in dataset.meta.camera_keys}
-    numbers = [key for key in names if key not in pictures]
-    table = dataset.hf_dataset.with_format("numpy", columns=[*numbers, "task_index"])[begin:end]
-    last, columns = np.append(kept[1:], end - begin) - 1, {}
-    for key in numbers:
-        values = np.asarray(table[key]).reshape(end - begin, -1)
+    rows = rows_of(dataset, episode)
+    length = rows.stop - rows.start
+    kept = np.arange(0, length, every)
+    names = [key for key in features if key not in {*DEFAULT_FEATURES, *dataset.meta.camera_keys}]
+    table = dataset.hf_dataset.with_format(None, columns=[*names, "task_index"])[rows]
+    last, columns = np.append(kept[1:], length) - 1, {}
+    for key in names:
+        values = np.asarray(table[key])
+        if features[key]["dtype"] == "string":
+            columns[key] = [str(value) for value in values.reshape(-1)[kept]]
+            continue
         if key == ACTION:
-            columns[key] = np.where(summed, np.add.reduceat(values, kept), values[last])
+            values = np.where(summed, np.add.reduceat(values, kept), values[last])
         elif key == REWARD:
-            columns[key] = np.add.reduceat(values, kept)
+            values = np.add.reduceat(values, kept)
         elif key in SUCCESS_COLUMNS:
-            columns[key] = np.logical_or.reduceat(values, kept)
+            values = np.logical_or.reduceat(values, kept)
         else:
-            columns[key] = values[last if key.startswith(AFTER) else kept]
-    tasks = [dataset.meta.tasks.index[index] for index in np.asarray(table["task_index"])[kept]]
-    return [
-        {key: frames[row].permute(1, 2, 0).numpy() for key, frames in pictures.items()}
-        | {
-            key: str(values[row, 0]) if features[key]["dtype"] == "string" else values[row]
-            for key, values in columns.items()
-        }
-        | {"task": tasks[row]}
-        for row in range(len(kept))
-    ]
+            values = values[last if key.startswith(AFTER) else kept]
+        columns[key] = values.astype(features[key]["dtype"]).reshape(-1, *features[key]["shape"])
+    tasks = dataset.meta.tasks.index
+    return columns | {"task": [tasks[index] for index in np.asarray(table["task_index"])[kept]]}
 
 
 def main() -> None:

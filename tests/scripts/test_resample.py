@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from lerobot_wmrl.data import frame_cache
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.scripts.resample import main
@@ -27,6 +28,8 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
         CAMERA: {"dtype": "image", "shape": (SIDE, SIDE, 3), "names": ["height", "width", "channels"]},
         "next.reward": {"dtype": "float32", "shape": (1,), "names": None},
         "next.success": {"dtype": "bool", "shape": (1,), "names": None},
+        "next.done": {"dtype": "int64", "shape": (1,), "names": None},
+        "pose": {"dtype": "float64", "shape": (2, 3), "names": None},
         "note": {"dtype": "string", "shape": (1,), "names": None},
         "start.seed": {"dtype": "int64", "shape": (1,), "names": None},
     }
@@ -38,6 +41,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 "observation.state": np.array([frame], np.float32),
                 CAMERA: np.full((SIDE, SIDE, 3), 20 * frame, np.uint8),
                 "next.reward": np.array([1], np.float32), "next.success": np.array([frame == 3]),
+                "next.done": np.array([frame == length - 1], np.int64), "pose": np.full((2, 3), frame + 0.1),
                 "note": f"frame {frame}", "start.seed": np.array([5 + episode]),
             })  # fmt: skip
         dataset.save_episode()
@@ -54,6 +58,7 @@ def test_what_happened_between_two_kept_frames_belongs_to_the_first(
     source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     slow = tmp_path / "slow"
+    monkeypatch.setattr(frame_cache, "DECODED", 3)  # frames that are decoded at a time
     resample(
         monkeypatch, f"--dataset.root={source}", "--every=2", "--displacements=[dx]", f"--output_dir={slow}"
     )
@@ -68,6 +73,8 @@ def test_what_happened_between_two_kept_frames_belongs_to_the_first(
     assert table.column("start.seed").tolist() == [5, 6]
     rows = dataset.hf_dataset.with_format("numpy")
     assert list(rows["note"])[:2] == ["frame 0", "frame 2"]
+    assert np.ravel(rows["next.done"]).tolist() == [0, 0, 0, 1, 0, 1]
+    np.testing.assert_array_equal(dataset.hf_dataset.with_format(None)[5]["pose"], np.full((2, 3), 2.1))
     assert np.ravel(rows["next.reward"]).tolist() == [2, 2, 2, 1, 2, 2]
     assert [round(float(dataset[row][CAMERA].mean()) * 255) for row in range(4)] == [0, 40, 80, 120]
     assert dataset.features["action"]["info"] == {"low": [-2, 0], "high": [2, 500]}
