@@ -339,7 +339,11 @@ def room_in(folder: Path) -> Iterator[None]:
 
 def file_stamps(dataset: LeRobotDataset) -> list[object]:
     """Return names, sizes and times of the dataset's files: a new recording needs caches of its own."""
-    files = sorted(path for pattern in ("*.mp4", "*.parquet") for path in Path(dataset.root).rglob(pattern))
+    root = Path(dataset.root)
+    folders = [root / name for name in ("data", "meta", "videos")]  # links, too, which rglob does not follow
+    files = sorted(
+        path for each in folders for kind in ("mp4", "parquet") for path in each.rglob(f"*.{kind}")
+    )
     return [item for path in files for item in (path.name, path.stat().st_size, path.stat().st_mtime_ns)]
 
 

@@ -162,7 +162,8 @@ def kept_values(
     kept = np.arange(0, length, every)
     names = [key for key in features if key not in {*DEFAULT_FEATURES, *dataset.meta.camera_keys}]
     table = dataset.hf_dataset.with_format(None, columns=[*names, "task_index"])[rows]
-    last, columns = np.append(kept[1:], length) - 1, {}
+    last = np.append(kept[1:], length) - 1
+    columns: dict[str, Any] = {}
     for key in names:
         values = np.asarray(table[key])
         if features[key]["dtype"] == "string":

@@ -12,7 +12,8 @@ new data.
 
 import json
 import shlex
-from dataclasses import dataclass, field, replace
+from copy import deepcopy
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -64,9 +65,10 @@ class TrainWorldModelConfig(RunConfig):
         log_freq: steps between lines of metrics.jsonl.
         seed: seed of the initial weights and of the batches.
         precision: `float32`; `bfloat16`, with weights and losses in float32; or `auto`, which is bfloat16
-            where the device has hardware for it. The checkpoints' train_config.json says which one was used.
+            where the device has hardware for it. train_config.json says which one was used.
         resume: require a checkpoint in `output_dir` and continue from it, as in lerobot-train. Works with
-            `--config_path=outputs/tokenizer/train_config.json` in place of all other flags too.
+            `--config_path=outputs/tokenizer/train_config.json`, or that of a checkpoint, in place of all
+            other flags too.
         wandb: `--wandb.enable=true` sends the metrics to Weights & Biases too, as lerobot-train does.
         job_name: name of the run in Weights & Biases; by default the name of `output_dir`.
     """
@@ -105,6 +107,8 @@ def check_config(cfg: TrainWorldModelConfig) -> None:
         raise FieldError("model.type", cfg.model.type, f"this command trains {', '.join(TRAINED)}")
     require_at_least(cfg, 1, "steps", "batch_size", "save_freq", "log_freq")
     require_choice(cfg, "precision", PRECISIONS)
+    if isinstance(cfg.model, FrameTokenizerConfig) and cfg.model.tokenizer.success:
+        require_at_least(cfg, 2, "batch_size")  # features are normalised over the batch
     if cfg.model.push_to_hub:
         from lerobot_wmrl.common.hub import check_login
 
@@ -162,7 +166,9 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
     check_processes(cfg, processes.num_processes)
     table = read_episodes(cfg.dataset.open())
     check_data(cfg, table)
-    given = draccus.encode(cfg)
+    cfg.precision = str(training_dtype(cfg.precision, cfg.model.device)).removeprefix("torch.")
+    begun = deepcopy(cfg)  # the model fills in what it takes from the data
+    given = draccus.encode(begun)
     checkpoint = latest_checkpoint(cfg.output_dir)
     set_seed(cfg.seed)
     require_free(cfg.output_dir, given, MAY_DIFFER)
@@ -172,7 +178,7 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
         claim_output_dir(cfg.output_dir, given, MAY_DIFFER)
         print(f"{cfg.output_dir}: already trained for {cfg.steps} steps")
     else:
-        run_training(cfg, model, table, given, processes)
+        run_training(begun, model, table, processes)
     if is_first_process():
         print(f"\n{conclusion(cfg, model, table)}")
         if cfg.model.push_to_hub:
@@ -197,9 +203,8 @@ def fingerprints(cfg: TrainWorldModelConfig, table: EpisodeTable) -> list[str]:
 
 
 def run_training(
-    cfg: TrainWorldModelConfig, model: Any, table: EpisodeTable, given: dict[str, Any],
-    processes: PartialState,
-) -> None:  # fmt: skip
+    cfg: TrainWorldModelConfig, model: Any, table: EpisodeTable, processes: PartialState
+) -> None:
     """Cache the data, in the first process before the others, and train."""
     from lerobot_wmrl.world_models.training import make_joint_sampler, train
 
@@ -207,12 +212,10 @@ def run_training(
         seed = cfg.seed + processes.process_index
         sampler = make_joint_sampler(model, table, cfg.dataset, cfg.batch_size, seed)
         if is_first_process():
-            claim_output_dir(cfg.output_dir, given, MAY_DIFFER)
+            claim_output_dir(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER)
             if not (cfg.output_dir / DATA_FILE).is_file():
                 write_json(cfg.output_dir / DATA_FILE, fingerprints(cfg, table))
-    dtype = training_dtype(cfg.precision, cfg.model.device)
-    used = replace(cfg, precision=str(dtype).removeprefix("torch."))
-    train(model, sampler, used, used.save_pretrained, make_wandb(cfg))
+    train(model, sampler, cfg, cfg.save_pretrained, make_wandb(cfg))
 
 
 def conclusion(cfg: TrainWorldModelConfig, model: Any, table: EpisodeTable) -> str:
@@ -242,7 +245,9 @@ def quality(cfg: TrainWorldModelConfig, model: Any, table: EpisodeTable) -> str:
     measured = held_out_metrics(model, table, cfg.batch_size)
     if measured:
         write_json(cfg.output_dir / HELD_OUT_FILE, measured)
-    where = "held-out episodes" if measured else "the last training batch (no episode is held out)"
+    where = (
+        "held-out episodes" if measured else "the last training batch (none of these episodes is held out)"
+    )
     measured = measured or read_metrics(cfg.output_dir)[-1]
     done = ("done_loss",) if table.done_known else ()
     shown = ("loss", "token_accuracy", "moving_token_accuracy", *done, "state_loss")

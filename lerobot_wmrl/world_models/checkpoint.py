@@ -79,14 +79,42 @@ def config_to_continue(path: str, overrides: Sequence[str]) -> RewardModelConfig
     """
     folder = resolve_checkpoint(path)
     try:
-        config = RewardModelConfig.from_pretrained(str(folder), cli_overrides=[*UNPUBLISHED, *overrides])
+        RewardModelConfig.from_pretrained(str(folder))
     except Exception as error:  # draccus, the hub and json each raise their own
         raise FieldError(
             "model.path", path, f"no model can be loaded from it ({first_line(error)})",
             "give the output folder of a training with this version of the package, or a hub id",
         ) from error  # fmt: skip
+    try:
+        config = RewardModelConfig.from_pretrained(str(folder), cli_overrides=[*UNPUBLISHED, *overrides])
+    except (ParsingError, TypeError, KeyError) as error:
+        raise FieldError(
+            "model.path", path, f"cannot be trained further with {' '.join(overrides)} ({first_line(error)})",
+            "give other settings of this kind of model alone, or train a new one with `model.type`",
+        ) from error  # fmt: skip
     config.pretrained_path = str(folder)
     return config
+
+
+def load_model_to_continue(config: RewardModelConfig, meta: Any) -> Any:
+    """Load the model of `config.pretrained_path` with the settings of `config`, to train it on a dataset.
+
+    Raises:
+        FieldError: its weights are of another structure than the settings.
+    """
+    try:
+        model = get_reward_model_class(config.type).from_pretrained(
+            config.pretrained_path, config=config, strict=True, dataset_stats=meta.stats, dataset_meta=meta
+        )
+    except torch.OutOfMemoryError:
+        raise
+    except RuntimeError as error:
+        raise FieldError(
+            "model.path", config.pretrained_path,
+            f"the weights do not fit the settings ({' '.join(str(error).split())})",
+            "leave the sizes of layers as they are, or train a new model with `model.type`",
+        ) from error  # fmt: skip
+    return model.to(config.device)
 
 
 def _stored_type(path: Path) -> Any:
@@ -136,8 +164,11 @@ def check_dataset(config: FrameTokenizerConfig | WorldModelConfig, meta: Any) ->
         check_same_robot(config.embodiment, meta)
 
 
-def check_tokenizer_source(config: WorldModelConfig) -> None:
-    """Raise FieldError unless the model gets its tokenizer from exactly one place."""
+def check_tokenizer_source(config: WorldModelConfig, untrained: bool) -> None:
+    """Raise FieldError unless the model gets its tokenizer from exactly one place.
+
+    untrained: whether the model begins to learn, rather than being loaded.
+    """
     if config.tokenizer_path and config.pretrained_path:
         raise FieldError(
             "tokenizer_path", config.tokenizer_path,
@@ -149,7 +180,7 @@ def check_tokenizer_source(config: WorldModelConfig) -> None:
             "tokenizer", config.tokenizer, "is that of the checkpoint at `tokenizer_path`",
             "leave its settings out",
         )  # fmt: skip
-    if not config.tokenizer_path and config.tokenizer is None:
+    if not config.tokenizer_path and (untrained or config.tokenizer is None):
         raise FieldError(
             "tokenizer_path", config.tokenizer_path, "is missing",
             "give the output folder of a training with type=frame_tokenizer",

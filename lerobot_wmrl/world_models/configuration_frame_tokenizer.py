@@ -17,8 +17,9 @@ PATCH: Final = 4
 NORM_GROUPS: Final = 8
 """Groups of channels that are normalised together at the coarsest scale."""
 
-LARGEST_TOKEN: Final = 2**31
-"""Tokens are cached as int32."""
+MOST_CODES: Final = {"fsq": 2**20, "lfq": 2**31}
+"""Codes of a token at most: FSQ computes their numbers in float32 and keeps a list of all, LFQ's tokens are
+cached as int32."""
 
 LARGEST_BINARY_FACTOR: Final = 2**12
 """LFQ's entropy term holds a probability for every code of a factor at every token of the batch."""
@@ -94,13 +95,12 @@ class TokenizerConfig:
             raise FieldError(
                 "tokenizer.levels", levels, f"give at least one factor, each of {fewest} or more levels"
             )
-        if math.prod(levels) > LARGEST_TOKEN:
+        most = MOST_CODES[self.quantizer]
+        if math.prod(levels) > most:
             raise FieldError(
-                "tokenizer.levels",
-                levels,
-                f"{math.prod(levels)} codes are more than 2^31",
+                "tokenizer.levels", levels, f"{math.prod(levels):,} codes are more than {most:,}",
                 "give fewer factors",
-            )
+            )  # fmt: skip
         size = levels[0]
         same_power = len(set(levels)) == 1 and not size & (size - 1) and size <= LARGEST_BINARY_FACTOR
         if self.quantizer == "lfq" and not same_power:

@@ -1,7 +1,7 @@
 """Interface of the dynamics (eq. 1), which both kinds implement, and the state of imaginations."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -137,7 +137,8 @@ class Dynamics(nn.Module):
             encode: turns actions into conditions.
             with_tokens: whether the tokens of the last frame are needed.
         """
-        imagination = self.start(frames[spread_rows(len(frames), len(actions), actions.device)])
+        used = replace(frames, context=Context(frames.context.maps[:1]))  # the others are the tokenizer's
+        imagination = self.start(used[spread_rows(len(frames), len(actions), actions.device)])
         steps = [self.step(imagination, encode(action[:, None])) for action in actions.unbind(1)]
         return OpenLoopPrediction(
             torch.stack([step.done_logit for step in steps], 1),

@@ -14,7 +14,7 @@ from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.images import stretch
 from lerobot_wmrl.data.checks import check_cameras, frame_size
 from lerobot_wmrl.data.frames import NO_CONTEXT
-from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig
+from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig, TokenizerConfig
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer, ImageLoss, motion_weight
 from lerobot_wmrl.world_models.goal import similarity_to_goal
 from lerobot_wmrl.world_models.hub_card import HubCard
@@ -55,9 +55,9 @@ def split_cameras(images: Tensor, shapes: dict[str, tuple[int, int, int]]) -> di
     return {key: stretch(view, height, width) for (key, (_, height, width)), view in views}
 
 
-def with_frame_sizes(config: FrameTokenizerConfig, features: dict[str, Any]) -> FrameTokenizerConfig:
-    """Return the config with the sizes of a dataset's frames, and log which frames are stretched."""
-    keys, side = config.tokenizer.camera_keys, config.tokenizer.image_size
+def with_frame_sizes(tokenizer: TokenizerConfig, features: dict[str, Any]) -> TokenizerConfig:
+    """Return the settings with the sizes of a dataset's frames, and log which frames are stretched."""
+    keys, side = tokenizer.camera_keys, tokenizer.image_size
     sizes = [list(frame_size(features[key])) for key in keys]
     for key, (height, width) in zip(keys, sizes, strict=True):
         if (height, width) != (side, side):
@@ -65,7 +65,7 @@ def with_frame_sizes(config: FrameTokenizerConfig, features: dict[str, Any]) -> 
                 "%s: frames of %d x %d (height x width) are stretched to `tokenizer.image_size`=%d",
                 key, height, width, side,
             )  # fmt: skip
-    return replace(config, tokenizer=replace(config.tokenizer, frame_sizes=sizes))
+    return replace(tokenizer, frame_sizes=sizes)
 
 
 class FrameTokenizerRewardModel(HubCard, PreTrainedRewardModel):
@@ -81,7 +81,8 @@ class FrameTokenizerRewardModel(HubCard, PreTrainedRewardModel):
     def __init__(self, config: FrameTokenizerConfig, dataset_meta: Any = None, **kwargs: Any) -> None:
         if dataset_meta is not None:
             check_cameras(dataset_meta.features, config.tokenizer.camera_keys, "tokenizer.cameras")
-            config = with_frame_sizes(config, dataset_meta.features)
+            sized = with_frame_sizes(config.tokenizer, dataset_meta.features)
+            config = replace(config, tokenizer=sized)
         super().__init__(config)
         self.config: FrameTokenizerConfig = config
         if dataset_meta is not None and config.perceptual_weight:

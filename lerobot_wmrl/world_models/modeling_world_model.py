@@ -39,7 +39,11 @@ from lerobot_wmrl.world_models.goal import imagine_goal, similarity_to_goal
 from lerobot_wmrl.world_models.hub_card import HubCard
 from lerobot_wmrl.world_models.imagination import ImaginationMixin
 from lerobot_wmrl.world_models.layers import Condition, FrameSizes, Prediction
-from lerobot_wmrl.world_models.modeling_frame_tokenizer import split_cameras, stack_cameras
+from lerobot_wmrl.world_models.modeling_frame_tokenizer import (
+    split_cameras,
+    stack_cameras,
+    with_frame_sizes,
+)
 from lerobot_wmrl.world_models.text import CHECKPOINT_FOLDER, FrozenT5, check_one_each, make_text_encoder
 
 CONDITION_TOKENS: Final = 4
@@ -99,7 +103,7 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
     ) -> None:
         super().__init__(config)
         self.config: Any = config
-        check_tokenizer_source(config)
+        check_tokenizer_source(config, dataset_meta is not None and not config.pretrained_path)
         if dataset_meta is not None:
             check_episode_lengths(dataset_meta)
         source = self._adopt_tokenizer() if config.tokenizer_path else None
@@ -137,6 +141,8 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
             check_dataset(self.config, meta)
         sizes, features = self.config.tokenizer, meta.features
         check_cameras(features, sizes.camera_keys)
+        if not self.config.pretrained_path:
+            self.config.tokenizer = with_frame_sizes(sizes, features)
         if self.config.depth:
             check_depth(features, sizes.camera_keys)
         if self.config.state_size and OBS_STATE not in features:

@@ -43,7 +43,7 @@ from lerobot_wmrl.data.frame_cache import (
     cached_frames,
     cached_tokens,
 )
-from lerobot_wmrl.world_models.checkpoint import check_dataset, load_model
+from lerobot_wmrl.world_models.checkpoint import check_dataset, load_model, load_model_to_continue
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import cosine_schedule
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig, TextWorldModelConfig
 
@@ -69,7 +69,9 @@ def build_model(config: RewardModelConfig, table: EpisodeTable, output_dir: Path
         model = load_model(checkpoint, config.type, config.device or "cpu")
         check_dataset(model.config, meta)
         return model
-    return make_reward_model(config, dataset_stats=meta.stats, dataset_meta=meta)
+    if not config.pretrained_path:
+        return make_reward_model(config, dataset_stats=meta.stats, dataset_meta=meta)
+    return load_model_to_continue(config, meta)
 
 
 def golden_episodes(table: EpisodeTable) -> np.ndarray:

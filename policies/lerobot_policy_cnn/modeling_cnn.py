@@ -14,6 +14,7 @@ from torch.distributions import Normal
 
 from lerobot_policy_cnn.configuration_cnn import MAX_STD, MIN_STD, CnnConfig, check_std
 from lerobot_policy_cnn.networks import ObservationEncoder, Readout
+from lerobot_policy_cnn.processor_cnn import bounded_statistics
 from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.images import random_shift
 
@@ -66,8 +67,10 @@ class CnnPolicy(PreTrainedPolicy):
     target_low: Tensor
     target_high: Tensor
 
-    def __init__(self, config: CnnConfig, **_: Any) -> None:
+    def __init__(self, config: CnnConfig, dataset_meta: Any = None, **_: Any) -> None:
         super().__init__(config)
+        if dataset_meta is not None:  # lerobot-train normalises by these where it trains a policy further
+            dataset_meta.stats.update(bounded_statistics(dataset_meta.stats))
         config.validate_features()
         self.cameras = sorted(config.image_features)
         state = config.state_feature

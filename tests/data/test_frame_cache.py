@@ -1,6 +1,8 @@
 """LeRobot's depth maps on the tokens' grid, and a world model trained, replayed and lived in with them."""
 
 import json
+import os
+import shutil
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,7 +17,7 @@ from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data import frame_cache
 from lerobot_wmrl.data.checks import check_cameras
-from lerobot_wmrl.data.dataset import ChosenEpisodes
+from lerobot_wmrl.data.dataset import ChosenEpisodes, open_dataset
 from lerobot_wmrl.data.frame_cache import cached_depth, depth_of_windows, token_depth
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.maniskill.embodiment import FPS
@@ -179,3 +181,14 @@ def test_a_dataset_without_depth_is_named_before_anything_is_trained(small_datas
             Path(small_dataset.root), tmp_path / "out",
         )  # fmt: skip
     assert not (tmp_path / "out").exists()
+
+
+def test_a_new_recording_behind_a_link_has_a_cache_of_its_own(small_dataset, tmp_path):
+    shutil.copytree(small_dataset.root, tmp_path / "data")
+    (tmp_path / "data" / "videos").rename(tmp_path / "elsewhere")
+    (tmp_path / "data" / "videos").symlink_to(tmp_path / "elsewhere")
+    dataset = open_dataset(tmp_path / "data")
+    before = frame_cache.file_stamps(dataset)
+    assert before == frame_cache.file_stamps(dataset)
+    os.utime(next((tmp_path / "elsewhere").rglob("*.mp4")), (0, 0))
+    assert before != frame_cache.file_stamps(dataset)

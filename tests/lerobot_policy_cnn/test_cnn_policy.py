@@ -1,5 +1,6 @@
 """The small image policy: one distribution samples and measures, constants stay constant, it learns."""
 
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +21,12 @@ from lerobot_policy_cnn.modeling_cnn import SUMMARY, UNKNOWN_POLICY, CnnPolicy
 from lerobot_policy_cnn.networks import ImageEncoder, InstructionEncoder, instance_norm
 from lerobot_policy_cnn.processor_cnn import make_cnn_pre_post_processors
 from lerobot_wmrl.common.images import random_shift
+from lerobot_wmrl.common.policies import load_processors, read_policy_config
+from tests.commands import run_here
 from tests.hub_server import Hub
 
 IMAGE = "observation.images.third_view"
+TRAINED = Path("checkpoints/last/pretrained_model")
 
 
 def image_feature(size: int) -> PolicyFeature:
@@ -61,8 +65,9 @@ def test_channels_are_normalised_as_by_instance_normalisation(layout: torch.memo
 def cloning(small_dataset: LeRobotDataset) -> tuple[CnnPolicy, Any, Any, dict[str, Any]]:
     """A policy that has learnt 48 frames by heart, its processors, and those frames."""
     torch.manual_seed(0)
-    policy = make_policy(CnnConfig(device="cpu", max_shift=0, width=8), ds_meta=small_dataset.meta)
-    pre, post = make_pre_post_processors(policy.config, dataset_stats=small_dataset.meta.stats)
+    meta = deepcopy(small_dataset.meta)
+    policy = make_policy(CnnConfig(device="cpu", max_shift=0, width=8), ds_meta=meta)
+    pre, post = make_pre_post_processors(policy.config, dataset_stats=meta.stats)
     rows = [small_dataset[index] for index in range(48)]
     raw = {name: torch.stack([row[name] for row in rows]) for name in (IMAGE, "observation.state", "action")}
     batch = {**raw, "task": [row["task"] for row in rows]}
@@ -167,6 +172,26 @@ def test_constant_components_are_neither_sampled_nor_blown_up(
     assert torch.allclose(post(sample.raw_action)[:, 2:], batch["action"][:, 2:], atol=1e-6)
     assert (sample.log_prob[:, 2:] == 0).all()
     assert (sample.log_prob[:, :2] != 0).all()
+
+
+def test_a_policy_that_is_cloned_further_does_not_blow_up_constants_either(
+    small_dataset: LeRobotDataset, tmp_path: Path
+) -> None:
+    """lerobot-train then gives a checkpoint's processors the statistics of its dataset."""
+    data = [
+        "--dataset.repo_id=local/synthetic", f"--dataset.root={small_dataset.root}", "--steps=1",
+        "--batch_size=2", "--num_workers=0", "--env_eval_freq=0", "--policy.push_to_hub=false",
+    ]  # fmt: skip
+    first, further = tmp_path / "first", tmp_path / "further"
+    run_here("lerobot-train", "--policy.type=cnn", "--policy.device=cpu", *data, f"--output_dir={first}")
+    run_here("lerobot-train", f"--policy.path={first / TRAINED}", *data, f"--output_dir={further}")
+    state = small_dataset[0]["observation.state"]
+    for folder in (first, further):
+        pre, _ = load_processors(read_policy_config(str(folder / TRAINED), []))
+        seen = pre({"observation.state": state + 1e-3, "action": torch.full((7,), 1e-6)})
+        still = pre({"observation.state": state, "action": torch.zeros(7)})
+        for name, unit in (("observation.state", 0.1), ("action", 0.01)):
+            assert (seen[name] - still[name]).abs().max() <= unit + 1e-4
 
 
 def test_actions_survive_normalisation_and_back(small_dataset: LeRobotDataset) -> None:

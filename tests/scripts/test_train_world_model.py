@@ -1,6 +1,7 @@
 """Training by the command: further with `--model.path`, resumed, tracked, and concluded."""
 
 import json
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -55,6 +56,25 @@ def test_a_path_without_a_model_is_named(
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.parametrize(("settings", "message"), [
+    (["--model.dynamics.layers=3"], r"weights do not fit the settings \(.*Missing key.*leave the sizes"),
+    (["--model.dynamics.width=64"], r"weights do not fit the settings \(.*size mismatch.*leave the sizes"),
+    (["--model.dynamics.type=autoregressive"], r"cannot be trained further with --dynamics\.type=autoreg"),
+])  # fmt: skip
+def test_settings_that_do_not_fit_the_weights_are_refused(
+    settings: list[str], message: str, trained_models: dict[str, Path], small_dataset, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.setattr(sys, "argv", [
+        "lerobot-wmrl-train-world-model", f"--model.path={trained_models['action_world_model']}", *settings,
+        f"--dataset.root={small_dataset.root}", "--batch_size=2", f"--output_dir={tmp_path / 'new'}",
+    ])  # fmt: skip
+    with pytest.raises(SystemExit):
+        main()
+    assert re.search(message, capsys.readouterr().err)
+    assert not (tmp_path / "new").exists()
+
+
 def flags(root: Path, output_dir: Path, *more: str) -> list[str]:
     return [
         "lerobot-wmrl-train-world-model", "--model.type=frame_tokenizer", "--model.device=cpu",
@@ -104,12 +124,12 @@ def test_a_run_is_resumed_where_there_is_one(
     assert not (tmp_path / "run").exists()
     monkeypatch.setattr(sys, "argv", given)
     main()
-    stored = tmp_path / "run" / "train_config.json"
-    monkeypatch.setattr(
-        sys, "argv", [given[0], f"--config_path={stored}", "--resume=true", "--job_name=again"]
-    )
-    main()
-    assert f"{tmp_path / 'run'}: already trained for 2 steps" in capsys.readouterr().out
+    for stored in (tmp_path / "run", tmp_path / "run" / TRAINED):
+        monkeypatch.setattr(sys, "argv", [
+            given[0], f"--config_path={stored / 'train_config.json'}", "--resume=true", "--job_name=again",
+        ])  # fmt: skip
+        main()
+        assert f"{tmp_path / 'run'}: already trained for 2 steps" in capsys.readouterr().out
     statistics = data / "meta" / "stats.json"
     statistics.write_text(json.dumps(json.loads(statistics.read_text()), indent=1))
     monkeypatch.setattr(sys, "argv", given)

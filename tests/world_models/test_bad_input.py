@@ -18,7 +18,14 @@ from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelE
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.scripts.eval_world_model import EvalWorldModelConfig, eval_world_model
 from lerobot_wmrl.world_models.checkpoint import load_model
-from tests.trained import action_config, run_training, text_config, tokenizer_config, train_tokenizer
+from tests.trained import (
+    action_config,
+    run_training,
+    small_tokenizer,
+    text_config,
+    tokenizer_config,
+    train_tokenizer,
+)
 
 
 def test_wrong_input_is_named(small_dataset, trained_models, tmp_path):
@@ -29,8 +36,11 @@ def test_wrong_input_is_named(small_dataset, trained_models, tmp_path):
         run_training(action_config(tokenizer), tmp_path / "nothing", tmp_path / "a")
     config = action_config(tokenizer)
     config.tokenizer_path = None
-    with pytest.raises(FieldError, match=r"^tokenizer_path=None: is missing"):
-        run_training(config, root, tmp_path / "b")
+    for config.tokenizer in (None, small_tokenizer()):  # settings alone make no trained tokenizer
+        with pytest.raises(FieldError, match=r"^tokenizer_path=None: is missing"):
+            run_training(config, root, tmp_path / "b")
+    with pytest.raises(FieldError, match=r"^batch_size=1: must be at least 2"):
+        run_training(tokenizer_config(success=True, context=True), root, tmp_path / "c", batch_size=1)
     with pytest.raises(ValueError, match="type=general: this command trains frame_tokenizer"):
         run_training(GeneralConfig(device="cpu"), root, tmp_path / "d")
     assert not (tmp_path / "a").exists()
@@ -39,6 +49,16 @@ def test_wrong_input_is_named(small_dataset, trained_models, tmp_path):
     with pytest.raises(ValueError, match="holds something else"):
         train_tokenizer(root, tmp_path / "foreign")
     assert (tmp_path / "foreign" / "thesis.txt").read_text() == "precious"
+
+
+def test_imagined_frames_have_the_size_of_the_world_models_dataset(
+    make_synthetic_dataset, trained_models, tmp_path
+):
+    """Which may be another than that of the tokenizer's."""
+    root = Path(make_synthetic_dataset(tmp_path / "larger", episodes=2, size=48).root)
+    folder = run_training(action_config(trained_models["frame_tokenizer"]), root, tmp_path / "model")
+    config = load_model(folder, "action_world_model").config
+    assert config.observation_shapes["observation.images.third_view"] == (3, 48, 48)
 
 
 def test_another_dataset_than_the_tokenizers_is_named(make_synthetic_dataset, trained_models, tmp_path):
