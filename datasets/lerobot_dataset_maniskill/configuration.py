@@ -15,7 +15,7 @@ from lerobot.envs.configs import EnvConfig
 
 from lerobot_dataset_maniskill.planners import MOTIONS
 from lerobot_wmrl.common.checkpoints import resolved_name
-from lerobot_wmrl.common.command_line import RunConfig
+from lerobot_wmrl.common.command_line import RunConfig, settings_beside
 from lerobot_wmrl.common.constants import EVALUATION_SEED, KINDS, POLICY
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
 from lerobot_wmrl.common.hub import check_login
@@ -134,7 +134,7 @@ class RecordConfig(RunConfig):
     def __post_init__(self) -> None:
         path = parser.get_path_arg("policy")
         if path:
-            self.policy = read_policy_config(path, parser.get_cli_overrides("policy") or [])
+            self.policy = read_policy_config(path, settings_beside("policy"))
 
     def validate(self) -> None:
         """Raise FieldError for the first setting that cannot be."""
@@ -311,8 +311,8 @@ class RecordConfig(RunConfig):
         if self.policy is None:
             return {"policy": None}
         if self.policy.pretrained_path:
-            changed = parser.get_cli_overrides("policy") or []
-            return {"policy": resolved_name(str(self.policy.pretrained_path)), "policy_settings": changed}
+            path = resolved_name(str(self.policy.pretrained_path))
+            return {"policy": path, "policy_settings": settings_beside("policy")}
         own = {each.name for each in fields(self.policy)} - {each.name for each in fields(PreTrainedConfig)}
         settings = draccus.encode(self.policy)
         return {"policy": self.policy.type, **{f"policy.{name}": settings[name] for name in sorted(own)}}

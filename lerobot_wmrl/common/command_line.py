@@ -57,6 +57,12 @@ class RunConfig:
         write_json(folder / CONFIG_FILE, draccus.encode(self))
 
 
+def settings_beside(path_field: str) -> list[str]:
+    """Return the settings that stand beside `--<field>.path`, in a `--config_path` file and then in flags, as
+    flags of the checkpoint's own configuration: `--n_action_steps=8`."""
+    return [*parser.get_yaml_overrides(path_field), *(parser.get_cli_overrides(path_field) or [])]
+
+
 def run_command[Config: RunConfig](
     function: Callable[[Config], None],
     config_class: type[Config],

@@ -262,9 +262,17 @@ def load_with_adapters(config: PreTrainedConfig, **options: Any) -> Any:
             "training was started, or write where it is now into adapter_config.json, base_model_name_or_path"
         )
     policy_class = get_policy_class(config.type)
-    policy = policy_class.from_pretrained(
-        base, config=config, revision=adapter.revision, strict=True, **options
-    )
+    try:
+        policy = policy_class.from_pretrained(
+            base, config=config, revision=adapter.revision, strict=True, **options
+        )
+    except torch.OutOfMemoryError:
+        raise
+    except (SafetensorError, RuntimeError, OSError) as error:
+        raise ValueError(
+            f"{path}: adapts the policy in {base}, which cannot be read ({first_line(error)}); put back what "
+            "was adapted"
+        ) from error
     return PeftModel.from_pretrained(policy, path, config=adapter, is_trainable=True)
 
 

@@ -8,7 +8,7 @@ import torch
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_wmrl.common.command_line import RunConfig
+from lerobot_wmrl.common.command_line import RunConfig, settings_beside
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice, require_share
 from lerobot_wmrl.common.policies import (
@@ -97,7 +97,7 @@ class ImproveConfig(RunConfig):
     @property
     def policy_flags(self) -> list[str]:
         """The settings of the policy that the command line changes: `--n_action_steps=8`."""
-        return parser.get_cli_overrides("policy") or []
+        return settings_beside("policy")
 
     def check(self) -> None:
         """Read the policy's configuration. FieldError for a setting that cannot be."""

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.optim import AdamW, Optimizer
 
 from lerobot_wmrl.common.errors import FieldError, Stopped, within
-from lerobot_wmrl.common.policies import load_trained_weights
+from lerobot_wmrl.common.policies import load_trained_weights, unwrapped
 from lerobot_wmrl.common.precision import require_exact_updates
 from lerobot_wmrl.rl.configuration_algorithms import PolicyGradientConfig
 from lerobot_wmrl.rl.policy_adapters import as_stochastic
@@ -48,10 +48,16 @@ class Algorithm(RLAlgorithm):
                     "algorithm.initial_std", config.initial_std,
                     "this policy has no standard deviation", "set it to null",
                 )  # fmt: skip
+            if self.policy is policy and unwrapped(policy) is not policy:
+                raise FieldError(
+                    "algorithm.initial_std", config.initial_std,
+                    "is none of the adapters' parameters, which checkpoints hold alone",
+                    "set it to null, or train without adapters",
+                )  # fmt: skip
             with within("algorithm"):
                 self.policy.set_std(config.initial_std)
         if not config.train_encoder:
-            if not isinstance(self.policy, EncodingPolicy):
+            if not isinstance(unwrapped(self.policy), EncodingPolicy):
                 raise FieldError(
                     "algorithm.train_encoder", config.train_encoder,
                     "this policy has no encoder that can be kept", "set it to true, or take the policy cnn",

@@ -11,7 +11,7 @@ from lerobot.configs.default import PeftConfig, WandBConfig
 from lerobot.envs.configs import EnvConfig
 from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 
-from lerobot_wmrl.common.command_line import RunConfig
+from lerobot_wmrl.common.command_line import RunConfig, settings_beside
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import FieldError, require_at_least, within
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
@@ -149,13 +149,15 @@ def load_config(cfg: TrainConfig) -> PreTrainedConfig:
     path = typed or (stored and stored.pretrained_path)
     if not path:
         raise ValueError("--policy.path: give the checkpoint of the policy to train")
-    overrides = parser.get_cli_overrides("policy") or []
+    overrides = settings_beside("policy")
     cfg.policy = read_policy_config(str(path), [*UNPUBLISHED, *overrides])
     if stored is not None:
+        given = {each.removeprefix("--").partition("=")[0] for each in overrides}
         settings = [each.name for each in fields(stored) if each.name not in READ]
         stored_run = Path(parser.parse_arg("config_path") or "").name == CONFIG_FILE
         for name in settings if stored_run and not typed else PUBLISHING:
-            setattr(cfg.policy, name, getattr(stored, name))
+            if name not in given:
+                setattr(cfg.policy, name, getattr(stored, name))
     if cfg.policy.push_to_hub and not cfg.policy.repo_id:
         raise FieldError("policy.push_to_hub", True, "give its name on the hub, --policy.repo_id=user/name")
     if cfg.policy.push_to_hub:

@@ -108,7 +108,7 @@ class Distillation(RLAlgorithm):
         if self.config.recorded and not self.labels.recorded:
             model = env.model.config
             self.labels.recorded = recorded_successes(
-                env.config.dataset, model.tokenizer.camera_keys, model.state_size, self.windows
+                env.config.dataset, model.tokenizer.frame_shapes, model.state_size, self.windows
             )
         shown = self.demonstrate(env, pipeline, rollout, seed)
         part = imagined_labels(rollout.observations, shown.actions, shown.labelled, self.windows)

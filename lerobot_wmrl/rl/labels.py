@@ -1,7 +1,7 @@
 """Observations labelled with actions to imitate, on the CPU and on disk. N labels, n steps of a window."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from lerobot_wmrl.common.constants import INSTRUCTIONS
+from lerobot_wmrl.common.images import stretch
 from lerobot_wmrl.common.pipeline import ACTION_IS_PAD
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.frame_cache import decode_episode
@@ -141,13 +142,13 @@ class Labels:
 
 
 def recorded_successes(
-    source: StartFrames, cameras: Sequence[str], state_size: int, windows: Windows
+    source: StartFrames, frame_shapes: Mapping[str, tuple[int, int, int]], state_size: int, windows: Windows
 ) -> list[Part]:
     """Return the actions of a dataset's successful episodes as labels; nothing without a dataset or success.
 
     Args:
         source: the episodes, those of its split, tasks and scenes.
-        cameras: keys of the images.
+        frame_shapes: camera → shape (3, H, W) of imagined images, to which recorded ones are stretched.
         state_size: components of the state, 0 for observations without it.
         windows: what the policy learns from.
     """
@@ -166,8 +167,10 @@ def recorded_successes(
     begin = length.cumsum(0) - length  # where the frames of each episode begin below
     episode = torch.arange(len(episodes)).repeat_interleave(length)  # (F,), of each frame
     observations = {
-        camera: torch.cat([decode_episode(table.dataset, int(each), camera) for each in episodes])
-        for camera in cameras
+        camera: torch.cat(
+            [stretch(decode_episode(table.dataset, int(each), camera), height, width) for each in episodes]
+        )
+        for camera, (_, height, width) in frame_shapes.items()
     }
     if state_size:
         rows = (start - begin)[episode] + torch.arange(len(episode))

@@ -82,11 +82,10 @@ class ActAdapter(nn.Module):
         """Return the distribution of the next n actions (B, n, K) and the values (B,)."""
         images = {OBS_IMAGES: [observation[camera] for camera in self.config.image_features]}
         decoded: list[Tensor] = []  # (B, chunk, D)
-        hook = self.policy.model.action_head.register_forward_pre_hook(
-            lambda _, inputs: decoded.append(inputs[0])
-        )
+        network = unwrapped(self.policy).model
+        hook = network.action_head.register_forward_pre_hook(lambda _, inputs: decoded.append(inputs[0]))
         try:
-            chunk = self.policy.model({**observation, **(images if images[OBS_IMAGES] else {})})[0]
+            chunk = network({**observation, **(images if images[OBS_IMAGES] else {})})[0]
         finally:
             hook.remove()
         mean = chunk[:, : self.config.n_action_steps]  # (B, n, K)

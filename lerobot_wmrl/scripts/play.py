@@ -34,7 +34,7 @@ from lerobot.configs import PreTrainedConfig, parser
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_wmrl.common.checkpoints import Checkpoint
-from lerobot_wmrl.common.command_line import RunConfig, run_command
+from lerobot_wmrl.common.command_line import RunConfig, run_command, settings_beside
 from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least
 from lerobot_wmrl.common.files import writing
 from lerobot_wmrl.common.policies import check_weights, read_policy_config, require_trained
@@ -97,7 +97,7 @@ class PlayConfig(RunConfig):
         """Read the policy's configuration. FieldError for a setting that cannot be."""
         path = parser.get_path_arg("policy")
         if path:
-            self.policy = read_policy_config(path, parser.get_cli_overrides("policy") or [])
+            self.policy = read_policy_config(path, settings_beside("policy"))
             check_weights(self.policy)
         if self.policy is not None:
             require_trained(self.policy)

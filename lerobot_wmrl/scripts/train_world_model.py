@@ -24,7 +24,7 @@ from lerobot.configs import parser
 from lerobot.configs.default import WandBConfig
 from lerobot.configs.rewards import RewardModelConfig
 
-from lerobot_wmrl.common.command_line import RunConfig, run_command
+from lerobot_wmrl.common.command_line import RunConfig, run_command, settings_beside
 from lerobot_wmrl.common.distributed import LONGEST_WAIT, is_first_process
 from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least, require_choice, within
 from lerobot_wmrl.common.files import write_json
@@ -158,7 +158,7 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
     from lerobot_wmrl.world_models.training import build_model
 
     if path := parser.get_path_arg("model"):
-        cfg.model = config_to_continue(path, parser.get_cli_overrides("model") or [])
+        cfg.model = config_to_continue(path, settings_beside("model"))
     check_config(cfg)
     if cfg.resume:
         require_resumable(cfg.output_dir)

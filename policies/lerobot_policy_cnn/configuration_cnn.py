@@ -53,10 +53,12 @@ class CnnConfig(ClonedConfig):
     def validate_features(self) -> None:
         """Raise FieldError unless there is a one-dimensional action, and an image or a state.
 
-        Depth maps (images of one channel) are left out, since environments do not show them.
+        Depth maps (images of one channel), which environments do not show, and a state that is not used are
+        left out.
         """
         inputs = self.input_features or {}
-        for key in [key for key, feature in inputs.items() if _is_depth(feature)]:
+        unused = [key for key, feature in inputs.items() if _is_depth(feature)]
+        for key in unused if self.use_state else [*unused, *({OBS_STATE} & inputs.keys())]:
             del inputs[key]
         action = self.action_feature
         if action is None or len(action.shape) != 1:

@@ -46,7 +46,7 @@ def check_images(images: Tensor) -> None:
 
 
 def resize(images: Tensor, height: int, width: int) -> Tensor:
-    """Resize as Pillow's BICUBIC does, on any device. uint8 (B, C, H, W) → uint8 (B, C, height, width)"""
+    """Resize as Pillow's BICUBIC does, on CPU and CUDA. uint8 (B, C, H, W) → uint8 (B, C, height, width)"""
     images = _resize_last(images, width)
     return _resize_last(images.transpose(2, 3), height).transpose(2, 3)
 
@@ -54,7 +54,7 @@ def resize(images: Tensor, height: int, width: int) -> Tensor:
 def _resize_last(images: Tensor, size: int) -> Tensor:
     """Resize along the last dimension. Pillow leaves out a pass that would change nothing.
 
-    Sums of integers below 2^53 are exact in float64, in which every device multiplies matrices.
+    Sums of integers below 2^53 are exact in float64.
     """
     if images.shape[-1] == size:
         return images

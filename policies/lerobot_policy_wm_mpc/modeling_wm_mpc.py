@@ -39,6 +39,16 @@ class WmMpcPolicy(PreTrainedPolicy):
         if config.objective == "goal":
             text_model = load_model(config.text_world_model_path, "text_world_model", device)
             check_same_tokenizer(model, text_model, "text_world_model_path", config.text_world_model_path)
+        elif model.config.learnt_successes == 0:
+            raise FieldError(
+                "world_model_path", config.world_model_path, "has learnt from no successful episode",
+                "train it on a dataset with successes, or set `objective` to goal",
+            )  # fmt: skip
+        if model.config.depth:
+            raise FieldError(
+                "world_model_path", config.world_model_path, "looks at depth, which environments do not show",
+                "plan in one without `dynamics.depth`",
+            )  # fmt: skip
         low, high = model.action_range()
         self.planner = Planner(
             model,

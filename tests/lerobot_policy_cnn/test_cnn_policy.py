@@ -267,6 +267,7 @@ def test_a_policy_with_nothing_to_see_is_refused() -> None:
 
 def test_cameras_do_not_share_weights_and_state_can_be_left_out() -> None:
     policy = build(cameras=2, use_state=False)
+    assert set(policy.config.input_features) == set(policy.config.image_features)
     observation = observe(policy)
     action = policy.select_action(observation)
     swapped = dict(observation)

@@ -9,13 +9,16 @@ import torch
 from lerobot.scripts import lerobot_eval
 
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
+from lerobot_policy_wm_mpc import modeling_wm_mpc
 from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
 from lerobot_policy_wm_mpc.modeling_wm_mpc import WmMpcPolicy
 from lerobot_wmrl.common.policies import load_processors, read_policy_config
 from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW
+from lerobot_wmrl.world_models.autoregressive.configuration import AutoregressiveConfig
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.configuration_planner import PlannerSettings
+from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig
 from lerobot_wmrl.world_models.planning import Planner, interpolate_knots, plan_knots, success_logit
 from tests.rl.checkpoints import save_untrained_policy
 
@@ -165,6 +168,19 @@ def test_bad_settings_name_the_field_and_the_remedy(trained_models):
         WmMpcConfig(device="cpu", elites=9, samples=4)
     with pytest.raises(ValueError, match=r"^knots=1: must be from 2"):
         WmMpcConfig(device="cpu", knots=1)
+
+
+@pytest.mark.parametrize(("settings", "message"), [
+    ({"learnt_successes": 0}, "has learnt from no successful episode"),
+    ({"dynamics": AutoregressiveConfig(depth=True)}, "looks at depth, which environments do not show"),
+])  # fmt: skip
+def test_a_world_model_in_which_nothing_can_be_planned_is_refused(config, settings, message, monkeypatch):
+    class Loaded:
+        config = ActionWorldModelConfig(**settings)
+
+    monkeypatch.setattr(modeling_wm_mpc, "load_model", lambda *_: Loaded())
+    with pytest.raises(ValueError, match=rf"^world_model_path=.*: {message}"):
+        WmMpcPolicy(config)
 
 
 def test_without_a_search_it_does_what_the_other_policy_does_in_imagination(config, small_dataset, tmp_path):

@@ -6,12 +6,14 @@ from typing import Any
 
 import pytest
 import torch
+from lerobot.configs.default import PeftConfig
 from lerobot.policies.act.modeling_act import ACTPolicy
 from safetensors.torch import load_file
 from torch.distributions import Normal
 
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.pipeline import Pipeline
+from lerobot_wmrl.common.policies import with_new_adapters
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.evaluation.agreement import policy_outcomes
@@ -149,3 +151,15 @@ def test_the_command_improves_act_in_a_world_model_and_lerobot_evaluates_it(
     assert ACTPolicy.from_pretrained(last).config.n_action_steps == 2
     env = WorldModelEnv(**models, dataset=StartFrames(root=str(small_dataset.root)), episode_length=4)
     assert len(policy_outcomes(env, last, episodes=2, seed=0, num_envs=2)) == 2
+
+
+def test_adapters_of_act_are_trained_too() -> None:
+    act = small_act(images=False)
+    act.config.pretrained_path = Path("cloned")  # which LeRobot asks of what it adapts
+    policy = with_new_adapters(act, PeftConfig(method_type="LORA", target_modules=["linear1"], r=2))
+    algorithm = PPO(policy, PPOConfig(initial_std=0.2))
+    sample = algorithm.policy.sample(OBSERVATION)
+    assert sample.raw_action.shape == (2, ACTED, 3)
+    names = {id(value): name for name, value in policy.named_parameters()}
+    trained = {names.get(id(each), "") for each in algorithm.policy_parameters}
+    assert any("lora_A" in name for name in trained)

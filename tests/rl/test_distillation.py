@@ -157,7 +157,7 @@ def test_recorded_successes_are_labels_as_lerobots_datasets_give_them(
 ) -> None:
     camera = "observation.images.third_view"
     source = StartFrames(root=str(small_dataset.root), max_starts=1, branches=2)
-    (part,) = recorded_successes(source, [camera], state_size=8, windows=windows)
+    (part,) = recorded_successes(source, {camera: (3, 32, 32)}, state_size=8, windows=windows)
     table = read_episodes(small_dataset)
     episodes = table.success.nonzero()[0]
     assert len(part) == table.length[episodes].sum()

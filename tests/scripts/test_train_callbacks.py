@@ -10,6 +10,8 @@ import gymnasium as gym
 import pytest
 import torch
 import wandb
+import yaml
+from lerobot.configs import parser
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import EnvConfig
 from safetensors.torch import load_file
@@ -119,8 +121,29 @@ def test_a_run_is_resumed_as_lerobot_train_resumes(improve: Any, paths: dict[str
     assert [line["step"] for line in read_metrics(out)] == [1, 2]
 
 
+def test_settings_of_the_policy_may_stand_in_a_file_and_flags_come_before_a_stored_run(
+    improve: Any, paths: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for kept in ("_config_path_args", "_config_yaml_overrides"):  # by LeRobot, until the process ends
+        monkeypatch.setattr(parser, kept, {})
+    given = {"policy": {"path": str(paths["pointing"]), "max_shift": 1, "optimizer_lr": 0.5}}
+    (tmp_path / "run.yaml").write_text(yaml.dump(given))
+    flags = [*POINT[1:], *SHORT, "--output_dir={out}"]
+    out = improve(f"--config_path={tmp_path / 'run.yaml'}", *flags)
+    last = out / "checkpoints" / "last" / "pretrained_model"
+    stored = json.loads((last / "config.json").read_text())
+    assert (stored["max_shift"], stored["optimizer_lr"]) == (1, 0.5)
+    new = f"--output_dir={tmp_path / 'new'}"
+    improve(
+        f"--config_path={out / 'train_config.json'}", f"--policy.path={last}", "--policy.license=mit", new
+    )
+    published = tmp_path / "new" / "checkpoints" / "last" / "pretrained_model" / "config.json"
+    assert json.loads(published.read_text())["license"] == "mit"
+
+
 def test_adapters_of_a_cnn_are_trained_beside_its_value_function(improve: Any) -> None:
-    out = improve(*POINT, *SHORT, *ADAPTERS, "--save_freq=1", "--output_dir={out}")
+    kept = "--algorithm.train_encoder=false"
+    out = improve(*POINT, *SHORT, *ADAPTERS, kept, "--save_freq=1", "--output_dir={out}")
     first, last = (
         load_file(out / "checkpoints" / step / "pretrained_model" / "adapter_model.safetensors")
         for step in ("000001", "000002")
@@ -195,6 +218,8 @@ def test_gate_and_selection_in_the_simulator(improve: Any) -> None:
     ([*POINT, "--num_envs=0"], "--num_envs=0: must be at least 1"),
     ([*POINT, *ADAPTERS, "--peft.full_training_modules=[encoder]"],
      "--peft.full_training_modules: adapters leave the value function"),
+    ([*POINT, *ADAPTERS, "--algorithm.initial_std=0.1"],
+     "--algorithm.initial_std=0.1: is none of the adapters' parameters"),
 ])  # fmt: skip
 def test_bad_input_is_named_and_nothing_is_written(
     flags: list[str], message: str, improve: Any, paths: dict[str, Any], capsys: pytest.CaptureFixture[str]
