@@ -100,8 +100,7 @@ class SuccessGate:
     def _fresh(self, recorder: Recorder, iteration: int, checkpoint: Path, folder: Path) -> Recording:
         """Record the current policy, from seeds that no earlier rollouts had."""
         episodes = self.config.n_episodes
-        first = GATE_SEED + iteration * episodes % (SEEDS - episodes)
-        recorder.record(checkpoint, episodes, first, folder)
+        recorder.record(checkpoint, episodes, first_rollout_seed(iteration, episodes), folder)
         return labelled_recording(self.env.model, open_dataset(folder))
 
     def _above(self, verdict: Gate) -> bool:
@@ -125,6 +124,11 @@ class SuccessGate:
         if not any(verdict.false_positives.n for verdict in verdicts.values()):
             return f"Gate, iteration {iteration}: no rollout failed, so false positives were not counted"
         return None
+
+
+def first_rollout_seed(iteration: int, episodes: int) -> int:
+    """Return the seed of the first of the rollouts that are recorded after an iteration."""
+    return GATE_SEED + iteration * episodes % (SEEDS - episodes)
 
 
 def save_strips(

@@ -63,10 +63,11 @@ def test_names_range_and_rate_come_from_the_dataset(tmp_path: Path, caplog: pyte
 def test_one_wrong_value_does_not_widen_the_range(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     actions = degrees()
-    actions[3, 0] = 1e6
-    _, high = observed_range(record(tmp_path / "data", actions))
+    actions[3, 0], actions[4, 1] = 1e6, -1e6
+    low, high = observed_range(record(tmp_path / "data", actions))
     assert 90 <= high[0] < 110
-    assert "0.2 % of the recorded actions lie outside" in caplog.text
+    assert -10 < low[1] <= 0
+    assert "0.5 % of the recorded actions lie outside" in caplog.text
 
 
 def test_a_recorded_range_goes_before_a_guessed_one_and_a_given_one_before_both(tmp_path: Path) -> None:

@@ -115,8 +115,10 @@ def test_one_row_ends_and_the_others_go_on(monkeypatch: pytest.MonkeyPatch) -> N
     lift = torch.zeros(3, 7)
     lift[1, 2] = 0.05
     env.step(lift)
-    observation, _, terminated, truncated, info = env.step(lift)
-    assert terminated.tolist() == [False, True, False]
+    observation, reward, terminated, truncated, info = env.step(lift)
+    assert terminated.tolist() == info["final_info"]["is_success"].tolist() == [False, True, False]
+    assert reward[1].item() == pytest.approx(env.config.reward.step_reward(1.0, 0.1, 0.05, 5))
+    assert reward[1] > 0.5 > reward[0]
     assert not truncated.any()
     assert info["final_info"]["episode_length"].tolist() == [2, 2, 2]
     assert info["final_obs"]["observation.state"][:, 0].tolist() == pytest.approx([0.0, 0.1, 0.0])

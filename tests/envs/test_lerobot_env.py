@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import gymnasium as gym
+import numpy as np
 import pytest
 import torch
 from lerobot.envs.configs import EnvConfig, LiberoEnv, PushtEnv
@@ -48,6 +49,31 @@ def test_episodes_begin_anew_when_they_end(env: LeRobotTensorEnv) -> None:
     moved = (info["final_obs"][OBS_STATE] - seen[OBS_STATE]).abs().max()
     begun = (after[OBS_STATE] - seen[OBS_STATE]).abs().max()
     assert moved < begun, "the last frame is near the one before, the new start is elsewhere"
+
+
+def test_rewards_and_success_are_the_environments_own(
+    env: LeRobotTensorEnv, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (bare,) = PushtEnv(episode_length=STEPS).create_envs(1)["pusht"].values()
+    env.reset(seed=5)
+    bare.reset(seed=5)
+    for target in (100.0, 400.0):
+        given = np.full((1, 2), target, np.float32)
+        expected = bare.step(given)[1]
+        assert env.step(torch.from_numpy(given).repeat(B, 1))[1][0].item() == pytest.approx(expected[0])
+    solved = env.envs[1].step
+
+    def step(action: Any) -> tuple[Any, ...]:
+        seen, _, _, _, info = solved(action)
+        return seen, 7.0, True, False, {**info, "is_success": True}
+
+    monkeypatch.setattr(env.envs[1], "step", step)
+    env.reset(seed=5)
+    _, reward, terminated, truncated, info = env.step(torch.full((B, 2), 250.0))
+    assert reward[1] == 7
+    assert terminated.tolist() == info["final_info"]["is_success"].tolist() == [False, True]
+    assert not truncated.any()
+    bare.close()
 
 
 def test_seeds_decide_where_episodes_begin(env: LeRobotTensorEnv) -> None:

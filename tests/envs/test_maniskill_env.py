@@ -12,6 +12,7 @@ from lerobot.envs.utils import NEW_ROLLOUT_OPTION, preprocess_observation
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.maniskill_env import ManiSkillEnv, ManiSkillTensorEnv
+from lerobot_wmrl.maniskill.episode import Frame
 from lerobot_wmrl.maniskill.tasks import TASKS
 from lerobot_wmrl.rewards.general import RuleBasedReward, default_discount
 
@@ -191,3 +192,39 @@ def test_unknown_tasks_and_foreign_scenes_are_named_before_anything_is_built() -
         WmrlManiSkillEnv(task="juggle").selected_scenes()
     with pytest.raises(ValueError, match="split 'ood' has"):
         WmrlManiSkillEnv(split="ood", scenes=[0]).selected_scenes()
+
+
+class Solving:
+    """A simulation in which the object comes nearer with every step, and is there after two."""
+
+    instruction = "push it"
+
+    def reset(self, *_: object) -> Frame:
+        self.steps = 0
+        return self._frame()
+
+    def step(self, _: np.ndarray) -> Frame:
+        self.steps += 1
+        return self._frame()
+
+    def close(self) -> None:
+        pass
+
+    def _frame(self) -> Frame:
+        images = {"third_view": np.zeros((64, 64, 3), np.uint8)}
+        return Frame(images, {}, np.zeros(8, np.float32), reward=self.steps / 4, success=self.steps == 2)
+
+
+def test_success_ends_an_episode_and_is_paid_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(WmrlManiSkillEnv, "create_simulation", lambda _: Solving())
+    config = WmrlManiSkillEnv(episode_length=5, cameras=["third_view"], image_size=64)
+    env = ManiSkillTensorEnv(config, 1, "cpu")
+    env.reset(seed=0)
+    first, second = (env.step(torch.zeros(1, 7)) for _ in range(2))
+    expected = [config.reward.step_reward(float(k == 2), k / 4, (k - 1) / 4, 5) for k in (1, 2)]
+    assert [first[1].item(), second[1].item()] == pytest.approx(expected)
+    assert expected[1] > 0.5 > expected[0]
+    assert [first[2].item(), second[2].item(), second[3].item()] == [False, True, False]
+    assert second[4]["final_info"]["is_success"].tolist() == [True]
+    assert second[4]["final_info"]["episode_length"].tolist() == [2]
+    env.close()

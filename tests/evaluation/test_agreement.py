@@ -14,6 +14,7 @@ from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
+from lerobot_wmrl.envs.evaluation_adapter import StepCounter
 from lerobot_wmrl.evaluation.agreement import Agreement, policy_checkpoints, policy_outcomes
 from lerobot_wmrl.evaluation.report import agreement_table
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
@@ -135,3 +136,27 @@ def test_agreement_is_pearsons_correlation_with_fishers_interval():
     equal = Agreement({str(i): (Proportion(5, 10), Proportion(i, 10)) for i in range(4)})
     assert equal.as_json()["pearson"]["value"] is None
     assert "No correlation" in agreement_table(equal)
+
+
+class Ending:
+    """Two environments, whose episodes end after one step and after three."""
+
+    num_envs = 2
+
+    def reset(self, **_: object) -> tuple[None, dict[str, object]]:
+        self.elapsed = 0
+        return None, {}
+
+    def step(self, _: object) -> tuple[object, ...]:
+        self.elapsed += 1
+        ended = np.array([self.elapsed == 1, self.elapsed == 3])
+        return None, None, ended, np.zeros(2, bool), {}
+
+
+def test_the_steps_of_first_episodes_alone_are_counted() -> None:
+    env = StepCounter(Ending())
+    for _ in range(2):
+        env.reset()
+        for _ in range(3):
+            env.step(None)
+    assert env.steps == 2 * (1 + 3)

@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.evaluation.gate import (
+    Gate,
     Outcomes,
     best_operating_point,
     by_task,
@@ -182,3 +184,18 @@ def test_every_task_has_a_gate_of_its_own(outcomes):
     assert lines[5].startswith("No recorded success of pull is recognised")
     assert len(task_table({"push": gates["push"]}, {"push": None}).splitlines()) == 3
     assert "| 0.5, 3: 0 % (0 of 1;" in task_table({"pull": gates["pull"]}, {"pull": gates["pull"]})
+
+
+def gate_of(false: int, failures: int, recognised: int, successes: int) -> Gate:
+    return Gate(
+        threshold=0.5, frames=2, false_positives=Proportion(false, failures),
+        recall=Proportion(recognised, successes), cut_short=0, repeats_last=False, auc=0.9,
+    )  # fmt: skip
+
+
+def test_the_gate_allows_five_false_positives_in_a_hundred_and_asks_for_ninety_recognised() -> None:
+    assert gate_of(5, 100, 90, 100).passed
+    assert not gate_of(6, 100, 100, 100).passed
+    assert not gate_of(0, 100, 89, 100).passed
+    allowed, tempting = gate_of(5, 100, 50, 100), gate_of(6, 100, 100, 100)
+    assert best_operating_point([tempting, allowed]) is allowed

@@ -215,3 +215,12 @@ def test_a_policy_that_looks_at_something_else_proposes_nothing(config, tmp_path
     config.proposal_path = str(tmp_path / "nothing")
     with pytest.raises(ValueError, match=r"^proposal_path=.*no checkpoint there.*give the output folder"):
         WmMpcPolicy(config)
+
+
+def test_a_plan_goes_on_where_it_was_carried_out(trained_models):
+    model = load_model(trained_models["action_world_model"], "action_world_model")
+    settings = PlannerSettings(horizon=8, execute=3, samples=6, elites=2, iterations=1, knots=8)
+    low, high = model.action_range()
+    planner = Planner(model, None, settings, done_frames=1, averaged=False, low=low, high=high, seed=0)
+    plan = torch.arange(8.0)[None, :, None].expand(1, 8, 7)
+    assert planner._remaining_knots(plan)[0, :, 0].tolist() == [3, 4, 5, 6, 7, 7, 7, 7]

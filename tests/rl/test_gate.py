@@ -1,18 +1,21 @@
 """The gate asks what the evaluation asks, stops or warns, and never passes what nobody has asked about."""
 
 import logging
+import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from lerobot_wmrl.common.constants import GATE_SEED
 from lerobot_wmrl.common.lerobot_commands import env_flags
+from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
-from lerobot_wmrl.evaluation.gate import gate_at, labelled_recording, predict_outcomes
+from lerobot_wmrl.evaluation.gate import Gate, gate_at, labelled_recording, predict_outcomes
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.configuration_callbacks import GateConfig
@@ -126,3 +129,31 @@ def test_the_recorder_gets_what_is_not_as_by_default() -> None:
         "env.type": "wmrl_maniskill", "env.task": "pull", "env.scenes": [0, 2], "env.image_size": 64,
         "env.cameras": ["wrist"],
     }  # fmt: skip
+
+
+@pytest.mark.parametrize(("labelled", "fresh", "failed"), [(0, 0, False), (9, 0, True), (0, 9, True)])
+def test_either_source_of_rollouts_fails_the_world_model(
+    labelled: int, fresh: int, failed: bool, env: Any, small_dataset: LeRobotDataset, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    class Recorder:
+        seeds: ClassVar[list[int]] = []
+
+        def record(self, checkpoint: Path, episodes: int, seed: int, folder: Path) -> None:
+            self.seeds.append(seed)
+            shutil.copytree(small_dataset.root, folder)
+
+    found = iter([labelled, fresh, fresh])
+
+    def verdict(*_: Any) -> Gate:
+        return Gate(
+            threshold=0.5, frames=1, false_positives=Proportion(next(found), 10), recall=Proportion(1, 1),
+            cut_short=0, repeats_last=False, auc=1.0,
+        )  # fmt: skip
+
+    monkeypatch.setattr("lerobot_wmrl.rl.gate.gate_at", verdict)
+    config = GateConfig(dataset=DatasetSource(str(small_dataset.root)), n_episodes=5, limit=0.5)
+    gate = SuccessGate(config, env, Recorder(), frozenset(), total=8)
+    assert gate.run(0, tmp_path, tmp_path / "first")["failed"] == failed
+    assert gate.run(4, tmp_path, tmp_path / "later")["failed"] == (fresh > 0)
+    assert Recorder.seeds == [GATE_SEED, GATE_SEED + 20]

@@ -12,6 +12,7 @@ from lerobot.rewards.factory import make_reward_model
 from safetensors.torch import load_file
 
 from lerobot_wmrl.common.checkpoints import Checkpoint
+from lerobot_wmrl.common.constants import KINDS, START_KIND
 from lerobot_wmrl.common.presets import PRESETS, preset_flags
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data.clips import ClipSampler, InTurn
@@ -173,6 +174,12 @@ def test_cached_frames_are_those_of_the_dataset(small_dataset):
 def test_only_successful_optimal_episodes_are_golden(small_dataset):
     table = read_episodes(small_dataset)
     assert golden_episodes(table).tolist() == [True, True, False] * 2
+    kinds = table.columns[START_KIND].copy()
+    kinds[[0, 1, 3]] = [KINDS.index(kind) for kind in ("policy", "near_miss", "human_like")]
+    assert golden_episodes(replace(table, columns={START_KIND: kinds})).tolist() == [
+        False, False, False, True, True, False,
+    ]  # fmt: skip
+    assert golden_episodes(replace(table, columns={})).tolist() == [True, True, False] * 2
 
 
 @pytest.mark.parametrize(("build", "precision"), [
