@@ -24,7 +24,7 @@ from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.improve import commands
 from lerobot_wmrl.improve import improvement as decisions
-from lerobot_wmrl.improve.findings import few_decisions
+from lerobot_wmrl.improve.findings import few_decisions, usual_length
 from lerobot_wmrl.improve.improvement import DISTILLED, FITTED, PPO, SFT
 from lerobot_wmrl.scripts.improve import settings
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
@@ -362,3 +362,19 @@ def test_a_policy_that_seldom_decides_is_named(make_synthetic_dataset: Any, tmp_
         "act takes 100 actions at a time, and an imagined episode has about 98 frames"
         in (few_decisions(ACTConfig(device="cpu"), table)[0])
     )
+
+
+@pytest.mark.parametrize(("held", "frames"), [(0, 1), (1, 1), (2, 2), (9, 2)])
+def test_success_is_asked_for_no_longer_than_recorded_ones_hold(
+    held: int, frames: int, tmp_path: Path
+) -> None:
+    assert improvement_of(tmp_path, held=held).strict_criterion()["done_frames"] == frames
+
+
+def test_one_long_recording_does_not_decide_how_long_episodes_usually_are() -> None:
+    def usual(lengths: list[int], tasks: list[int]) -> int:
+        table: Any = SimpleNamespace(length=np.array(lengths), column=lambda _: np.array(tasks))
+        return usual_length(table)
+
+    assert usual([20] * 9 + [9000], [0] * 10) == 20
+    assert usual([20] * 9 + [9000] + [50], [0] * 10 + [1]) == 50

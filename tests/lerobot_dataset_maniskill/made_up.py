@@ -48,7 +48,7 @@ class MadeUpRecorder(PartRecorder):
         for camera in env.cameras:
             images[camera] = rng.integers(0, NOISE, (env.image_size, env.image_size, 3), dtype=np.uint8)
             images[camera][..., env.cameras.index(camera)] += BRIGHTER * row
-        return Frame(images, {}, np.zeros(8, np.float32), 0.0, success)
+        return Frame(images, {}, np.zeros(8, np.float32), row / ROWS, success)
 
 
 def source_of(config: RecordConfig) -> ManiSkillEpisodes:

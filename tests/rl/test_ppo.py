@@ -10,6 +10,7 @@ import torch
 
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_wmrl.common.pipeline import Pipeline
+from lerobot_wmrl.rewards.general import default_discount
 from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.policy_gradient import (
@@ -20,7 +21,7 @@ from lerobot_wmrl.rl.policy_gradient import (
     read_batch,
     reference_penalty,
 )
-from lerobot_wmrl.rl.ppo import PPO
+from lerobot_wmrl.rl.ppo import PPO, generalised_advantages, normalised
 from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
 from tests.rl.learning import assert_it_learns, update
 from tests.rl.point_env import PointEnv
@@ -183,3 +184,29 @@ def test_the_reference_holds_the_policy(make_policy: MakePolicy, pipeline: Pipel
             stats = update(algorithm, buffer, pipeline)
         distance[coefficient] = stats.extra["reference_kl"]
     assert distance[3.0] < 0.5 * distance[0.0]
+
+
+def test_targets_have_the_discount_of_the_longest_episode_and_gradients_are_clipped(
+    make_policy: MakePolicy, pipeline: Pipeline, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy = make_policy()
+    algorithm = PPO(policy, PPOConfig(value_iterations=0, value_normalisation=False, policy_lr=1e-3))
+    buffer = RolloutBuffer(12, 16, "cpu", longest=6)
+    collect(PointEnv(16, horizon=6), policy, pipeline, buffer, seed=0)
+    algorithm.add_targets(buffer)
+    advantages = generalised_advantages(
+        buffer.reward, buffer.value, buffer.next_value, buffer.terminated, buffer.truncated,
+        default_discount(6), algorithm.config.gae_lambda, buffer.decided,
+    )  # fmt: skip
+    torch.testing.assert_close(buffer.columns["target"], advantages + buffer.value)
+    torch.testing.assert_close(buffer.columns["advantage"], normalised(advantages, buffer.decided))
+    algorithm.add_reference(buffer, pipeline)
+    buffer.columns["advantage"] *= 1e4
+    norms: list[float] = []
+
+    def step(*_: Any, **__: Any) -> None:
+        norms.append(torch.stack([p.grad.norm() for p in algorithm.policy_parameters]).norm().item())
+
+    monkeypatch.setattr(algorithm.optimizer, "step", step)
+    update(algorithm, buffer, pipeline)
+    assert norms == pytest.approx([1.0] * len(norms), abs=1e-3)

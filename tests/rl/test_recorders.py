@@ -62,6 +62,16 @@ def test_rows_are_what_the_policy_saw_and_did(checkpoint: Path, tmp_path: Path) 
     assert moved > 1, "the state of the second frame follows the first action"
 
 
+def test_rewards_are_the_environments(checkpoint: Path, tmp_path: Path) -> None:
+    table = recorded(checkpoint, tmp_path / "rollouts")
+    rewards = np.ravel(table.dataset.hf_dataset.with_format("numpy")["next.reward"])
+    (env,) = PushtEnv(episode_length=STEPS).create_envs(1)["pusht"].values()
+    env.reset(seed=7)
+    for action, reward in zip(table.action[:STEPS], rewards, strict=False):
+        assert env.step(action[None])[1][0] == pytest.approx(reward)
+    env.close()
+
+
 def test_seeds_decide_the_start_and_noise_stays_in_range(checkpoint: Path, tmp_path: Path) -> None:
     first = recorded(checkpoint, tmp_path / "first")
     again = recorded(checkpoint, tmp_path / "again")

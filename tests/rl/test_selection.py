@@ -1,15 +1,24 @@
 """The checkpoint that is kept as the best, and when imagined and real success part."""
 
+import inspect
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from lerobot.envs.configs import EnvConfig, PushtEnv
 
+from lerobot_wmrl.common.constants import SELECTION_SEED
 from lerobot_wmrl.common.statistics import Proportion
+from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.evaluation.agreement import Evaluated
+from lerobot_wmrl.rl import make_callbacks
 from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.callbacks import Record
+from lerobot_wmrl.rl.configuration_callbacks import CallbackSettings
 from lerobot_wmrl.rl.selection import Measure, Selection, best_iteration, diverged
+from tests.rl.point_env import PointEnv
+from tests.scripts.point_config import PointConfig
 
 N = 64
 
@@ -95,3 +104,32 @@ def test_a_training_whose_imagination_parts_from_reality_is_stopped(tmp_path: Pa
     with pytest.raises(TrainingStopped, match=r"iteration 10: real success has fallen.*53 %.*at iteration 5"):
         selection.apply({0: record(0.40, 0.5), 5: record(0.53, 0.55), 10: record(0.20, 0.80)})
     assert best(tmp_path) == "000005", "the best checkpoint is pointed at nonetheless"
+
+
+class Imagining(PointEnv):
+    """In the place of a world model."""
+
+    config = SimpleNamespace(dataset=StartFrames(root="episodes"))
+    starts = range(9)
+
+
+@pytest.mark.parametrize(("real_env", "config", "env", "places"), [
+    (None, PushtEnv(), PointEnv, ["real"]), (None, PointConfig(), PointEnv, ["real"]),
+    (PushtEnv(), PointConfig(), Imagining, ["real", "imagined"]),
+])  # fmt: skip
+def test_success_is_measured_on_seeds_that_nothing_is_reported_on(
+    real_env: EnvConfig | None, config: EnvConfig, env: type[PointEnv], places: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    for name in ("evaluate_policy", "evaluate_within"):
+        signature = inspect.signature(getattr(make_callbacks, name))
+
+        def seed_of(*given: Any, signature: inspect.Signature = signature, **flags: Any) -> int:
+            return int(signature.bind(*given, **flags).arguments["seed"])
+
+        monkeypatch.setattr(make_callbacks, name, seed_of)
+    monkeypatch.setattr(make_callbacks, "WorldModelVectorEnv", Imagining)
+    monkeypatch.setattr(make_callbacks, "make_success_env", lambda env, *_: env)
+    trained = make_callbacks.Trained(None, (None, None), env(2), config)
+    measures: dict[str, Any] = make_callbacks.make_measures(CallbackSettings(real_env=real_env), trained)
+    assert {place: measure() for place, measure in measures.items()} == dict.fromkeys(places, SELECTION_SEED)
