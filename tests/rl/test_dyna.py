@@ -53,7 +53,9 @@ def test_a_round_refreshes_the_world_model_and_a_killed_one_goes_on(
     small_dataset: LeRobotDataset,
     trained_models: dict[str, Path],
     tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(dyna, "run_subcommand", lambda command: run_here(*command))
     folder = tmp_path / "dyna" / "000003"
     before = {name: value.clone() for name, value in env.model.state_dict().items()}
     record = rounds.run(3, tmp_path, folder)

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -29,7 +28,6 @@ from tests.hub_server import Hub
 from tests.rl.checkpoints import save_untrained_policy
 from tests.scripts.point_config import PointConfig
 
-BIN = Path(sys.executable).parent
 SIMULATOR = ["--env.type=wmrl_maniskill", "--env.image_size=32", "--env.episode_length=4"]
 SHORT = [
     "--algorithm.type=ppo",
@@ -69,9 +67,7 @@ def test_clone_improve_and_evaluate(cloned: Path, tmp_path: Path, monkeypatch: p
     assert all(line["episode_length"] <= 4 for line in lines)
     last = output_dir / "checkpoints" / "last" / "pretrained_model"
     flags = [f"--policy.path={last}", *SIMULATOR, "--eval.n_episodes=1", "--eval.batch_size=1"]
-    flags += ["--seed=1000000", f"--output_dir={tmp_path / 'eval'}"]
-    evaluated = subprocess.run([BIN / "lerobot-eval", *flags], capture_output=True, text=True)
-    assert evaluated.returncode == 0, evaluated.stderr[-3000:]
+    run_here("lerobot-eval", *flags, "--seed=1000000", f"--output_dir={tmp_path / 'eval'}")
     assert "pc_success" in json.loads((tmp_path / "eval" / "eval_info.json").read_text())["overall"]
 
 
