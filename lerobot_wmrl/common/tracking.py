@@ -25,6 +25,17 @@ def append_metrics(output_dir: Path, step: int, metrics: Mapping[str, float]) ->
         file.write(json.dumps({"step": step, **metrics}).encode() + b"\n")
 
 
+def log_metrics(
+    output_dir: Path, step: int, metrics: Mapping[str, float], wandb: Any, mode: str = "train"
+) -> None:
+    """Write metrics to the file and, as `train/…` or `eval/…`, to wandb, if there is its logger; from the
+    first process."""
+    if is_first_process():
+        append_metrics(output_dir, step, metrics)
+        if wandb is not None:
+            wandb.log_dict(dict(metrics), step, mode)
+
+
 def read_metrics(output_dir: Path) -> list[dict[str, Any]]:
     """Return the metrics of each step, in order of steps.
 
@@ -75,12 +86,8 @@ class Tracker:
         self.log_freq, self.wandb = log_freq, wandb
 
     def log(self, step: int, metrics: Mapping[str, float], mode: str = "train") -> None:
-        """Write metrics to the file and to wandb, as `train/…` or `eval/…`, from the first process."""
-        if not is_first_process():
-            return
-        append_metrics(self.output_dir, step, metrics)
-        if self.wandb is not None:
-            self.wandb.log_dict(dict(metrics), step, mode)
+        """Write metrics to the file and to wandb, as `log_metrics` does."""
+        log_metrics(self.output_dir, step, metrics, self.wandb, mode)
 
     def log_step(self, step: int, metrics: Mapping[str, float]) -> None:
         """Log a finished step, every `log_freq` steps also as a line in the terminal."""

@@ -8,6 +8,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -30,7 +31,7 @@ from lerobot_wmrl.common.cuda_graphs import cuda_graphs
 from lerobot_wmrl.common.distributed import is_first_process, mean_over_processes
 from lerobot_wmrl.common.errors import FieldError, renamed
 from lerobot_wmrl.common.precision import compute_in, training_dtype
-from lerobot_wmrl.common.tracking import append_metrics
+from lerobot_wmrl.common.tracking import log_metrics
 from lerobot_wmrl.common.training_state import gather_random_states, load_training_state, save_training_state
 from lerobot_wmrl.data.checks import require_shown
 from lerobot_wmrl.data.clips import ClipSampler, FrameSampler, InTurn
@@ -237,7 +238,7 @@ def train(
     first = 0 if checkpoint is None else load_training_state(checkpoint, optimizer, scheduler)
     network = DistributedDataParallel(model) if processes.num_processes > 1 else model
 
-    def save(folder: Path) -> None:
+    def save(folder: Path, step: int, random_states: list[dict[str, Any]]) -> None:
         model.save_pretrained(folder / PRETRAINED_MODEL_DIR)
         save_config(folder / PRETRAINED_MODEL_DIR)
         save_training_state(folder, step, random_states, optimizer, scheduler)
@@ -253,11 +254,13 @@ def train(
         if step % settings.log_freq == 0 or step == settings.steps:
             metrics = mean_over_processes(metrics, device)
             metrics["steps_per_s"] = (step - first) / (time.monotonic() - began)
-            log(settings.output_dir, step, metrics, progress, wandb)
+            progress.set_postfix(loss=f"{metrics['loss']:.3f}")
+            log_metrics(settings.output_dir, step, metrics, wandb)
         if should_save_checkpoint(step, settings.save_freq, settings.steps):
-            random_states = gather_random_states()
+            states = gather_random_states()
             if is_first_process():
-                write_checkpoint(settings.output_dir, settings.steps, step, save)
+                write = partial(save, step=step, random_states=states)
+                write_checkpoint(settings.output_dir, settings.steps, step, write)
         progress.update()
     progress.close()
 
@@ -266,15 +269,6 @@ def progress_bar(name: str, first: int, steps: int) -> tqdm:
     """Show steps done and the time left, in the first process."""
     quiet = not is_first_process()
     return tqdm(total=steps, initial=first, desc=f"Training {name}", unit="step", disable=quiet)
-
-
-def log(output_dir: Path, step: int, metrics: dict[str, float], progress: tqdm, wandb: Any) -> None:
-    """Show the loss beside the bar, and let the first process write a line of metrics."""
-    progress.set_postfix(loss=f"{metrics['loss']:.3f}")
-    if is_first_process():
-        append_metrics(output_dir, step, metrics)
-        if wandb is not None:
-            wandb.log_dict(metrics, step)
 
 
 def optimizer_step(

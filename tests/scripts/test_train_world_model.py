@@ -148,7 +148,7 @@ def test_wandb_gets_the_metrics_of_the_file(
             assert (cfg.job_name, cfg.resume, cfg.reward_model.type) == ("run", False, "frame_tokenizer")
             assert cfg.to_dict()["wandb"]["enable"]
 
-        def log_dict(self, metrics: dict[str, float], step: int) -> None:
+        def log_dict(self, metrics: dict[str, float], step: int, mode: str = "train") -> None:
             logged.append({"step": step, **metrics})
 
     monkeypatch.setattr("lerobot.common.wandb_utils.WandBLogger", Logger)
