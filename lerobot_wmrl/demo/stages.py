@@ -70,7 +70,7 @@ class DemoConfig(RunConfig):
     rollouts: int = 300
     eval_episodes: int = 100
 
-    def check(self) -> None:
+    def validate(self) -> None:
         """Raise FieldError for a setting that cannot be."""
         require_choice(self, "size", [*presets_of("demo")])
         last = EVALUATION_SEED // SEED_STRIDE - 1

@@ -46,7 +46,7 @@ class StartFrames(ChosenEpisodes):
     frames: Path | None = None
     resets: int = 0
 
-    def check(self) -> None:
+    def validate(self) -> None:
         """Raise FieldError unless there is exactly one kind of starts, and it can be chosen as asked."""
         given = [name for name in ("given", "frames", "resets") if getattr(self, name)]
         if len(given) != 1:

@@ -111,7 +111,7 @@ def read_start_images(source: StartFrames, config: WorldModelConfig) -> StartIma
     Raises:
         ValueError: `source` asks for frames that are not there or do not fit the world model.
     """
-    source.check()
+    source.validate()
     if source.frames is not None:
         return read_saved_frames(source.frames, source.max_starts, config)
     if source.resets:

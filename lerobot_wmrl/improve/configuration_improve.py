@@ -99,7 +99,7 @@ class ImproveConfig(RunConfig):
         """The settings of the policy that the command line changes: `--n_action_steps=8`."""
         return settings_beside("policy")
 
-    def check(self) -> None:
+    def validate(self) -> None:
         """Read the policy's configuration. FieldError for a setting that cannot be."""
         path = parser.get_path_arg("policy")
         if path:

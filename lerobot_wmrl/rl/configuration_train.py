@@ -94,30 +94,29 @@ class TrainConfig(CallbackSettings, RunConfig):
         """Return the configuration as the dictionary that LeRobot's WandBLogger asks for."""
         return draccus.encode(self)
 
-
-def check_config(cfg: TrainConfig) -> None:
-    """Raise FieldError for the first setting that is impossible."""
-    if not isinstance(cfg.algorithm, PolicyGradientConfig | DistillationConfig):
-        raise FieldError(
-            "algorithm.type", cfg.algorithm.type, "this command trains with ppo, grpo or distillation"
-        )
-    if cfg.env is None:
-        raise FieldError("env.type", None, "is missing", "choose world_model, or another environment")
-    require_at_least(cfg, 1, "num_envs", "iterations", "save_freq", "log_freq")
-    if isinstance(cfg.algorithm, PPOConfig) and cfg.algorithm.value_iterations >= cfg.iterations:
-        logging.warning(
-            "iterations=%d: the policy stays as it is, because the value function alone learns in the first "
-            "%d (algorithm.value_iterations)", cfg.iterations, cfg.algorithm.value_iterations,
-        )  # fmt: skip
-    if isinstance(cfg.algorithm, GRPOConfig):
-        cfg.algorithm.check_num_envs(cfg.num_envs)
-    if isinstance(cfg.algorithm, DistillationConfig):
-        check_distillation(cfg.algorithm, cfg.env)
-    if not 0 <= cfg.seed < EVALUATION_SEED:
-        raise FieldError(
-            "seed", cfg.seed, f"must be from 0 to {EVALUATION_SEED - 1}; those above are for evaluation"
-        )
-    cfg.check_callbacks(cfg.env, cfg.iterations)
+    def validate(self) -> None:
+        """Raise FieldError for the first setting that is impossible."""
+        if not isinstance(self.algorithm, PolicyGradientConfig | DistillationConfig):
+            raise FieldError(
+                "algorithm.type", self.algorithm.type, "this command trains with ppo, grpo or distillation"
+            )
+        if self.env is None:
+            raise FieldError("env.type", None, "is missing", "choose world_model, or another environment")
+        require_at_least(self, 1, "num_envs", "iterations", "save_freq", "log_freq")
+        if isinstance(self.algorithm, PPOConfig) and self.algorithm.value_iterations >= self.iterations:
+            logging.warning(
+                "iterations=%d: the policy stays as it is, because the value function alone learns in the "
+                "first %d (algorithm.value_iterations)", self.iterations, self.algorithm.value_iterations,
+            )  # fmt: skip
+        if isinstance(self.algorithm, GRPOConfig):
+            self.algorithm.check_num_envs(self.num_envs)
+        if isinstance(self.algorithm, DistillationConfig):
+            check_distillation(self.algorithm, self.env)
+        if not 0 <= self.seed < EVALUATION_SEED:
+            raise FieldError(
+                "seed", self.seed, f"must be from 0 to {EVALUATION_SEED - 1}; those above are for evaluation"
+            )
+        self.check_callbacks(self.env, self.iterations)
 
 
 def check_distillation(algorithm: DistillationConfig, env: EnvConfig) -> None:

@@ -65,7 +65,7 @@ class CompareConfig(RunConfig):
     trust_remote_code: bool = False
     output_dir: Path = Path("outputs/comparison")
 
-    def check(self) -> None:
+    def validate(self) -> None:
         """Raise FieldError for a setting that cannot be."""
         if len(self.policies) < 2:
             raise FieldError(
@@ -93,7 +93,7 @@ def compare(cfg: CompareConfig) -> None:
     from lerobot_wmrl.evaluation.compare import read_policies
     from lerobot_wmrl.evaluation.comparison import RESULTS, Comparison, read_episodes, save_picture
 
-    cfg.check()
+    cfg.validate()
     assert cfg.env is not None
     configs = read_policies(cfg.policies, cfg.env)
     cfg.policies = list(configs)

@@ -20,7 +20,7 @@ def run_demo(cfg: DemoConfig) -> None:
     from lerobot_wmrl.common.stages import claimed, run_stages
     from lerobot_wmrl.maniskill.backend import require_simulator
 
-    cfg.check()
+    cfg.validate()
     require_simulator()
     demo = Demo(cfg)
     with claimed(cfg.output_dir, {**asdict(cfg), "output_dir": str(cfg.output_dir)}):

@@ -97,7 +97,7 @@ class EvalWorldModelConfig(RunConfig):
     push_to_hub: bool = False
     output_dir: Path = Path("outputs/eval_world_model")
 
-    def check(self) -> None:
+    def validate(self) -> None:
         """Raise FieldError for a setting that cannot be."""
         require_at_least(self, 1, "max_episodes", "done_frames", "policy_episodes")
         if self.episode_length is not None:
@@ -129,7 +129,7 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     from lerobot_wmrl.maniskill.recordings import scene_splits
     from lerobot_wmrl.world_models.checkpoint import check_dataset, load_model
 
-    cfg.check()
+    cfg.validate()
     if cfg.push_to_hub:
         check_login()
     model = load_model(cfg.model.path, "action_world_model", cfg.device, "model.path")

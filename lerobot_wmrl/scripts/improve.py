@@ -34,7 +34,7 @@ def improve(cfg: ImproveConfig) -> None:
     from lerobot_wmrl.improve.report.page import Page
     from lerobot_wmrl.improve.report.words import verdict
 
-    cfg.check()
+    cfg.validate()
     improvement = Improvement.of(cfg)
     print(f"{cfg.dataset.name}:\n{improvement.found}\n  {improvement.duration}")
     stages = commands.stages(improvement)

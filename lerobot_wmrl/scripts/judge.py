@@ -92,7 +92,7 @@ class JudgeConfig(RunConfig):
     device: str | None = None
     output_dir: Path = Path("outputs/judgement")
 
-    def check(self) -> None:
+    def validate(self) -> None:
         """Raise FieldError for a setting that cannot be."""
         if not self.policies:
             raise FieldError("policies", [], "there is nothing to judge", "give checkpoints: [a,b]")
@@ -126,7 +126,7 @@ class JudgeConfig(RunConfig):
             )  # fmt: skip
         if self.starts_given:
             with regrouped("dataset", "starts"):
-                starts.check()
+                starts.validate()
         elif starts != StartFrames(max_starts=starts.max_starts):
             raise FieldError(
                 "starts.root", "", "is missing, so that imagined episodes start in the rollouts",
@@ -161,7 +161,7 @@ def judge(cfg: JudgeConfig) -> None:
     )
     from lerobot_wmrl.evaluation.judgement import LEAST_YOUDEN, Judgement, save_picture, told
 
-    cfg.check()
+    cfg.validate()
     cfg.world_model.path = resolved_name(cfg.world_model.path)
     env = cfg.imagination()
     configs, references = read_both(cfg, env)

@@ -60,7 +60,7 @@ def label(cfg: LabelConfig) -> None:
     """Write the labelled dataset and say what is in it."""
 
     dataset = cfg.dataset.open()
-    check(cfg, dataset)
+    require_unlabelled(cfg, dataset)
     success = cfg.success.labels(dataset)
     with writing("output_dir", cfg.output_dir, resumes=False):
         write_labelled(dataset, success, cfg.output_dir, cfg.repo_id or f"local/{cfg.output_dir.name}")
@@ -69,7 +69,7 @@ def label(cfg: LabelConfig) -> None:
     print("\n".join(report(runs, cfg)))
 
 
-def check(cfg: LabelConfig, dataset: "LeRobotDataset") -> None:
+def require_unlabelled(cfg: LabelConfig, dataset: "LeRobotDataset") -> None:
     """Raise FieldError if the dataset is labelled already, or there is something at `output_dir`.
 
     A column `next.success` of numbers becomes one of truth values where the rule reads it.

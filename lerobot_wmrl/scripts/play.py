@@ -93,7 +93,7 @@ class PlayConfig(RunConfig):
     export: Path | None = None
     export_starts: int = 64
 
-    def check(self) -> None:
+    def validate(self) -> None:
         """Read the policy's configuration. FieldError for a setting that cannot be."""
         path = parser.get_path_arg("policy")
         if path:
@@ -145,7 +145,7 @@ def play(cfg: PlayConfig) -> None:
     from lerobot_wmrl.play.web import serve
     from lerobot_wmrl.play.world import load_world
 
-    cfg.check()
+    cfg.validate()
     reward = {"reward": GeneralConfig()} if cfg.text_world_model.path else {}
     with (
         renamed("world_model_path", "world_model.path"),

@@ -57,7 +57,7 @@ def resample(cfg: ResampleConfig) -> None:
 
     dataset = cfg.dataset.open()
     table = read_episodes(dataset)
-    summed = check(cfg, dataset)
+    summed = summed_components(cfg, dataset)
     if absolute_control(table) is False and not summed.any():
         logging.warning(
             "the actions do not follow the state: if they are displacements, name the components that add up "
@@ -73,7 +73,7 @@ def resample(cfg: ResampleConfig) -> None:
     )
 
 
-def check(cfg: ResampleConfig, dataset: "LeRobotDataset") -> np.ndarray:
+def summed_components(cfg: ResampleConfig, dataset: "LeRobotDataset") -> np.ndarray:
     """Mark the components of the action that add up. FieldError for a setting that cannot be. (A,)"""
     from lerobot.utils.constants import ACTION
 

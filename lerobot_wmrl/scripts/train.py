@@ -39,7 +39,7 @@ from lerobot_wmrl.rewards.general import RuleBasedReward, potential_discount
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
-from lerobot_wmrl.rl.configuration_train import MAY_DIFFER, TrainConfig, check_config, load_config
+from lerobot_wmrl.rl.configuration_train import MAY_DIFFER, TrainConfig, load_config
 from lerobot_wmrl.rl.trained_policy import publish, summary
 
 
@@ -52,7 +52,7 @@ def train_policy(cfg: TrainConfig) -> None:
     from lerobot_wmrl.envs.lerobot_env import make_tensor_env
     from lerobot_wmrl.rl.budget import check_data
 
-    check_config(cfg)
+    cfg.validate()
     check_data(cfg, cfg.env)
     config = load_config(cfg)
     if isinstance(cfg.env, WorldModelEnv) and cfg.env.device not in (None, config.device):

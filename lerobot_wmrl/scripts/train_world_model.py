@@ -100,22 +100,21 @@ class TrainWorldModelConfig(RunConfig):
         """Return the settings as LeRobot's WandBLogger asks for them."""
         return draccus.encode(self)
 
+    def validate(self) -> None:
+        """Raise FieldError for a setting that cannot be."""
+        if self.model.type not in TRAINED:
+            raise FieldError("model.type", self.model.type, f"this command trains {', '.join(TRAINED)}")
+        require_at_least(self, 1, "steps", "batch_size", "save_freq", "log_freq")
+        require_choice(self, "precision", PRECISIONS)
+        if isinstance(self.model, FrameTokenizerConfig) and self.model.tokenizer.success:
+            require_at_least(self, 2, "batch_size")  # features are normalised over the batch
+        if self.model.push_to_hub:
+            from lerobot_wmrl.common.hub import check_login
 
-def check_config(cfg: TrainWorldModelConfig) -> None:
-    """Raise FieldError for a setting that cannot be."""
-    if cfg.model.type not in TRAINED:
-        raise FieldError("model.type", cfg.model.type, f"this command trains {', '.join(TRAINED)}")
-    require_at_least(cfg, 1, "steps", "batch_size", "save_freq", "log_freq")
-    require_choice(cfg, "precision", PRECISIONS)
-    if isinstance(cfg.model, FrameTokenizerConfig) and cfg.model.tokenizer.success:
-        require_at_least(cfg, 2, "batch_size")  # features are normalised over the batch
-    if cfg.model.push_to_hub:
-        from lerobot_wmrl.common.hub import check_login
-
-        if not cfg.model.repo_id:
-            raise FieldError("model.push_to_hub", True, "needs a name on the hub", "give `model.repo_id`")
-        with within("model"):
-            check_login()
+            if not self.model.repo_id:
+                raise FieldError("model.push_to_hub", True, "needs a name on the hub", "give `model.repo_id`")
+            with within("model"):
+                check_login()
 
 
 def check_processes(cfg: TrainWorldModelConfig, processes: int) -> None:
@@ -135,17 +134,17 @@ def check_data(cfg: TrainWorldModelConfig, table: EpisodeTable) -> None:
     from lerobot_wmrl.data.budget import Ledger
     from lerobot_wmrl.maniskill.recordings import require_unreported
 
-    def check(table: EpisodeTable, chosen: list[int] | None) -> None:
+    def check_table(table: EpisodeTable, chosen: list[int] | None) -> None:
         episodes = table.among(chosen).nonzero()[0]
         learnt = episodes[~table.validation[episodes]]
         require_unreported(table, learnt, "choose others with `dataset.episodes`")
         if cfg.budget is not None:
             Ledger(cfg.budget).require_known(table, episodes)
 
-    check(table, cfg.dataset.episodes)
+    check_table(table, cfg.dataset.episodes)
     with renamed("dataset.root", "dataset.more"):
         for further in cfg.dataset.read_more():
-            check(further, None)
+            check_table(further, None)
 
 
 def train_world_model(cfg: TrainWorldModelConfig) -> None:
@@ -159,7 +158,7 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
 
     if path := parser.get_path_arg("model"):
         cfg.model = config_to_continue(path, settings_beside("model"))
-    check_config(cfg)
+    cfg.validate()
     if cfg.resume:
         require_resumable(cfg.output_dir)
     processes = PartialState(cpu=cfg.model.device == "cpu", timeout=LONGEST_WAIT)

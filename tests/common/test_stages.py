@@ -190,7 +190,7 @@ def test_two_runs_do_not_share_a_folder(tmp_path: Path) -> None:
 )  # fmt: skip
 def test_impossible_settings_are_named(flags: dict[str, int]) -> None:
     with pytest.raises(ValueError, match=f"{next(iter(flags))}="):
-        DemoConfig(**flags).check()
+        DemoConfig(**flags).validate()
 
 
 def test_training_and_evaluation_seeds_are_disjoint(tmp_path: Path) -> None:

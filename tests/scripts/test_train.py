@@ -20,7 +20,7 @@ from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rewards.general import RuleBasedReward
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
-from lerobot_wmrl.rl.configuration_train import TrainConfig, check_config
+from lerobot_wmrl.rl.configuration_train import TrainConfig
 from lerobot_wmrl.rl.trained_policy import evaluation
 from lerobot_wmrl.scripts.train import check_discount, main, rollout_length
 from tests.commands import run_here
@@ -209,7 +209,7 @@ def test_bad_input_is_named_and_nothing_is_written(
 ])  # fmt: skip
 def test_impossible_settings_are_named(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        check_config(TrainConfig(**{"env": PointConfig(), **settings}))
+        TrainConfig(**{"env": PointConfig(), **settings}).validate()
 
 
 @pytest.mark.parametrize(("flags", "warned"), [
