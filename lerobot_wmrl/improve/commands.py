@@ -127,7 +127,7 @@ def learn(improvement: Improvement, model: str, folder: str, flags: Flags) -> li
 def check(improvement: Improvement) -> list[str]:
     data, split = improvement.checked()
     # imagination that also begins in the middle of episodes reaches their ends
-    length: Flags = {} if improvement.branches else {"episode_length": improvement.length}
+    length: Flags = {} if improvement.branches() else {"episode_length": improvement.length}
     return ["lerobot-wmrl-eval-world-model", *format_flags({
         "model.path": str(improvement.out / "world_model"), **data, "split": split, **length,
         **improvement.strict_criterion(), "max_episodes": 200, "output_dir": str(improvement.out / "check"),
@@ -206,7 +206,7 @@ def imagination(improvement: Improvement) -> Flags:
     return {
         "env.type": "world_model", "env.world_model_path": str(improvement.out / "world_model"),
         **{f"env.{name}": value for name, value in improvement.data.flags().items()},
-        "env.dataset.max_starts": MAX_STARTS, "env.dataset.branches": improvement.branches,
+        "env.dataset.max_starts": MAX_STARTS, "env.dataset.branches": improvement.branches(),
         "env.reward.type": "general", "env.reward.alpha": 1, "env.episode_length": improvement.length,
         **{f"env.{name}": value for name, value in improvement.criterion().items()},
     }  # fmt: skip

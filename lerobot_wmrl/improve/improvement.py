@@ -222,10 +222,11 @@ class Improvement:
 
     def fewest_starts(self) -> int:
         """Return the number of episodes that imagination begins in, of the task that has the fewest."""
-        if not self.config.rollouts and self.found.total * (1 + self.branches) <= MAX_STARTS:
+        branches = self.branches()
+        if not self.config.rollouts and self.found.total * (1 + branches) <= MAX_STARTS:
             return self.found.fewest
         table = self.learnt()
-        begun = chosen_episodes(table, StartFrames(max_starts=MAX_STARTS, branches=self.branches))
+        begun = chosen_episodes(table, StartFrames(max_starts=MAX_STARTS, branches=branches))
         return int(np.unique(table.column(START_TASK)[begun], return_counts=True)[1].min())
 
     def checked(self) -> tuple[Flags, str]:
@@ -268,10 +269,9 @@ class Improvement:
         """Frames of an imagined episode."""
         return min(self.found.longest, LONGEST_IMAGINATION)
 
-    @property
     def branches(self) -> int:
-        """Frames beyond the first from which imagination of a recorded episode begins: as far apart as an
-        imagined episode is long."""
+        """Return the number of frames beyond the first from which imagination of a recorded episode begins:
+        as far apart as an imagined episode is long."""
         usual = usual_length(self.learnt()) if self.config.rollouts else self.found.usual
         return max(0, round(usual / self.length) - 1)
 

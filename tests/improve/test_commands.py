@@ -56,10 +56,10 @@ def test_imagination_begins_all_over_the_rollouts_too(
 ) -> None:
     """Here they have 20 frames. A frame more than the dataset has is no reason to begin in the middle."""
     improvement = improvement_of(tmp_path, longest=longest, usual=longest, total=3)
-    assert improvement.branches == 0
+    assert improvement.branches() == 0
     make_synthetic_dataset(tmp_path / "merged", episodes=6)
     improvement.config.rollouts = 3
-    assert improvement.branches == branches
+    assert improvement.branches() == branches
 
 
 def test_no_start_is_imagined_twice_where_one_task_has_few(
