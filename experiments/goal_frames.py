@@ -18,12 +18,11 @@ from typing import Any, Final
 
 import numpy as np
 import torch
-from scipy.stats import mannwhitneyu
 
 from experiments.gates import training_minutes
 from lerobot_wmrl.common.constants import START_SCENE
 from lerobot_wmrl.common.files import write_json
-from lerobot_wmrl.common.statistics import RESAMPLES
+from lerobot_wmrl.common.statistics import RESAMPLES, roc_auc
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import choose_episodes, read_episodes
 from lerobot_wmrl.data.frame_cache import frames_to_tensor
@@ -55,17 +54,11 @@ def similarity_of_ends(
 
 def auc(similarity: np.ndarray, success: np.ndarray) -> dict[str, Any]:
     """Return the share of pairs in which the success is the more similar, with a bootstrap over episodes."""
-
-    def once(rows: np.ndarray) -> float:
-        good, bad = similarity[rows][success[rows]], similarity[rows][~success[rows]]
-        return float(mannwhitneyu(good, bad).statistic / (len(good) * len(bad)))
-
-    rng, every = np.random.default_rng(0), np.arange(len(success))
-    draws = (rng.choice(every, len(every)) for _ in range(RESAMPLES))
-    drawn = [once(rows) for rows in draws if 0 < success[rows].sum() < len(rows)]
-    low, high = np.quantile(drawn, (0.025, 0.975))
+    rng = np.random.default_rng(0)
+    draws = (rng.choice(len(success), len(success)) for _ in range(RESAMPLES))
+    low, high = np.nanquantile([roc_auc(similarity[rows], success[rows]) for rows in draws], (0.025, 0.975))
     return {
-        "value": once(every),
+        "value": roc_auc(similarity, success),
         "bootstrap_95": [float(low), float(high)],
         "successes": int(success.sum()),
         "failures": int((~success).sum()),

@@ -36,9 +36,10 @@ import pyarrow.parquet as pq
 from lerobot.datasets.io_utils import load_info, write_info, write_tasks
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from experiments.value_model import auc, cross_fitted_values, log_loss
+from experiments.value_model import cross_fitted_values, log_loss
 from lerobot_wmrl.common.constants import KINDS, START_KIND
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.statistics import roc_auc
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import EpisodeTable, parquet_files, read_episodes
 
@@ -148,7 +149,7 @@ def describe(values: np.ndarray, relative: np.ndarray, table: EpisodeTable) -> s
     known, constant = outcome[rollout], np.full(rollout.sum(), outcome[rollout].mean())
     positive = relative >= 0
     return (
-        f"held-out rollouts: AUC {auc(values[rollout], known):.3f}, "
+        f"held-out rollouts: AUC {roc_auc(values[rollout], known.astype(bool)):.3f}, "
         f"log-loss {log_loss(values[rollout], known):.3f} (of a constant {log_loss(constant, known):.3f})\n"
         f"positive actions: {positive[rollout & outcome].mean():.0%} in successful rollouts, "
         f"{positive[rollout & ~outcome].mean():.0%} in failures"

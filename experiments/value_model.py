@@ -13,7 +13,6 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from lerobot.utils.constants import OBS_STATE
-from scipy.stats import mannwhitneyu
 from torch import Tensor, nn
 
 from lerobot_policy_cnn.modeling_cnn import STATE_LIMIT
@@ -161,10 +160,3 @@ def log_loss(values: np.ndarray, outcome: np.ndarray) -> float:
     """Return the mean negative log-likelihood of outcomes, 1 or 0, in nats a frame."""
     likelihood = np.where(outcome, values, 1 - values)
     return float(-np.log(likelihood.clip(MIN_PROBABILITY)).mean())
-
-
-def auc(values: np.ndarray, outcome: np.ndarray) -> float:
-    """Return how often a frame of a success has a higher value than one of a failure; 0.5 is chance."""
-    success = outcome.astype(bool)
-    above = mannwhitneyu(values[success], values[~success]).statistic
-    return float(above / (success.sum() * (~success).sum()))

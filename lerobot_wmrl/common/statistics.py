@@ -8,7 +8,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from scipy.stats import binomtest
+from scipy.stats import binomtest, mannwhitneyu
 
 RESAMPLES = 2000
 
@@ -190,3 +190,18 @@ class RunsMean:
 def evenly_spaced(count: int, limit: int) -> np.ndarray:
     """Return at most `limit` of the indices below `count`, the first and the last among them. (N,) int64"""
     return np.linspace(0, count - 1, min(count, limit)).round().astype(int)
+
+
+def roc_auc(scores: np.ndarray, positive: np.ndarray) -> float:
+    """Return the area under the ROC curve: how often a positive scores higher than a negative.
+
+    0.5 is chance; NaN without both.
+
+    Args:
+        scores: (N,).
+        positive: (N,) bool.
+    """
+    if positive.all() or not positive.any():
+        return math.nan
+    above = mannwhitneyu(scores[positive], scores[~positive]).statistic
+    return float(above / (positive.sum() * (~positive).sum()))

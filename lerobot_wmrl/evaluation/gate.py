@@ -14,12 +14,11 @@ import numpy as np
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy.stats import mannwhitneyu
 from torch import Tensor
 
 from lerobot_wmrl.common.constants import KINDS, PLAY, START_KIND, START_TASK, TASKS
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.statistics import Estimate, Proportion
+from lerobot_wmrl.common.statistics import Estimate, Proportion, roc_auc
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_features
@@ -153,15 +152,8 @@ class Outcomes:
         return sliding_window_view(probability, frames, axis=1).min(-1).max(1)
 
     def auc(self, frames: int) -> float:
-        """Return the area under the ROC curve: how often a success scores higher than a failure.
-
-        0.5 is chance; NaN without both successes and failures.
-        """
-        scores, success = self.scores(frames), self.success
-        if success.all() or not success.any():
-            return math.nan
-        above = mannwhitneyu(scores[success], scores[~success]).statistic
-        return float(above / (success.sum() * (~success).sum()))
+        """Return how often a success scores higher than a failure, `roc_auc`."""
+        return roc_auc(self.scores(frames), self.success)
 
 
 @dataclass(frozen=True)

@@ -23,9 +23,10 @@ from experiments.value_labels import (
     relative_advantages,
     write_weights,
 )
-from experiments.value_model import auc, cross_fitted_values, deal_folds, log_loss
+from experiments.value_model import cross_fitted_values, deal_folds, log_loss
 from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_wmrl.common.constants import KINDS
+from lerobot_wmrl.common.statistics import roc_auc
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import EpisodeTable, parquet_files, read_episodes
 from tests.relabelled import UNLABELLED, relabelled
@@ -120,7 +121,7 @@ def test_folds_share_successes_and_failures_equally() -> None:
 
 def test_scores_of_values() -> None:
     outcome = np.array([1, 1, 0, 0])
-    assert auc(np.array([0.9, 0.4, 0.5, 0.1]), outcome) == 0.75
+    assert roc_auc(np.array([0.9, 0.4, 0.5, 0.1]), outcome.astype(bool)) == 0.75
     assert log_loss(np.full(4, 0.5), outcome) == pytest.approx(np.log(2))
 
 
@@ -128,7 +129,7 @@ def test_values_of_unseen_episodes_tell_success_and_rise_towards_it(
     table: EpisodeTable, values: np.ndarray
 ) -> None:
     outcome = np.repeat(table.success, table.length)
-    assert auc(values, outcome) > 0.8
+    assert roc_auc(values, outcome.astype(bool)) > 0.8
     assert log_loss(values, outcome) < log_loss(np.full(len(outcome), outcome.mean()), outcome)
     ends = table.start + table.length - 1
     assert (values[ends] - values[table.start])[table.success].mean() > 0.1
