@@ -43,7 +43,6 @@ SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     ),
     "value_pick_place_simulator": ("Policies", partial(SECOND_ROWS, ["simulated_ppo"])),
     "value_pick_place_dyna": ("Policies", partial(SECOND_ROWS, ["dyna"])),
-    "value_pick_place_iterations": ("Policies", partial(SECOND_ROWS, ["longer_ppo_80"])),
     "value_pick_place_iterated": ("Policies", partial(SECOND_ROWS, ["iterated", "iterated_ppo"])),
     "value_tasks": ("Policies", value.value_tasks),
     "value_tasks_simulator": ("Policies", partial(TASKS_ROWS, ["simulated_ppo"])),

@@ -31,14 +31,13 @@ TITLES: Final = {
     "longer_ppo_distilled": "PPO in imagination, from the longer BC, then the planner distilled",
     "discounted_ppo": "PPO in imagination, discount 0.989",
     "longer_discounted_ppo": "PPO in imagination, discount 0.989, from the longer BC",
-    "longer_ppo_80": "PPO in imagination, discount 0.989, from the longer BC, 80 iterations",
 }
 """Methods in the order of the table."""
 
 IMAGINED: Final = (
     "imagined_ppo", "planned", "dyna", "iterated_ppo", "iterated_ppo_distilled", "imagined_cloning",
     "distilled", "distilled_ppo", "ppo_distilled", "longer_imagined_ppo", "longer_ppo_distilled",
-    "discounted_ppo", "longer_discounted_ppo", "longer_ppo_80",
+    "discounted_ppo", "longer_discounted_ppo",
 )  # fmt: skip
 """Methods that use a world model."""
 
@@ -71,7 +70,6 @@ SECOND_PARTS: Final = (
     "value_pick_place_simulator",
     "value_pick_place_dyna",
     "value_pick_place_iterated",
-    "value_pick_place_iterations",
 )
 """The same of the second task."""
 
