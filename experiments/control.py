@@ -27,7 +27,7 @@ from torch.distributions import Categorical, Distribution, Normal
 from lerobot_wmrl.common.constants import EVALUATION_SEED, Observation
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.pipeline import Pipeline
-from lerobot_wmrl.envs.tensor_env import TensorEnv
+from lerobot_wmrl.envs.tensor_env import Outcome, TensorEnv
 from lerobot_wmrl.rl.configuration_algorithms import PolicyGradientConfig, PPOConfig
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 from lerobot_wmrl.rl.rollout import RolloutBuffer
@@ -82,7 +82,13 @@ class ControlEnv(TensorEnv):
             vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP},
         )  # fmt: skip
         self.num_envs, self.single_action_space = num_envs, self.envs.single_action_space
-        self.max_episode_steps = gym.spec(task).max_episode_steps
+        self.max_episode_steps, self.device = gym.spec(task).max_episode_steps, torch.device("cpu")
+        space = self.single_action_space
+        self.discrete = isinstance(space, gym.spaces.Discrete)
+        self.action_low, self.action_high = (
+            torch.as_tensor(end).float()
+            for end in (([0], [space.n - 1]) if self.discrete else (space.low, space.high))
+        )
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -90,23 +96,27 @@ class ControlEnv(TensorEnv):
         self.elapsed = torch.zeros(self.num_envs, dtype=torch.long)
         return self._observe(self.envs.reset(seed=seed)[0]), {}
 
-    def step(self, action: Tensor) -> tuple[Observation, Tensor, Tensor, Tensor, dict[str, Any]]:
-        if isinstance(self.single_action_space, gym.spaces.Discrete):
-            chosen = action[:, 0].numpy()
-        else:
-            chosen = action.numpy().clip(self.single_action_space.low, self.single_action_space.high)
-        observation, reward, *ends, found = self.envs.step(chosen)
+    def _advance(self, actions: Tensor) -> Outcome:
+        """Take a step; the environments then begin anew by themselves."""
+        chosen = actions[:, 0].long().numpy() if self.discrete else actions.numpy()
+        self.seen, reward, *ends, info = self.envs.step(chosen)
+        self.elapsed = self.elapsed + 1
+        last = self.seen.copy()
+        for row in np.flatnonzero(ends[0] | ends[1]):
+            last[row] = info["final_obs"][row]
         terminated, truncated = (torch.from_numpy(end) for end in ends)
-        self.elapsed += 1
-        finished, info = terminated | truncated, {}
-        if finished.any():
-            final = observation.copy()
-            for row in finished.nonzero()[:, 0].tolist():
-                final[row] = found["final_obs"][row]
-            info["final_obs"] = self._observe(final)
-            info["final_info"] = {"is_success": truncated, "episode_length": self.elapsed.clone()}
-            self.elapsed = self.elapsed.masked_fill(finished, 0)
-        return self._observe(observation), torch.from_numpy(reward).float(), terminated, truncated, info
+        return Outcome(
+            self._observe(last),
+            torch.from_numpy(reward).float(),
+            terminated,
+            truncated,
+            truncated,
+            self.elapsed,
+        )
+
+    def _restart(self, ended: Tensor, outcome: Outcome) -> Observation:
+        self.elapsed = self.elapsed.masked_fill(ended, 0)
+        return self._observe(self.seen)
 
     def close_extras(self, **kwargs: Any) -> None:
         self.envs.close()

@@ -26,8 +26,9 @@ from lerobot_wmrl.common.statistics import RESAMPLES, roc_auc
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import choose_episodes, read_episodes
 from lerobot_wmrl.data.frame_cache import frames_to_tensor
-from lerobot_wmrl.evaluation.goals import TrainedProbe, goal_quality, imagine_goals, train_probe
+from lerobot_wmrl.evaluation.goals import goal_quality, imagine_goals
 from lerobot_wmrl.evaluation.replay import Recording
+from lerobot_wmrl.evaluation.success_probe import TrainedProbe, train_probe
 from lerobot_wmrl.maniskill.recordings import scene_splits
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.goal import imagine_goal, similarity_to_goal

@@ -10,12 +10,11 @@ from gymnasium.vector import AutoresetMode
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from lerobot_wmrl.common.actions import clip_actions
-from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.constants import EVALUATION_SEED, Observation
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.maniskill_env import image_observations, observation_space
 from lerobot_wmrl.envs.scene_results import SceneResults
-from lerobot_wmrl.envs.tensor_env import TensorEnv
+from lerobot_wmrl.envs.tensor_env import Outcome, TensorEnv
 from lerobot_wmrl.maniskill.batched import BatchedFrame
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW, FPS
 from lerobot_wmrl.maniskill.scenes import scene_for_seed
@@ -39,7 +38,9 @@ class BatchedManiSkillEnv(TensorEnv):
         self.device, self.max_episode_steps = self.simulation.device, config.horizon
         self._elapsed = torch.zeros(n_envs, dtype=torch.long, device=self.device)
         self._progress = torch.zeros(n_envs, device=self.device)
-        self._low, self._high = (torch.tensor(box, device=self.device) for box in (ACTION_LOW, ACTION_HIGH))
+        self.action_low, self.action_high = (
+            torch.tensor(end, device=self.device) for end in (ACTION_LOW, ACTION_HIGH)
+        )
         self._rng = np.random.default_rng()
         self.single_action_space = gym.spaces.Box(
             np.array(ACTION_LOW, np.float32), np.array(ACTION_HIGH, np.float32)
@@ -59,10 +60,9 @@ class BatchedManiSkillEnv(TensorEnv):
         frame = self._begin(self._draw_seeds(self.num_envs) if seed is None else seed, range(self.num_envs))
         return self._observation(frame), {}
 
-    def step(self, action: Tensor) -> tuple[dict[str, Any], Tensor, Tensor, Tensor, dict[str, Any]]:
-        """Simulate one control step of every episode. action (B, 7)"""
-        clipped, share = clip_actions(action.to(self.device).float(), self._low, self._high)
-        frame = self.simulation.step(clipped)
+    def _advance(self, actions: Tensor) -> Outcome:
+        """Simulate one control step of every episode. actions (B, 7)"""
+        frame = self.simulation.step(actions)
         self._elapsed += 1
         terminated = frame.success
         truncated = (self._elapsed >= self.max_episode_steps) & ~terminated
@@ -70,18 +70,16 @@ class BatchedManiSkillEnv(TensorEnv):
             terminated.float(), frame.reward, self._progress, self.max_episode_steps
         )
         self._progress = frame.reward
-        observation = self._observation(frame)
-        info: dict[str, Any] = {"reward_parts": {"clipped": share}}
-        ended = terminated | truncated
-        if bool(ended.any()):
-            info["final_obs"] = observation
-            info["final_info"] = {"is_success": terminated, "episode_length": self._elapsed.clone()}
-            if self.restart:
-                rows = ended.nonzero()[:, 0].tolist()
-                observation = self._observation(self._begin(self._draw_seeds(len(rows)), rows))
-            else:
-                self._count(ended, terminated)
-        return observation, reward, terminated, truncated, info
+        return Outcome(
+            self._observation(frame), reward, terminated, truncated, terminated, self._elapsed.clone()
+        )
+
+    def _restart(self, ended: Tensor, outcome: Outcome) -> Observation:
+        if not self.restart:
+            self._count(ended, outcome.success)
+            return outcome.observation
+        rows = ended.nonzero()[:, 0].tolist()
+        return self._observation(self._begin(self._draw_seeds(len(rows)), rows))
 
     def close_extras(self, **kwargs: Any) -> None:
         self.simulation.close()

@@ -14,13 +14,12 @@ from lerobot.envs.utils import NEW_ROLLOUT_OPTION, FreezeAfterEpisodeEnd, prepro
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
-from lerobot_wmrl.common.actions import clip_actions
 from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.errors import FieldError, within
 from lerobot_wmrl.common.policies import check_fit, seen_shape
 from lerobot_wmrl.envs.configuration_hub import HubEnv
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
-from lerobot_wmrl.envs.tensor_env import TensorEnv
+from lerobot_wmrl.envs.tensor_env import Outcome, TensorEnv
 from lerobot_wmrl.maniskill.backend import render_backend
 
 FRAME_LIMIT: Final = "_max_episode_steps"
@@ -116,7 +115,7 @@ class LeRobotTensorEnv(TensorEnv):
     """B environments of LeRobot's, stepped one after the other.
 
     Observations are what its rollout makes of them. An episode is truncated after `_max_episode_steps`
-    frames, which LIBERO leaves to LeRobot's rollout. Actions that are NaN are refused.
+    frames, which LIBERO leaves to LeRobot's rollout.
     """
 
     def __init__(self, config: EnvConfig, n_envs: int, device: str) -> None:
@@ -134,6 +133,8 @@ class LeRobotTensorEnv(TensorEnv):
         self.num_envs, self.device = n_envs, torch.device(device)
         self.single_action_space = self.envs[0].action_space
         self.action_space = gym.vector.utils.batch_space(self.single_action_space, n_envs)
+        box: Any = self.single_action_space
+        self.action_low, self.action_high = (torch.as_tensor(end).float() for end in (box.low, box.high))
         self._limits = [_frame_limit(config, env) for env in self.envs]
         self.max_episode_steps = max(self._limits)
         self.metadata = {"render_fps": config.fps, "autoreset_mode": AutoresetMode.SAME_STEP}
@@ -155,35 +156,27 @@ class LeRobotTensorEnv(TensorEnv):
         return self._stacked(self._seen), {}
 
     def step(self, actions: Tensor) -> tuple[Observation, Tensor, Tensor, Tensor, dict[str, Any]]:
-        """Step all, and begin new episodes where one has ended. ValueError if an action is NaN."""
-        if bool(actions.isnan().any()):
-            rows = actions.isnan().any(1).nonzero().flatten().tolist()
-            raise ValueError(f"action: NaN in environments {rows}")
-        given = self.after({ACTION: actions})[ACTION].detach().cpu().float()
-        box: Any = self.single_action_space
-        clipped, share = clip_actions(
-            given, torch.as_tensor(box.low).float(), torch.as_tensor(box.high).float()
-        )
-        taken = clipped.numpy()
+        """Take a step, see `TensorEnv`; actions pass LeRobot's processors of the environment first."""
+        return super().step(self.after({ACTION: actions})[ACTION])
+
+    def _advance(self, actions: Tensor) -> Outcome:
         reward, flags = np.zeros(self.num_envs, np.float32), np.zeros((3, self.num_envs), bool)
-        for row, env in enumerate(self.envs):
-            observation, gained, terminated, truncated, info = env.step(taken[row])
+        for row, (env, taken) in enumerate(zip(self.envs, actions.numpy(), strict=True)):
+            observation, gained, terminated, truncated, info = env.step(taken)
             self._length[row] += 1
             truncated |= not terminated and self._length[row] >= self._limits[row]
             reward[row], flags[:, row] = gained, (terminated, truncated, info.get("is_success", False))
             self._seen[row] = self._observe(row, observation)
-        ended = flags[0] | flags[1]
-        result = self._stacked(self._seen)
-        info = {"reward_parts": {"clipped": share.to(self.device)}}
-        if ended.any():
-            info["final_obs"] = result
-            info["final_info"] = {
-                "is_success": self._vector(flags[2]), "episode_length": self._vector(self._length.copy()),
-            }  # fmt: skip
-            for row in np.flatnonzero(ended):
-                self._seen[row] = self._begin(row, None)
-            result = self._stacked(self._seen)
-        return result, self._vector(reward), self._vector(flags[0]), self._vector(flags[1]), info
+        terminated, truncated, success = map(self._vector, flags)
+        return Outcome(
+            self._stacked(self._seen), self._vector(reward), terminated, truncated, success,
+            self._vector(self._length.copy()),
+        )  # fmt: skip
+
+    def _restart(self, ended: Tensor, outcome: Outcome) -> Observation:
+        for row in ended.nonzero()[:, 0].tolist():
+            self._seen[row] = self._begin(row, None)
+        return self._stacked(self._seen)
 
     def repeats_starts(self) -> bool:
         """Return whether a seed decides the start. In LIBERO the number of resets does."""

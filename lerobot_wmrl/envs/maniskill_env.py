@@ -13,11 +13,10 @@ from lerobot.envs.utils import FreezeAfterEpisodeEnd
 from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
-from lerobot_wmrl.common.actions import clip_actions
-from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.constants import EVALUATION_SEED, Observation
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.scene_results import CountingAsyncVectorEnv, CountingSyncVectorEnv
-from lerobot_wmrl.envs.tensor_env import TensorEnv
+from lerobot_wmrl.envs.tensor_env import Outcome, TensorEnv
 from lerobot_wmrl.maniskill.backend import simulating_context
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW, FPS, STATE_NAMES
 from lerobot_wmrl.maniskill.episode import Frame
@@ -150,7 +149,7 @@ class ManiSkillTensorEnv(TensorEnv):
         self.single_observation_space = observation_space(config)
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, n_envs)
         self.max_episode_steps = config.horizon
-        self._low, self._high = torch.tensor(ACTION_LOW), torch.tensor(ACTION_HIGH)
+        self.action_low, self.action_high = torch.tensor(ACTION_LOW), torch.tensor(ACTION_HIGH)
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -159,25 +158,27 @@ class ManiSkillTensorEnv(TensorEnv):
         self._instructions = [str(text) for text in info["instruction"]]
         return self._tensors(observation, self._instructions), {}
 
-    def step(self, action: Tensor) -> tuple[dict[str, Any], Tensor, Tensor, Tensor, dict[str, Any]]:
-        clipped, share = clip_actions(action.detach().cpu().float(), self._low, self._high)
-        before = self._instructions
-        observation, reward, terminated, truncated, info = self.envs.step(clipped.numpy())
-        ended = terminated | truncated
+    def _advance(self, actions: Tensor) -> Outcome:
+        """Take a step; the simulators then begin anew by themselves."""
+        self._seen, reward, *ends, self._info = self.envs.step(actions.numpy())
+        ended = ends[0] | ends[1]
+        length = np.array(self._info["episode_length"])
         if ended.any():
-            self._instructions = [
-                str(new) if over else old
-                for old, new, over in zip(before, info["instruction"], ended, strict=True)
-            ]
-        result = self._tensors(observation, self._instructions)
-        extra: dict[str, Any] = {"reward_parts": {"clipped": share.to(self.device)}}
-        if ended.any():
-            extra["final_obs"] = self._tensors(_final_observation(observation, info, ended), before)
-            extra["final_info"] = {
-                "is_success": torch.from_numpy(terminated.copy()).to(self.device),
-                "episode_length": self._vector(info["final_info"]["episode_length"]),
-            }
-        return result, self._vector(reward).float(), self._vector(terminated), self._vector(truncated), extra
+            length = np.where(ended, self._info["final_info"]["episode_length"], length)
+        observation = self._tensors(_final_observation(self._seen, self._info, ended), self._instructions)
+        terminated, truncated = map(self._vector, ends)
+        return Outcome(
+            observation, self._vector(reward).float(), terminated, truncated, terminated, self._vector(length)
+        )
+
+    def _restart(self, ended: Tensor, outcome: Outcome) -> Observation:
+        self._instructions = [
+            str(new) if over else old
+            for old, new, over in zip(
+                self._instructions, self._info["instruction"], ended.tolist(), strict=True
+            )
+        ]
+        return self._tensors(self._seen, self._instructions)
 
     def close_extras(self, **kwargs: Any) -> None:
         self.envs.close()

@@ -13,13 +13,12 @@ from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 from torch.distributions import Bernoulli
 
-from lerobot_wmrl.common.actions import clip_actions
 from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.statistics import evenly_spaced
 from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.start_frames import GoalFeatures, StartImages, Starts, load_starts, read_start_images
-from lerobot_wmrl.envs.tensor_env import TensorEnv
+from lerobot_wmrl.envs.tensor_env import Outcome, TensorEnv
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rewards.general import consecutive_count, is_done
 from lerobot_wmrl.rewards.loading import Reward, load_reward
@@ -38,13 +37,14 @@ from lerobot_wmrl.world_models.modeling_world_model import (
 class WorldModelVectorEnv(TensorEnv):
     """B imagined episodes.
 
-    Images have the size of the dataset's frames, and there is a state if the model predicts it. Actions that
-    are NaN are refused.
+    Images have the size of the dataset's frames, and there is a state if the model predicts it.
 
     A step synchronises with the device once, to learn whether an episode has ended and whether every action
     was a number. Resets are expensive, so they run only when an episode has ended, and only then the
     instructions of new episodes are fetched.
     """
+
+    refuses_nan_first = False
 
     def __init__(
         self, model: ActionWorldModelRewardModel, starts: Starts, goals: GoalFeatures | None,
@@ -95,33 +95,16 @@ class WorldModelVectorEnv(TensorEnv):
             self._similarity = self.goals.similarity[drawn]
         return self._observe(self.starts.images[drawn], frames.state), {}
 
-    @torch.no_grad()
-    def step(self, actions: Tensor) -> tuple[Observation, Tensor, Tensor, Tensor, dict[str, Any]]:
-        """Imagine one frame in every environment and restart the finished ones. actions (B, A)
-
-        Raises:
-            ValueError: the actions have another shape, or contain NaN; then reset before the next step.
-        """
-        clipped, share = clip_actions(self._checked(actions), self.action_low, self.action_high)
-        imagined = self.model.step(self._imagination, clipped)
-        terminated, truncated = self._advance(imagined)
+    def _advance(self, actions: Tensor) -> Outcome:
+        """Imagine one frame in every environment. actions (B, A)"""
+        imagined = self.model.step(self._imagination, actions)
+        terminated, truncated = self._ends(imagined)
         decoded = self.model.decode(imagined.tokens, self._imagination.context)
         observation = self._observe(decoded.images, imagined.state)
         parts = {"success": terminated.float(), **self._progress(decoded)}
         reward = self.reward.compute_reward({**observation, **parts, "hidden": imagined.hidden})
         parts |= {**entropies(imagined), "done_probability": imagined.done_logit.sigmoid()}
-        parts["clipped"] = share
-        info: dict[str, Any] = {"reward_parts": parts}
-        finished = terminated | truncated
-        any_finished, any_nan = torch.stack([finished.any(), clipped.isnan().any()]).tolist()
-        if any_nan:
-            rows = clipped.isnan().any(1).nonzero().flatten().tolist()
-            raise ValueError(f"action: NaN in environments {rows}; nothing can be imagined after it")
-        if any_finished:
-            info["final_obs"] = observation
-            info["final_info"] = {"is_success": terminated, "episode_length": self._elapsed.clone()}
-            observation = self._restart(finished, observation)
-        return observation, reward, terminated, truncated, info
+        return Outcome(observation, reward, terminated, truncated, terminated, self._elapsed, parts)
 
     def newest_frames(self) -> Frames:
         """Return the newest imagined frames, from which a planner can look ahead."""
@@ -153,7 +136,7 @@ class WorldModelVectorEnv(TensorEnv):
         check_same_tokenizer(self.model, model, "world_model_path", "the refreshed one")
         self.model = model
 
-    def _advance(self, imagined: Imagined) -> tuple[Tensor, Tensor]:
+    def _ends(self, imagined: Imagined) -> tuple[Tensor, Tensor]:
         """Count frames. Return terminated (k consecutive done frames) and truncated (at the horizon). → (B,)
         bool, (B,) bool"""
         fired = is_done(imagined.done_logit, self.config.done_threshold)
@@ -162,35 +145,26 @@ class WorldModelVectorEnv(TensorEnv):
         terminated = self._done_streak >= self.config.done_frames
         return terminated, (self._elapsed >= self.max_episode_steps) & ~terminated
 
-    def _restart(self, mask: Tensor, observation: Observation) -> Observation:
-        """Begin new episodes where `mask` (B,) is True. Return the observation with these rows replaced."""
-        self._begin_at(torch.where(mask, self._draw_starts(), self._start_index))
+    def _restart(self, ended: Tensor, outcome: Outcome) -> Observation:
+        """Begin new episodes where `ended` (B,) is True; for the others nothing changes."""
+        self._begin_at(torch.where(ended, self._draw_starts(), self._start_index))
         index, starts = self._start_index, self.starts
         frames = starts.frames[index]
-        self.model.restart(self._imagination, mask, frames)
-        self._elapsed = self._elapsed.masked_fill(mask, 0)
-        self._done_streak = self._done_streak.masked_fill(mask, 0)
+        self.model.restart(self._imagination, ended, frames)
+        self._elapsed = self._elapsed.masked_fill(ended, 0)
+        self._done_streak = self._done_streak.masked_fill(ended, 0)
         if self.goals is not None:
-            self._similarity = torch.where(mask, self.goals.similarity[index], self._similarity)
+            self._similarity = torch.where(ended, self.goals.similarity[index], self._similarity)
         fresh = self._observe(starts.images[index], frames.state)
-        for key, value in observation.items():
+        for key, value in outcome.observation.items():
             if isinstance(value, Tensor):
-                fresh[key] = torch.where(mask.reshape(-1, *[1] * (value.ndim - 1)), fresh[key], value)
+                fresh[key] = torch.where(ended.reshape(-1, *[1] * (value.ndim - 1)), fresh[key], value)
         return fresh
 
     def _begin_at(self, index: Tensor) -> None:
         """Set the start of every environment's episode, index (B,), and fetch its instruction."""
         self._start_index = index
         self._instructions = [self.starts.instructions[row] for row in index.tolist()]
-
-    def _checked(self, actions: Tensor) -> Tensor:
-        """Return actions in float32 on the device. ValueError for another shape than (B, A)."""
-        if tuple(actions.shape) != self.action_space.shape:
-            raise ValueError(
-                f"action: shape {tuple(actions.shape)}, but {self.num_envs} environments take "
-                f"{self.action_space.shape}"
-            )
-        return torch.as_tensor(actions, dtype=torch.float32, device=self.device)
 
     def _seeded_starts(self, seed: int | Sequence[int] | None) -> Tensor:
         """Seed the generator (by the first of several seeds) and return the starts. → (B,)"""

@@ -1,9 +1,5 @@
-"""Goal frames of the text world model: distance to recorded final frames, and whether success holds in them.
-
-The second question is answered by a success probe: a small CNN trained on recorded frames, labelled by the
-dataset's own `next.success`. It sees every frame as the tokenizer decodes it, because goal frames exist only
-decoded, and beside its episode's first frame, because success can depend on where things were.
-"""
+"""Goal frames of the text world model: their distance to recorded final frames, and whether success holds in
+them (`success_probe.py`)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,31 +7,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor, nn
-from torch.nn import functional as F
-from tqdm import trange
+from torch import Tensor
 
 from lerobot_wmrl.common.statistics import Estimate, Proportion, evenly_spaced
 from lerobot_wmrl.data.frame_cache import frames_to_tensor
 from lerobot_wmrl.evaluation.image_metrics import psnr
 from lerobot_wmrl.evaluation.replay import Recording
+from lerobot_wmrl.evaluation.success_probe import TrainedProbe, held_out_from_probe
 from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer, feature_distance
 from lerobot_wmrl.world_models.goal import imagine_goal
 from lerobot_wmrl.world_models.modeling_world_model import TextWorldModelRewardModel
 
 MAX_FINALS = 200
-
-PROBE_VALIDATION_EVERY = 5
-"""Every fifth episode is held out from the probe's training, those that world models hold out among them."""
-
-MAX_PROBE_FRAMES = 1500
-"""Frames of each class in the probe's training, and of each in its validation."""
-
-PROBE_SIZE = 64
-PROBE_EPOCHS = 10
-PROBE_BATCH = 64
-PROBE_LEARNING_RATE = 1e-3
-ENCODE_BATCH = 128
 
 
 class Finals(NamedTuple):
@@ -103,7 +86,7 @@ def imagine_goals(model: TextWorldModelRewardModel, recording: Recording, episod
     )  # fmt: skip
 
 
-def goal_quality(goals: Goals, probe: "TrainedProbe | None") -> dict[str, Any]:
+def goal_quality(goals: Goals, probe: TrainedProbe | None) -> dict[str, Any]:
     """Return the distances of goals and starts to the nearest finals, and the probe's share of successes."""
     result = {
         "goals": len(goals.episodes),
@@ -171,135 +154,3 @@ def least(distance: np.ndarray, allowed: np.ndarray) -> tuple[np.ndarray, np.nda
     masked = np.where(allowed, distance, np.inf)
     index, some = masked.argmin(1), allowed.any(1)
     return np.where(some, masked.min(1), np.nan), np.where(some, index, -1)
-
-
-class SuccessProbe(nn.Module):
-    """First frame and frame (B, N, 3, H, W) in [0, 1], both decoded → the logit of success (B,)."""
-
-    def __init__(self, num_cameras: int) -> None:
-        super().__init__()
-        self.layers = nn.Sequential(
-            nn.Conv2d(6 * num_cameras, 32, 5, stride=2, padding=2), nn.ReLU(),
-            nn.Conv2d(32, 48, 3, stride=2, padding=1), nn.ReLU(),
-            nn.Conv2d(48, 64, 3, stride=2, padding=1), nn.ReLU(),
-            nn.Flatten(), nn.Dropout(0.2), nn.Linear(64 * (PROBE_SIZE // 8) ** 2, 64), nn.ReLU(),
-            nn.Linear(64, 1),
-        )  # fmt: skip
-
-    def forward(self, first: Tensor, images: Tensor) -> Tensor:
-        return self.layers(torch.cat([_small(first), _small(images)], 1) - 0.5)[:, 0]
-
-
-@dataclass(frozen=True)
-class TrainedProbe:
-    """A probe and its balanced accuracy on episodes it has not seen, NaN without any."""
-
-    network: SuccessProbe
-    balanced_accuracy: float
-    frames: int
-    held_out_frames: int
-
-    @torch.no_grad()
-    def success(self, first: Tensor, images: Tensor) -> Proportion:
-        """Return the share of decoded frames (F, N, 3, H, W) in which success holds."""
-        holds = self.network(first, images) > 0
-        return Proportion(int(holds.sum()), len(holds))
-
-    def as_json(self) -> dict[str, Any]:
-        known = np.isfinite(self.balanced_accuracy)
-        return {
-            "balanced_accuracy": self.balanced_accuracy if known else None,
-            "frames": self.frames,
-            "held_out_frames": self.held_out_frames,
-        }
-
-
-@dataclass(frozen=True)
-class LabelledFrames:
-    """first, images (F, N, 3, H, W), decoded; success (F,) bool."""
-
-    first: Tensor
-    images: Tensor
-    success: Tensor
-
-
-def train_probe(tokenizer: FrameTokenizer, recording: Recording) -> TrainedProbe | None:
-    """Train on as many frames with success as without, with a fixed seed. None if a class is empty."""
-    held_out = held_out_from_probe(np.arange(len(recording.table.start)))
-    rng = np.random.default_rng(0)
-    training, test = (labelled_frames(tokenizer, recording, part, rng) for part in (~held_out, held_out))
-    if training is None:
-        return None
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        network = fit(SuccessProbe(tokenizer.num_cameras).to(training.images.device), training, rng)
-    accuracy = balanced_accuracy(network, test) if test is not None else np.nan
-    return TrainedProbe(network, accuracy, len(training.success), 0 if test is None else len(test.success))
-
-
-def held_out_from_probe(episodes: np.ndarray) -> np.ndarray:
-    """Whether the probe does not train on each episode. (E,) → (E,) bool"""
-    return episodes % PROBE_VALIDATION_EVERY == PROBE_VALIDATION_EVERY - 1
-
-
-def fit(network: SuccessProbe, data: LabelledFrames, rng: np.random.Generator) -> SuccessProbe:
-    """Minimise the binary cross-entropy over `PROBE_EPOCHS` passes."""
-    optimizer = torch.optim.AdamW(network.parameters(), PROBE_LEARNING_RATE, weight_decay=0.01)
-    for _ in trange(PROBE_EPOCHS, desc="Training the success probe", unit="epoch"):
-        for index in torch.from_numpy(rng.permutation(len(data.success))).split(PROBE_BATCH):
-            logit = network(data.first[index], data.images[index])
-            loss = F.binary_cross_entropy_with_logits(logit, data.success[index].float())
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-    return network.eval()
-
-
-@torch.no_grad()
-def balanced_accuracy(network: SuccessProbe, data: LabelledFrames) -> float:
-    """Return the mean of the accuracies on frames with and without success."""
-    right = (network(data.first, data.images) > 0) == data.success
-    return float((right[data.success].float().mean() + right[~data.success].float().mean()) / 2)
-
-
-def labelled_frames(
-    tokenizer: FrameTokenizer, recording: Recording, chosen: np.ndarray, rng: np.random.Generator
-) -> LabelledFrames | None:
-    """Draw as many frames with success as without from episodes `chosen` (E,); None if one is missing."""
-    table = recording.table
-    episodes = np.repeat(np.arange(len(table.start)), table.length - 1)
-    rows = np.concatenate(
-        [start + np.arange(1, n) for start, n in zip(table.start, table.length, strict=True)]
-    )
-    success = table.shown[rows]
-    classes = [np.flatnonzero(chosen[episodes] & (success == wanted)) for wanted in (True, False)]
-    count = min(*map(len, classes), MAX_PROBE_FRAMES)
-    if not count:
-        return None
-    index = np.concatenate([rng.choice(of_class, count, replace=False) for of_class in classes])
-    starts = table.start[episodes[index]]
-    first, images = (decoded(tokenizer, recording.frames, which, starts) for which in (starts, rows[index]))
-    return LabelledFrames(first, images, torch.from_numpy(success[index]).to(images.device))
-
-
-@torch.no_grad()
-def decoded(tokenizer: FrameTokenizer, frames: np.ndarray, rows: np.ndarray, starts: np.ndarray) -> Tensor:
-    """Encode and decode recorded frames, at the probe's size: rows (R,) → (R, N, 3, h, w).
-
-    starts (R,): the first rows of their episodes.
-    """
-    device, parts = next(tokenizer.parameters()).device, []
-    for begin in range(0, len(rows), ENCODE_BATCH):
-        part = slice(begin, begin + ENCODE_BATCH)
-        images, first = (frames_to_tensor(frames[which[part]]).to(device) for which in (rows, starts))
-        context = tokenizer.context(first)
-        parts.append(_small(tokenizer.decode(tokenizer.encode(images, context), context)))
-    return torch.cat(parts).unflatten(1, (-1, 3))
-
-
-def _small(images: Tensor) -> Tensor:
-    """(B, N, 3, H, W) → (B, 3N, PROBE_SIZE, PROBE_SIZE)"""
-    flat = images.flatten(1, 2)
-    return (
-        flat if flat.shape[-1] == PROBE_SIZE else F.interpolate(flat, (PROBE_SIZE, PROBE_SIZE), mode="area")
-    )

@@ -37,9 +37,10 @@ from lerobot_wmrl.evaluation.gate import (
     seen_outcomes,
     sweep,
 )
-from lerobot_wmrl.evaluation.goals import goal_quality, imagine_goals, train_probe
+from lerobot_wmrl.evaluation.goals import goal_quality, imagine_goals
 from lerobot_wmrl.evaluation.image_metrics import cached_lpips
 from lerobot_wmrl.evaluation.replay import COMPARED_FRAMES, EpisodeReplay, Recording, replay_episodes
+from lerobot_wmrl.evaluation.success_probe import train_probe
 from lerobot_wmrl.world_models.modeling_world_model import (
     ActionWorldModelRewardModel,
     TextWorldModelRewardModel,

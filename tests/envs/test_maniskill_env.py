@@ -122,6 +122,10 @@ def test_the_tensor_environment_keeps_the_last_observation_of_an_episode(
         assert info["reward_parts"]["clipped"].tolist() == [0]
     *_, beyond = env.step(torch.tensor([[9.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0]]))
     assert beyond["reward_parts"]["clipped"].tolist() == pytest.approx([1 / 7])
+    with pytest.raises(ValueError, match=r"NaN in environments \[0\]"):
+        env.step(torch.full((1, 7), torch.nan))
+    with pytest.raises(ValueError, match=r"shape \(1, 6\), but 1 environments take \(1, 7\)"):
+        env.step(torch.zeros(1, 6))
     assert reward.dtype == torch.float32
     assert truncated.all()
     assert not terminated.any()

@@ -5,10 +5,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch
-from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
-from lerobot_wmrl.envs.tensor_env import TensorEnv
+from lerobot_wmrl.envs.tensor_env import Outcome, TensorEnv
 
 REACH = 0.15
 """Distance from the goal at which an episode succeeds."""
@@ -21,7 +20,9 @@ class PointEnv(TensorEnv):
     Every sub-environment's episodes follow from its own seed.
     """
 
-    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
+    device = torch.device("cpu")
+    action_low, action_high = torch.full((3,), -0.1), torch.full((3,), 0.1)
+    refuses_nan_first = False  # so that a step waits for nothing but an end
 
     def __init__(self, num_envs: int, horizon: int = 15, image_size: int = 0) -> None:
         self.num_envs, self.max_episode_steps, self.image_size = num_envs, horizon, image_size
@@ -41,28 +42,27 @@ class PointEnv(TensorEnv):
         for generator, own in zip(self.generators, seeds, strict=False):
             generator.manual_seed(own)
         self.state, self.elapsed = torch.zeros(self.num_envs, 4), torch.zeros(self.num_envs, dtype=torch.long)
-        self._restart(torch.ones(self.num_envs, dtype=torch.bool))
+        self._begin(torch.ones(self.num_envs, dtype=torch.bool))
         return self._observe(), {}
 
-    def step(self, action: Tensor) -> tuple[dict[str, Any], Tensor, Tensor, Tensor, dict[str, Any]]:
+    def _advance(self, actions: Tensor) -> Outcome:
         before = self._distance()
-        self.state[:, :2] += action[:, :2].clamp(-0.1, 0.1)
+        self.state[:, :2] += actions[:, :2]
         self.elapsed += 1
         distance = self._distance()
         terminated = distance < REACH
         truncated = (self.elapsed >= self.max_episode_steps) & ~terminated
         reward = before - distance + terminated.float()
-        finished, info = terminated | truncated, {}
-        if finished.any():
-            info["final_obs"] = self._observe()
-            info["final_info"] = {"is_success": terminated, "episode_length": self.elapsed.clone()}
-            self._restart(finished)
-        return self._observe(), reward, terminated, truncated, info
+        return Outcome(self._observe(), reward, terminated, truncated, terminated, self.elapsed.clone())
 
     def close_extras(self, **kwargs: Any) -> None:
         """Nothing to release."""
 
-    def _restart(self, rows: Tensor) -> None:
+    def _restart(self, ended: Tensor, outcome: Outcome) -> dict[str, Any]:
+        self._begin(ended)
+        return self._observe()
+
+    def _begin(self, rows: Tensor) -> None:
         for row in rows.nonzero()[:, 0].tolist():
             self.state[row] = torch.rand(4, generator=self.generators[row]) * 1.6 - 0.8
         self.elapsed = self.elapsed.masked_fill(rows, 0)
