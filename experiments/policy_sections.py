@@ -141,8 +141,9 @@ def improvement_table(found: Mapping[str, Any], names: Mapping[str, str]) -> str
 def planning(load: Load) -> str:
     found = load("planning")
     return f"""Not on this task, with a world model of 2,200 episodes: `wm_mpc`, which imagines action
-sequences and executes the best one, beats every policy that was trained in it, but not [BC of 180 planned
-episodes](#cloning_control). With one of 308 episodes it had 76 and 72 % in a pilot, PPO in imagination 87 and 82.
+sequences and executes the best one, beats every policy that was trained in it, but not
+[BC of 180 planned episodes](#cloning_control). With one of 308 episodes it had 76 and 72 % in a pilot, PPO
+in imagination 87 and 82.
 
 {table(["scenes", "success of `wm_mpc`"], [[DOMAINS[d], counted(found[d])] for d in ("ind", "ood")])}
 

@@ -142,7 +142,7 @@ def test_the_readme_says_what_was_measured() -> None:
         f"{100 * each:.0f}".replace("-", "−")
         for each in gains(pick_place, "longer_discounted_ppo", "longer_filtered", "ind")
     )
-    assert f"longer BC has {before}, PPO from it {after} (three seeds: {by_seed} points in known scenes" in text
+    assert f"longer BC has {before}, PPO from it {after} (three seeds: {by_seed} points in known" in text
     assert len(pick_place) == 3
     assert best(pick_place, BASELINES, "ind") == "longer_filtered"
     over_seeds = ttest_1samp(gains(pick_place, "longer_discounted_ppo", "longer_filtered", "ind"), 0)

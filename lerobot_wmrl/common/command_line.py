@@ -1,6 +1,7 @@
 """What every console command shares: parsing, help, errors without tracebacks."""
 
 import inspect
+import json
 import logging
 import re
 import sys
@@ -24,7 +25,7 @@ from lerobot.utils.utils import init_logging
 from lerobot_wmrl.common.errors import STOPPED, FieldError, Stopped
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.output_folders import CONFIG_FILE
-from lerobot_wmrl.common.presets import TYPE, format_value, read_settings
+from lerobot_wmrl.common.presets import TYPE, format_flags, format_value, read_settings
 from lerobot_wmrl.common.settings import (
     Setting,
     help_page,
@@ -33,6 +34,9 @@ from lerobot_wmrl.common.settings import (
     type_hints,
     without_none,
 )
+
+MAPPINGS = "input_features", "output_features", "normalization_mapping"
+"""Settings of LeRobot's policies and reward models whose value is a mapping."""
 
 FIELD = re.compile(r"`([\w.]+)((?:=[^`]*)?)`")
 """A field in a message, alone or with a value: `dynamics.type=anchored`."""
@@ -59,8 +63,24 @@ class RunConfig:
 
 def settings_beside(path_field: str) -> list[str]:
     """Return the settings that stand beside `--<field>.path`, in a `--config_path` file and then in flags, as
-    flags of the checkpoint's own configuration: `--n_action_steps=8`."""
-    return [*parser.get_yaml_overrides(path_field), *(parser.get_cli_overrides(path_field) or [])]
+    flags of the checkpoint's own configuration: `--n_action_steps=8`.
+
+    LeRobot's own reading of the file leaves out lists and nulls.
+    """
+    file, inside = parser.parse_arg("config_path"), f"{path_field}."
+    stored = read_settings(Path(file), [inside + name for name in MAPPINGS]) if is_file(file) else {}
+    own = {name.removeprefix(inside): value for name, value in stored.items() if name.startswith(inside)}
+    beside = {  # draccus reads a list of texts or null only as JSON
+        name: json.dumps(value) if isinstance(value, list) else value
+        for name, value in own.items()
+        if name not in ("path", TYPE)
+    }
+    return [*(format_flags(beside) if "path" in own else []), *(parser.get_cli_overrides(path_field) or [])]
+
+
+def is_file(path: str | None) -> bool:
+    """Return whether a file is there; LeRobot also takes folders and hub ids."""
+    return path is not None and Path(path).is_file()
 
 
 def run_command[Config: RunConfig](

@@ -27,6 +27,7 @@ from typing import Any, BinaryIO, NoReturn
 import huggingface_hub.constants
 import psutil
 import torch
+from lerobot.configs import parser
 
 from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.files import write_json
@@ -266,6 +267,8 @@ def _run_command(command: list[str], output: int, parent: int, anew: bool) -> No
         os.environ["PYTHONUNBUFFERED"] = "1"
         os.execv(find_program(command[0]), command)
     sys.argv = command
+    for remembered in (parser._config_path_args, parser._config_yaml_overrides):
+        remembered.clear()  # of this program's --config_path, which LeRobot ranks above a command's flags
     sys.exit(entry_point(command[0])())
 
 

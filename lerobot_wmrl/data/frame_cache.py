@@ -340,9 +340,12 @@ def room_in(folder: Path) -> Iterator[None]:
 def file_stamps(dataset: LeRobotDataset) -> list[object]:
     """Return names, sizes and times of the dataset's files: a new recording needs caches of its own."""
     root = Path(dataset.root)
-    folders = [root / name for name in ("data", "meta", "videos")]  # links, too, which rglob does not follow
     files = sorted(
-        path for each in folders for kind in ("mp4", "parquet") for path in each.rglob(f"*.{kind}")
+        Path(folder) / name
+        for each in ("data", "meta", "videos")
+        for folder, _, names in os.walk(root / each, followlinks=True)
+        for name in names
+        if name.endswith((".mp4", ".parquet"))
     )
     return [item for path in files for item in (path.name, path.stat().st_size, path.stat().st_mtime_ns)]
 

@@ -70,6 +70,12 @@ class Algorithm(RLAlgorithm):
         self.policy_parameters = [
             p for p in self.policy.parameters() if p.requires_grad and id(p) not in owned
         ]
+        if not self.policy_parameters:
+            raise FieldError(
+                "algorithm.train_encoder", config.train_encoder,
+                "leaves nothing of the policy to train: its adapters are all in the encoder",
+                "set it to true, or give adapters to other layers (`peft.target_modules`)",
+            )  # fmt: skip
         require_exact_updates(self.policy_parameters)
         self.optimizer = self.make_optimizers_and_scheduler()[self.name]
 

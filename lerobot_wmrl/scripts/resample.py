@@ -97,6 +97,11 @@ def summed_components(cfg: ResampleConfig, dataset: "LeRobotDataset") -> np.ndar
             "dataset.root", dataset.root, f"has depth ({depth}), which is not copied",
             "remove it first: lerobot-edit-dataset --operation.type=remove_feature",
         )  # fmt: skip
+    if language := [name for name, each in dataset.features.items() if each["dtype"] == "language"]:
+        raise FieldError(
+            "dataset.root", dataset.root, f"has annotations ({', '.join(language)}), which are not copied",
+            "remove them first: lerobot-edit-dataset --operation.type=remove_feature",
+        )  # fmt: skip
     if cfg.output_dir.exists():
         raise FieldError("output_dir", cfg.output_dir, "already exists", "choose a new folder")
     return np.isin(names, cfg.displacements)
@@ -166,8 +171,9 @@ def kept_values(
     columns: dict[str, Any] = {}
     for key in names:
         values = np.asarray(table[key])
+        chosen = last if key.startswith(AFTER) else kept
         if features[key]["dtype"] == "string":
-            columns[key] = [str(value) for value in values.reshape(-1)[kept]]
+            columns[key] = [str(value) for value in values.reshape(-1)[chosen]]
             continue
         if key == ACTION:
             values = np.where(summed, np.add.reduceat(values, kept), values[last])
@@ -176,7 +182,7 @@ def kept_values(
         elif key in SUCCESS_COLUMNS:
             values = np.logical_or.reduceat(values, kept)
         else:
-            values = values[last if key.startswith(AFTER) else kept]
+            values = values[chosen]
         columns[key] = values.astype(features[key]["dtype"]).reshape(-1, *features[key]["shape"])
     tasks = dataset.meta.tasks.index
     return columns | {"task": [tasks[index] for index in np.asarray(table["task_index"])[kept]]}

@@ -28,7 +28,7 @@ from lerobot_wmrl.common.command_line import RunConfig, run_command, settings_be
 from lerobot_wmrl.common.distributed import LONGEST_WAIT, is_first_process
 from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least, require_choice, within
 from lerobot_wmrl.common.files import write_json
-from lerobot_wmrl.common.output_folders import claim_output_dir, require_free
+from lerobot_wmrl.common.output_folders import CONFIG_FILE, claim_output_dir, require_free
 from lerobot_wmrl.common.precision import PRECISIONS, keep_freed_memory, training_dtype
 from lerobot_wmrl.common.presets import expand_preset, format_flags
 from lerobot_wmrl.common.tracking import make_wandb
@@ -165,7 +165,7 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
     check_processes(cfg, processes.num_processes)
     table = read_episodes(cfg.dataset.open())
     check_data(cfg, table)
-    cfg.precision = str(training_dtype(cfg.precision, cfg.model.device)).removeprefix("torch.")
+    cfg.precision = precision_of(cfg)
     begun = deepcopy(cfg)  # the model fills in what it takes from the data
     given = draccus.encode(begun)
     checkpoint = latest_checkpoint(cfg.output_dir)
@@ -182,8 +182,17 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
         print(f"\n{conclusion(cfg, model, table)}")
         if cfg.model.push_to_hub:
             with within("model"):
-                model.push_model_to_hub(cfg)
+                model.push_model_to_hub(begun)
             print(f"Published as {cfg.model.repo_id}.")
+
+
+def precision_of(cfg: TrainWorldModelConfig) -> str:
+    """Return the format to train in. `auto` is what the training in the output folder was begun with, which
+    may have been on another machine."""
+    begun = cfg.output_dir / CONFIG_FILE
+    if cfg.precision == "auto" and begun.is_file():
+        return str(json.loads(begun.read_text()).get("precision", "auto"))
+    return str(training_dtype(cfg.precision, cfg.model.device)).removeprefix("torch.")
 
 
 def require_same_data(cfg: TrainWorldModelConfig, table: EpisodeTable) -> None:

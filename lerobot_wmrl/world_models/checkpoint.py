@@ -7,6 +7,7 @@ from typing import Any, Final
 
 import torch
 from draccus.utils import ParsingError
+from lerobot.configs import parser
 from lerobot.configs.rewards import RewardModelConfig
 from lerobot.rewards.factory import get_reward_model_class
 from lerobot.utils.constants import ACTION, OBS_STATE
@@ -78,15 +79,18 @@ def config_to_continue(path: str, overrides: Sequence[str]) -> RewardModelConfig
     It is not published where that model was, unless they say so.
     """
     folder = resolve_checkpoint(path)
+    revision = parser.parse_arg("pretrained_revision", overrides)
     try:
-        RewardModelConfig.from_pretrained(str(folder))
+        RewardModelConfig.from_pretrained(str(folder), revision=revision)
     except Exception as error:  # draccus, the hub and json each raise their own
         raise FieldError(
             "model.path", path, f"no model can be loaded from it ({first_line(error)})",
             "give the output folder of a training with this version of the package, or a hub id",
         ) from error  # fmt: skip
     try:
-        config = RewardModelConfig.from_pretrained(str(folder), cli_overrides=[*UNPUBLISHED, *overrides])
+        config = RewardModelConfig.from_pretrained(
+            str(folder), revision=revision, cli_overrides=[*UNPUBLISHED, *overrides]
+        )
     except (ParsingError, TypeError, KeyError) as error:
         raise FieldError(
             "model.path", path, f"cannot be trained further with {' '.join(overrides)} ({first_line(error)})",
@@ -100,14 +104,17 @@ def load_model_to_continue(config: RewardModelConfig, meta: Any) -> Any:
     """Load the model of `config.pretrained_path` with the settings of `config`, to train it on a dataset.
 
     Raises:
-        FieldError: its weights are of another structure than the settings.
+        ValueError: its weights cannot be read, or are of another structure than the settings.
     """
     try:
         model = get_reward_model_class(config.type).from_pretrained(
-            config.pretrained_path, config=config, strict=True, dataset_stats=meta.stats, dataset_meta=meta
-        )
+            config.pretrained_path, revision=config.pretrained_revision, config=config, strict=True,
+            dataset_stats=meta.stats, dataset_meta=meta,
+        )  # fmt: skip
     except torch.OutOfMemoryError:
         raise
+    except (SafetensorError, OSError) as error:
+        raise unreadable_weights(config.pretrained_path, error) from error
     except RuntimeError as error:
         raise FieldError(
             "model.path", config.pretrained_path,
@@ -141,10 +148,15 @@ def load_model(
     except torch.OutOfMemoryError:
         raise
     except (SafetensorError, RuntimeError, OSError) as error:
-        raise ValueError(
-            f"{path}: model.safetensors cannot be read ({error}). It is truncated or of another version: "
-            "use an earlier checkpoint or train again"
-        ) from error
+        raise unreadable_weights(path, error) from error
+
+
+def unreadable_weights(path: object, error: Exception) -> ValueError:
+    """Return the error for a checkpoint whose weights cannot be loaded."""
+    return ValueError(
+        f"{path}: model.safetensors cannot be read ({error}). It is truncated or of another version: "
+        "use an earlier checkpoint or train again"
+    )
 
 
 def check_dataset(config: FrameTokenizerConfig | WorldModelConfig, meta: Any) -> None:

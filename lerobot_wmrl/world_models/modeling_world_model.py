@@ -141,8 +141,7 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
             check_dataset(self.config, meta)
         sizes, features = self.config.tokenizer, meta.features
         check_cameras(features, sizes.camera_keys)
-        if not self.config.pretrained_path:
-            self.config.tokenizer = with_frame_sizes(sizes, features)
+        self.config.tokenizer = with_frame_sizes(sizes, features)
         if self.config.depth:
             check_depth(features, sizes.camera_keys)
         if self.config.state_size and OBS_STATE not in features:

@@ -69,7 +69,8 @@ class CnnPolicy(PreTrainedPolicy):
 
     def __init__(self, config: CnnConfig, dataset_meta: Any = None, **_: Any) -> None:
         super().__init__(config)
-        if dataset_meta is not None:  # lerobot-train normalises by these where it trains a policy further
+        if dataset_meta is not None and dataset_meta.stats:
+            # lerobot-train normalises by these where it trains a policy further
             dataset_meta.stats.update(bounded_statistics(dataset_meta.stats))
         config.validate_features()
         self.cameras = sorted(config.image_features)

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from lerobot.configs import parser
 
 from lerobot_wmrl.common import stages as runner
 from lerobot_wmrl.common.constants import EVALUATION_SEED
@@ -205,6 +206,22 @@ def test_training_and_evaluation_seeds_are_disjoint(tmp_path: Path) -> None:
                 trained.update(seeds)
     assert trained == {100_000 * seed for seed in range(10)}
     assert EVALUATION_SEED - max(trained) >= 2 * ROLLOUT_SEED_OFFSET
+
+
+def test_a_stage_does_not_read_this_program_s_config_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """LeRobot keeps what a `--config_path` file says of `policy.path`, and ranks it above `--resume`."""
+    monkeypatch.setattr(parser, "_config_path_args", {"policy": "outputs/policy"})
+    monkeypatch.setattr(parser, "_config_yaml_overrides", {"policy": ["--push_to_hub=true"]})
+    code = (
+        "from lerobot.configs import parser as p\n"
+        "print(p.get_path_arg('policy'), p.get_yaml_overrides('policy'))"
+    )
+    log = tmp_path / "log"
+    assert run_measured(["python", code], log, lambda *_: None) == 0
+    assert log.read_text().split() == ["None", "[]"]
+    assert parser.get_path_arg("policy") == "outputs/policy"
 
 
 def test_with_cuda_a_stage_is_a_fresh_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

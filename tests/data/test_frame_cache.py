@@ -183,10 +183,11 @@ def test_a_dataset_without_depth_is_named_before_anything_is_trained(small_datas
     assert not (tmp_path / "out").exists()
 
 
-def test_a_new_recording_behind_a_link_has_a_cache_of_its_own(small_dataset, tmp_path):
+@pytest.mark.parametrize("linked", ["videos", "videos/observation.images.third_view"])
+def test_a_new_recording_behind_a_link_has_a_cache_of_its_own(linked, small_dataset, tmp_path):
     shutil.copytree(small_dataset.root, tmp_path / "data")
-    (tmp_path / "data" / "videos").rename(tmp_path / "elsewhere")
-    (tmp_path / "data" / "videos").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "data" / linked).rename(tmp_path / "elsewhere")
+    (tmp_path / "data" / linked).symlink_to(tmp_path / "elsewhere")
     dataset = open_dataset(tmp_path / "data")
     before = frame_cache.file_stamps(dataset)
     assert before == frame_cache.file_stamps(dataset)

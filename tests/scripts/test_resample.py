@@ -6,12 +6,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from lerobot.datasets.language import language_feature_info
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data import frame_cache
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
-from lerobot_wmrl.scripts.resample import main
+from lerobot_wmrl.scripts.resample import ResampleConfig, main, summed_components
 
 LENGTHS, FPS, SIDE = (7, 4), 50, 8
 CAMERA = "observation.images.top"
@@ -31,6 +33,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "next.done": {"dtype": "int64", "shape": (1,), "names": None},
         "pose": {"dtype": "float64", "shape": (2, 3), "names": None},
         "note": {"dtype": "string", "shape": (1,), "names": None},
+        "next.note": {"dtype": "string", "shape": (1,), "names": None},
         "start.seed": {"dtype": "int64", "shape": (1,), "names": None},
     }
     dataset = LeRobotDataset.create("local/fast", FPS, features, root=root, use_videos=False)
@@ -42,7 +45,8 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 CAMERA: np.full((SIDE, SIDE, 3), 20 * frame, np.uint8),
                 "next.reward": np.array([1], np.float32), "next.success": np.array([frame == 3]),
                 "next.done": np.array([frame == length - 1], np.int64), "pose": np.full((2, 3), frame + 0.1),
-                "note": f"frame {frame}", "start.seed": np.array([5 + episode]),
+                "note": f"frame {frame}", "next.note": f"after {frame}",
+                "start.seed": np.array([5 + episode]),
             })  # fmt: skip
         dataset.save_episode()
     dataset.finalize()
@@ -73,6 +77,7 @@ def test_what_happened_between_two_kept_frames_belongs_to_the_first(
     assert table.column("start.seed").tolist() == [5, 6]
     rows = dataset.hf_dataset.with_format("numpy")
     assert list(rows["note"])[:2] == ["frame 0", "frame 2"]
+    assert list(rows["next.note"])[:2] == ["after 1", "after 3"]
     assert np.ravel(rows["next.done"]).tolist() == [0, 0, 0, 1, 0, 1]
     np.testing.assert_array_equal(dataset.hf_dataset.with_format(None)[5]["pose"], np.full((2, 3), 2.1))
     assert np.ravel(rows["next.reward"]).tolist() == [2, 2, 2, 1, 2, 2]
@@ -85,6 +90,14 @@ def test_depth_is_refused(make_synthetic_dataset: Any, tmp_path: Path, monkeypat
     with pytest.raises(SystemExit):
         resample(monkeypatch, f"--dataset.root={deep.root}", "--every=5", f"--output_dir={tmp_path / 'slow'}")
     assert "has depth (observation.images.third_view_depth), which is not copied" in capsys.readouterr().err
+
+
+def test_annotations_are_refused(make_synthetic_dataset: Any, tmp_path: Path) -> None:
+    """LeRobot's language columns."""
+    told = make_synthetic_dataset(tmp_path / "told", episodes=1)
+    told.features.update(language_feature_info())
+    with pytest.raises(FieldError, match=r"has annotations \(language_persistent, language_events\)"):
+        summed_components(ResampleConfig(output_dir=tmp_path / "slow", every=5), told)
 
 
 def test_videos_stay_videos(make_synthetic_dataset: Any, tmp_path: Path, monkeypatch) -> None:

@@ -126,13 +126,17 @@ def test_settings_of_the_policy_may_stand_in_a_file_and_flags_come_before_a_stor
 ) -> None:
     for kept in ("_config_path_args", "_config_yaml_overrides"):  # by LeRobot, until the process ends
         monkeypatch.setattr(parser, kept, {})
-    given = {"policy": {"path": str(paths["pointing"]), "max_shift": 1, "optimizer_lr": 0.5}}
+    given = {"policy": {
+        "path": str(paths["pointing"]), "max_shift": 1, "optimizer_lr": 0.5, "tags": ["a", "b"],
+        "license": None, "normalization_mapping": {"STATE": "MIN_MAX"},
+    }}  # fmt: skip
     (tmp_path / "run.yaml").write_text(yaml.dump(given))
     flags = [*POINT[1:], *SHORT, "--output_dir={out}"]
     out = improve(f"--config_path={tmp_path / 'run.yaml'}", *flags)
     last = out / "checkpoints" / "last" / "pretrained_model"
     stored = json.loads((last / "config.json").read_text())
-    assert (stored["max_shift"], stored["optimizer_lr"]) == (1, 0.5)
+    assert (stored["max_shift"], stored["optimizer_lr"], stored["tags"]) == (1, 0.5, ["a", "b"])
+    assert (stored["license"], stored["normalization_mapping"]["STATE"]) == (None, "MIN_MAX")
     new = f"--output_dir={tmp_path / 'new'}"
     improve(
         f"--config_path={out / 'train_config.json'}", f"--policy.path={last}", "--policy.license=mit", new
@@ -220,6 +224,9 @@ def test_gate_and_selection_in_the_simulator(improve: Any) -> None:
      "--peft.full_training_modules: adapters leave the value function"),
     ([*POINT, *ADAPTERS, "--algorithm.initial_std=0.1"],
      "--algorithm.initial_std=0.1: is none of the adapters' parameters"),
+    ([*POINT, "--peft.method_type=LORA", "--peft.target_modules=.*encoder.*grid.*",
+      "--algorithm.train_encoder=false"],
+     "--algorithm.train_encoder=false: leaves nothing of the policy to train"),
 ])  # fmt: skip
 def test_bad_input_is_named_and_nothing_is_written(
     flags: list[str], message: str, improve: Any, paths: dict[str, Any], capsys: pytest.CaptureFixture[str]

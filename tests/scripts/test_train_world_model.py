@@ -11,10 +11,11 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from lerobot_wmrl.common import precision
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.scripts.train_world_model import main
-from lerobot_wmrl.world_models.checkpoint import load_model
+from lerobot_wmrl.world_models.checkpoint import config_to_continue, load_model, load_model_to_continue
 
 TRAINED = "checkpoints/last/pretrained_model"
 
@@ -75,6 +76,54 @@ def test_settings_that_do_not_fit_the_weights_are_refused(
     assert not (tmp_path / "new").exists()
 
 
+def test_weights_that_are_truncated_are_named(
+    trained_models: dict[str, Path], small_dataset, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    torn = tmp_path / "torn"
+    shutil.copytree(trained_models["action_world_model"] / TRAINED, torn)
+    weights = torn / "model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:1000])
+    monkeypatch.setattr(sys, "argv", [
+        "lerobot-wmrl-train-world-model", f"--model.path={torn}", f"--dataset.root={small_dataset.root}",
+        "--batch_size=2", f"--output_dir={tmp_path / 'new'}",
+    ])  # fmt: skip
+    with pytest.raises(SystemExit):
+        main()
+    assert f"{torn}: model.safetensors cannot be read" in capsys.readouterr().err
+
+
+def test_a_model_of_the_hub_is_continued_from_the_revision_that_is_given(
+    trained_models: dict[str, Path], small_dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def download(repo_id: str, filename: str, revision: str | None = None, **_: object) -> str:
+        asked.append((repo_id, filename, revision))
+        return str(trained_models["frame_tokenizer"] / TRAINED / filename)
+
+    for module in ("lerobot.configs.rewards", "lerobot.rewards.pretrained"):
+        monkeypatch.setattr(f"{module}.hf_hub_download", download)
+    config = config_to_continue("someone/tokenizer", ["--pretrained_revision=abc"])
+    load_model_to_continue(config, small_dataset.meta)
+    assert {(name, revision) for name, _, revision in asked} == {("someone/tokenizer", "abc")}
+    assert {file for _, file, _ in asked} == {"config.json", "model.safetensors"}
+
+
+def test_frames_have_the_size_of_those_that_were_learnt_last(
+    trained_models: dict[str, Path], make_synthetic_dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    larger = make_synthetic_dataset(tmp_path / "larger", episodes=4, size=48)
+    monkeypatch.setattr(sys, "argv", [
+        "lerobot-wmrl-train-world-model", f"--model.path={trained_models['action_world_model']}",
+        f"--dataset.root={larger.root}", "--steps=1", "--batch_size=2",
+        f"--output_dir={tmp_path / 'further'}",
+    ])  # fmt: skip
+    main()
+    model = load_model(tmp_path / "further", "action_world_model")
+    assert model.config.observation_shapes["observation.images.third_view"] == (3, 48, 48)
+
+
 def flags(root: Path, output_dir: Path, *more: str) -> list[str]:
     return [
         "lerobot-wmrl-train-world-model", "--model.type=frame_tokenizer", "--model.device=cpu",
@@ -130,6 +179,10 @@ def test_a_run_is_resumed_where_there_is_one(
         ])  # fmt: skip
         main()
         assert f"{tmp_path / 'run'}: already trained for 2 steps" in capsys.readouterr().out
+    monkeypatch.setattr(precision, "multiplies_bfloat16", lambda _: True)  # moved to such a machine
+    monkeypatch.setattr(sys, "argv", given)
+    main()
+    assert f"{tmp_path / 'run'}: already trained for 2 steps" in capsys.readouterr().out
     statistics = data / "meta" / "stats.json"
     statistics.write_text(json.dumps(json.loads(statistics.read_text()), indent=1))
     monkeypatch.setattr(sys, "argv", given)
