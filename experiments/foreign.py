@@ -54,9 +54,9 @@ def section(load: Load) -> str:
             [cell["seed"], POLICIES[name], counted(found[name]), changes.get(name, "")] for name in POLICIES
         ]
     improved = gains(cells, "improve")
-    for rival in ("cloned", "further"):
-        mean = RunsMean.over(improved - gains(cells, rival))
-        rows.append(["all", f"improved, against the one {POLICIES[rival]}", "", points(asdict(mean))])
+    for baseline in ("cloned", "further"):
+        mean = RunsMean.over(improved - gains(cells, baseline))
+        rows.append(["all", f"improved, against the one {POLICIES[baseline]}", "", points(asdict(mean))])
     first = cells[0]
     return f"""`{first["task"]}`: {first["episodes"]} episodes of a scripted expert with noise on its actions
 ({first["noise"]} of half their range), {first["rollouts"]} rollouts of the policy cloned from them,

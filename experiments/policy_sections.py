@@ -26,7 +26,7 @@ def demo(load: Load) -> str:
     )
     places = found[0]["places"]
     n = next(iter(places.values()))["policies"][CLONED]["n"]
-    return f"""The last policy ({DISTILLED}) against its rival, the first policy trained further on the same
+    return f"""The last policy ({DISTILLED}) against its baseline, the first policy trained further on the same
 data's successes, on the same starts. {changes}.
 
 {table(["seed", "policy", *places], rows)}
@@ -36,7 +36,7 @@ data."""
 
 
 def gained(place: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return what the last policy gained over the rival on the same data."""
+    """Return what the last policy gained over the baseline on the same data."""
     (found,) = (each for each in place["pairs"] if each["after"] == DISTILLED and each["before"] == CLONED)
     return found
 
@@ -80,10 +80,10 @@ def rl_comparison(load: Load) -> str:
                 {"imagined": "world model", "simulated": "ManiSkill"}[place], DOMAINS[domain], f"{steps:,}",
                 f"{minutes:.0f}", percents(rates), points(mean),
             ])  # fmt: skip
-    last, rival = found["mean_change"]["imagined 60"], found["mean_change"]["simulated 20"]
+    last, baseline = found["mean_change"]["imagined 60"], found["mean_change"]["simulated 20"]
     cloned = found["cloned"]
     return f"""It does, by {points(last["ind"])} in known scenes and {points(last["ood"])} in unseen ones. A
-step in ManiSkill gains more ({points(rival["ind"])} after 51,200 steps) and takes more than twice as long.
+step in ManiSkill gains more ({points(baseline["ind"])} after 51,200 steps) and takes more than twice as long.
 
 {table(["PPO in", "scenes", "steps", "minutes", "three seeds", "change on the same starts"], rows)}
 

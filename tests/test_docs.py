@@ -144,6 +144,14 @@ def test_the_readme_says_what_was_measured() -> None:
     )
     assert f"longer BC has {before}, PPO from it {after} (three seeds: {by_seed} points in known" in text
     assert len(pick_place) == 3
+    rounds = {
+        method: "/".join(str(best_success(pick_place, (method,), domain)) for domain in ("ind", "ood"))
+        for method in ("iterated", "iterated_ppo")
+    }
+    in_rounds = ", ".join(
+        f"{100 * each:.0f}" for each in gains(pick_place, "iterated_ppo", "iterated", "ind")
+    )
+    assert f"BC has {rounds['iterated']}, PPO from it {rounds['iterated_ppo']} ({in_rounds})" in text
     assert best(pick_place, BASELINES, "ind") == "longer_filtered"
     over_seeds = ttest_1samp(gains(pick_place, "longer_discounted_ppo", "longer_filtered", "ind"), 0)
     assert over_seeds.pvalue > 0.05, "not significant over seeds"

@@ -38,7 +38,7 @@ DISTILLED: Final = "PPO, then planner distilled"
 
 DURATIONS: Final = {
     "tiny": "about a minute on two cores", "demo": "about an hour on two cores",
-    "cpu": "several hours on two cores, less with an accelerator",
+    "cpu": "several hours on two cores, not measured with an accelerator",
 }  # fmt: skip
 """How long all stages but those in `real_env` take."""
 
