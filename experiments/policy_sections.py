@@ -26,8 +26,8 @@ def demo(load: Load) -> str:
     )
     places = found[0]["places"]
     n = next(iter(places.values()))["policies"][CLONED]["n"]
-    return f"""The last policy ({DISTILLED}) against its baseline, the first policy trained further on the same
-data's successes, on the same starts. {changes}.
+    return f"""The last policy ({DISTILLED}) against its baseline, the first policy trained further on the
+same data's successes, on the same starts. {changes}.
 
 {table(["seed", "policy", *places], rows)}
 
