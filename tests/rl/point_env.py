@@ -27,6 +27,7 @@ class PointEnv(TensorEnv):
     def __init__(self, num_envs: int, horizon: int = 15, image_size: int = 0) -> None:
         self.num_envs, self.max_episode_steps, self.image_size = num_envs, horizon, image_size
         self.single_action_space = gym.spaces.Box(-0.1, 0.1, (3,), np.float32)
+        self.action_space = gym.vector.utils.batch_space(self.single_action_space, num_envs)
         seen = {"observation.state": gym.spaces.Box(-np.inf, np.inf, (4,), np.float32)}
         if image_size:
             seen["observation.images.third_view"] = gym.spaces.Box(

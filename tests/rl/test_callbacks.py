@@ -4,9 +4,7 @@ import random
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -30,26 +28,11 @@ from lerobot_wmrl.rl.seeds import first_seed
 from lerobot_wmrl.rl.selection import Selection
 from lerobot_wmrl.rl.trainer import Schedule, train
 from tests.rl.conftest import ACTION_SCALE
+from tests.rl.killed import Killed
 from tests.rl.point_env import PointEnv
 
 MakePolicy = Callable[..., CnnPolicy]
 ITERATIONS = 4
-
-
-class Killed(Exception):
-    """Stands for kill -9: nothing after it runs."""
-
-
-class EvaluablePointEnv(PointEnv):
-    """As lerobot-eval asks for: a device, a batched action space, and one seed a sub-environment."""
-
-    def __init__(self, num_envs: int, horizon: int) -> None:
-        super().__init__(num_envs, horizon)
-        self.device = torch.device("cpu")
-        self.action_space = gym.vector.utils.batch_space(self.single_action_space, num_envs)
-
-    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
-        return super().reset(seed=seed[0] if isinstance(seed, list) else seed, options=options)
 
 
 def roll() -> list[float]:
@@ -93,7 +76,7 @@ def run(
     """The trainer as the command calls it, with a checkpoint at the end and wherever a callback is due."""
     output_dir.mkdir(exist_ok=True)
     torch.manual_seed(7)
-    env = EvaluablePointEnv(8, horizon=6)
+    env = PointEnv(8, horizon=6)
     algorithm = PPO(policy, PPOConfig(value_iterations=1, minibatch_size=32, policy_lr=1e-3))
     train(
         env, algorithm, pipeline, RolloutBuffer(6, 8, "cpu"), Schedule(ITERATIONS, 100, 0), output_dir,

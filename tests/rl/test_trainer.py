@@ -16,13 +16,10 @@ from lerobot_wmrl.rl.ppo import PPO
 from lerobot_wmrl.rl.rollout import RolloutBuffer
 from lerobot_wmrl.rl.seeds import first_seed
 from lerobot_wmrl.rl.trainer import Schedule, train
+from tests.rl.killed import Killed
 from tests.rl.point_env import PointEnv
 
 MakePolicy = Callable[..., CnnPolicy]
-
-
-class Killed(Exception):
-    """Stands for kill -9: nothing after it runs."""
 
 
 class FailingEnv(PointEnv):

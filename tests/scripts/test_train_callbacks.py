@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import pytest
 import torch
 import wandb
@@ -43,18 +42,6 @@ SIMULATOR = [
 ]  # fmt: skip
 
 
-class EvaluablePointEnv(PointEnv):
-    """As lerobot-eval asks for: a device, a batched action space, and one seed a sub-environment."""
-
-    def __init__(self, num_envs: int) -> None:
-        super().__init__(num_envs, horizon=4, image_size=32)
-        self.device = torch.device("cpu")
-        self.action_space = gym.vector.utils.batch_space(self.single_action_space, num_envs)
-
-    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
-        return super().reset(seed=seed[0] if isinstance(seed, list) else seed, options=options)
-
-
 @EnvConfig.register_subclass("test_evaluable_point")
 @dataclass
 class EvaluablePointConfig(EnvConfig):
@@ -64,8 +51,8 @@ class EvaluablePointConfig(EnvConfig):
     def gym_kwargs(self) -> dict[str, Any]:
         return {}
 
-    def create_tensor_env(self, n_envs: int, device: str) -> EvaluablePointEnv:
-        return EvaluablePointEnv(n_envs)
+    def create_tensor_env(self, n_envs: int, device: str) -> PointEnv:
+        return PointEnv(n_envs, horizon=4, image_size=32)
 
 
 @pytest.fixture
