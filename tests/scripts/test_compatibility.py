@@ -29,7 +29,7 @@ from lerobot_wmrl.world_models.checkpoint import read_config
 from tests.scripts.test_train import improve
 from tests.trained import action_config, run_training, tokenizer_config
 
-PAGE = Path(__file__).parents[2] / "docs" / "own_data.md"
+PAGE = Path(__file__).parents[2] / "docs" / "supported_data.md"
 
 
 @dataclass(frozen=True)
