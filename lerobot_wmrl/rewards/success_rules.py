@@ -2,21 +2,15 @@
 
 from collections.abc import Collection
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 from draccus import ChoiceRegistry
 
-from lerobot_wmrl.common.errors import FieldError, first_line, renamed, require_at_least
+from lerobot_wmrl.common.errors import FieldError, require_at_least
 
 if TYPE_CHECKING:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-BATCH: Final = 32
-"""Frames that a reward model looks at together."""
-
-FRAME_REWARDS: Final = ("reward_classifier", "proxy", "embedding")
-"""Types of reward models that judge a frame without the episode around it."""
 
 
 @dataclass
@@ -132,7 +126,9 @@ class RewardModelRule(SuccessRule):
     device: str | None = None
 
     def labels(self, dataset: "LeRobotDataset") -> np.ndarray:
-        return reach(rewards_of(self, dataset), self.threshold)
+        from lerobot_wmrl.rewards.frame_rewards import frame_rewards
+
+        return reach(frame_rewards(self.path, self.device, dataset), self.threshold)
 
 
 def frame_positions(dataset: "LeRobotDataset") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -178,56 +174,3 @@ def reach(values: np.ndarray, threshold: float) -> np.ndarray:
             f"{values.max():.3g}", "lower it",
         )  # fmt: skip
     return np.asarray(values >= threshold)
-
-
-def rewards_of(rule: RewardModelRule, dataset: "LeRobotDataset") -> np.ndarray:
-    """Return what a reward model gives for every row. (N,)
-
-    The model is shown what its configuration asks for, frames before and after included, as in lerobot-train.
-    """
-    import torch
-    from lerobot.configs.rewards import RewardModelConfig
-    from lerobot.datasets.factory import resolve_delta_timestamps
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-    from lerobot.rewards.factory import make_reward_model
-    from tqdm import tqdm
-
-    from lerobot_wmrl.common.checkpoints import local_checkpoint
-    from lerobot_wmrl.data.dataset import VIDEO_BACKEND
-    from lerobot_wmrl.rewards.loading import load_preprocessor
-
-    try:
-        folder = local_checkpoint(rule.path)
-        config = RewardModelConfig.from_pretrained(folder)
-    except Exception as error:  # a missing file, a type that nobody registered, or what the hub answers
-        raise FieldError(
-            "path", rule.path, f"no reward model of LeRobot there ({first_line(error)})",
-            "give the checkpoint of one, as lerobot-train --reward_model.type=… makes it",
-        ) from error  # fmt: skip
-    if config.type not in FRAME_REWARDS:
-        raise FieldError(
-            "path", rule.path, f"a reward model of type {config.type} does not judge frames one by one",
-            f"give one of type {', '.join(FRAME_REWARDS)}, or write its rewards into a column and set "
-            "`success.type` to column",
-        )  # fmt: skip
-    config.pretrained_path, config.device = str(folder), rule.device or config.device
-    missing = [name for name in config.input_features or () if name not in dataset.features]
-    if missing:
-        raise FieldError(
-            "path", rule.path, f"looks at {', '.join(missing)}, which {dataset.root} has not",
-            "give a reward model that was trained on datasets like this",
-        )  # fmt: skip
-    shown = LeRobotDataset(
-        dataset.repo_id, root=dataset.root, delta_timestamps=resolve_delta_timestamps(config, dataset.meta),
-        video_backend=VIDEO_BACKEND,
-    )  # fmt: skip
-    with renamed("reward.pretrained_path", "path"):
-        prepare = load_preprocessor(config)
-    model = make_reward_model(config).eval()
-    batches = torch.utils.data.DataLoader(shown, BATCH)
-    with torch.no_grad():
-        found = [
-            model.compute_reward(prepare(batch)).float().cpu()
-            for batch in tqdm(batches, "label", unit="batch")
-        ]
-    return torch.cat(found).numpy().reshape(-1)

@@ -24,7 +24,8 @@ from selenium.webdriver.remote.webdriver import WebDriver
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.dataset import DatasetSource, open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
-from lerobot_wmrl.play.labels import ByHandRule, LabelPage
+from lerobot_wmrl.play.label_page import LabelPage
+from lerobot_wmrl.play.labels import ByHandRule
 from lerobot_wmrl.scripts.label import LabelConfig, label
 
 CAMERA = "observation.images.third_view"
@@ -41,6 +42,10 @@ def unlabelled(small_dataset, tmp_path_factory) -> LeRobotDataset:
 @pytest.fixture
 def rule(tmp_path) -> ByHandRule:
     return ByHandRule(file=tmp_path / "labels.json", port=0)
+
+
+def page_of(rule: ByHandRule, dataset: LeRobotDataset) -> LabelPage:
+    return LabelPage(rule.file, rule.last, rule.host, dataset)
 
 
 @pytest.fixture
@@ -139,12 +144,12 @@ def test_labels_are_kept_while_they_are_made(address, rule, unlabelled):
     assert post(f"{address}label", {"episode": 3, "first": 5})[0] == 200
     assert post(f"{address}label", {"episode": 1, "first": None})[0] == 200
     assert post(f"{address}label", {"episode": 1, "first": "none"})[0] == 200
-    assert LabelPage(rule, unlabelled).labels == {3: 5}
+    assert page_of(rule, unlabelled).labels == {3: 5}
     assert json.loads(get(f"{address}dataset")[1])["labels"] == {"3": 5}
 
 
 def test_ctrl_c_keeps_the_labels_and_says_so(unlabelled, rule, tmp_path):
-    LabelPage(rule, unlabelled).label(2, 4)
+    page_of(rule, unlabelled).label(2, 4)
     command = subprocess.Popen(
         [sys.executable, "-m", "lerobot_wmrl.scripts.label", f"--dataset.root={unlabelled.root}",
          "--success.type=by_hand", f"--success.file={rule.file}", "--success.port=0",
@@ -164,12 +169,12 @@ def test_ctrl_c_keeps_the_labels_and_says_so(unlabelled, rule, tmp_path):
 
 
 def test_complete_labels_can_still_be_changed(unlabelled, rule, request):
-    page = LabelPage(rule, unlabelled)
+    page = page_of(rule, unlabelled)
     for episode in range(6):
         page.label(episode, None)
     address = request.getfixturevalue("address")
     assert post(f"{address}label", {"episode": 4, "first": 2})[0] == 200
-    assert LabelPage(rule, unlabelled).labels == {**dict.fromkeys(range(6)), 4: 2}
+    assert page_of(rule, unlabelled).labels == {**dict.fromkeys(range(6)), 4: 2}
 
 
 def test_frames_are_those_of_the_dataset(address, unlabelled):
@@ -220,15 +225,15 @@ def test_another_site_cannot_label(address):
 
 
 def test_labels_of_another_dataset_are_refused(rule, unlabelled, small_dataset):
-    LabelPage(rule, unlabelled).label(0, 1)
+    page_of(rule, unlabelled).label(0, 1)
     with pytest.raises(FieldError, match=r"^file=.*: holds the labels of .*; choose another file"):
-        LabelPage(rule, small_dataset)
+        page_of(rule, small_dataset)
 
 
 def test_a_file_that_holds_no_labels_is_refused(rule, unlabelled):
     rule.file.write_text("[1, 2]")
     with pytest.raises(FieldError, match=r"^file=.*: holds no labels"):
-        LabelPage(rule, unlabelled)
+        page_of(rule, unlabelled)
 
 
 def test_a_key_that_is_held_down_and_a_slow_server_label_what_was_seen(address, chromium, rule, unlabelled):
@@ -244,6 +249,6 @@ def test_a_key_that_is_held_down_and_a_slow_server_label_what_was_seen(address, 
         press("KeyS", false); press("KeyS", true); press("KeyS", true); press("KeyF", false);
         """
     )
-    wait(lambda: len(LabelPage(rule, unlabelled).labels) == 2)
-    labels = LabelPage(rule, unlabelled).labels
+    wait(lambda: len(page_of(rule, unlabelled).labels) == 2)
+    labels = page_of(rule, unlabelled).labels
     assert labels == {0: int(read_episodes(unlabelled).length[0]) - 3, 1: None}
