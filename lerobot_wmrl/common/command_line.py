@@ -35,7 +35,7 @@ from lerobot_wmrl.common.settings import (
     without_none,
 )
 
-MAPPINGS = "input_features", "output_features", "normalization_mapping"
+MAPPINGS = "input_features", "output_features", "normalization_mapping", "norm_stats"
 """Settings of LeRobot's policies and reward models whose value is a mapping."""
 
 FIELD = re.compile(r"`([\w.]+)((?:=[^`]*)?)`")
@@ -73,7 +73,7 @@ def settings_beside(path_field: str) -> list[str]:
     beside = {  # draccus reads a list of texts or null only as JSON
         name: json.dumps(value) if isinstance(value, list) else value
         for name, value in own.items()
-        if name not in ("path", TYPE)
+        if name not in ("path", "type")
     }
     return [*(format_flags(beside) if "path" in own else []), *(parser.get_cli_overrides(path_field) or [])]
 

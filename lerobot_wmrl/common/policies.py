@@ -29,6 +29,11 @@ def read_policy_config(path: str, overrides: list[str]) -> PreTrainedConfig:
         )  # fmt: skip
     try:
         config = PreTrainedConfig.from_pretrained(str(folder), cli_overrides=overrides)
+    except SystemExit as error:  # argparse, of flags that are none of the policy's
+        raise FieldError(
+            "policy.path", path, f"its policy has not all of these settings: {' '.join(overrides)}",
+            "leave out the others",
+        ) from error  # fmt: skip
     except Exception as error:  # draccus, the hub and json each raise their own
         raise FieldError(
             "policy.path", path, f"no policy can be loaded from it ({first_line(error)})",

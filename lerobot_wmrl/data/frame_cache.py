@@ -341,13 +341,24 @@ def file_stamps(dataset: LeRobotDataset) -> list[object]:
     """Return names, sizes and times of the dataset's files: a new recording needs caches of its own."""
     root = Path(dataset.root)
     files = sorted(
-        Path(folder) / name
+        path
         for each in ("data", "meta", "videos")
-        for folder, _, names in os.walk(root / each, followlinks=True)
-        for name in names
-        if name.endswith((".mp4", ".parquet"))
+        for path in files_below(root / each)
+        if path.suffix in (".mp4", ".parquet")
     )
     return [item for path in files for item in (path.name, path.stat().st_size, path.stat().st_mtime_ns)]
+
+
+def files_below(root: Path) -> Iterator[Path]:
+    """Yield all files below a folder, behind links too; a folder that links lead back to counts once."""
+    known = set[tuple[int, int]]()
+    for folder, folders, names in os.walk(root, followlinks=True):
+        status = Path(folder).stat()
+        if (status.st_dev, status.st_ino) in known:
+            folders.clear()
+            continue
+        known.add((status.st_dev, status.st_ino))
+        yield from (Path(folder) / name for name in names)
 
 
 def digest(parts: Sequence[object]) -> str:

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -128,12 +129,14 @@ class WorldModelVectorEnv(TensorEnv):
         return self.model.policy_actions(self.newest_frames()[rows], bounded, steps)
 
     def adopt(self, model: ActionWorldModelRewardModel) -> None:
-        """Imagine with a refreshed model from the next reset on.
+        """Imagine with a refreshed model from the next reset on, frames of the same size.
 
         Raises:
             ValueError: it has another tokenizer, so that it cannot read the tokens of starts and goals.
         """
         check_same_tokenizer(self.model, model, "world_model_path", "the refreshed one")
+        sizes = self.model.config.trained_tokenizer.frame_sizes  # which the policy has learnt from
+        model.config.tokenizer = replace(model.config.trained_tokenizer, frame_sizes=sizes)
         self.model = model
 
     def _ends(self, imagined: Imagined) -> tuple[Tensor, Tensor]:

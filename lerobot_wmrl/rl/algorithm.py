@@ -70,7 +70,7 @@ class Algorithm(RLAlgorithm):
         self.policy_parameters = [
             p for p in self.policy.parameters() if p.requires_grad and id(p) not in owned
         ]
-        if not self.policy_parameters:
+        if not (config.train_encoder or self.policy_parameters):
             raise FieldError(
                 "algorithm.train_encoder", config.train_encoder,
                 "leaves nothing of the policy to train: its adapters are all in the encoder",

@@ -7,7 +7,6 @@ from typing import Any, Final
 
 import torch
 from draccus.utils import ParsingError
-from lerobot.configs import parser
 from lerobot.configs.rewards import RewardModelConfig
 from lerobot.rewards.factory import get_reward_model_class
 from lerobot.utils.constants import ACTION, OBS_STATE
@@ -79,7 +78,7 @@ def config_to_continue(path: str, overrides: Sequence[str]) -> RewardModelConfig
     It is not published where that model was, unless they say so.
     """
     folder = resolve_checkpoint(path)
-    revision = parser.parse_arg("pretrained_revision", overrides)
+    revision = given_revision(overrides)
     try:
         RewardModelConfig.from_pretrained(str(folder), revision=revision)
     except Exception as error:  # draccus, the hub and json each raise their own
@@ -91,13 +90,28 @@ def config_to_continue(path: str, overrides: Sequence[str]) -> RewardModelConfig
         config = RewardModelConfig.from_pretrained(
             str(folder), revision=revision, cli_overrides=[*UNPUBLISHED, *overrides]
         )
+    except SystemExit as error:  # argparse, of flags that are none of the model's
+        raise FieldError(
+            "model.path", path, f"its model has not all of these settings: {' '.join(overrides)}",
+            "leave out the others",
+        ) from error  # fmt: skip
     except (ParsingError, TypeError, KeyError) as error:
         raise FieldError(
             "model.path", path, f"cannot be trained further with {' '.join(overrides)} ({first_line(error)})",
             "give other settings of this kind of model alone, or train a new one with `model.type`",
         ) from error  # fmt: skip
-    config.pretrained_path = str(folder)
+    config.pretrained_path, config.pretrained_revision = str(folder), revision
     return config
+
+
+def given_revision(overrides: Sequence[str]) -> str | None:
+    """Return the last `--pretrained_revision` among flags; None if there is none."""
+    revision = None
+    for flag, following in zip(overrides, [*overrides[1:], ""], strict=False):
+        name, is_same, value = flag.partition("=")
+        if name == "--pretrained_revision":
+            revision = value if is_same else following
+    return None if revision in ("", "null") else revision
 
 
 def load_model_to_continue(config: RewardModelConfig, meta: Any) -> Any:
@@ -113,7 +127,7 @@ def load_model_to_continue(config: RewardModelConfig, meta: Any) -> Any:
         )  # fmt: skip
     except torch.OutOfMemoryError:
         raise
-    except (SafetensorError, OSError) as error:
+    except SafetensorError as error:
         raise unreadable_weights(config.pretrained_path, error) from error
     except RuntimeError as error:
         raise FieldError(

@@ -191,5 +191,7 @@ def test_a_new_recording_behind_a_link_has_a_cache_of_its_own(linked, small_data
     dataset = open_dataset(tmp_path / "data")
     before = frame_cache.file_stamps(dataset)
     assert before == frame_cache.file_stamps(dataset)
+    (tmp_path / "elsewhere" / "back").symlink_to(tmp_path / "elsewhere")
+    assert before == frame_cache.file_stamps(dataset)
     os.utime(next((tmp_path / "elsewhere").rglob("*.mp4")), (0, 0))
     assert before != frame_cache.file_stamps(dataset)

@@ -17,6 +17,7 @@ from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rewards.similarity import TokenizerSimilarity
 from lerobot_wmrl.scripts.eval_world_model import EvalWorldModelConfig, eval_world_model
+from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.frame_tokenizer import Decoded
 from tests.envs.imagination import IMAGE, STATE, B, always_done
 from tests.trained import CLIP_LENGTH, run_training
@@ -280,6 +281,16 @@ def test_entropies_say_how_uncertain_the_world_model_is(config):
     parts = env.step(torch.zeros(B, 7))[-1]["reward_parts"]
     torch.testing.assert_close(parts["done_entropy"], torch.tensor([0, 0.6931, 0.3653, 0]), atol=1e-3, rtol=0)
     assert parts["token_entropy"].tolist() == [0, 1, 2, 3]
+
+
+def test_a_refreshed_model_shows_frames_of_the_size_that_the_policy_knows(config, trained_models):
+    """Though it was trained further on larger ones."""
+    env = config.create_tensor_env(B)
+    model = load_model(trained_models["action_world_model"], "action_world_model")
+    model.config.tokenizer = replace(model.config.tokenizer, frame_sizes=[[48, 48]])
+    env.adopt(model)
+    image = env.reset(seed=0)[0][IMAGE]
+    assert image.shape == env.step(torch.zeros(B, 7))[0][IMAGE].shape == (B, 3, 32, 32)
 
 
 def test_episodes_last_as_long_as_the_world_model_has_learnt(config, trained_models, caplog):

@@ -114,7 +114,8 @@ def test_settings_of_the_policy_may_stand_in_a_file_and_flags_come_before_a_stor
     for kept in ("_config_path_args", "_config_yaml_overrides"):  # by LeRobot, until the process ends
         monkeypatch.setattr(parser, kept, {})
     given = {"policy": {
-        "path": str(paths["pointing"]), "max_shift": 1, "optimizer_lr": 0.5, "tags": ["a", "b"],
+        "path": str(paths["pointing"]), "type": "cnn", "max_shift": 1, "optimizer_lr": 0.5,
+        "tags": ["a", "b"],
         "license": None, "normalization_mapping": {"STATE": "MIN_MAX"},
     }}  # fmt: skip
     (tmp_path / "run.yaml").write_text(yaml.dump(given))

@@ -94,19 +94,25 @@ def test_weights_that_are_truncated_are_named(
 
 
 def test_a_model_of_the_hub_is_continued_from_the_revision_that_is_given(
-    trained_models: dict[str, Path], small_dataset, monkeypatch: pytest.MonkeyPatch
+    trained_models: dict[str, Path], small_dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = []
+    source = shutil.copytree(trained_models["frame_tokenizer"] / TRAINED, tmp_path / "published")
 
     def download(repo_id: str, filename: str, revision: str | None = None, **_: object) -> str:
         asked.append((repo_id, filename, revision))
-        return str(trained_models["frame_tokenizer"] / TRAINED / filename)
+        return str(source / filename)
 
     for module in ("lerobot.configs.rewards", "lerobot.rewards.pretrained"):
         monkeypatch.setattr(f"{module}.hf_hub_download", download)
     config = config_to_continue("someone/tokenizer", ["--pretrained_revision=abc"])
     load_model_to_continue(config, small_dataset.meta)
     assert {(name, revision) for name, _, revision in asked} == {("someone/tokenizer", "abc")}
+    asked.clear()
+    settings = json.loads((source / "config.json").read_text())
+    (source / "config.json").write_text(json.dumps({**settings, "pretrained_revision": "abc"}))
+    load_model_to_continue(config_to_continue("someone/derived", []), small_dataset.meta)
+    assert {(name, revision) for name, _, revision in asked} == {("someone/derived", None)}, "its base's"
     assert {file for _, file, _ in asked} == {"config.json", "model.safetensors"}
 
 
