@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
-import numpy as np
 import pytest
 import torch
 from lerobot.configs.types import FeatureType, PolicyFeature
@@ -60,9 +58,7 @@ class SevenPointsConfig(EnvConfig):
         return {}
 
     def create_tensor_env(self, n_envs: int, device: str) -> PointEnv:
-        env = PointEnv(n_envs, horizon=4, image_size=32)
-        env.single_action_space = gym.spaces.Box(-0.1, 0.1, (7,), np.float32)
-        return env
+        return PointEnv(n_envs, horizon=4, image_size=32, actions=7)
 
 
 def improve(

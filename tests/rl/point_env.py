@@ -14,19 +14,19 @@ REACH = 0.15
 
 
 class PointEnv(TensorEnv):
-    """Move a point, in steps of at most 0.1 a component, to a goal in [-1, 1]²; three components, one idle.
+    """Move a point, in steps of at most 0.1 a component, to a goal in [-1, 1]²; only two components act.
 
     The state is point and goal (B, 4); with `image_size`, they are drawn as a red and a blue square too.
     Every sub-environment's episodes follow from its own seed.
     """
 
     device = torch.device("cpu")
-    action_low, action_high = torch.full((3,), -0.1), torch.full((3,), 0.1)
     refuses_nan_first = False  # so that a step waits for nothing but an end
 
-    def __init__(self, num_envs: int, horizon: int = 15, image_size: int = 0) -> None:
+    def __init__(self, num_envs: int, horizon: int = 15, image_size: int = 0, actions: int = 3) -> None:
         self.num_envs, self.max_episode_steps, self.image_size = num_envs, horizon, image_size
-        self.single_action_space = gym.spaces.Box(-0.1, 0.1, (3,), np.float32)
+        self.single_action_space = gym.spaces.Box(-0.1, 0.1, (actions,), np.float32)
+        self.action_low, self.action_high = torch.full((actions,), -0.1), torch.full((actions,), 0.1)
         self.action_space = gym.vector.utils.batch_space(self.single_action_space, num_envs)
         seen = {"observation.state": gym.spaces.Box(-np.inf, np.inf, (4,), np.float32)}
         if image_size:
