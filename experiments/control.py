@@ -106,13 +106,9 @@ class ControlEnv(TensorEnv):
             last[row] = info["final_obs"][row]
         terminated, truncated = (torch.from_numpy(end) for end in ends)
         return Outcome(
-            self._observe(last),
-            torch.from_numpy(reward).float(),
-            terminated,
-            truncated,
-            truncated,
+            self._observe(last), torch.from_numpy(reward).float(), terminated, truncated, truncated,
             self.elapsed,
-        )
+        )  # fmt: skip
 
     def _restart(self, ended: Tensor, outcome: Outcome) -> Observation:
         self.elapsed = self.elapsed.masked_fill(ended, 0)
@@ -139,7 +135,7 @@ class ControlPolicy(nn.Module):
     def __init__(self, env: ControlEnv) -> None:
         super().__init__()
         space = env.single_action_space
-        self.config, self.discrete = SimpleNamespace(type="control"), isinstance(space, gym.spaces.Discrete)
+        self.config, self.discrete = SimpleNamespace(type="control"), env.discrete
         self.scale = 1.0 if self.discrete else float(space.high[0])
         inputs = env.envs.single_observation_space.shape[0]
         self.actor = network(inputs, int(space.n) if self.discrete else space.shape[0], 0.01)

@@ -29,10 +29,10 @@ def read_policy_config(path: str, overrides: list[str]) -> PreTrainedConfig:
         )  # fmt: skip
     try:
         config = PreTrainedConfig.from_pretrained(str(folder), cli_overrides=overrides)
-    except SystemExit as error:  # argparse, of flags that are none of the policy's
+    except SystemExit as error:  # of argparse, which has named them
         raise FieldError(
-            "policy.path", path, f"its policy has not all of these settings: {' '.join(overrides)}",
-            "leave out the others",
+            "policy.path", path, "its policy has not all of the settings that are given beside it",
+            "leave out those that the message above names",
         ) from error  # fmt: skip
     except Exception as error:  # draccus, the hub and json each raise their own
         raise FieldError(

@@ -162,14 +162,15 @@ class ManiSkillTensorEnv(TensorEnv):
         """Take a step; the simulators then begin anew by themselves."""
         self._seen, reward, *ends, self._info = self.envs.step(actions.numpy())
         ended = ends[0] | ends[1]
-        length = np.array(self._info["episode_length"])
+        last, length = self._seen, np.array(self._info["episode_length"])
         if ended.any():
+            last = _final_observation(self._seen, self._info, ended)
             length = np.where(ended, self._info["final_info"]["episode_length"], length)
-        observation = self._tensors(_final_observation(self._seen, self._info, ended), self._instructions)
         terminated, truncated = map(self._vector, ends)
         return Outcome(
-            observation, self._vector(reward).float(), terminated, truncated, terminated, self._vector(length)
-        )
+            self._tensors(last, self._instructions), self._vector(reward).float(), terminated, truncated,
+            terminated, self._vector(length),
+        )  # fmt: skip
 
     def _restart(self, ended: Tensor, outcome: Outcome) -> Observation:
         self._instructions = [

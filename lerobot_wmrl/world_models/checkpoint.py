@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
@@ -90,10 +91,10 @@ def config_to_continue(path: str, overrides: Sequence[str]) -> RewardModelConfig
         config = RewardModelConfig.from_pretrained(
             str(folder), revision=revision, cli_overrides=[*UNPUBLISHED, *overrides]
         )
-    except SystemExit as error:  # argparse, of flags that are none of the model's
+    except SystemExit as error:  # of argparse, which has named them
         raise FieldError(
-            "model.path", path, f"its model has not all of these settings: {' '.join(overrides)}",
-            "leave out the others",
+            "model.path", path, "its model has not all of the settings that are given beside it",
+            "leave out those that the message above names",
         ) from error  # fmt: skip
     except (ParsingError, TypeError, KeyError) as error:
         raise FieldError(
@@ -107,7 +108,7 @@ def config_to_continue(path: str, overrides: Sequence[str]) -> RewardModelConfig
 def given_revision(overrides: Sequence[str]) -> str | None:
     """Return the last `--pretrained_revision` among flags; None if there is none."""
     revision = None
-    for flag, following in zip(overrides, [*overrides[1:], ""], strict=False):
+    for flag, following in pairwise([*overrides, ""]):
         name, is_same, value = flag.partition("=")
         if name == "--pretrained_revision":
             revision = value if is_same else following

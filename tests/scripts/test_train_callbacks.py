@@ -207,6 +207,7 @@ def test_gate_and_selection_in_the_simulator(improve: Any) -> None:
     ([*POINT, "--selection.freq=-1"], "--selection.freq=-1: must be at least 0"),
     ([*POINT, "--resume=true"], "--resume=true: there is no checkpoint in"),
     ([*POINT, "--algorithm.clipp=0.3"], "there is no flag --algorithm.clipp: did you mean --algorithm.clip?"),
+    ([*POINT, "--policy.shifts=1"], "unrecognized arguments: --shifts=1\nerror: --policy.path="),
     ([*POINT, "--num_envs=0"], "--num_envs=0: must be at least 1"),
     ([*POINT, *ADAPTERS, "--peft.full_training_modules=[encoder]"],
      "--peft.full_training_modules: adapters leave the value function"),

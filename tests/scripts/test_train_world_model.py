@@ -60,6 +60,7 @@ def test_a_path_without_a_model_is_named(
 @pytest.mark.parametrize(("settings", "message"), [
     (["--model.dynamics.layers=3"], r"weights do not fit the settings \(.*Missing key.*leave the sizes"),
     (["--model.dynamics.width=64"], r"weights do not fit the settings \(.*size mismatch.*leave the sizes"),
+    (["--model.shifts=1"], r"(?s)unrecognized arguments: --shifts=1.*has not all of the settings"),
     (["--model.dynamics.type=autoregressive"], r"cannot be trained further with --dynamics\.type=autoreg"),
 ])  # fmt: skip
 def test_settings_that_do_not_fit_the_weights_are_refused(
