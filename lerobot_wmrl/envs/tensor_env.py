@@ -13,7 +13,7 @@ from torch import Tensor
 from lerobot_wmrl.common.actions import clip_actions
 from lerobot_wmrl.common.constants import Observation
 
-NOTHING: Final[Mapping[str, Tensor]] = MappingProxyType({})
+NO_PARTS: Final[Mapping[str, Tensor]] = MappingProxyType({})
 
 
 class Outcome(NamedTuple):
@@ -34,7 +34,7 @@ class Outcome(NamedTuple):
     truncated: Tensor
     success: Tensor
     length: Tensor
-    parts: Mapping[str, Tensor] = NOTHING
+    parts: Mapping[str, Tensor] = NO_PARTS
 
 
 class TensorEnv(gym.vector.VectorEnv):
@@ -58,8 +58,8 @@ class TensorEnv(gym.vector.VectorEnv):
     """Number of tasks, which are shared out among the environments."""
 
     refuses_nan_first: ClassVar[bool] = True
-    """Whether actions are looked at before they are taken: a simulator may not survive NaN. Each look waits
-    for the device, so that an environment to which NaN does no harm looks once, after the step."""
+    """Whether NaN is searched for before the step: a simulator may crash on it. Each search synchronises
+    with the device, so the world model, which NaN does not harm, searches once, after the step."""
 
     @torch.no_grad()
     def step(self, actions: Tensor) -> tuple[Observation, Tensor, Tensor, Tensor, dict[str, Any]]:

@@ -18,7 +18,7 @@ from lerobot_wmrl.rewards.loading import load_preprocessor
 BATCH: Final = 32
 """Frames that a reward model looks at together."""
 
-JUDGES: Final = ("reward_classifier", "proxy", "embedding")
+FRAME_REWARD_TYPES: Final = ("reward_classifier", "proxy", "embedding")
 """Types of reward models that judge a frame without the episode around it."""
 
 
@@ -43,10 +43,10 @@ def frame_rewards(path: str, device: str | None, dataset: LeRobotDataset) -> np.
             "path", path, f"no reward model of LeRobot there ({first_line(error)})",
             "give the checkpoint of one, as lerobot-train --reward_model.type=… makes it",
         ) from error  # fmt: skip
-    if config.type not in JUDGES:
+    if config.type not in FRAME_REWARD_TYPES:
         raise FieldError(
             "path", path, f"a reward model of type {config.type} does not judge frames one by one",
-            f"give one of type {', '.join(JUDGES)}, or write its rewards into a column and set "
+            f"give one of type {', '.join(FRAME_REWARD_TYPES)}, or write its rewards into a column and set "
             "`success.type` to column",
         )  # fmt: skip
     config.pretrained_path, config.device = str(folder), device or config.device

@@ -1,5 +1,5 @@
-"""An end without a goodbye."""
+"""A stand-in for `kill -9` in tests of resuming."""
 
 
 class Killed(Exception):
-    """Stands for kill -9: nothing after it runs."""
+    """Nothing that stands after it runs."""
