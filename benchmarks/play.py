@@ -143,9 +143,10 @@ async def measure(world: World, maniskill: bool, exported: Path | None, steps: i
     action = torch.zeros(1, count)
     works = {"environment": lambda: alone.env.step(action)}
     if maniskill:
-        simulator = WmrlManiSkillEnv(task="push", cameras=list(world.sizes.cameras)).create_tensor_env(
-            1, "cpu"
+        settings = WmrlManiSkillEnv(
+            task="push", cameras=list(world.sizes.cameras), image_size=world.sizes.image_size
         )
+        simulator = settings.create_tensor_env(1, "cpu")
         simulator.reset(seed=[0])
         works["maniskill"] = lambda: simulator.step(action)
     found: dict[str, list[float]] = {"page": [], **{name: [] for name in works}}

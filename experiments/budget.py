@@ -30,7 +30,13 @@ ROOTS: Final = ("dataset.root", "env.dataset.root", "gate.dataset.root")
 LISTS: Final = ("dataset.more",)
 """Flags with the folders of several."""
 
-INSERTED: Final = "$()"
+DIVIDING: Final = ";|&<>()"
+"""Characters between the commands of a line of bash."""
+
+SUBSTITUTION: Final = r"\$\((?:[^()]|\((?:[^()]|\([^()]*\))*\))*\)"
+"""`$(…)` and `$((…))`, with brackets in them up to two deep."""
+
+INSERTED: Final = "$inserted"
 """What stands for something that the shell inserts."""
 
 
@@ -77,6 +83,10 @@ def check_commands(study: Study) -> None:
     """Raise StudyError unless every command that records or trains has the ledger, and says what it reads."""
     for step in study.steps:
         for words in simple_commands(step.command):
+            if spaced := [word for word in words if word.removeprefix("--") in (*ROOTS, *LISTS)]:
+                raise StudyError(
+                    f"{step.name}: {spaced[0]} needs an equals sign before its value in a study with a budget"
+                )
             programs = [word for word in words if Path(word).name in COMMANDS or word in MODULES]
             if programs and f"--budget={study.budget}" not in words:
                 raise StudyError(
@@ -145,8 +155,9 @@ def listed(value: str) -> list[str]:
 
 def simple_commands(command: str) -> Iterator[list[str]]:
     """Yield the words of each command in a line of bash, which `&&`, `;`, `|` and brackets divide."""
-    lexer = shlex.shlex(re.sub(r"\$\([^)]*\)", INSERTED, command), posix=True, punctuation_chars=";|&<>")
+    plain = re.sub(SUBSTITUTION, lambda _: INSERTED, command)
+    lexer = shlex.shlex(plain, posix=True, punctuation_chars=DIVIDING)
     lexer.whitespace_split, lexer.commenters = True, ""
-    for divides, words in groupby(lexer, key=lambda word: set(word) <= set(";|&<>")):
+    for divides, words in groupby(lexer, key=lambda word: set(word) <= set(DIVIDING)):
         if not divides:
             yield list(words)

@@ -18,14 +18,21 @@ from lerobot_wmrl.data.episodes import SUCCESS, read_episodes
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
 
+def count(value: str) -> int:
+    """Read a number of episodes. ArgumentTypeError if it is not a whole number from 1 on."""
+    if not value.isdecimal() or not int(value):
+        raise argparse.ArgumentTypeError(f"{value!r} is not a whole number from 1 on")
+    return int(value)
+
+
 def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("root", type=Path, help="a recorded LeRobotDataset")
     chosen = parser.add_mutually_exclusive_group(required=True)
-    chosen.add_argument("--optimal", type=int, help="as many optimal successes, from the scenes in turn")
-    chosen.add_argument("--successes", type=int, help="the first successes")
+    chosen.add_argument("--optimal", type=count, help="as many optimal successes, from the scenes in turn")
+    chosen.add_argument("--successes", type=count, help="the first successes")
     chosen.add_argument("--every_success", action="store_true", help="all successes")
     return parser
 
@@ -67,7 +74,7 @@ def main() -> None:
     """Entry point."""
     given = make_parser().parse_args()
     try:
-        if given.optimal:
+        if given.optimal is not None:
             chosen = optimal_episodes(given.root, given.optimal)
         else:
             chosen = successes(given.root, given.successes)

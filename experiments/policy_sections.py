@@ -5,6 +5,7 @@ from typing import Any, Final
 
 from experiments.cells import DOMAINS, Load, counted, paired, percents, points, share
 from experiments.study import ROOT, read_cells
+from experiments.success import STEPS_AN_ITERATION
 from experiments.value_cells import SCENES, against, published
 from lerobot_wmrl.common.files import markdown_table as table
 from lerobot_wmrl.improve.improvement import CLONED, DISTILLED
@@ -66,7 +67,7 @@ def rl_comparison(load: Load) -> str:
     rows = []
     for name, change in found["mean_change"].items():
         place, _, iteration = name.partition(" ")
-        steps = int(iteration) * 2560
+        steps = int(iteration) * STEPS_AN_ITERATION
         runs = found["runs"][place]
         for domain, mean in change.items():
             rates = [

@@ -22,6 +22,7 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -57,9 +58,7 @@ def run_study(study: Study, repeat: bool = False) -> None:
             print(f"{heading}: done in {record['seconds']:.0f} s", flush=True)
         elif repeat:
             print(f"{heading}: its command has changed, so it and what follows is repeated", flush=True)
-            for later in study.steps[number - 1 :]:
-                record_path(study.folder, later.name).unlink(missing_ok=True)
-                delete_output(study, later)
+            forget(study, study.steps[number - 1 :])
             run_step(study, step, heading)
         else:
             raise StudyError(
@@ -72,7 +71,7 @@ def run_study(study: Study, repeat: bool = False) -> None:
 def run_step(study: Study, step: Step, heading: str) -> None:
     """Print one command, run it, and record that it is finished."""
     if step.fresh:
-        delete_output(study, step)
+        delete(written_by(study, [step]))
     checked = budget.check_datasets(study, step)
     print(f"\n{heading}\n$ {step.command}", flush=True)
     commands = Path(sys.executable).parent
@@ -98,13 +97,31 @@ def read_record(folder: Path, step: str) -> dict[str, Any] | None:
     return json.loads(path.read_text()) if path.exists() else None
 
 
-def delete_output(study: Study, step: Step) -> None:
-    """Delete the folder that a step writes. StudyError if it is not in the study's own folder."""
-    if step.output is None or not step.output.exists():
-        return
-    if study.folder.resolve() not in step.output.resolve().parents:
-        raise StudyError(f"{step.name}: {step.output} is outside {study.folder}; nothing was deleted")
-    shutil.rmtree(step.output)
+def forget(study: Study, steps: Sequence[Step]) -> None:
+    """Delete the records of finished steps, the last first, and then the folders that they wrote."""
+    folders = written_by(study, steps)
+    for step in reversed(steps):
+        record_path(study.folder, step.name).unlink(missing_ok=True)
+    delete(folders)
+
+
+def written_by(study: Study, steps: Iterable[Step]) -> list[Path]:
+    """Return the folders that steps write within the study's own. StudyError if one is outside it."""
+    own = study.folder.resolve()
+    folders = []
+    for step in steps:
+        if step.output is not None and step.output.resolve() != own:
+            if own not in step.output.resolve().parents:
+                raise StudyError(f"{step.name}: {step.output} is outside {study.folder}; nothing was deleted")
+            folders.append(step.output)
+    return folders
+
+
+def delete(folders: Iterable[Path]) -> None:
+    """Delete the folders that exist."""
+    for folder in folders:
+        if folder.exists():
+            shutil.rmtree(folder)
 
 
 def publish(study: Study, docs: Path) -> list[Path]:

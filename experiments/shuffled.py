@@ -22,6 +22,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import ACTION, DONE, REWARD
 
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.files import whole_folder
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import EpisodeTable, parquet_files, read_episodes
 
@@ -45,19 +46,17 @@ def shuffle(root: Path, folder: Path, what: str, seed: int) -> LeRobotDataset:
     if folder.exists():
         raise FieldError("folder", folder, "exists", "remove it or choose another")
     rows = donor_rows(read_episodes(open_dataset(root)), seed)
-    partial = folder.with_name(f"{folder.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    shutil.copytree(root, partial)
-    files = parquet_files(partial)
-    whole = pq.ParquetDataset(files).read(columns=["index", *COLUMNS[what]]).sort_by("index")
-    for path in files:
-        table = pq.read_table(path)
-        taken = whole.take(rows[table["index"].to_numpy()])
-        for name in COLUMNS[what]:
-            column = table.schema.get_field_index(name)
-            table = table.set_column(column, table.schema.field(column), taken[name])
-        pq.write_table(table, path)
-    partial.rename(folder)
+    with whole_folder(folder) as partial:
+        shutil.copytree(root, partial)
+        files = parquet_files(partial)
+        whole = pq.ParquetDataset(files).read(columns=["index", *COLUMNS[what]]).sort_by("index")
+        for path in files:
+            table = pq.read_table(path)
+            taken = whole.take(rows[table["index"].to_numpy()])
+            for name in COLUMNS[what]:
+                column = table.schema.get_field_index(name)
+                table = table.set_column(column, table.schema.field(column), taken[name])
+            pq.write_table(table, path)
     return open_dataset(folder)
 
 

@@ -56,7 +56,7 @@ class Step:
     @property
     def output(self) -> Path | None:
         """The folder that the command writes, by its flags."""
-        found = re.search(r"--(?:output_dir|new_root|target)=(\S+)", self.command)
+        found = re.search(r"--(?:output_dir|new_root|target|export)=(\S+)", self.command)
         return Path(found[1]) if found else None
 
 
@@ -87,15 +87,6 @@ class Study:
         return Path(self.variables[BUDGET])
 
 
-def read_study(path: Path, given: Sequence[str] = ()) -> Study:
-    """Read a study without cells, or one cell of a study; see `read_cells`. ValueError if there are more."""
-    studies = read_cells(path, given)
-    if len(studies) > 1:
-        names = ", ".join(cells_of(path))
-        raise ValueError(f"{path}: {len(studies)} cells; choose one by name=value for {names}")
-    return studies[0]
-
-
 def read_cells(path: Path, given: Sequence[str] = ()) -> list[Study]:
     """Read a study, once for each of its cells.
 
@@ -113,8 +104,12 @@ def read_cells(path: Path, given: Sequence[str] = ()) -> list[Study]:
     for assignment in given:
         name, _, value = assignment.partition("=")
         if name in cells:
-            chosen = yaml.safe_load(value)
-            cells[name] = chosen if isinstance(chosen, list) else [chosen]
+            read = yaml.safe_load(value)
+            chosen = read if isinstance(read, list) else [read]
+            if wrong := [each for each in chosen if each not in cells[name]]:
+                there = ", ".join(map(str, cells[name]))
+                raise ValueError(f"{path}: {name}={wrong[0]}: there are {there}")
+            cells[name] = chosen
         else:
             rest.append(assignment)
     combinations = (dict(zip(cells, values, strict=True)) for values in product(*cells.values()))
@@ -139,8 +134,6 @@ def _read_cell(
     more = {}
     for key, value in cell.items():
         if isinstance(values := content["cells"][key], Mapping):
-            if value not in values:
-                raise ValueError(f"{path}: {key}={value}: there are {', '.join(map(str, values))}")
             more.update(values[value])
     folders = {"output_dir": str(OUTPUTS / path.stem), **{need: str(OUTPUTS / need) for need in needs}}
     if content.get(BUDGET):
@@ -248,7 +241,10 @@ def repeated(entry: Mapping[str, Any], variables: Mapping[str, Any]) -> list[Ste
         known = {**variables, **row}
         known.update({name: fill(value, known) for name, value in row.items() if isinstance(value, str)})
         command = " ".join(fill(entry["command"], known).split())
-        steps.append(Step(fill(entry["name"], known), command, entry.get("fresh", False)))
+        step = Step(fill(entry["name"], known), command, entry.get("fresh", False))
+        if step.fresh and step.output is None:
+            raise ValueError(f"step {step.name}: `fresh` needs a flag that says where its command writes")
+        steps.append(step)
     return steps
 
 

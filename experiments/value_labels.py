@@ -39,6 +39,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from experiments.value_model import cross_fitted_values, log_loss
 from lerobot_wmrl.common.constants import KINDS, START_KIND
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.files import whole_folder
 from lerobot_wmrl.common.statistics import roc_auc
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import EpisodeTable, parquet_files, read_episodes
@@ -116,29 +117,27 @@ def write_conditioned(folder: Path, table: EpisodeTable, negative: np.ndarray) -
 
     LeRobot's own `modify_tasks` gives an episode one instruction, this gives one to each frame.
     """
-    partial = folder.with_name(f"{folder.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    shutil.copytree(table.dataset.root, partial)
-    plain = table.dataset.meta.tasks[["task_index"]]
-    suffixed = plain.rename(lambda task: task + NEGATIVE) + len(plain)
-    for path in parquet_files(partial):
-        rows = pq.read_table(path)
-        task = rows["task_index"].to_numpy() + len(plain) * negative[rows["index"].to_numpy()]
-        column = rows.schema.get_field_index("task_index")
-        pq.write_table(rows.set_column(column, rows.schema.field(column), pa.array(task)), path)
-    mixed = np.logical_or.reduceat(negative, table.start)
-    for path in sorted((partial / "meta" / "episodes").rglob("*.parquet")):
-        rows = pd.read_parquet(path)
-        rows["tasks"] = [
-            [*tasks, *(task + NEGATIVE for task in tasks if mixed[episode])]
-            for episode, tasks in zip(rows["episode_index"], rows["tasks"], strict=True)
-        ]
-        rows.to_parquet(path, index=False)
-    write_tasks(pd.concat([plain, suffixed]), partial)
-    info = load_info(partial)
-    info.total_tasks = 2 * len(plain)
-    write_info(info, partial)
-    partial.rename(folder)
+    with whole_folder(folder) as partial:
+        shutil.copytree(table.dataset.root, partial)
+        plain = table.dataset.meta.tasks[["task_index"]]
+        suffixed = plain.rename(lambda task: task + NEGATIVE) + len(plain)
+        for path in parquet_files(partial):
+            rows = pq.read_table(path)
+            task = rows["task_index"].to_numpy() + len(plain) * negative[rows["index"].to_numpy()]
+            column = rows.schema.get_field_index("task_index")
+            pq.write_table(rows.set_column(column, rows.schema.field(column), pa.array(task)), path)
+        mixed = np.logical_or.reduceat(negative, table.start)
+        for path in sorted((partial / "meta" / "episodes").rglob("*.parquet")):
+            rows = pd.read_parquet(path)
+            rows["tasks"] = [
+                [*tasks, *(task + NEGATIVE for task in tasks if mixed[episode])]
+                for episode, tasks in zip(rows["episode_index"], rows["tasks"], strict=True)
+            ]
+            rows.to_parquet(path, index=False)
+        write_tasks(pd.concat([plain, suffixed]), partial)
+        info = load_info(partial)
+        info.total_tasks = 2 * len(plain)
+        write_info(info, partial)
     return open_dataset(folder)
 
 

@@ -92,18 +92,21 @@ def renamed(field: str, name: str) -> Iterator[None]:
 
 @contextmanager
 def regrouped(group: str, name: str) -> Iterator[None]:
-    """Let a FieldError about a field of `group` that leaves the block be about the same field of `name`."""
+    """Let a FieldError about a field of `group` that leaves the block be about the same field of `name`.
+
+    Fields that its text names in backquotes are renamed too.
+    """
 
     def moved(text: str) -> str:
-        return text.replace(f"{group}.", f"{name}.")
+        return text.replace(f"`{group}.", f"`{name}.")
 
     try:
         yield
     except FieldError as error:
         if not error.field.startswith(f"{group}."):
             raise
-        field, remedy = moved(error.field), moved(error.remedy)
-        raise FieldError(field, error.value, moved(error.problem), remedy) from error
+        field = f"{name}{error.field.removeprefix(group)}"
+        raise FieldError(field, error.value, moved(error.problem), moved(error.remedy)) from error
 
 
 def suggestion(name: str, known: Sequence[str], prefix: str = "") -> str:

@@ -100,7 +100,7 @@ class Estimate:
 
 
 def bootstrap_ratio(
-    numerator: np.ndarray, denominator: np.ndarray, seed: int = 0
+    numerator: np.ndarray, denominator: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return Σ numerator / Σ denominator over E episodes and its bootstrap 95 % interval (Efron 1979).
 
@@ -112,7 +112,7 @@ def bootstrap_ratio(
     if not episodes:
         nothing = np.full(sums[0].shape[1:], np.nan)
         return nothing, nothing, nothing
-    drawn = np.random.default_rng(seed).multinomial(episodes, np.full(episodes, 1 / episodes), RESAMPLES)
+    drawn = np.random.default_rng(0).multinomial(episodes, np.full(episodes, 1 / episodes), RESAMPLES)
     with np.errstate(invalid="ignore", divide="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # columns without any episode are NaN, as they should
         value = sums[0].sum(0) / sums[1].sum(0)
@@ -148,13 +148,13 @@ class PairedChange:
 
 
 @lru_cache(maxsize=4)
-def drawn_counts(runs: int, starts: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def drawn_counts(runs: int, starts: int) -> tuple[np.ndarray, np.ndarray]:
     """Return how often each resample draws each run and each start. (B, R) and (B, E) float64
 
     The same for every table of one shape, and drawn once, which takes most of an interval's time. They are
     whole numbers: sums of outcomes (0 and 1) are exact, and every machine rounds an interval's ends alike.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     drawn = [
         rng.multinomial(count, np.full(count, 1 / count), RESAMPLES).astype(np.float64)
         for count in (runs, starts)
@@ -173,7 +173,7 @@ class RunsMean:
     high: float
 
     @classmethod
-    def over(cls, values: Sequence[Sequence[float]], seed: int = 0) -> "RunsMean":
+    def over(cls, values: Sequence[Sequence[float]]) -> "RunsMean":
         """Average one number a run and start, (R, E): an outcome, or the difference of two.
 
         The bootstrap draws runs and starts, each with replacement (pigeonhole bootstrap, Owen 2007). With
@@ -181,7 +181,7 @@ class RunsMean:
         """
         table = np.asarray(values, np.float64)
         runs, starts = table.shape
-        drawn_runs, drawn_starts = drawn_counts(runs, starts, seed)
+        drawn_runs, drawn_starts = drawn_counts(runs, starts)
         means = np.einsum("be,be->b", drawn_runs @ table, drawn_starts) / table.size
         low, high = np.percentile(means, (2.5, 97.5))
         return cls(float(table.mean()), float(low), float(high))

@@ -76,18 +76,19 @@ class TensorEnv(gym.vector.VectorEnv):
             `info["final_info"]` has `is_success` and `episode_length`, (B,) each.
 
         Raises:
-            ValueError: the actions have another shape, or contain NaN; then reset before the next step.
+            ValueError: the actions have another shape.
+            NanActionError: the actions contain NaN; reset before the next step.
         """
         clipped, share = clip_actions(self._checked(actions), self.action_low, self.action_high)
         nan = clipped.isnan().any(1)
         if self.refuses_nan_first and bool(nan.any()):
-            raise nan_error(nan)
+            raise NanActionError(nan)
         outcome = self._advance(clipped)
         info: dict[str, Any] = {"reward_parts": {**outcome.parts, "clipped": share.to(self.device)}}
         ended = outcome.terminated | outcome.truncated
         any_ended, any_nan = torch.stack([ended.any(), nan.any().to(ended.device)]).tolist()
         if any_nan:
-            raise nan_error(nan)
+            raise NanActionError(nan)
         observation = outcome.observation
         if any_ended:
             info["final_obs"] = observation
@@ -118,10 +119,11 @@ class TensorEnv(gym.vector.VectorEnv):
         return torch.as_tensor(actions, dtype=torch.float32, device=self.action_low.device).detach()
 
 
-def nan_error(nan: Tensor) -> ValueError:
-    """Return the error for environments, (B,) bool, whose actions are NaN."""
-    rows = nan.nonzero().flatten().tolist()
-    return ValueError(
-        f"action: NaN in environments {rows}: the policy's weights or its observations are not finite; reset "
-        "before the next step"
-    )
+class NanActionError(ValueError):
+    """The actions of some environments, (B,) bool, are NaN."""
+
+    def __init__(self, nan: Tensor) -> None:
+        super().__init__(
+            f"action: NaN in environments {nan.nonzero().flatten().tolist()}: the policy's weights or its "
+            "observations are not finite; reset before the next step"
+        )

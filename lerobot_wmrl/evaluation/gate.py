@@ -145,10 +145,14 @@ class Outcomes:
         return probability
 
     def scores(self, frames: int) -> np.ndarray:
-        """Return the highest threshold at which the model predicts success for `frames` frames. (E,)"""
-        probability = np.nan_to_num(self.padded_probability(frames))
+        """Return the highest threshold at which the model predicts success for `frames` frames. (E,)
+
+        −∞ for an episode that is shorter.
+        """
+        probability = self.padded_probability(frames)
         if probability.shape[1] < frames:
-            return np.zeros(len(probability))
+            return np.full(len(probability), -np.inf)
+        probability = np.where(np.isnan(probability), -np.inf, probability)
         return sliding_window_view(probability, frames, axis=1).min(-1).max(1)
 
     def auc(self, frames: int) -> float:

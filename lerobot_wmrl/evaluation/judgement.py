@@ -36,6 +36,7 @@ class Judgement:
         coverage: share of the intervals that shall contain the real rate.
         warnings: what is wrong with the rollouts.
         outcomes: success of each policy's imagined episodes, those of the references included.
+        earlier: the same of policies that an earlier call has judged and this one does not.
     """
 
     confusion: Confusion
@@ -44,6 +45,7 @@ class Judgement:
     coverage: float
     warnings: Sequence[str] = ()
     outcomes: dict[str, list[bool]] = field(default_factory=dict)
+    earlier: Mapping[str, list[bool]] = field(default_factory=dict)
 
     def imagined(self, name: str) -> Proportion:
         """Return how often a policy succeeds in the world model."""
@@ -92,7 +94,7 @@ class Judgement:
             "warnings": list(self.warnings),
             "references": len(self.usable_references),
             "policies": {name: self._policy_json(name) for name in self.outcomes},
-            "outcomes": self.outcomes,
+            "outcomes": {**self.earlier, **self.outcomes},
         }
 
     def _policy_json(self, name: str) -> dict[str, Any]:

@@ -1,6 +1,5 @@
 """What the columns that our recorder adds say about episodes. Imports no simulator and decodes no video."""
 
-from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -42,15 +41,12 @@ def recorded_episodes(root: Path) -> dict[str, np.ndarray]:
     return {"episode": episodes, **started, "length": np.bincount(inverse), "success": success}
 
 
-def scene_splits(
-    scene: np.ndarray, split: str, unseen: Collection[int] | None = None
-) -> dict[str, np.ndarray]:
+def scene_splits(scene: np.ndarray, split: str) -> dict[str, np.ndarray]:
     """Mark the episodes in scenes that training may see, `ind`, and in those held out, `ood`.
 
     Args:
         scene: index of each episode's scene, −1 where it is not known. (E,)
         split: what is asked for.
-        unseen: indices of the scenes that are held out, by default those of `scenes.SCENES`.
 
     Returns:
         The two masks, (E,) each.
@@ -65,7 +61,7 @@ def scene_splits(
             "the dataset does not say which scenes its episodes are in (no column start.scene)",
             "choose all, train or validation",
         )  # fmt: skip
-    held_out = np.isin(scene, [each.index for each in scenes_of("ood")] if unseen is None else list(unseen))
+    held_out = np.isin(scene, [each.index for each in scenes_of("ood")])
     return {"ind": (scene >= 0) & ~held_out, "ood": (scene >= 0) & held_out}
 
 

@@ -187,7 +187,7 @@ class Simulation:
         rendering: which pictures are taken.
     """
 
-    def __init__(self, task: Task, scenes: Sequence[Scene], rendering: Rendering = Rendering()) -> None:  # noqa: B008 (frozen)
+    def __init__(self, task: Task, scenes: Sequence[Scene], rendering: Rendering) -> None:
         self.task, self.rendering = task, rendering
         self.env = TabletopEnv(scenes, rendering, render_backend=render_backend())
         self.env.reset(seed=0)

@@ -129,14 +129,14 @@ class PlayServer:
             raise web.HTTPUnsupportedMediaType(text="send a form (multipart/form-data)")
         try:
             form = await request.post()
-            files = {name: part.file for name, part in form.items() if isinstance(part, web.FileField)}
+            files = [(name, part.file) for name, part in form.items() if isinstance(part, web.FileField)]
             cameras = self.world.sizes.cameras
-            if len(form.getall(next(iter(files), ""), [])) > 1 or {*files} != {*cameras}:
+            if (given := sorted(name for name, _ in files)) != sorted(cameras):
                 raise FieldError(
-                    "picture", sorted(files), f"the world model sees the cameras {', '.join(cameras)}",
+                    "picture", given, f"the world model sees the cameras {', '.join(cameras)}",
                     "give one picture for each",
                 )  # fmt: skip
-            images = {name: read_image(name, file) for name, file in files.items()}
+            images = {name: read_image(name, file) for name, file in files}
             state = json.loads(str(form["state"])) if "state" in form else None
             task = instruction(str(form.get("instruction", "")))
             name = secrets.token_hex(8)

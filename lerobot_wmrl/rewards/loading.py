@@ -110,10 +110,10 @@ def load_preprocessor(config: RewardModelConfig) -> PolicyProcessorPipeline:
 
 def check_observation(config: RewardModelConfig, cameras: list[str]) -> None:
     """Raise FieldError unless one frame of `cameras` (dataset keys) is all that the reward needs."""
-    if any(step > 0 for step in config.observation_delta_indices or ()):
+    if any(config.observation_delta_indices or ()):
         raise FieldError(
-            "reward.type", config.type,
-            "looks at frames of the future, which an acting policy does not have", "choose another reward",
+            "reward.type", config.type, "looks at earlier or later frames than the one that it rewards",
+            "choose another reward",
         )  # fmt: skip
     missing = [name for name in config.input_features if name.startswith(OBS_IMAGE) and name not in cameras]
     if missing:

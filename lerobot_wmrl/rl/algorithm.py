@@ -123,7 +123,7 @@ class Algorithm(RLAlgorithm):
         if broken:
             raise TrainingStopped(
                 f"iteration {self.iteration + 1}: {', '.join(broken)} is not finite; the last checkpoint is "
-                "kept: lower `algorithm.policy_lr` or `algorithm.value_lr`"
+                "kept: lower `algorithm.policy_lr`, or `algorithm.value_lr` of PPO"
             )
 
     def check_reference_kl(self, record: dict[str, float]) -> None:

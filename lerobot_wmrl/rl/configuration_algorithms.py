@@ -82,7 +82,8 @@ class PPOConfig(PolicyGradientConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_positive(self, "gae_lambda", "clip", "value_lr")
+        require_positive(self, "clip", "value_lr")
+        require_at_least(self, 0, "value_iterations")
         require_share(self, "gae_lambda", "clip")
         if self.gamma is not None:
             require_positive(self, "gamma")

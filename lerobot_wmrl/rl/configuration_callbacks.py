@@ -24,7 +24,7 @@ class SelectionConfig:
         freq: iterations between two measurements of success. Each one also saves a checkpoint. 0: off.
         n_episodes: episodes in a measurement, always from the same starts. They run in `real_env` if it is
             set, so many of each task, from starts that are used neither for training nor for evaluation;
-            otherwise in the world model, from starts spread evenly over `dataset`.
+            otherwise in the world model, from as many starts in `dataset` or, if there are fewer, from all.
         dataset: dataset in whose episodes the imagined ones begin; by default `env.dataset`.
     """
 
@@ -43,8 +43,8 @@ class GateConfig:
             successes.
         dataset: labelled rollouts that the world model was not trained on. The gate replays them before the
             first update and after each Dyna round.
-        freq: iterations between two checks on new rollouts in `real_env`; 0: no such checks. There is always
-            one before the first update.
+        freq: iterations between two checks on new rollouts in `real_env`. There is always one before the
+            first update and after each Dyna round; 0: no others.
         n_episodes: rollouts in each check in `real_env`.
     """
 

@@ -51,6 +51,7 @@ class DynaRounds:
         learnt: the dataset that the world model was trained on.
         output_dir: the training's output folder.
         total: iterations of the training.
+        seed: seed of the training, from which those of starts and of the world model's training follow.
         budget: ledger that knows every dataset; None without.
     """
 
@@ -60,6 +61,7 @@ class DynaRounds:
     learnt: DatasetSource
     output_dir: Path
     total: int
+    seed: int
     budget: Path | None = None
     name: str = DYNA
 
@@ -100,7 +102,8 @@ class DynaRounds:
 
     def _record(self, recorder: Recorder, noise: str, number: int, checkpoint: Path, folder: Path) -> Path:
         half, n_episodes = list(NOISE_LEVELS).index(noise), self.config.n_episodes  # first or second half
-        seed = EVALUATION_SEED - DYNA_SEEDS + number * n_episodes + half * (n_episodes // 2)
+        place = self.seed + number * n_episodes + half * (n_episodes // 2)
+        seed = EVALUATION_SEED - DYNA_SEEDS + place % (DYNA_SEEDS - n_episodes)
         recorder.record(checkpoint, (n_episodes + half) // 2, seed, folder / noise, NOISE_LEVELS[noise])
         return folder / noise
 
@@ -122,7 +125,7 @@ class DynaRounds:
             "dataset.more": str(more),
             "model.learning_rate": LEARNING_RATE,
             "steps": self.config.steps, "batch_size": self.config.batch_size,
-            "save_freq": max(1, self.config.steps // 4), "seed": number, "output_dir": str(output_dir),
+            "save_freq": max(1, self.config.steps // 4), "seed": self.seed + number, "output_dir": str(output_dir),
             **budget_flags(self.budget),
         }  # fmt: skip
         run_subcommand(["lerobot-wmrl-train-world-model", *format_flags(flags)])

@@ -5,7 +5,7 @@ from torch import Tensor, nn
 
 from lerobot_wmrl.common.distributed import mean_over_processes
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
-from lerobot_wmrl.rl.policy_gradient import Batch, PolicyGradient
+from lerobot_wmrl.rl.policy_gradient import POLICY, Batch, PolicyGradient
 from lerobot_wmrl.rl.rollout import RolloutBuffer
 
 
@@ -41,7 +41,7 @@ class GRPO(PolicyGradient):
 
     def parameter_groups(self) -> dict[str, tuple[list[nn.Parameter], float]]:
         """Return the policy alone: a value function that it has is not trained."""
-        return {"policy": (self.policy_parameters, self.config.policy_lr)}
+        return {POLICY: (self.policy_parameters, self.config.policy_lr)}
 
     @torch.no_grad()
     def add_targets(self, rollout: RolloutBuffer) -> tuple[Tensor, dict[str, float]]:

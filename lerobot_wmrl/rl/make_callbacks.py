@@ -32,7 +32,7 @@ class Trained(NamedTuple):
 
 
 def make_callbacks(
-    settings: CallbackSettings, trained: Trained, output_dir: Path, iterations: int
+    settings: CallbackSettings, trained: Trained, output_dir: Path, iterations: int, seed: int
 ) -> list[Callback]:
     """Return the callbacks in the order in which they run: Dyna rounds, gate, selection."""
     callbacks: list[Callback] = []
@@ -43,7 +43,7 @@ def make_callbacks(
             learnt, elsewhere = settings.learnt(trained.config), settings.dyna.dataset.roots is not None
             callbacks.append(DynaRounds(
                 settings.dyna, trained.env, None if elsewhere else recorder, learnt, output_dir, iterations,
-                settings.budget,
+                seed, settings.budget,
             ))  # fmt: skip
         if settings.gate.action != "off":
             callbacks.append(SuccessGate(settings.gate, trained.env, recorder, refreshed, iterations))

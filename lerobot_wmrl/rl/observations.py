@@ -65,6 +65,16 @@ def decoded(stored: dict[str, Tensor], instructions: Sequence[str]) -> Observati
     }  # fmt: skip
 
 
+def at_rows(observation: Observation, rows: Tensor) -> Observation:
+    """Return the observations of the environments `rows`. (B, …), (E,) → (E, …)"""
+    return {
+        name: value[rows.to(value.device)]
+        if isinstance(value, Tensor)
+        else [value[row] for row in rows.tolist()]
+        for name, value in observation.items()
+    }
+
+
 def as_read_back(observation: Observation) -> Observation:
     """Return the observation with images rounded to bytes, as an ObservationBuffer would return it."""
     return {

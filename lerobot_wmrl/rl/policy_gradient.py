@@ -4,10 +4,11 @@ T time, B environments or decisions, K action components, J ratios of a decision
 one cuts minibatches from its own rollout, and gradients and metrics are averaged over all of them.
 """
 
+import logging
 import math
 import time
 from abc import abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -35,6 +36,15 @@ from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
 
 GRAD_CLIP_NORM = 1.0
 """Largest gradient norm, of the policy's parameters and of the value's separately."""
+
+UNDONE_KL = 10.0
+"""A step that moves the policy by more than this many times `target_kl` is undone."""
+
+LEAST_LR_FACTOR = 0.1
+"""The least factor by which the learning rate falls then. Estimates of a large KL are far too large."""
+
+POLICY = "policy"
+"""The parameter group of the policy."""
 
 REFERENCE, EXECUTED = "reference_log_prob", "executed"
 
@@ -93,12 +103,17 @@ class Minibatch(NamedTuple):
 
     Args:
         size: their number, averaged over the processes.
-        micro_batches: the parts that they are cut into, each with the number of its decisions that count: the
-            first ones (`Minibatches._read`).
+        parts: what they are cut into for micro-batches: rows of the rollout.
+        read: returns the batch of such rows, and how many of its decisions count: the first ones.
     """
 
     size: float
-    micro_batches: Iterator[tuple[int, Batch]]
+    parts: Sequence[Tensor]
+    read: Callable[[Tensor], tuple[int, Batch]]
+
+    def micro_batches(self) -> Iterator[tuple[int, Batch]]:
+        """Read one part after another."""
+        return map(self.read, self.parts)
 
 
 class Minibatches:
@@ -126,7 +141,7 @@ class Minibatches:
                 sizes = [min(max(count - first, 0), size) for count in self.counts]
                 micro_batches = math.ceil(max(sizes) / (self.config.micro_batch_size or size))
                 cut = order[first : first + size].tensor_split(micro_batches)
-                yield Minibatch(sum(sizes) / len(sizes), (self._read(rows) for rows in cut))
+                yield Minibatch(sum(sizes) / len(sizes), cut, self._read)
 
     def _read(self, rows: Tensor) -> tuple[int, Batch]:
         """Return the number of rows and their batch. A process without rows left still runs the policy, on
@@ -215,27 +230,63 @@ class PolicyGradient(Algorithm):
 
     def update(self, batch_iterator: Iterator[Minibatch]) -> TrainingStats:
         """Take one optimiser step on each minibatch, until the KL to the rollout's policy exceeds
-        `target_kl`."""
+        `target_kl`. A step that is much too long is undone, and the next ones are shorter."""
         records: list[dict[str, float]] = []
         first = self.optimization_step
+        before: list[Tensor] = []  # the policy's parameters before the last step, if it was trained
         for minibatch in batch_iterator:
-            record = self.accumulate_gradient(minibatch)
+            self.optimizer.zero_grad()
+            record = self.measure(minibatch)
+            if self.taken_back(before, record["kl"]):
+                break
             self.check_finite(record)
             self.check_reference_kl(record)
-            records.append(record)
+            records.append({**record, "policy_lr": self.policy_group["lr"]})
             if record["kl"] > self.config.target_kl:
                 break
-            record |= self.optimizer_step()
+            if POLICY in self.trained_groups():
+                before = [parameter.detach().clone() for parameter in self.policy_parameters]
+            records[-1] |= self.optimizer_step()
+        else:
+            if before:
+                with torch.no_grad():
+                    self.taken_back(before, self.measure(minibatch)["kl"])
         self.iteration += 1
         return training_stats(records, self.optimization_step - first)
 
-    def accumulate_gradient(self, minibatch: Minibatch) -> dict[str, float]:
-        """Accumulate the gradient of a minibatch's mean loss over micro-batches, and return its metrics."""
-        self.optimizer.zero_grad()
+    @property
+    def policy_group(self) -> dict[str, Any]:
+        """The optimiser's group of the policy, with its learning rate."""
+        group: dict[str, Any] = self.optimizer.param_groups[list(self.parameter_groups()).index(POLICY)]
+        return group
+
+    @torch.no_grad()
+    def taken_back(self, before: Sequence[Tensor], kl: float) -> bool:
+        """Return whether the last step has moved the policy much too far, and if so take it back.
+
+        The learning rate falls then, so that the next step comes to `target_kl`: the KL grows with the square
+        of a step. A KL that has overflowed is too far as well.
+        """
+        if not before or kl <= UNDONE_KL * self.config.target_kl:
+            return False
+        for parameter, old in zip(self.policy_parameters, before, strict=True):
+            parameter.copy_(old)
+        factor = max(LEAST_LR_FACTOR, math.sqrt(self.config.target_kl / kl))  # the former for NaN too
+        self.policy_group["lr"] *= factor
+        logging.info(
+            "iteration %d: one step has moved the policy by %.3g nats, and is undone; its learning rate is "
+            "now %.2g", self.iteration + 1, kl, self.policy_group["lr"],
+        )  # fmt: skip
+        return True
+
+    def measure(self, minibatch: Minibatch) -> dict[str, float]:
+        """Return the metrics of a minibatch, and accumulate the gradient of its mean loss over micro-batches
+        where gradients are computed."""
         parts: list[dict[str, Tensor]] = []
-        for counted, batch in minibatch.micro_batches:
+        for counted, batch in minibatch.micro_batches():
             loss, record = self.losses(batch)  # (B,), (B,) by name; rows from `counted` on do not count
-            loss[:counted].sum().div(minibatch.size).backward()
+            if torch.is_grad_enabled():
+                loss[:counted].sum().div(minibatch.size).backward()
             parts.append({name: value.detach()[:counted] for name, value in record.items()})
         joined = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
         largest_error = F.pad(joined.pop(RATIO_ERROR), (0, 1)).max()  # 0 where no decision counts

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from lerobot_wmrl.common.distributed import mean_and_variance
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
-from lerobot_wmrl.rl.policy_gradient import Batch, PolicyGradient
+from lerobot_wmrl.rl.policy_gradient import POLICY, Batch, PolicyGradient
 from lerobot_wmrl.rl.return_scale import ReturnScale
 from lerobot_wmrl.rl.rollout import RolloutBuffer
 
@@ -79,7 +79,7 @@ class PPO(PolicyGradient):
     def parameter_groups(self) -> dict[str, tuple[list[nn.Parameter], float]]:
         """Return two groups: the value function has a learning rate and a gradient norm of its own."""
         return {
-            "policy": (self.policy_parameters, self.config.policy_lr),
+            POLICY: (self.policy_parameters, self.config.policy_lr),
             "value": (self.value_parameters, self.config.value_lr),
         }
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -61,8 +61,9 @@ class ManiSkillRecorder:
         self, checkpoint: Path, episodes: int, seed: int, folder: Path, exploration: float = 0.0
     ) -> None:
         flags: Flags = {
-            "policy.path": str(checkpoint / PRETRAINED_MODEL_DIR), **env_flags(self.env),
-            "env.cameras": str(list(self.cameras)), "depth": self.depth, "num_workers": self.num_workers,
+            "policy.path": str(checkpoint / PRETRAINED_MODEL_DIR), "num_workers": self.num_workers,
+            **env_flags(replace(self.env, batched=False)),  # each worker has a simulation of its own
+            "env.cameras": str(list(self.cameras)), "depth": self.depth,
             "num_episodes": episodes, "seed": seed, "exploration": exploration, "output_dir": str(folder),
             **budget_flags(self.budget),
         }  # fmt: skip

@@ -10,8 +10,9 @@ from tqdm import tqdm
 from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.distributed import hidden_progress, mean_over_processes
 from lerobot_wmrl.common.pipeline import Pipeline
-from lerobot_wmrl.envs.tensor_env import TensorEnv
-from lerobot_wmrl.rl.observations import ObservationBuffer, as_read_back
+from lerobot_wmrl.envs.tensor_env import NanActionError, TensorEnv
+from lerobot_wmrl.rl.algorithm import TrainingStopped
+from lerobot_wmrl.rl.observations import ObservationBuffer, as_read_back, at_rows
 from lerobot_wmrl.rl.protocol import ActionSample, StochasticPolicy
 from lerobot_wmrl.rl.seeds import seeded_noise, start_seeds
 
@@ -69,19 +70,26 @@ class RolloutBuffer:
         self.success[step], self.final_value[step] = False, torch.nan
         self.terminated[step], self.truncated[step] = terminated, truncated
 
-    def write_end(self, step: int, success: Tensor, final_value: Tensor) -> None:
-        """Store success and value of the final observation where an episode ended at `step`. (B,), (B,)"""
-        self.success[step] = success & self.finished[step]
-        self.final_value[step] = final_value
+    def write_end(self, step: int, rows: Tensor, success: Tensor, final_value: Tensor) -> None:
+        """Store success and value of the final observation where an episode ended at `step`.
+
+        Args:
+            step: the step.
+            rows: environments in which one ended. (E,)
+            success: of all environments. (B,)
+            final_value: of `rows`. (E,)
+        """
+        self.success[step, rows] = success[rows]
+        self.final_value[step, rows] = final_value
 
     def fill_next_value(self, last_value: Tensor) -> None:
         """Set V(o_{t+1}): the next row's value, or the final observation's where an episode has ended."""
         following = torch.cat([self.value[1:], last_value[None]])  # (T, B)
         self.next_value = torch.where(self.finished, self.final_value, following)
         if not bool(self.value.isfinite().all()):
-            raise ValueError(
+            raise TrainingStopped(
                 "rollout: the policy's value is not finite, because its observation or its weights are not; "
-                "the last checkpoint is kept: lower `algorithm.value_lr` or `algorithm.policy_lr`"
+                "the last checkpoint is kept: lower `algorithm.policy_lr`, or `algorithm.value_lr` of PPO"
             )
         if not bool(self.next_value.isfinite().all()):
             raise ValueError(
@@ -201,14 +209,20 @@ def collect(
             buffer.observations.write(step, pipeline.store(observation))
             raw_action, age = actor.act(step), actor.age  # (B, K), (B,)
             action = pipeline.to_action(raw_action).to(buffer.device)
-            observation, reward, terminated, truncated, info = env.step(action)
+            try:
+                observation, reward, terminated, truncated, info = env.step(action)
+            except NanActionError as error:
+                raise TrainingStopped(
+                    f"rollout: {error}. The last checkpoint is kept: lower `algorithm.policy_lr`"
+                ) from error
             buffer.write(step, age, reward, terminated, truncated)
             actor.advance(terminated | truncated, any_finished="final_obs" in info)
             for name, part in info.get("reward_parts", {}).items():
                 logged.setdefault(name, []).append(part.float().mean())
             if "final_obs" in info:
-                final = pipeline.prepare(as_read_back(pipeline.store(info["final_obs"])))
-                buffer.write_end(step, info["final_info"]["is_success"], policy.value(final))
+                rows = (terminated | truncated).nonzero()[:, 0]
+                final = pipeline.prepare(as_read_back(pipeline.store(at_rows(info["final_obs"], rows))))
+                buffer.write_end(step, rows, info["final_info"]["is_success"], policy.value(final))
         last_value = policy.value(pipeline.prepare(as_read_back(pipeline.store(observation))))
     buffer.fill_next_value(last_value)
     parts = {name: torch.stack(values).mean().item() for name, values in logged.items()}

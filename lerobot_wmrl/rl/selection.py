@@ -79,8 +79,7 @@ class Selection:
                 f"{before} at iteration {earlier}. The policy exploits errors of the world model. "
                 f"{checkpoint} is the best one; train the world model on what this policy does "
                 "(`dyna.rounds`), keep the policy nearer to the SFT policy "
-                "(`algorithm.reference_coefficient`), or stop earlier "
-                "(`iterations`)"
+                "(`algorithm.reference_coefficient` of PPO and GRPO), or stop earlier (`iterations`)"
             )
 
 

@@ -174,10 +174,12 @@ def judge(cfg: JudgeConfig) -> None:
             "more failures"
         )
     reasons = {name: trained_inside(name, cfg.world_model.path) for name in configs}
+    before = imagined_before(cfg, confusion)
     judgement = Judgement(
         confusion, references, {name: why for name, why in reasons.items() if why}, cfg.coverage,
         [*learnt_from(cfg.world_model.path, cfg.dataset, cfg.split), *warnings],
-        imagined_before(cfg, configs, confusion),
+        {name: found for name, found in before.items() if name in configs},
+        {name: found for name, found in before.items() if name not in configs},
     )  # fmt: skip
     with writing("output_dir", cfg.output_dir):
         imagine(cfg, env, judgement, configs)
@@ -210,10 +212,8 @@ def read_both(
     return others | judged, dict(zip(others, known.values(), strict=True))
 
 
-def imagined_before(
-    cfg: JudgeConfig, configs: "Mapping[str, PreTrainedConfig]", confusion: "Confusion"
-) -> dict[str, list[bool]]:
-    """Return what an earlier call has imagined of these policies.
+def imagined_before(cfg: JudgeConfig, confusion: "Confusion") -> dict[str, list[bool]]:
+    """Return what earlier calls have imagined, by policy.
 
     Raises:
         ValueError: the rollouts or the world model are not what they were then.
@@ -230,7 +230,8 @@ def imagined_before(
                 f"--output_dir={cfg.output_dir}: {cfg.dataset.name} or the world model has changed since its "
                 "episodes were imagined; choose another folder"
             )
-    return {name: outcomes for name, outcomes in found["outcomes"].items() if name in configs}
+    outcomes: dict[str, list[bool]] = found["outcomes"]
+    return outcomes
 
 
 def imagine(

@@ -36,8 +36,9 @@ class ResampleConfig(RunConfig):
     Args:
         dataset: the dataset to copy.
         every: keep every second frame, third, …; must divide the dataset's frames a second.
-        displacements: names, or numbers from 0 on, of the action's components that add up, such as changes of
-            a position. The others, such as targets and grippers, keep the last value.
+        displacements: the action's components that add up, such as changes of a position: their names, or
+            numbers from 0 on where they have none. The others, such as targets and grippers, keep the last
+            value.
         output_dir: folder of the copy.
         repo_id: its name, for the hub; by default `local/` and the folder's.
     """
@@ -113,12 +114,14 @@ def write_resampled(dataset: "LeRobotDataset", cfg: ResampleConfig, summed: np.n
     from tqdm import trange
 
     from lerobot_wmrl.common.files import whole_folder
+    from lerobot_wmrl.data.features import encoder_of
 
     with whole_folder(cfg.output_dir) as partial:
         copy = LeRobotDataset.create(
             cfg.repo_id or f"local/{cfg.output_dir.name}", dataset.fps // cfg.every,
             scaled_features(dataset.features, summed, cfg.every), root=partial,
             robot_type=dataset.meta.robot_type, use_videos=bool(dataset.meta.video_keys),
+            rgb_encoder=encoder_of(dataset.features),
         )  # fmt: skip
         for episode in trange(dataset.num_episodes, unit="episode", desc="Copying"):
             for row in episode_rows(dataset, episode, copy.features, cfg.every, summed):

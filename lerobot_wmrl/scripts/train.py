@@ -134,7 +134,7 @@ def train_in(
     longest = env.max_episode_steps
     buffer = RolloutBuffer(rollout_length(cfg, longest), cfg.num_envs, config.device, longest)
     trained = Trained(policy, processors, env, cfg.env)
-    callbacks = make_callbacks(cfg, trained, cfg.output_dir, cfg.iterations)
+    callbacks = make_callbacks(cfg, trained, cfg.output_dir, cfg.iterations, cfg.seed)
     if is_first_process():
         claim_output_dir(cfg.output_dir, settings, MAY_DIFFER)
         if cfg.budget is not None and not isinstance(cfg.env, WorldModelEnv):

@@ -98,7 +98,7 @@ class WmMpcPolicy(PreTrainedPolicy):
         frames, instructions = Frames(tokens, state, self._context), list(batch.get("task", []))
         proposed = None
         if self.proposal is not None:
-            proposed = self.proposal.actions(frames, instructions, images, self.config.horizon)
+            proposed = self.proposal.actions(frames, batch, images, self.config.horizon)
         return self.planner.plan(frames, instructions, proposed)
 
 
@@ -126,13 +126,20 @@ class Proposal:
         except FieldError as error:
             raise FieldError("proposal_path", path, error.problem, error.remedy) from error
 
-    def actions(self, frames: Frames, instructions: list[str], images: Tensor, steps: int) -> Tensor:
-        """Return the policy's next `steps` actions from B frames on, of which these are the images
-        (B, N, 3, H, W). → (B, T, A)"""
+    def actions(self, frames: Frames, observed: Observation, images: Tensor, steps: int) -> Tensor:
+        """Return the policy's next `steps` actions. → (B, T, A)
+
+        Args:
+            frames: B of them.
+            observed: how an environment shows them, which the policy sees at its first step.
+            images: their images as the tokenizer has them. (B, N, 3, S, S)
+            steps: T.
+        """
         self.policy.reset()
+        instructions, real = list(observed.get("task", [])), [observed]
 
         def act(images: Tensor, state: Tensor) -> Tensor:
-            seen = self.model.observation(images, state, instructions)
+            seen = real.pop() if real else self.model.observation(images, state, instructions)
             action: Tensor = self.postprocess(self.policy.select_action(self.preprocess(seen)))
             return action.to(self.low.device).clamp(self.low, self.high)
 

@@ -102,6 +102,9 @@ def test_auc_is_the_share_of_pairs_in_the_right_order(outcomes):
     assert outcomes.scores(3).tolist() == [0.9, 0.8, 0.1, 0.7, 0.1]
     assert outcomes.auc(3) == pytest.approx((2 + 2 + 0.5) / 6)
     assert math.isnan(Outcomes(np.arange(2), np.ones((2, 4)), np.ones((2, 4), bool)).auc(3))
+    below = np.array([[-0.3, -0.2, np.nan], [-0.3, -0.2, -0.1]])
+    labels = np.array([[False, True, False], [False] * 3])
+    assert Outcomes(np.arange(2), below, labels).auc(1) == 0, "a shorter episode has no frame of 0"
     assert outcomes.auc(7) == pytest.approx((2 + 2 + 1) / 6), "most successes are cut short: last frames last"
     assert Outcomes(np.arange(2), np.ones((2, 4)), np.array([[True] * 4, [False] * 4])).auc(7) == 0.5
 

@@ -212,7 +212,8 @@ def test_policies_references_and_coverage_may_be_added_and_what_was_imagined_is_
     write(path, {**stored, "outcomes": {first: [True, False, False], "another": [True] * 3}})
     known = write(tmp_path / "known.json", {"policies": {second: {"k": 1, "n": 2}}})
     found = results_of(replace(config, references=known, coverage=0.5))
-    assert found["outcomes"] == {first: [True, False, False], second: [True] * 3}
+    assert found["outcomes"] == {first: [True, False, False], second: [True] * 3, "another": [True] * 3}
+    assert [*found["policies"]] == [first, second]
     assert found["policies"][second]["real"]["k"] == 1
     with pytest.raises(ValueError, match="was begun with other settings"):
         judge(replace(config, done_threshold=0.9999))

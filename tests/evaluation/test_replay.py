@@ -30,6 +30,7 @@ from lerobot_wmrl.evaluation.replay import EpisodeReplay, Recording, replay_epis
 from lerobot_wmrl.evaluation.report import evaluate
 from lerobot_wmrl.evaluation.reward_curves import reward_along_episode
 from lerobot_wmrl.maniskill.recordings import scene_splits
+from lerobot_wmrl.maniskill.scenes import scenes_of
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.scripts.eval_world_model import EvalWorldModelConfig, eval_world_model
 from lerobot_wmrl.world_models.checkpoint import load_model
@@ -157,7 +158,8 @@ def test_actions_are_absolute_where_they_follow_the_state(source):
 def test_splits_compose(small_dataset):
     table = read_episodes(small_dataset)
     assert choose_episodes(table, "all", 4).tolist() == [0, 2, 3, 5]
-    scenes = scene_splits(table.column("start.scene"), "ind", unseen={1})
+    held_out = scenes_of("ood")[0].index
+    scenes = scene_splits(np.where(table.column("start.scene") == 1, held_out, 0), "ind")
     assert choose_episodes(table, "ind", 6, scenes).tolist() == [0, 2, 4]
     assert choose_episodes(table, "train,ood", 6, scenes).tolist() == [1, 3, 5]
     with pytest.raises(FieldError, match=r"^split=validation: .* has no episode in it"):

@@ -9,7 +9,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from experiments.budget import Source, simple_commands, sources
 from experiments.run import StudyError, run_study
-from experiments.study import Step, Study, read_study
+from experiments.study import Step, Study, read_cells
 from lerobot_wmrl.data.budget import Ledger, Limits
 from lerobot_wmrl.data.episodes import read_episodes
 
@@ -26,7 +26,8 @@ def study(folder: Path, *commands: str, given: tuple[str, ...] = (), head: str =
     path = folder / "fair.yaml"
     steps = [{"name": f"step_{number}", "command": command} for number, command in enumerate(commands)]
     path.write_text(head + "\n".join(f"  - {json.dumps(step)}" for step in steps))
-    return read_study(path, [f"output_dir={folder / 'out'}", *given])
+    (study,) = read_cells(path, [f"output_dir={folder / 'out'}", *given])
+    return study
 
 
 def finished(study: Study) -> list[str]:
@@ -99,6 +100,8 @@ def test_a_dataset_that_the_step_itself_makes_is_looked_up_afterwards(
     ("a=1 lerobot-wmrl-train-world-model --steps=$$(echo 1 --budget=$budget)", "train-world-model needs"),
     ("torchrun -m lerobot_wmrl.scripts.train --budget=other.json", "scripts.train needs --budget="),
     ("true --budget=$budget; lerobot-wmrl-train --seed=1", "lerobot-wmrl-train needs --budget="),
+    ("(lerobot-wmrl-train --seed=1) && true", "lerobot-wmrl-train needs --budget="),
+    ("lerobot-train --dataset.root made", "--dataset.root needs an equals sign"),
     ("lerobot-train --dataset.root=$$folder", "only the shell knows this dataset"),
     ("lerobot-train --dataset.more=[a,$$(cat b)]", "only the shell knows this dataset"),
 ])  # fmt: skip
@@ -133,8 +136,9 @@ def test_wrong_limits_are_named(tmp_path: Path) -> None:
 
 
 def test_every_command_of_a_line_is_read() -> None:
-    line = "n=$(seq -s, 0 3) && a --kinds='{x: 1; y}' --dataset.root=d --dataset.episodes=[0, 2] | b > c"
-    assert [words[0] for words in simple_commands(line)] == ["n=$()", "a", "b", "c"]
+    line = "n=$(seq 0 3) && a --kinds='{x: (1; y)}' --steps=$((3 * (1 + 2))) --seed=0 | b > c; (d --e=f) && g"
+    assert [words[0] for words in simple_commands(line)] == ["n=$inserted", "a", "b", "c", "d", "g"]
+    assert [len(words) for words in simple_commands(line)] == [1, 4, 1, 1, 2, 1]
     step = Step(
         "s", "a --dataset.root=d --dataset.episodes=[0,2] --env.dataset.root=e --dataset.more='[f, g]'"
     )

@@ -1,13 +1,14 @@
 """The runner of studies: it resumes, refuses what has changed, and publishes with provenance."""
 
 import json
+import shutil
 import sys
 from pathlib import Path
 
 import pytest
 
 from experiments.run import StudyError, main, publish, run_study
-from experiments.study import Study, read_cells, read_study
+from experiments.study import Study, read_cells
 
 COUNT = """
 question: How often
@@ -33,7 +34,8 @@ def study_file(tmp_path: Path) -> Path:
 
 
 def read(path: Path, *given: str) -> Study:
-    return read_study(path, [f"output_dir={path.parent / 'out'}", *given])
+    (study,) = read_cells(path, [f"output_dir={path.parent / 'out'}", *given])
+    return study
 
 
 def lines(study: Study) -> list[str]:
@@ -78,6 +80,35 @@ def test_a_changed_command_is_refused_or_repeated(study_file: Path) -> None:
     assert sum("hello two" in line for line in lines(read(study_file))) == 2
 
 
+TWO = """
+question: x
+variables: {word: one}
+steps:
+  - name: a
+    command: mkdir -p $output_dir/a && echo $word --output_dir=$output_dir/a > $output_dir/a/said
+  - name: b
+    command: cp $output_dir/a/said $output_dir/b && true --output_dir=$output_dir
+"""
+
+
+def test_an_interrupted_repetition_leaves_no_old_step_finished(
+    study_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study_file.write_text(TWO)
+    run_study(read(study_file))
+
+    def interrupt(folder: Path) -> None:
+        raise KeyboardInterrupt
+
+    changed = read(study_file, "word=two")
+    with monkeypatch.context() as patched:
+        patched.setattr(shutil, "rmtree", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            run_study(changed, repeat=True)
+    run_study(changed)
+    assert (changed.folder / "b").read_text().startswith("two")
+
+
 def test_results_are_published_with_commit_machine_and_commands(study_file: Path) -> None:
     study = read(study_file)
     run_study(study)
@@ -104,7 +135,8 @@ def test_what_is_needed_must_be_there(study_file: Path) -> None:
     needed = study_file.with_name("needed.yaml")
     needed.write_text("cells: {seed: [0, 1]}\n" + COUNT)
     folder = study_file.parent / "made"
-    run_study(read_study(needed, ["seed=1", f"output_dir={folder}"]))
+    (one,) = read_cells(needed, ["seed=1", f"output_dir={folder}"])
+    run_study(one)
     both = read_cells(
         study_file, ["letter=b", f"output_dir={study_file.parent / 'out'}/", f"needed={folder}/"]
     )
@@ -114,7 +146,7 @@ def test_what_is_needed_must_be_there(study_file: Path) -> None:
     run_study(both[1])
     study_file.write_text("needs: [needed]\n" + COUNT)
     with pytest.raises(ValueError, match="`cells` lacks seed, which makes the cells of needed"):
-        read_study(study_file)
+        read_cells(study_file)
 
 
 def test_a_value_that_makes_a_cell_may_bring_more_variables(study_file: Path) -> None:
@@ -152,6 +184,7 @@ def test_only_what_the_step_itself_writes_is_deleted(tmp_path: Path) -> None:
     (COUNT + "colour: red\n", "unknown key colour"),
     (COUNT.replace("$word", "$wrd"), r"\$wrd in .* there is no such variable"),
     (COUNT.replace("say_$seed", "say"), "steps with the same name: say"),
+    (COUNT.replace("name: result", "name: result\n    fresh: true"), "step result: `fresh` needs a flag"),
     ("question: x\nsteps: [say]\n", r"step say: write its name and command; .* \(it extends none\)"),
 ])  # fmt: skip
 def test_mistakes_are_named(study_file: Path, text: str, message: str) -> None:
@@ -233,9 +266,9 @@ def test_a_cell_that_publishes_nothing_is_run(
     assert capfd.readouterr().out.count("$ mkdir") == 2
 
 
-def test_one_cell_must_be_chosen_where_one_is_wanted(tmp_path: Path) -> None:
+def test_cells_are_chosen_from_those_that_there_are(tmp_path: Path) -> None:
     path = tmp_path / "sizes.yaml"
     path.write_text(CELLS)
-    with pytest.raises(ValueError, match="4 cells; choose one by name=value for size, word"):
-        read_study(path)
-    assert read_study(path, ["size=2", "word=a"]).variables["cell"] == "size2_a"
+    with pytest.raises(ValueError, match="size=7: there are 1, 2"):
+        read_cells(path, ["size=[2,7]", "word=a"])
+    assert [each.variables["cell"] for each in read_cells(path, ["size=2", "word=a"])] == ["size2_a"]

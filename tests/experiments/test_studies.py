@@ -6,7 +6,7 @@ import pytest
 
 from experiments.budget import check_commands
 from experiments.run import provenance
-from experiments.study import ROOT, read_cells, read_study
+from experiments.study import ROOT, read_cells
 from experiments.tables import SECTIONS, results_page
 from tests.experiments.typed import check
 
@@ -70,5 +70,5 @@ def test_the_committed_page_is_what_the_json_says() -> None:
 
 
 def test_results_say_where_they_come_from(tmp_path: Path) -> None:
-    study = read_study(ROOT / "experiments" / "planning.yaml", [f"output_dir={tmp_path}"])
+    (study,) = read_cells(ROOT / "experiments" / "planning.yaml", [f"output_dir={tmp_path}"])
     assert provenance(study)["commands"]["eval_ood"].startswith("lerobot-eval --policy.type=wm_mpc")

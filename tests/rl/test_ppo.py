@@ -14,7 +14,6 @@ from lerobot_wmrl.rewards.general import default_discount
 from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.policy_gradient import (
-    Minibatch,
     Minibatches,
     clipped_objective,
     kl_estimate,
@@ -62,9 +61,28 @@ def test_positive_advantage_raises_the_log_prob_of_what_was_done(
         algorithm, buffer = one_rollout(policy, pipeline, policy_lr=1e-3)
         buffer.columns["advantage"] = torch.full((12, 16), sign)
         batch = read_batch(buffer, torch.arange(192), pipeline)
-        algorithm.update(iter([Minibatch(192, iter([(192, batch)]))]))
+        algorithm.update(iter(Minibatches(buffer, buffer.decided, pipeline, PPOConfig(epochs=1))))
         moved = policy.evaluate(batch["observation"], batch["raw_action"])[0] - batch["log_prob"]
         assert sign * moved.sum(dim=1).mean() > 1e-3
+
+
+def test_a_step_that_is_much_too_long_is_undone_and_the_next_are_shorter(
+    make_policy: MakePolicy, pipeline: Pipeline
+) -> None:
+    policy = make_policy()
+    algorithm, buffer = one_rollout(policy, pipeline, policy_lr=1.0, value_iterations=0)
+    began = [parameter.detach().clone() for parameter in algorithm.policy_parameters]
+    batch = read_batch(buffer, torch.arange(192), pipeline)
+    undone = 0
+    for _ in range(12):
+        rate = algorithm.policy_group["lr"]
+        algorithm.update(iter(Minibatches(buffer, buffer.decided, pipeline, PPOConfig(epochs=1))))
+        undone += algorithm.policy_group["lr"] < rate
+        moved = algorithm.losses(batch)[1]["kl"].mean().item()
+        assert moved <= 10 * algorithm.config.target_kl + 1e-6
+    assert undone
+    assert algorithm.policy_group["lr"] >= 0.1**undone
+    assert any(not torch.equal(a, b) for a, b in zip(algorithm.policy_parameters, began, strict=True))
 
 
 def test_the_objective_stops_paying_outside_the_clip() -> None:

@@ -117,7 +117,7 @@ def test_minibatches_visit_every_step_once_an_epoch(
     _, buffer, _ = filled(make_policy(), pipeline)
     buffer.columns = {"row": torch.arange(20 * 16).view(20, 16)}
     batches = Minibatches(buffer, buffer.decided, pipeline, PPOConfig(epochs=2, minibatch_size=50))
-    rows = torch.cat([steps["row"] for batch in batches for _, steps in batch.micro_batches])
+    rows = torch.cat([steps["row"] for batch in batches for _, steps in batch.micro_batches()])
     assert len(batches) == 2 * 7
     assert torch.equal(rows.sort().values, torch.arange(320).repeat_interleave(2))
 
