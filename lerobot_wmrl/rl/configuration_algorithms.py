@@ -22,9 +22,10 @@ class PolicyGradientConfig(RLAlgorithmConfig):
         policy_lr: learning rate of the policy (AdamW).
         ratio: probability ratio that is clipped: of the whole `action`, or of each `token` (component) of it.
         reference_coefficient: weight of the KL penalty towards the SFT policy that training starts from.
-        target_kl: KL to the policy that collected the rollout, in nats per decision. Above it, the updates of
-            this iteration end early.
-        max_reference_kl: KL to the SFT policy, in nats per decision. Above it, the training stops.
+        target_kl: KL to the policy that collected the rollout, in nats for each step that a decision covers.
+            Above it, the updates of this iteration end early. A step of the optimiser that moves the policy
+            ten times as far is undone, and the learning rate falls.
+        max_reference_kl: KL to the SFT policy, in the same unit. Above it, the training stops.
         initial_std: standard deviation of exploration in normalised actions; by default the policy's own.
         train_encoder: train the policy's encoder of observations too. `false` keeps it as it was cloned, so
             that every frame is encoded once, and an update takes a small part of the time. For the policy

@@ -90,6 +90,11 @@ def reference_penalty(log_prob: Tensor, reference: Tensor) -> Tensor:
     return 0.5 * (log_prob - reference).square().sum(dim=1)
 
 
+def steps_of(executed: Tensor) -> Tensor:
+    """Return how many steps of a decision's actions were executed, at least 1. (B, n, 1) or (B, 1) → (B,)"""
+    return executed.flatten(1).sum(dim=1).clamp_min(1)
+
+
 def read_batch(rollout: RolloutBuffer, rows: Tensor, pipeline: Pipeline) -> Batch:
     """Return the decisions of flat rows t · B + b (N,), which are on the CPU."""
     on_device = rows.to(rollout.device)
@@ -223,9 +228,9 @@ class PolicyGradient(Algorithm):
             log_prob = self.reference.evaluate(batch["observation"], batch["raw_action"])[0]
             reference.flatten(0, 1)[rows.to(reference.device)] = log_prob
         rollout.columns[REFERENCE] = reference
-        counted = 1.0 if executed is None else executed
+        counted = torch.ones_like(rollout.log_prob[..., :1]) if executed is None else executed
         flat = [(each * counted).flatten(0, 1).flatten(1) for each in (rollout.log_prob, reference)]
-        kl = kl_estimate(*flat)  # (T · B, K) each → (T · B,)
+        kl = kl_estimate(*flat) / steps_of(counted.flatten(0, 1))  # (T · B, K) each → (T · B,)
         return mean_and_variance(kl[rollout.decided.flatten()])[0].item()
 
     def update(self, batch_iterator: Iterator[Minibatch]) -> TrainingStats:
@@ -305,20 +310,21 @@ class PolicyGradient(Algorithm):
         """
         log_prob, entropy, value = self.policy.evaluate(batch["observation"], batch["raw_action"])
         # (B, n, 1). Not executed: ratio 1 and no gradient, but counted in the mean over ratios.
-        executed = batch.get(EXECUTED, 1.0)
+        executed = batch.get(EXECUTED, torch.ones_like(log_prob[..., :1]))
+        steps = steps_of(executed)
         now, old, reference = (
             (each * executed).flatten(1) for each in (log_prob, batch["log_prob"], batch[REFERENCE])
         )  # (B, K), or (B, n · K)
         log_ratio = log_ratios(now - old, self.config.ratio)  # (B, J)
         record = {
             "policy_loss": clipped_objective(log_ratio, batch["advantage"], low, high).mean(dim=1),
-            "kl": kl_estimate(old, now),
-            "reference_kl": kl_estimate(now, reference),
+            "kl": kl_estimate(old, now) / steps,
+            "reference_kl": kl_estimate(now, reference) / steps,
             "entropy": entropy,
             "clip_fraction": outside_clip(log_ratio, low, high).mean(dim=1),
             RATIO_ERROR: (log_ratio.exp() - 1).abs().amax(dim=1),
         }
-        penalty = self.config.reference_coefficient * reference_penalty(now, reference)
+        penalty = self.config.reference_coefficient * reference_penalty(now, reference) / steps
         return record["policy_loss"] + penalty, record, value
 
     def optimizer_step(self) -> dict[str, float]:
