@@ -126,11 +126,11 @@ class Algorithm(RLAlgorithm):
                 "kept: lower `algorithm.policy_lr`, or `algorithm.value_lr` of PPO"
             )
 
-    def check_reference_kl(self, record: dict[str, float]) -> None:
+    def check_reference_kl(self, kl: float) -> None:
         """Raise TrainingStopped if the policy is further from the SFT policy than `max_reference_kl`."""
-        if record["reference_kl"] > self.config.max_reference_kl:
+        if kl > self.config.max_reference_kl:
             raise TrainingStopped(
-                f"iteration {self.iteration + 1}: the policy is {record['reference_kl']:.1f} nats from the "
+                f"iteration {self.iteration + 1}: the policy is {kl:.1f} nats from the "
                 f"SFT policy, above `algorithm.max_reference_kl` ({self.config.max_reference_kl}); raise "
                 "`algorithm.reference_coefficient` or lower `algorithm.policy_lr`"
             )

@@ -125,8 +125,8 @@ class DynaRounds:
             "dataset.more": str(more),
             "model.learning_rate": LEARNING_RATE,
             "steps": self.config.steps, "batch_size": self.config.batch_size,
-            "save_freq": max(1, self.config.steps // 4), "seed": self.seed + number, "output_dir": str(output_dir),
-            **budget_flags(self.budget),
+            "save_freq": max(1, self.config.steps // 4), "seed": self.seed + number,
+            "output_dir": str(output_dir), **budget_flags(self.budget),
         }  # fmt: skip
         run_subcommand(["lerobot-wmrl-train-world-model", *format_flags(flags)])
 

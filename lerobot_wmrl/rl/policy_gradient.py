@@ -209,9 +209,15 @@ class PolicyGradient(Algorithm):
 
     def prepare(self, rollout: RolloutBuffer, pipeline: Pipeline) -> tuple[Minibatches, dict[str, float]]:
         """Compute advantages and the reference's log-probabilities; return minibatches for `update`, and
-        metrics."""
+        metrics.
+
+        Raises:
+            TrainingStopped: the policy is too far from the reference.
+        """
         chosen, metrics = self.add_targets(rollout)
-        metrics["rollout_reference_kl"] = self.add_reference(rollout, pipeline)
+        metrics["reference_kl"] = self.add_reference(rollout, pipeline)
+        self.check_finite({"reference_kl": metrics["reference_kl"]})
+        self.check_reference_kl(metrics["reference_kl"])
         return Minibatches(rollout, chosen, pipeline, self.config), metrics
 
     @torch.no_grad()
@@ -245,7 +251,6 @@ class PolicyGradient(Algorithm):
             if self.taken_back(before, record["kl"]):
                 break
             self.check_finite(record)
-            self.check_reference_kl(record)
             records.append({**record, "policy_lr": self.policy_group["lr"]})
             if record["kl"] > self.config.target_kl:
                 break
@@ -305,8 +310,8 @@ class PolicyGradient(Algorithm):
         """Return the policy's loss of each decision, with the ratio clipped to [1 − low, 1 + high]; its
         metrics by name; and the value. All (B,)
 
-        The actions are samples of the policy before the update. There `reference_kl` and the penalty's
-        gradient are unbiased; after it they are approximate.
+        The actions are samples of the policy before the update. There the penalty's gradient is unbiased;
+        after it, it is approximate.
         """
         log_prob, entropy, value = self.policy.evaluate(batch["observation"], batch["raw_action"])
         # (B, n, 1). Not executed: ratio 1 and no gradient, but counted in the mean over ratios.
@@ -319,7 +324,6 @@ class PolicyGradient(Algorithm):
         record = {
             "policy_loss": clipped_objective(log_ratio, batch["advantage"], low, high).mean(dim=1),
             "kl": kl_estimate(old, now) / steps,
-            "reference_kl": kl_estimate(now, reference) / steps,
             "entropy": entropy,
             "clip_fraction": outside_clip(log_ratio, low, high).mean(dim=1),
             RATIO_ERROR: (log_ratio.exp() - 1).abs().amax(dim=1),

@@ -110,7 +110,7 @@ def train_in(
 ) -> None:
     """Check that policy and environment fit, then train. `settings` are the configuration's, as JSON."""
     from lerobot_wmrl.common.pipeline import make_pipeline
-    from lerobot_wmrl.common.policies import adopt_features, check_fit, with_new_adapters
+    from lerobot_wmrl.common.policies import adopt_features, check_fit, check_spread, with_new_adapters
     from lerobot_wmrl.envs.lerobot_env import check_real_env, shapes_of
     from lerobot_wmrl.rl.budget import charge_steps
     from lerobot_wmrl.rl.make_callbacks import Trained, make_callbacks
@@ -126,6 +126,9 @@ def train_in(
     check_fit(config, shown, env.single_action_space.shape[-1])
     if isinstance(cfg.env, WorldModelEnv):
         env.model.check_units(config, processors[1])
+        if isinstance(cfg.algorithm, DistillationConfig):
+            names = env.model.config.embodiment.action_names
+            check_spread(config, processors[1], names, env.model.action_spread())
     if cfg.real_env is not None:
         check_real_env(config, cfg.real_env)
     if cfg.peft is not None:

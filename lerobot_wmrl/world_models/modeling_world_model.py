@@ -256,6 +256,10 @@ class ActionWorldModelRewardModel(WorldModelRewardModel):
         """Raise FieldError if a policy's actions are in other units than those that the model learnt from."""
         check_units(policy, postprocessor, self.config.embodiment.action_names, *self.action_range())
 
+    def action_spread(self) -> Tensor:
+        """Return the standard deviation of each component of an action, 0 where it never varies. (A,)"""
+        return torch.where(self.action_std == 1, 0.0, self.action_std)  # statistics hold 1 for constants
+
     def action_range(self) -> tuple[Tensor, Tensor]:
         """Return the least and the greatest value of each component of an action. (A,), (A,)
 

@@ -111,8 +111,7 @@ class Planner:
         """
         model, settings = self.model, self.settings
         value = self._objective(frames, instructions)
-        # Statistics hold a std of 1 for components that never vary: these are not searched.
-        std = settings.spread * torch.where(model.action_std == 1, 0.0, model.action_std)
+        std = settings.spread * model.action_spread()
 
         def search(objective: Objective, mean: Tensor, low: Tensor, high: Tensor) -> Tensor:
             best, average = plan_knots(

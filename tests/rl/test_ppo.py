@@ -50,7 +50,6 @@ def test_before_the_first_update_the_ratio_is_one_and_kl_is_zero(
     _, record = algorithm.losses(read_batch(buffer, torch.randperm(192)[:100], pipeline))
     assert record["ratio_error"].max() < 1e-3
     assert record["kl"].abs().max() < 1e-5
-    assert record["reference_kl"].abs().max() < 1e-5
 
 
 def test_positive_advantage_raises_the_log_prob_of_what_was_done(
@@ -159,21 +158,24 @@ def test_updates_stop_at_the_target_kl(make_policy: MakePolicy, pipeline: Pipeli
     assert 1 < stats.extra["updates"] < 9 * 6
 
 
-@pytest.mark.parametrize(("column", "value", "reason"), [
-    ("advantage", torch.nan, "not finite"), ("reference_log_prob", 50.0, "max_reference_kl"),
-])  # fmt: skip
-def test_training_stops_before_a_bad_step(
-    make_policy: MakePolicy, pipeline: Pipeline, column: str, value: float, reason: str
-) -> None:
+def test_training_stops_before_a_bad_step(make_policy: MakePolicy, pipeline: Pipeline) -> None:
     policy = make_policy()
     algorithm, buffer = one_rollout(policy, pipeline)
     before = copy.deepcopy(policy.state_dict())
-    shift = torch.full_like(buffer.columns[column], value)
-    buffer.columns[column] = buffer.columns[column] - shift
+    buffer.columns["advantage"] = torch.full_like(buffer.columns["advantage"], torch.nan)
     minibatches = Minibatches(buffer, buffer.decided, pipeline, PPOConfig(epochs=1, minibatch_size=64))
-    with pytest.raises(TrainingStopped, match=reason):
+    with pytest.raises(TrainingStopped, match="not finite"):
         algorithm.update(iter(minibatches))
     assert all(torch.equal(value, before[name]) for name, value in policy.state_dict().items())
+
+
+def test_training_stops_far_from_the_reference(make_policy: MakePolicy, pipeline: Pipeline) -> None:
+    policy = make_policy()
+    algorithm, buffer = one_rollout(policy, pipeline, policy_lr=1e-3, max_reference_kl=1e-4)
+    update(algorithm, buffer, pipeline)
+    collect(PointEnv(16, horizon=6), policy, pipeline, buffer, seed=0)
+    with pytest.raises(TrainingStopped, match="max_reference_kl"):
+        algorithm.prepare(buffer, pipeline)
 
 
 def test_a_policy_without_log_probs_is_refused() -> None:
@@ -199,8 +201,8 @@ def test_the_reference_holds_the_policy(make_policy: MakePolicy, pipeline: Pipel
         algorithm = PPO(policy, PPOConfig(**FAST, reference_coefficient=coefficient))
         for iteration in range(6):
             collect(env, policy, pipeline, buffer, 64 * iteration)
-            stats = update(algorithm, buffer, pipeline)
-        distance[coefficient] = stats.extra["reference_kl"]
+            update(algorithm, buffer, pipeline)
+        distance[coefficient] = algorithm.add_reference(buffer, pipeline)
     assert distance[3.0] < 0.5 * distance[0.0]
 
 
