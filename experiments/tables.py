@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from experiments import foreign, four_tasks_section, judged, value_cells, value_figure
+from experiments import act_section, foreign, four_tasks_section, judged, value_cells, value_figure
 from experiments import policy_sections as policies
 from experiments import value_sections as value
 from experiments import world_model_sections as world_models
@@ -67,6 +67,7 @@ SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     "value_imagined": ("Policies", partial(value.rows_above, ["imagined_cloning"])),
     "value_distilled_ppo": ("Policies", partial(value.rows_above, ["distilled_ppo"])),
     "value_ppo_distilled": ("Policies", partial(value.rows_above, ["ppo_distilled"])),
+    "value_act": ("Policies", act_section.section),
     "value_controls": ("Policies", value.value_controls),
     "driven": ("Policies", policies.driven),
     "demo": ("Policies", policies.demo),

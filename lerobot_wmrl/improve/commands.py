@@ -85,7 +85,7 @@ def merged(improvement: Improvement) -> list[str]:
 
 
 def cloned(improvement: Improvement) -> list[str]:
-    policy, table = improvement.config.policy, improvement.table()
+    policy, table = improvement.config.policy, improvement.table
     assert policy is not None
     successes = np.flatnonzero(table.success & table.among(improvement.data.episodes)).tolist()
     # LeRobot keeps loaded adapters, but writes no policy's configuration beside them without the flag

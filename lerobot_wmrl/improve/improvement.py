@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
@@ -204,13 +205,14 @@ class Improvement:
         """Return the numbers of the rollouts among the merged episodes."""
         return range(self.found.total, self.found.total + self.config.rollouts)
 
+    @cached_property
     def table(self) -> EpisodeTable:
-        """Read all episodes of the data that is learnt from, chosen or not."""
+        """All episodes of the data that is learnt from, chosen or not; there once rollouts are merged."""
         return read_episodes(self.data.open())
 
     def learnt(self) -> EpisodeTable:
         """Read the episodes that are learnt from."""
-        table = self.table()
+        table = self.table
         return table.subset(table.among(self.data.episodes))
 
     def success_frames(self) -> int:
@@ -239,7 +241,7 @@ class Improvement:
         data = self.config.dataset.flags(), "validation" if holds_out else "all"
         if self.config.rollouts < ENOUGH_HELD_OUT:
             return data
-        table, numbers = self.table(), list(self.rollout_numbers())
+        table, numbers = self.table, list(self.rollout_numbers())
         success, validation = table.success[numbers], table.validation[numbers]
         held_out = success[validation]
         rollouts = replace(self.data, episodes=numbers).flags()

@@ -35,7 +35,7 @@ def rollouts_line(improvement: Improvement) -> list[str]:
     real = improvement.config.real_env
     if real is None or not improvement.config.rollouts:
         return []
-    success = improvement.table().success[[*improvement.rollout_numbers()]]
+    success = improvement.table.success[[*improvement.rollout_numbers()]]
     noise = improvement.config.exploration
     return [
         f"{len(success)} rollouts of the {SFT} in {real.type}, exploration {noise}: {success.sum()} succeed"

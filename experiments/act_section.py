@@ -1,0 +1,51 @@
+"""What imagination is worth to LeRobot's ACT: the section of docs/results.md."""
+
+from typing import Final
+
+from experiments.cells import Load
+from experiments.study import ROOT, read_cells
+from experiments.value_cells import SCENES, Cell, against, measured, minutes, published, shares
+from lerobot_wmrl.common.files import markdown_table as table
+
+STUDY: Final = "value_act"
+BEFORE: Final = "filtered"
+"""What all others begin from."""
+
+TITLES: Final = {
+    BEFORE: "filtered BC, 3,000 steps",
+    "longer_filtered": "filtered BC, 6,000 steps",
+    "distilled": "planner distilled in imagination, from the BC of 3,000 steps",
+}
+"""Methods in the order of the table."""
+
+
+def section(load: Load) -> str:
+    """Return the section: success after every method, and what each gains on the policy before it."""
+    cells = [
+        cell
+        for each in read_cells(ROOT / "experiments" / f"{STUDY}.yaml")
+        if (cell := published(load, STUDY, each.variables["cell"]))
+    ]
+    methods = measured(cells, TITLES)
+    rates = [
+        [TITLES[method], *(shares(cells, method, domain) for domain in SCENES), minutes(cells, method)]
+        for method in methods
+    ]
+    changes = [[cell["seed"], *row] for cell in cells for row in changed(cell, methods)]
+    return f"""{table(["method", "known scenes", "unseen scenes", "minutes"], rates)}
+
+Against the BC of 3,000 steps, on the same {cells[0]["starts"]} starts:
+
+{table(["seed", "method", "known scenes", "unseen scenes"], changes)}
+
+{LIMITS}"""
+
+
+def changed(cell: Cell, methods: list[str]) -> list[list[str]]:
+    """Return a row for each method: its success, and the starts gained and lost."""
+    found = cell["methods"]
+    return [
+        [TITLES[method], *(against(found[method][domain], found[BEFORE][domain]) for domain in SCENES)]
+        for method in methods
+        if method != BEFORE
+    ]
