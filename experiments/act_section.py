@@ -18,6 +18,11 @@ TITLES: Final = {
 }
 """Methods in the order of the table."""
 
+LIMITS: Final = """\
+ACT has a ResNet-18 that begins untrained (no weights are downloaded), a width of 256, and chunks of 16
+actions of which it executes 8. The rollouts are those of a cnn policy, and the world model is that of the
+cell of [value_push](#value_push). `minutes` of the distilled policy include the world model's."""
+
 
 def section(load: Load) -> str:
     """Return the section: success after every method, and what each gains on the policy before it."""

@@ -43,6 +43,9 @@ UNDONE_KL = 10.0
 LEAST_LR_FACTOR = 0.1
 """The least factor by which the learning rate falls then. Estimates of a large KL are far too large."""
 
+LR_RECOVERY = 1.1
+"""Factor by which it rises again in each iteration without such a step, up to `policy_lr`."""
+
 POLICY = "policy"
 """The parameter group of the policy."""
 
@@ -241,14 +244,14 @@ class PolicyGradient(Algorithm):
 
     def update(self, batch_iterator: Iterator[Minibatch]) -> TrainingStats:
         """Take one optimiser step on each minibatch, until the KL to the rollout's policy exceeds
-        `target_kl`. A step that is much too long is undone, and the next ones are shorter."""
+        `target_kl`. A step that is much too long is undone, and the next ones are shorter for a while."""
         records: list[dict[str, float]] = []
-        first = self.optimization_step
+        first, undone = self.optimization_step, False
         before: list[Tensor] = []  # the policy's parameters before the last step, if it was trained
         for minibatch in batch_iterator:
             self.optimizer.zero_grad()
             record = self.measure(minibatch)
-            if self.taken_back(before, record["kl"]):
+            if undone := self.taken_back(before, record["kl"]):
                 break
             self.check_finite(record)
             records.append({**record, "policy_lr": self.policy_group["lr"]})
@@ -260,7 +263,9 @@ class PolicyGradient(Algorithm):
         else:
             if before:
                 with torch.no_grad():
-                    self.taken_back(before, self.measure(minibatch)["kl"])
+                    undone = self.taken_back(before, self.measure(minibatch)["kl"])
+        if not undone:
+            self.policy_group["lr"] = min(self.config.policy_lr, LR_RECOVERY * self.policy_group["lr"])
         self.iteration += 1
         return training_stats(records, self.optimization_step - first)
 
