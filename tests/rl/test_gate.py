@@ -17,6 +17,7 @@ from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.evaluation.gate import Gate, gate_at, labelled_recording, predict_outcomes
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
+from lerobot_wmrl.rl import recorders
 from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.configuration_callbacks import GateConfig
 from lerobot_wmrl.rl.gate import SuccessGate
@@ -129,6 +130,17 @@ def test_the_recorder_gets_what_is_not_as_by_default() -> None:
         "env.type": "wmrl_maniskill", "env.task": "pull", "env.scenes": [0, 2], "env.image_size": 64,
         "env.cameras": ["wrist"],
     }  # fmt: skip
+
+
+def test_a_recording_in_a_batched_maniskill_has_a_simulation_in_each_worker(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[list[str]] = []
+    monkeypatch.setattr(recorders, "run_subcommand", given.append)
+    recorder = ManiSkillRecorder(WmrlManiSkillEnv(task="pull", batched=True), 1, ["wrist"], False)
+    recorder.record(tmp_path / "checkpoint", 2, 0, tmp_path / "rollouts")
+    assert "--env.task=pull" in given[0]
+    assert not [flag for flag in given[0] if flag.startswith("--env.batched")]
 
 
 @pytest.mark.parametrize(("labelled", "fresh", "failed"), [(0, 0, False), (9, 0, True), (0, 9, True)])

@@ -9,6 +9,7 @@ import pytest
 from lerobot.datasets.language import language_feature_info
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from lerobot_dataset_maniskill.writer import video_encoder
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data import frame_cache
 from lerobot_wmrl.data.dataset import open_dataset
@@ -108,6 +109,28 @@ def test_videos_stay_videos(make_synthetic_dataset: Any, tmp_path: Path, monkeyp
     key = slow.meta.video_keys[0]
     far = [float((slow[1][key] - fast[row][key]).abs().mean()) for row in (0, 5, 10)]
     assert np.argmin(far) == 1
+
+
+def test_videos_are_encoded_as_they_were(tmp_path: Path, monkeypatch) -> None:
+    """LeRobot's default encoding loses much of small frames."""
+    features = {
+        "observation.images.top": {
+            "dtype": "video",
+            "shape": (64, 64, 3),
+            "names": ["height", "width", "channels"],
+        },
+        "action": {"dtype": "float32", "shape": (1,), "names": ["x"]},
+    }
+    root = tmp_path / "fast"
+    fast = LeRobotDataset.create("local/fast", 10, features, root=root, rgb_encoder=video_encoder())
+    pictures = np.random.default_rng(0).integers(0, 256, (4, 8, 8, 3), np.uint8).repeat(8, 1).repeat(8, 2)
+    for picture in pictures:
+        fast.add_frame({"observation.images.top": picture, "action": np.zeros(1, np.float32), "task": "x"})
+    fast.save_episode()
+    fast.finalize()
+    resample(monkeypatch, f"--dataset.root={root}", "--every=2", f"--output_dir={tmp_path / 'slow'}")
+    copied = open_dataset(tmp_path / "slow")[1]["observation.images.top"].permute(1, 2, 0).numpy()
+    assert np.abs(255 * copied - pictures[2]).mean() < 3
 
 
 @pytest.mark.parametrize(("flags", "message"), [
