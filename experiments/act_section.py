@@ -14,6 +14,7 @@ BEFORE: Final = "filtered"
 TITLES: Final = {
     BEFORE: "filtered BC, 3,000 steps",
     "longer_filtered": "filtered BC, 6,000 steps",
+    "imagined_ppo": "PPO in imagination, from the BC of 3,000 steps",
     "distilled": "planner distilled in imagination, from the BC of 3,000 steps",
 }
 """Methods in the order of the table."""

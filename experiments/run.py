@@ -4,7 +4,7 @@
     python -m experiments.run experiments/gate.yaml steps=200 output_dir=outputs/short --docs=outputs/docs
     python -m experiments.run experiments/rl_comparison.yaml --dry_run
 
-    python -m experiments.run experiments/value_push.yaml demonstrations=8 seed=[0,1]
+    python -m experiments.run experiments/value_push.yaml demonstrations=8 seed=[0,100000]
 
 Commands are printed before they run. The same call again continues: a finished step is not repeated. A step
 whose command has changed since it was finished is refused, unless `--repeat` says that it and the steps after
@@ -98,11 +98,11 @@ def read_record(folder: Path, step: str) -> dict[str, Any] | None:
 
 
 def forget(study: Study, steps: Sequence[Step]) -> None:
-    """Delete the records of finished steps, the last first, and then the folders that they wrote."""
-    folders = written_by(study, steps)
+    """Delete the folders that steps wrote, and then their records, the first step's last: until then, a
+    changed command is refused."""
+    delete(written_by(study, steps))
     for step in reversed(steps):
         record_path(study.folder, step.name).unlink(missing_ok=True)
-    delete(folders)
 
 
 def written_by(study: Study, steps: Iterable[Step]) -> list[Path]:

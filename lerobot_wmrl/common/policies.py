@@ -18,9 +18,6 @@ from lerobot_wmrl.common.checkpoints import ADAPTERS_FILE, local_checkpoint, res
 from lerobot_wmrl.common.errors import FieldError, first_line
 from lerobot_wmrl.common.files import whole_folder
 
-LEAST_SPREAD = 0.05
-"""Least share of the standard deviation of new actions that a policy must have been trained on."""
-
 
 def read_policy_config(path: str, overrides: list[str]) -> PreTrainedConfig:
     """Read the configuration of a policy's checkpoint. Raises FieldError if it is none."""
@@ -239,31 +236,6 @@ def check_units(
                 f"was trained on actions whose {names[component]} is {mean[component]:.4g} on average, in "
                 f"{where} it is between {least[component]:.4g} and {most[component]:.4g}",
                 "use a policy with the same actions in the same units",
-            )  # fmt: skip
-
-
-def check_spread(config: PreTrainedConfig, postprocessor: Any, names: Sequence[str], std: Tensor) -> None:
-    """Raise FieldError if a component of actions hardly varied where a policy was trained, and varies now.
-
-    Normalised by the policy's standard deviation, such actions would outweigh all others in its loss.
-
-    Args:
-        config: the policy's.
-        postprocessor: the policy's, which knows that standard deviation, if actions are normalised.
-        names: one for each component of an action.
-        std: standard deviations of the actions to be learnt, 0 for constants. (A,)
-    """
-    for step in postprocessor.steps:
-        known = (getattr(step, "stats", None) or {}).get(ACTION, {}).get("std")
-        if known is None:
-            continue
-        learnt, wanted = (torch.as_tensor(each).flatten().cpu().double() for each in (known, std))
-        for component in (learnt < LEAST_SPREAD * wanted).nonzero().flatten().tolist()[:1]:
-            raise FieldError(
-                "policy.path", config.pretrained_path,
-                f"was trained where {names[component]} hardly varies (standard deviation "
-                f"{learnt[component]:.2g}), in the world model's data it varies ({wanted[component]:.2g})",
-                "train it further on these data first: lerobot-train --policy.path",
             )  # fmt: skip
 
 

@@ -130,7 +130,7 @@ class Algorithm(RLAlgorithm):
         """Raise TrainingStopped if the policy is further from the SFT policy than `max_reference_kl`."""
         if kl > self.config.max_reference_kl:
             raise TrainingStopped(
-                f"iteration {self.iteration + 1}: the policy is {kl:.1f} nats from the "
+                f"iteration {self.iteration + 1}: the policy is {kl:.1f} nats a step from the "
                 f"SFT policy, above `algorithm.max_reference_kl` ({self.config.max_reference_kl}); raise "
                 "`algorithm.reference_coefficient` or lower `algorithm.policy_lr`"
             )

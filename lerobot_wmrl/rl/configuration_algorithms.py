@@ -21,7 +21,8 @@ class PolicyGradientConfig(RLAlgorithmConfig):
             memory. The gradient stays the same; by default the whole minibatch.
         policy_lr: learning rate of the policy (AdamW).
         ratio: probability ratio that is clipped: of the whole `action`, or of each `token` (component) of it.
-        reference_coefficient: weight of the KL penalty towards the SFT policy that training starts from.
+        reference_coefficient: weight of the KL penalty towards the SFT policy that training starts from, for
+            each step that a decision covers.
         target_kl: KL to the policy that collected the rollout, in nats for each step that a decision covers.
             Above it, the updates of this iteration end early. A step of the optimiser that moves the policy
             ten times as far is undone, and the learning rate falls.

@@ -163,9 +163,11 @@ class CallbackSettings:
                 raise FieldError(
                     "rounds", dyna.rounds, f"there is room for {iterations - 1}, one between two iterations"
                 )
-            if dyna.rounds * dyna.n_episodes > DYNA_SEEDS:
+            if dyna.rounds * dyna.n_episodes >= DYNA_SEEDS:
                 raise FieldError(
-                    "n_episodes", dyna.n_episodes, f"at most {DYNA_SEEDS} episodes in all rounds together"
+                    "n_episodes",
+                    dyna.n_episodes,
+                    f"there are fewer than {DYNA_SEEDS} for all rounds together",
                 )
 
     def _check_dyna(self, env: EnvConfig) -> None:

@@ -35,6 +35,11 @@ from lerobot_wmrl.world_models.planning import Planner
 
 LABELS_FOLDER = "labels"
 
+LEAST_SPREAD = 0.05
+"""A component of actions is learnt if one normalised unit of the policy is at least this share of the
+component's standard deviation in the world model's data. Otherwise it hardly varied where the policy was
+trained, and its errors would outweigh all others in the loss."""
+
 
 class Demonstrated(NamedTuple):
     """A rollout in which the planner took over: its actions (T, B, A), the steps of the planner in episodes
@@ -151,7 +156,7 @@ class Distillation(RLAlgorithm):
             return pipeline.to_action(policy.select_action(pipeline.prepare(as_read_back(observation))))
 
         policy.reset()
-        planner = self.make_planner(env, seed)
+        planner = self.make_planner(env, seed, self.learnt_components(env, pipeline))
         generator = torch.Generator().manual_seed(seed)
         lead = int(torch.randint(self.config.longest_lead + 1, (), generator=generator))
         lead = 0 if not self.iteration else min(lead, steps - 1)
@@ -184,15 +189,34 @@ class Distillation(RLAlgorithm):
         metrics = {"success_rate": success.float().mean().item(), "lead": float(lead)}
         return Demonstrated(actions, acting & success, mean_over_processes(metrics, env.device))
 
-    def make_planner(self, env: WorldModelVectorEnv, seed: int) -> Planner:
+    def make_planner(self, env: WorldModelVectorEnv, seed: int, learnt: Tensor) -> Planner:
         """Return a planner in the environment's world model, with its criterion of success.
 
         It follows averages: labels vary less, and a policy fitted to them succeeds more often.
         """
         return Planner(
             env.model, None, self.config.planner, env.config.done_frames, averaged=True,
-            low=env.action_low, high=env.action_high, seed=seed,
+            low=env.action_low, high=env.action_high, seed=seed, searched=learnt,
         )  # fmt: skip
+
+    def learnt_components(self, env: WorldModelVectorEnv, pipeline: Pipeline) -> Tensor:
+        """Return which components of actions the policy's normalisation lets it learn (LEAST_SPREAD). (A,)"""
+        none = torch.zeros(1, len(env.action_low), device=self.lerobot_policy.config.device)
+        unit = (pipeline.to_action(none + 1) - pipeline.to_action(none)).abs()[0].to(env.device)
+        return unit >= LEAST_SPREAD * env.model.action_spread()
+
+    def check_recorded(self, env: WorldModelVectorEnv, pipeline: Pipeline) -> None:
+        """Raise FieldError if recorded episodes are learnt from, and vary in what the policy cannot learn."""
+        strange = (~self.learnt_components(env, pipeline)).nonzero().flatten().tolist()
+        if self.config.recorded and strange:
+            name = env.model.config.embodiment.action_names[strange[0]]
+            raise FieldError(
+                "algorithm.recorded", True,
+                f"{name} varies in the recorded episodes, and hardly where the policy was trained: its "
+                "errors would outweigh all others",
+                "set it to false, or train the policy further on these episodes first (lerobot-train "
+                "--policy.path)",
+            )  # fmt: skip
 
     def batches(self, updates: int, pipeline: Pipeline) -> Iterator[dict[str, Any]]:
         """Draw that many batches of labels."""

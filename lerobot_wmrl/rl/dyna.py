@@ -101,11 +101,16 @@ class DynaRounds:
         )
 
     def _record(self, recorder: Recorder, noise: str, number: int, checkpoint: Path, folder: Path) -> Path:
-        half, n_episodes = list(NOISE_LEVELS).index(noise), self.config.n_episodes  # first or second half
-        place = self.seed + number * n_episodes + half * (n_episodes // 2)
-        seed = EVALUATION_SEED - DYNA_SEEDS + place % (DYNA_SEEDS - n_episodes)
-        recorder.record(checkpoint, (n_episodes + half) // 2, seed, folder / noise, NOISE_LEVELS[noise])
+        half = list(NOISE_LEVELS).index(noise)
+        count, seed = (self.config.n_episodes + half) // 2, self.start(number, half)
+        recorder.record(checkpoint, count, seed, folder / noise, NOISE_LEVELS[noise])
         return folder / noise
+
+    def start(self, number: int, half: int) -> int:
+        """Return the seed of the first episode of one half, 0 or 1, of a round's recording."""
+        n_episodes = self.config.n_episodes
+        place = self.seed * self.config.rounds + number * n_episodes + half * (n_episodes // 2)
+        return EVALUATION_SEED - DYNA_SEEDS + place % (DYNA_SEEDS - n_episodes)
 
     def _earlier(self, iteration: int) -> list[str]:
         """Return the datasets of earlier rounds."""

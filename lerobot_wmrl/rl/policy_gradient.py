@@ -44,7 +44,7 @@ LEAST_LR_FACTOR = 0.1
 """The least factor by which the learning rate falls then. Estimates of a large KL are far too large."""
 
 LR_RECOVERY = 1.1
-"""Factor by which it rises again in each iteration without such a step, up to `policy_lr`."""
+"""Factor by which it rises again, up to `policy_lr`, in each iteration that stays within `target_kl`."""
 
 POLICY = "policy"
 """The parameter group of the policy."""
@@ -246,12 +246,12 @@ class PolicyGradient(Algorithm):
         """Take one optimiser step on each minibatch, until the KL to the rollout's policy exceeds
         `target_kl`. A step that is much too long is undone, and the next ones are shorter for a while."""
         records: list[dict[str, float]] = []
-        first, undone = self.optimization_step, False
+        first, within_target = self.optimization_step, False
         before: list[Tensor] = []  # the policy's parameters before the last step, if it was trained
         for minibatch in batch_iterator:
             self.optimizer.zero_grad()
             record = self.measure(minibatch)
-            if undone := self.taken_back(before, record["kl"]):
+            if self.taken_back(before, record["kl"]):
                 break
             self.check_finite(record)
             records.append({**record, "policy_lr": self.policy_group["lr"]})
@@ -261,10 +261,12 @@ class PolicyGradient(Algorithm):
                 before = [parameter.detach().clone() for parameter in self.policy_parameters]
             records[-1] |= self.optimizer_step()
         else:
+            within_target = True
             if before:
                 with torch.no_grad():
-                    undone = self.taken_back(before, self.measure(minibatch)["kl"])
-        if not undone:
+                    kl = self.measure(minibatch)["kl"]
+                within_target = not self.taken_back(before, kl) and kl <= self.config.target_kl
+        if within_target:
             self.policy_group["lr"] = min(self.config.policy_lr, LR_RECOVERY * self.policy_group["lr"])
         self.iteration += 1
         return training_stats(records, self.optimization_step - first)

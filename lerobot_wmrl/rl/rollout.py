@@ -86,14 +86,10 @@ class RolloutBuffer:
         """Set V(o_{t+1}): the next row's value, or the final observation's where an episode has ended."""
         following = torch.cat([self.value[1:], last_value[None]])  # (T, B)
         self.next_value = torch.where(self.finished, self.final_value, following)
-        if not bool(self.value.isfinite().all()):
+        if not bool(self.value.isfinite().all() & self.next_value.isfinite().all()):
             raise TrainingStopped(
                 "rollout: the policy's value is not finite, because its observation or its weights are not; "
                 "the last checkpoint is kept: lower `algorithm.policy_lr`, or `algorithm.value_lr` of PPO"
-            )
-        if not bool(self.next_value.isfinite().all()):
-            raise ValueError(
-                "environment: an episode ended without `final_obs` in info, or the value is not finite"
             )
 
     @property

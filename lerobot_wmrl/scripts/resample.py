@@ -116,12 +116,17 @@ def write_resampled(dataset: "LeRobotDataset", cfg: ResampleConfig, summed: np.n
     from lerobot_wmrl.common.files import whole_folder
     from lerobot_wmrl.data.features import encoder_of
 
+    try:
+        encoder = encoder_of(dataset.features)
+    except ValueError as error:  # LeRobot reads more codecs than it writes
+        logging.warning("videos are encoded as LeRobot does by default, not as they were: %s", error)
+        encoder = None
     with whole_folder(cfg.output_dir) as partial:
         copy = LeRobotDataset.create(
             cfg.repo_id or f"local/{cfg.output_dir.name}", dataset.fps // cfg.every,
             scaled_features(dataset.features, summed, cfg.every), root=partial,
             robot_type=dataset.meta.robot_type, use_videos=bool(dataset.meta.video_keys),
-            rgb_encoder=encoder_of(dataset.features),
+            rgb_encoder=encoder,
         )  # fmt: skip
         for episode in trange(dataset.num_episodes, unit="episode", desc="Copying"):
             for row in episode_rows(dataset, episode, copy.features, cfg.every, summed):

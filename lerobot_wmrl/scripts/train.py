@@ -110,9 +110,10 @@ def train_in(
 ) -> None:
     """Check that policy and environment fit, then train. `settings` are the configuration's, as JSON."""
     from lerobot_wmrl.common.pipeline import make_pipeline
-    from lerobot_wmrl.common.policies import adopt_features, check_fit, check_spread, with_new_adapters
+    from lerobot_wmrl.common.policies import adopt_features, check_fit, with_new_adapters
     from lerobot_wmrl.envs.lerobot_env import check_real_env, shapes_of
     from lerobot_wmrl.rl.budget import charge_steps
+    from lerobot_wmrl.rl.distillation import Distillation
     from lerobot_wmrl.rl.make_callbacks import Trained, make_callbacks
     from lerobot_wmrl.rl.rollout import RolloutBuffer
     from lerobot_wmrl.rl.trainer import Schedule, make_algorithm, train
@@ -126,14 +127,14 @@ def train_in(
     check_fit(config, shown, env.single_action_space.shape[-1])
     if isinstance(cfg.env, WorldModelEnv):
         env.model.check_units(config, processors[1])
-        if isinstance(cfg.algorithm, DistillationConfig):
-            names = env.model.config.embodiment.action_names
-            check_spread(config, processors[1], names, env.model.action_spread())
     if cfg.real_env is not None:
         check_real_env(config, cfg.real_env)
     if cfg.peft is not None:
         policy = with_new_adapters(policy, cfg.peft)
     algorithm = make_algorithm(policy, cfg.algorithm, cfg.output_dir)
+    pipeline = make_pipeline(config, *processors)
+    if isinstance(algorithm, Distillation):
+        algorithm.check_recorded(env, pipeline)
     longest = env.max_episode_steps
     buffer = RolloutBuffer(rollout_length(cfg, longest), cfg.num_envs, config.device, longest)
     trained = Trained(policy, processors, env, cfg.env)
@@ -150,8 +151,8 @@ def train_in(
 
     schedule = Schedule(cfg.iterations, cfg.save_freq, cfg.seed, cfg.log_freq)
     train(
-        env, algorithm, make_pipeline(config, *processors), buffer, schedule, cfg.output_dir, save_pretrained,
-        callbacks, make_wandb(cfg),
+        env, algorithm, pipeline, buffer, schedule, cfg.output_dir, save_pretrained, callbacks,
+        make_wandb(cfg),
     )  # fmt: skip
 
 

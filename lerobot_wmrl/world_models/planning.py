@@ -80,15 +80,19 @@ class Planner:
         averaged: follow the mean of the last elites in place of the best sample.
         low, high: bounds of actions (A,).
         seed: seed of the samples.
+        searched: components of actions that are searched, of those that vary in the model's data; by default
+            all. (A,) bool
     """
 
     def __init__(
         self, model: Any, text_model: Any, settings: PlannerSettings, done_frames: int, averaged: bool,
-        low: Tensor, high: Tensor, seed: int,
+        low: Tensor, high: Tensor, seed: int, searched: Tensor | None = None,
     ) -> None:  # fmt: skip
         self.model, self.text_model = model, text_model
         self.settings, self.done_frames, self.averaged = settings, done_frames, averaged
         self.low, self.high, self.seed = low, high, seed
+        spread = model.action_spread()
+        self.std = settings.spread * (spread if searched is None else spread * searched)  # (A,)
         self.reset()
 
     def reset(self) -> None:
@@ -111,11 +115,10 @@ class Planner:
         """
         model, settings = self.model, self.settings
         value = self._objective(frames, instructions)
-        std = settings.spread * model.action_spread()
 
         def search(objective: Objective, mean: Tensor, low: Tensor, high: Tensor) -> Tensor:
             best, average = plan_knots(
-                objective, mean, std, low, high, horizon=settings.horizon, samples=settings.samples,
+                objective, mean, self.std, low, high, horizon=settings.horizon, samples=settings.samples,
                 elites=settings.elites, iterations=settings.iterations, generator=self.generator,
             )  # fmt: skip
             return average if self.averaged else best

@@ -87,13 +87,11 @@ steps:
   - name: a
     command: mkdir -p $output_dir/a && echo $word --output_dir=$output_dir/a > $output_dir/a/said
   - name: b
-    command: cp $output_dir/a/said $output_dir/b && true --output_dir=$output_dir
+    command: test -e $output_dir/b || cp -r $output_dir/a $output_dir/b; true --output_dir=$output_dir/b
 """
 
 
-def test_an_interrupted_repetition_leaves_no_old_step_finished(
-    study_file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_repetition_is_repeated(study_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     study_file.write_text(TWO)
     run_study(read(study_file))
 
@@ -105,8 +103,10 @@ def test_an_interrupted_repetition_leaves_no_old_step_finished(
         patched.setattr(shutil, "rmtree", interrupt)
         with pytest.raises(KeyboardInterrupt):
             run_study(changed, repeat=True)
-    run_study(changed)
-    assert (changed.folder / "b").read_text().startswith("two")
+    with pytest.raises(StudyError, match="finished with another command"):
+        run_study(changed)
+    run_study(changed, repeat=True)
+    assert (changed.folder / "b" / "said").read_text().startswith("two")
 
 
 def test_results_are_published_with_commit_machine_and_commands(study_file: Path) -> None:

@@ -40,7 +40,7 @@ def arguments(folder: Path, demonstrations: Path, *flags: str) -> list[str]:
     """Return those of the command, for an untrained policy."""
     policy = folder / "policy"
     if not policy.exists():
-        save_untrained_policy(policy, OBS_IMAGE, size=96, actions=2, constant=250.0, spread=10.0)
+        save_untrained_policy(policy, OBS_IMAGE, size=96, actions=2, constant=250.0)
     return [
         f"--policy.path={policy}", f"--dataset.root={demonstrations}", "--size=tiny", "--iterations=1",
         "--selection_episodes=2", "--eval_episodes=2", f"--output_dir={folder / 'improve'}", *flags,

@@ -204,6 +204,13 @@ def test_without_a_search_it_does_what_the_other_policy_does_in_imagination(conf
     torch.testing.assert_close(plan, torch.stack(actions, 1), atol=1e-4, rtol=0)
     assert not torch.allclose(plan[0], plan[1])
 
+    fine = torch.rand(2, 3, 64, 64)  # finer than the tokenizer's frames
+    planning.reset()
+    first = planning.predict_action_chunk({**seen, IMAGE: fine})[:, 0]
+    policy.reset()
+    batch = before({IMAGE: fine, "observation.state": seen["observation.state"], "task": seen["task"]})
+    torch.testing.assert_close(first, after(policy.select_action(batch)).clamp(low, high))
+
 
 def test_a_policy_that_looks_at_something_else_proposes_nothing(config, tmp_path):
     config.proposal_path = str(save_untrained_policy(tmp_path, camera="wrist", actions=7))

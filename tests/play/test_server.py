@@ -54,9 +54,11 @@ def picture(size: tuple[int, int] = (40, 30), kind: str = "PNG") -> bytes:
 
 
 def form(**fields: Any) -> aiohttp.FormData:
+    """A form with these fields; a list is several of one name."""
     data = aiohttp.FormData()
-    for name, value in fields.items():
-        data.add_field(name, value, **({"filename": f"{name}.png"} if isinstance(value, bytes) else {}))
+    for name, values in fields.items():
+        for value in values if isinstance(values, list) else [values]:
+            data.add_field(name, value, **({"filename": f"{name}.png"} if isinstance(value, bytes) else {}))
     return data
 
 
@@ -190,6 +192,7 @@ def test_a_message_that_cannot_be_is_refused_and_the_drive_goes_on(served, messa
             400,
             "sees the cameras third_view",
         ),
+        ("POST", "picture", {"data": {"third_view": [picture()] * 2, "state": STATE}}, 400, "one picture"),
         ("POST", "picture", {"data": {"third_view": b"no picture", "state": STATE}}, 400, "cannot be read"),
         ("POST", "picture", {"data": {"third_view": picture((5000, 2))}}, 400, "at most 4096"),
         ("POST", "picture", {"data": {"third_view": picture()[:-40], "state": STATE}}, 400, "picture"),

@@ -15,6 +15,7 @@ from lerobot.rewards.sarm.configuration_sarm import SARMConfig
 from transformers import ResNetConfig, ResNetModel
 
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
+from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig
 
 IMAGE = "observation.images.third_view"
 MEAN, STD = 0.4, 0.2
@@ -82,9 +83,10 @@ def test_a_classifier_on_the_hub_brings_its_preprocessor(config, classifier, hub
 
 
 def test_what_an_environment_cannot_show_is_refused(config, classifier, tmp_path):
-    other = replace(config, reward=SARMConfig(device="cpu"))
-    with pytest.raises(ValueError, match=r"^reward\.type=sarm: looks at frames of the future"):
-        other.create_tensor_env(1)
+    several = r"^reward\.type=\w+: looks at earlier or later frames"
+    for reward in (SARMConfig(device="cpu"), ActionWorldModelConfig(device="cpu")):
+        with pytest.raises(ValueError, match=several):
+            replace(config, reward=reward).create_tensor_env(1)
     text = (classifier / "config.json").read_text().replace("third_view", "top")
     elsewhere = tmp_path / "trained"
     elsewhere.mkdir()

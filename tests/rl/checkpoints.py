@@ -18,12 +18,10 @@ def save_untrained_policy(
     size: int | tuple[int, int] = 32,
     actions: int = 3,
     constant: float | Sequence[float] | None = None,
-    spread: float = 0.0,
 ) -> Path:
     """A policy that sees one camera, with its processors.
 
-    With `constant` all its actions are that one, or have that number in every component, give or take about
-    `spread`.
+    With `constant` all its actions are that one, or have that number in every component.
     """
     image = PolicyFeature(
         type=FeatureType.VISUAL, shape=(3, *((size, size) if isinstance(size, int) else size))
@@ -35,7 +33,7 @@ def save_untrained_policy(
         output_features={"action": action},
     )
     CnnPolicy(config).save_pretrained(folder)
-    mean, std = (0.0, 1.0) if constant is None else (constant, spread)
+    mean, std = (0.0, 1.0) if constant is None else (constant, 0.0)
     means = torch.as_tensor(mean, dtype=torch.float32).expand(actions)
     stats = {"action": {"mean": means, "std": torch.full((actions,), std)}}
     for processor in make_pre_post_processors(config, dataset_stats=stats):

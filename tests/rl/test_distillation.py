@@ -273,6 +273,26 @@ def test_policies_of_several_observations_learn_from_as_many(
     assert any(not torch.equal(before[name], value) for name, value in weights(output_dir).items())
 
 
+def test_what_hardly_varied_where_the_policy_was_trained_is_left_as_it_is(
+    imagined: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its normalisation would make errors in it outweigh all others."""
+    stuck, output_dir = save_untrained_policy(tmp_path / "policy", actions=7, constant=0.01), tmp_path / "rl"
+    flags = [f"--policy.path={stuck}", *FAST, *imagined, f"--output_dir={output_dir}"]
+    with pytest.raises(SystemExit):
+        train(monkeypatch, *(flag.replace("recorded=false", "recorded=true") for flag in flags))
+    assert (
+        "x varies in the recorded episodes, and hardly where the policy was trained"
+        in capsys.readouterr().err
+    )
+    train(monkeypatch, *flags)
+    labels = Labels(output_dir / "labels", 0)
+    labels.load(3)
+    for part in labels.imagined:
+        actions = part.actions["action"]
+        torch.testing.assert_close(actions, torch.full_like(actions, 0.01), atol=1e-3, rtol=0)
+
+
 def test_without_a_success_there_is_nothing_to_learn_from(
     imagined: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -109,6 +110,11 @@ def test_rounds_build_on_one_another(
         ("000003", 2, 900_000, 0.0), ("000003", 3, 900_002, 0.4),
         ("000006", 2, 900_005, 0.0), ("000006", 3, 900_007, 0.4),
     ]  # fmt: skip
+    starts = {
+        replace(rounds, seed=seed).start(number, half)
+        for seed in (0, 100_000, 200_000) for number in (0, 1) for half in (0, 1)
+    }  # fmt: skip
+    assert len(starts) == 3 * 4, "runs with other seeds record other starts"
     last = folder / "action_world_model" / "checkpoints" / "last" / "pretrained_model"
     settings = json.loads((last / "train_config.json").read_text())
     assert settings["model"]["pretrained_path"].startswith(str(tmp_path / "dyna" / "000003"))

@@ -68,22 +68,28 @@ def test_positive_advantage_raises_the_log_prob_of_what_was_done(
 def test_a_step_that_is_much_too_long_is_undone_and_the_next_are_shorter(
     make_policy: MakePolicy, pipeline: Pipeline
 ) -> None:
-    policy = make_policy()
-    algorithm, buffer = one_rollout(policy, pipeline, policy_lr=1.0, value_iterations=0)
-    began = [parameter.detach().clone() for parameter in algorithm.policy_parameters]
-    batch = read_batch(buffer, torch.arange(192), pipeline)
-    undone = 0
-    for _ in range(12):
-        rate = algorithm.policy_group["lr"]
-        algorithm.update(iter(Minibatches(buffer, buffer.decided, pipeline, PPOConfig(epochs=1))))
-        undone += algorithm.policy_group["lr"] < rate
-        moved = algorithm.losses(batch)[1]["kl"].mean().item()
-        assert moved <= 10 * algorithm.config.target_kl + 1e-6
-    assert undone
-    algorithm.policy_group["lr"] = 1e-3
-    algorithm.update(iter(Minibatches(buffer, buffer.decided, pipeline, PPOConfig(epochs=1))))
-    assert algorithm.policy_group["lr"] == pytest.approx(1.1e-3), "a while later they are longer again"
-    assert any(not torch.equal(a, b) for a, b in zip(algorithm.policy_parameters, began, strict=True))
+    """Between two minibatches, and after the last one."""
+    for size in (48, 192):
+        algorithm, buffer = one_rollout(make_policy(), pipeline, policy_lr=1.0)
+        minibatches = Minibatches(buffer, buffer.decided, pipeline, PPOConfig(epochs=1, minibatch_size=size))
+        before = [parameter.detach().clone() for parameter in algorithm.policy_parameters]
+        algorithm.update(iter(minibatches))
+        assert all(torch.equal(a, b) for a, b in zip(algorithm.policy_parameters, before, strict=True))
+        shortened = algorithm.policy_group["lr"]
+        assert 0.1 <= shortened < 1
+        algorithm.policy_group["lr"] = 1e-4
+        algorithm.update(iter(minibatches))
+        assert algorithm.policy_group["lr"] == pytest.approx(1.1e-4), "shorter for a while alone"
+        assert not any(torch.equal(a, b) for a, b in zip(algorithm.policy_parameters, before, strict=True))
+
+
+def test_the_learning_rate_does_not_rise_where_the_target_kl_ends_an_iteration(
+    make_policy: MakePolicy, pipeline: Pipeline
+) -> None:
+    algorithm, buffer = one_rollout(make_policy(), pipeline, policy_lr=5e-3, minibatch_size=32, epochs=9)
+    algorithm.policy_group["lr"] = 2e-3
+    update(algorithm, buffer, pipeline)
+    assert algorithm.policy_group["lr"] == 2e-3
 
 
 def test_the_objective_stops_paying_outside_the_clip() -> None:
