@@ -295,7 +295,7 @@ def test_rl_is_measured_four_times_at_most(
 
 @pytest.mark.parametrize(("kind", "names"), [
     (CnnConfig, [SFT, PPO, DISTILLED]),
-    (ACTConfig, [SFT, PPO]),
+    (ACTConfig, [SFT, FITTED]),
     (VQBeTConfig, [SFT, FITTED]),
 ])  # fmt: skip
 def test_only_policies_for_which_it_was_measured_are_fitted_to_a_planner_after_ppo(

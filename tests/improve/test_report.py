@@ -111,7 +111,7 @@ def test_failures_among_the_rollouts_count(finished: Improvement, monkeypatch: p
     for failures, lacking in ((3, True), (20, False)):
         table = SimpleNamespace(success=np.arange(60) < 60 - failures, among=lambda episodes: None)
         monkeypatch.setattr(table, "subset", lambda among, table=table: table, raising=False)
-        monkeypatch.setattr(Improvement, "table", lambda improvement, table=table: table)
+        monkeypatch.setattr(Improvement, "table", property(lambda improvement, table=table: table))
         page = text_of(finished)
         assert f"20 rollouts of the {SFT} in pusht, exploration 0.2: {20 - failures} succeed" in page
         said = verdict(finished, [compared(finished)])
@@ -193,7 +193,7 @@ def test_another_round_begins_from_the_policy_to_use_on_all_episodes(
     write_records(finished)
     table = SimpleNamespace(success=np.arange(60) < 40, among=lambda episodes: None)
     monkeypatch.setattr(table, "subset", lambda among: table, raising=False)
-    monkeypatch.setattr(Improvement, "table", lambda improvement: table)
+    monkeypatch.setattr(Improvement, "table", property(lambda improvement: table))
     page = text_of(finished)
     assert "<p>This records as many rollouts of the policy to use" in page
     assert html.escape(command).replace("&#x27;", "&#39;") in page

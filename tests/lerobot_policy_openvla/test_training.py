@@ -191,7 +191,7 @@ def test_adapters_are_improved_in_the_world_model(
         monkeypatch, tuned, tmp_path, f"--env.world_model_path={trained_models['action_world_model']}",
         "--env.reward.type=general", "--env.reward.alpha=1", f"--env.dataset.root={small_dataset.root}",
         "--env.episode_length=3", "--iterations=2", f"--algorithm.ratio={ratio}", "--gate.action=off",
-        env="world_model",
+        "--algorithm.target_kl=1", env="world_model",
     )  # fmt: skip
     lines = read_metrics(tmp_path)
     assert lines[1]["first_ratio_error"] < 1e-3
