@@ -37,6 +37,10 @@ class Stopped(ValueError):
     """A command ends before its work is done, by a rule of its own; what it has made so far is whole."""
 
 
+class TrainingStopped(Stopped):
+    """Reinforcement learning or distillation cannot go on; the last checkpoint is good."""
+
+
 def first_line(error: BaseException) -> str:
     """Return the first line of an error's message, or its kind if it has none."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0]

@@ -21,11 +21,10 @@ from lerobot_wmrl.common.distributed import (
     mean_over_processes,
     rank_and_size,
 )
-from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.errors import FieldError, TrainingStopped
 from lerobot_wmrl.common.pipeline import Pipeline
 from lerobot_wmrl.common.policies import load_trained_weights
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
-from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
 from lerobot_wmrl.rl.labels import Labels, Windows, imagined_labels, recorded_successes
 from lerobot_wmrl.rl.observations import as_read_back

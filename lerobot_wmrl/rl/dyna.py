@@ -13,12 +13,12 @@ from typing import Final
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 
 from lerobot_wmrl.common.constants import DYNA, EVALUATION_SEED
+from lerobot_wmrl.common.errors import TrainingStopped
 from lerobot_wmrl.common.presets import Flags, format_flags
 from lerobot_wmrl.common.processes import run_subcommand
 from lerobot_wmrl.data.budget import budget_flags
 from lerobot_wmrl.data.dataset import DatasetSource, open_dataset
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
-from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.callbacks import REAL_STEPS, Record, record_folder
 from lerobot_wmrl.rl.configuration_callbacks import DYNA_SEEDS, DynaConfig
 from lerobot_wmrl.rl.recorders import Recorder

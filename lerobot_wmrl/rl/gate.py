@@ -15,12 +15,12 @@ import numpy as np
 from termcolor import colored
 
 from lerobot_wmrl.common.constants import GATE_SEED
+from lerobot_wmrl.common.errors import TrainingStopped
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.evaluation.gate import Gate, Outcomes, gate_at, labelled_recording, predict_outcomes
 from lerobot_wmrl.evaluation.pictures import save_strip, side_by_side
 from lerobot_wmrl.evaluation.replay import Recording, replay_episodes
-from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.callbacks import REAL_STEPS, Record
 from lerobot_wmrl.rl.configuration_callbacks import GateConfig
 from lerobot_wmrl.rl.recorders import Recorder

@@ -5,7 +5,8 @@ from torch import Tensor, nn
 
 from lerobot_wmrl.common.distributed import mean_over_processes
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
-from lerobot_wmrl.rl.policy_gradient import POLICY, Batch, PolicyGradient
+from lerobot_wmrl.rl.minibatches import Batch
+from lerobot_wmrl.rl.policy_gradient import POLICY, PolicyGradient
 from lerobot_wmrl.rl.rollout import RolloutBuffer
 
 

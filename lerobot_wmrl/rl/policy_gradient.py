@@ -1,37 +1,52 @@
-"""What PPO and GRPO share: minibatches, the clipped objective, the KL penalty and the update.
+"""What PPO and GRPO share: policy and reference, the optimiser, the update and reasons to stop.
 
-T time, B environments or decisions, K action components, J ratios of a decision. In several processes each
-one cuts minibatches from its own rollout, and gradients and metrics are averaged over all of them.
+T time, B environments or decisions, K action components, J ratios of a decision. In several processes
+gradients and metrics are averaged over all of them.
 """
 
+import copy
 import logging
 import math
 import time
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium as gym
 import torch
 import torch.nn.functional as F
+from lerobot.rl.algorithms.base import RLAlgorithm
 from lerobot.rl.algorithms.configs import TrainingStats
 from torch import Tensor, nn
+from torch.optim import AdamW, Optimizer
 from tqdm import tqdm
 
 from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.distributed import (
     average_gradients,
-    gather_counts,
     hidden_progress,
     largest_over_processes,
     mean_and_variance,
     mean_over_processes,
 )
+from lerobot_wmrl.common.errors import FieldError, TrainingStopped, within
 from lerobot_wmrl.common.pipeline import Pipeline, unchanged
-from lerobot_wmrl.rl.algorithm import NORM, RATIO_ERROR, Algorithm, training_stats
+from lerobot_wmrl.common.policies import load_trained_weights, unwrapped
+from lerobot_wmrl.common.precision import require_exact_updates
 from lerobot_wmrl.rl.configuration_algorithms import PolicyGradientConfig
+from lerobot_wmrl.rl.minibatches import Batch, Minibatch, Minibatches, read_batch
+from lerobot_wmrl.rl.objective import (
+    clipped_objective,
+    kl_estimate,
+    log_ratios,
+    outside_clip,
+    reference_penalty,
+    steps_of,
+)
 from lerobot_wmrl.rl.observations import as_read_back
+from lerobot_wmrl.rl.policy_adapters import as_stochastic
+from lerobot_wmrl.rl.protocol import EncodingPolicy
 from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
 
 GRAD_CLIP_NORM = 1.0
@@ -50,121 +65,121 @@ POLICY = "policy"
 """The parameter group of the policy."""
 
 REFERENCE, EXECUTED = "reference_log_prob", "executed"
-
-Batch = dict[str, Any]
-"""B decisions: `observation`, `raw_action`, `log_prob` and the buffer's columns."""
+RATIO_ERROR, LOSS, NORM = "ratio_error", "_loss", "_grad_norm"
 
 
-def log_ratios(log_prob_change: Tensor, kind: str) -> Tensor:
-    """Return log-ratios of whole actions (B, 1) or of each token (B, K) from the components' (B, K)."""
-    return log_prob_change if kind == "token" else log_prob_change.sum(dim=1, keepdim=True)
-
-
-def clipped_objective(log_ratio: Tensor, advantage: Tensor, low: float, high: float) -> Tensor:
-    """Return −min(r A, clip(r, 1 − low, 1 + high) A), r = exp(log_ratio) (Schulman et al. 2017, eq. 7).
-
-    (B, J), (B,) → (B, J)
-    """
-    ratio, advantage = log_ratio.exp(), advantage[:, None]
-    return -torch.minimum(ratio * advantage, ratio.clamp(1 - low, 1 + high) * advantage)
-
-
-def outside_clip(log_ratio: Tensor, low: float, high: float) -> Tensor:
-    """Return 1 where a ratio has left the interval in which it may move. (B, J) → (B, J)"""
-    ratio = log_ratio.exp()
-    return ((ratio < 1 - low) | (ratio > 1 + high)).to(ratio.dtype)
-
-
-def kl_estimate(log_prob: Tensor, other: Tensor) -> Tensor:
-    """Estimate KL(p ‖ q) on samples of p by r − 1 − log r, r = q / p (Schulman 2020). (B, K), (B, K) → (B,)
-
-    `log_prob` is log p of each component, `other` is log q.
-    """
-    log_ratio = (other - log_prob).sum(dim=1)
-    return log_ratio.exp() - 1 - log_ratio
-
-
-def reference_penalty(log_prob: Tensor, reference: Tensor) -> Tensor:
-    """Return ½ Σ (log π − log π_ref)² over the components. (B, K), (B, K) → (B,)
-
-    Its mean gradient on π's samples is that of KL(π ‖ π_ref) for independent components; per token it ignores
-    what a token does to later ones.
-    """
-    return 0.5 * (log_prob - reference).square().sum(dim=1)
-
-
-def steps_of(executed: Tensor) -> Tensor:
-    """Return how many steps of a decision's actions were executed, at least 1. (B, n, 1) or (B, 1) → (B,)"""
-    return executed.flatten(1).sum(dim=1).clamp_min(1)
-
-
-def read_batch(rollout: RolloutBuffer, rows: Tensor, pipeline: Pipeline) -> Batch:
-    """Return the decisions of flat rows t · B + b (N,), which are on the CPU."""
-    on_device = rows.to(rollout.device)
-    stored = {"raw_action": rollout.raw_action, "log_prob": rollout.log_prob, **rollout.columns}
-    taken = {name: values.flatten(0, 1)[on_device] for name, values in stored.items()}
-    return {"observation": pipeline.prepare(rollout.observations.read(rows)), **taken}
-
-
-class Minibatch(NamedTuple):
-    """Decisions of one optimiser step.
-
-    Args:
-        size: their number, averaged over the processes.
-        parts: what they are cut into for micro-batches: rows of the rollout.
-        read: returns the batch of such rows, and how many of its decisions count: the first ones.
-    """
-
-    size: float
-    parts: Sequence[Tensor]
-    read: Callable[[Tensor], tuple[int, Batch]]
-
-    def micro_batches(self) -> Iterator[tuple[int, Batch]]:
-        """Read one part after another."""
-        return map(self.read, self.parts)
-
-
-class Minibatches:
-    """Every chosen decision of a rollout once an epoch, in random order.
-
-    All processes get the same number of minibatches and micro-batches, even if they have chosen different
-    numbers of decisions, because they average gradients and may share a large model.
-    """
-
-    def __init__(
-        self, rollout: RolloutBuffer, chosen: Tensor, pipeline: Pipeline, config: PolicyGradientConfig
-    ) -> None:
-        self.rollout, self.pipeline, self.config = rollout, pipeline, config
-        self.rows = chosen.flatten().nonzero()[:, 0].cpu()  # (T, B) bool → (N,)
-        self.counts = gather_counts(len(self.rows), rollout.device)
-
-    def __len__(self) -> int:
-        return self.config.epochs * math.ceil(max(self.counts) / self.config.minibatch_size)
-
-    def __iter__(self) -> Iterator[Minibatch]:
-        size = self.config.minibatch_size
-        for _ in range(self.config.epochs if max(self.counts) else 0):
-            order = self.rows[torch.randperm(len(self.rows))]
-            for first in range(0, max(self.counts), size):
-                sizes = [min(max(count - first, 0), size) for count in self.counts]
-                micro_batches = math.ceil(max(sizes) / (self.config.micro_batch_size or size))
-                cut = order[first : first + size].tensor_split(micro_batches)
-                yield Minibatch(sum(sizes) / len(sizes), cut, self._read)
-
-    def _read(self, rows: Tensor) -> tuple[int, Batch]:
-        """Return the number of rows and their batch. A process without rows left still runs the policy, on
-        one row that does not count."""
-        return len(rows), read_batch(self.rollout, rows if len(rows) else rows.new_zeros(1), self.pipeline)
-
-
-class PolicyGradient(Algorithm):
+class PolicyGradient(RLAlgorithm):
     """Ascent on a clipped objective, with a KL penalty towards the SFT policy, the frozen `reference`.
 
     An iteration is `rollout.collect`, `prepare`, then `update`. Subclasses say what the advantages
     are (`add_targets`) and what else is in the loss (`losses`).
+
+    Args:
+        policy: LeRobot's policy, trained in place and kept as `lerobot_policy`. `self.policy` is a
+            StochasticPolicy: the same object, or an adapter around it. `self.reference` is a copy of
+            `self.policy` before training, the SFT policy.
+        config: the algorithm's configuration.
     """
 
     config: PolicyGradientConfig
+    iteration: int
+    """Rollouts that were trained on."""
+
+    def __init__(self, policy: Any, config: PolicyGradientConfig) -> None:
+        self.lerobot_policy, self.policy = policy, as_stochastic(policy)
+        self.config, self.iteration = config, 0
+        if config.initial_std is not None:
+            if not hasattr(self.policy, "set_std"):
+                raise FieldError(
+                    "algorithm.initial_std", config.initial_std,
+                    "this policy has no standard deviation", "set it to null",
+                )  # fmt: skip
+            if self.policy is policy and unwrapped(policy) is not policy:
+                raise FieldError(
+                    "algorithm.initial_std", config.initial_std,
+                    "is none of the adapters' parameters, which checkpoints hold alone",
+                    "set it to null, or train without adapters",
+                )  # fmt: skip
+            with within("algorithm"):
+                self.policy.set_std(config.initial_std)
+        if not config.train_encoder:
+            if not isinstance(unwrapped(self.policy), EncodingPolicy):
+                raise FieldError(
+                    "algorithm.train_encoder", config.train_encoder,
+                    "this policy has no encoder that can be kept", "set it to true, or take the policy cnn",
+                )  # fmt: skip
+            self.policy.freeze_encoder()
+        self.policy.eval()
+        self.reference = frozen_copy(self.policy)
+        self.value_parameters = list(self.policy.value_parameters())
+        owned = {id(parameter) for parameter in self.value_parameters}
+        self.policy_parameters = [
+            p for p in self.policy.parameters() if p.requires_grad and id(p) not in owned
+        ]
+        if not (config.train_encoder or self.policy_parameters):
+            raise FieldError(
+                "algorithm.train_encoder", config.train_encoder,
+                "leaves nothing of the policy to train: its adapters are all in the encoder",
+                "set it to true, or give adapters to other layers (`peft.target_modules`)",
+            )  # fmt: skip
+        require_exact_updates(self.policy_parameters)
+        self.optimizer = self.make_optimizers_and_scheduler()[self.name]
+
+    @property
+    def group_size(self) -> int:
+        """Neighbouring environments that start from the same state."""
+        return 1
+
+    @abstractmethod
+    def parameter_groups(self) -> dict[str, tuple[list[nn.Parameter], float]]:
+        """Return parameters and learning rates by name."""
+
+    def make_optimizers_and_scheduler(self) -> dict[str, Optimizer]:
+        """Return AdamW with a constant rate for each parameter group."""
+        groups = [{"params": params, "lr": rate} for params, rate in self.parameter_groups().values()]
+        return {self.name: AdamW(groups, weight_decay=0.0)}
+
+    def get_optimizers(self) -> dict[str, Optimizer]:
+        """Return the optimiser in use, with its moments; `make_optimizers_and_scheduler` makes a new one."""
+        return {self.name: self.optimizer}
+
+    def load_weights(self, weights: dict[str, Any], device: str | torch.device = "cpu") -> None:
+        """Load a checkpoint's weights into `lerobot_policy`. Reference and adapter stay as they are."""
+        load_trained_weights(self.lerobot_policy, weights)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the tensors that the policy's own checkpoint lacks: its adapter's. Subclasses add theirs."""
+        added = {} if self.policy is self.lerobot_policy else self.policy.own_tensors()
+        return {f"adapter.{name}": value for name, value in added.items()}
+
+    @torch.no_grad()
+    def load_state_dict(self, state_dict: dict[str, Tensor], device: str | torch.device = "cpu") -> None:
+        """Copy the tensors of `state_dict` into this algorithm's own."""
+        own = self.state_dict()
+        if state_dict.keys() != own.keys():
+            raise ValueError(
+                f"algorithm.type={self.name}: its tensors are {sorted(own)}, got {sorted(state_dict)}"
+            )
+        for name, value in own.items():
+            value.copy_(state_dict[name])
+
+    def check_finite(self, record: dict[str, float]) -> None:
+        """Raise TrainingStopped if a logged number is not finite."""
+        broken = [name for name, value in record.items() if not math.isfinite(value)]
+        if broken:
+            raise TrainingStopped(
+                f"iteration {self.iteration + 1}: {', '.join(broken)} is not finite; the last checkpoint is "
+                "kept: lower `algorithm.policy_lr`, or `algorithm.value_lr` of PPO"
+            )
+
+    def check_reference_kl(self, kl: float) -> None:
+        """Raise TrainingStopped if the policy is further from the SFT policy than `max_reference_kl`."""
+        if kl > self.config.max_reference_kl:
+            raise TrainingStopped(
+                f"iteration {self.iteration + 1}: the policy is {kl:.1f} nats a step from the "
+                f"SFT policy, above `algorithm.max_reference_kl` ({self.config.max_reference_kl}); raise "
+                "`algorithm.reference_coefficient` or lower `algorithm.policy_lr`"
+            )
 
     def trained_groups(self) -> list[str]:
         """Return the names of the parameter groups that this iteration trains."""
@@ -225,21 +240,18 @@ class PolicyGradient(Algorithm):
 
     @torch.no_grad()
     def add_reference(self, rollout: RolloutBuffer, pipeline: Pipeline) -> float:
-        """Add the reference's log-probabilities of the actions, and which actions of chunks were executed.
+        """Add the reference's log-probabilities of the actions, and which actions were executed.
         Return the mean KL of the policy to the reference."""
         reference = torch.zeros_like(rollout.log_prob)  # (T, B, K) or (T, B, n, K)
-        executed = rollout.executed()
-        if executed is not None:
-            rollout.columns[EXECUTED] = executed
+        rollout.columns[EXECUTED] = executed = rollout.executed()
         size = self.config.micro_batch_size or self.config.minibatch_size
         for rows in rollout.decided.flatten().nonzero()[:, 0].cpu().split(size):
             batch = read_batch(rollout, rows, pipeline)
             log_prob = self.reference.evaluate(batch["observation"], batch["raw_action"])[0]
             reference.flatten(0, 1)[rows.to(reference.device)] = log_prob
         rollout.columns[REFERENCE] = reference
-        counted = torch.ones_like(rollout.log_prob[..., :1]) if executed is None else executed
-        flat = [(each * counted).flatten(0, 1).flatten(1) for each in (rollout.log_prob, reference)]
-        kl = kl_estimate(*flat) / steps_of(counted.flatten(0, 1))  # (T · B, K) each → (T · B,)
+        flat = [(each * executed).flatten(0, 1).flatten(1) for each in (rollout.log_prob, reference)]
+        kl = kl_estimate(*flat) / steps_of(executed.flatten(0, 1))  # (T · B, K) each → (T · B,)
         return mean_and_variance(kl[rollout.decided.flatten()])[0].item()
 
     def update(self, batch_iterator: Iterator[Minibatch]) -> TrainingStats:
@@ -321,8 +333,8 @@ class PolicyGradient(Algorithm):
         after it, it is approximate.
         """
         log_prob, entropy, value = self.policy.evaluate(batch["observation"], batch["raw_action"])
-        # (B, n, 1). Not executed: ratio 1 and no gradient, but counted in the mean over ratios.
-        executed = batch.get(EXECUTED, torch.ones_like(log_prob[..., :1]))
+        # (B, 1) or (B, n, 1). Not executed: ratio 1 and no gradient, but counted in the mean over ratios.
+        executed = batch[EXECUTED]
         steps = steps_of(executed)
         now, old, reference = (
             (each * executed).flatten(1) for each in (log_prob, batch["log_prob"], batch[REFERENCE])
@@ -357,3 +369,22 @@ class PolicyGradient(Algorithm):
         self.optimizer.step()
         self.optimization_step += 1
         return norms
+
+
+def frozen_copy(policy: Any) -> Any:
+    """Return a copy that is not trained. It shares the parameters that the policy does not train either, such
+    as a large network under LoRA's adapters."""
+    frozen = {id(each): each for each in policy.parameters() if not each.requires_grad}
+    return copy.deepcopy(policy, frozen).requires_grad_(False)
+
+
+def training_stats(records: list[dict[str, float]], updates: int) -> TrainingStats:
+    """Return each metric's mean over minibatches, and the first minibatch's ratio error, which is 0 up to
+    rounding if `sample` and `evaluate` agree."""
+    names = dict.fromkeys(name for record in records for name in record)
+    seen = {name: [record[name] for record in records if name in record] for name in names}
+    mean = {name: sum(values) / len(values) for name, values in seen.items()}
+    losses = {name: mean.pop(name) for name in names if name.endswith(LOSS)}
+    norms = {name.removesuffix(NORM): mean.pop(name) for name in names if name.endswith(NORM)}
+    first = {"first_ratio_error": records[0][RATIO_ERROR]} if records else {}
+    return TrainingStats(losses, norms, extra={**mean, **first, "updates": float(updates)})

@@ -9,7 +9,8 @@ from torch import Tensor, nn
 from lerobot_wmrl.common.distributed import mean_and_variance
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
-from lerobot_wmrl.rl.policy_gradient import POLICY, Batch, PolicyGradient
+from lerobot_wmrl.rl.minibatches import Batch
+from lerobot_wmrl.rl.policy_gradient import POLICY, PolicyGradient
 from lerobot_wmrl.rl.return_scale import ReturnScale
 from lerobot_wmrl.rl.rollout import RolloutBuffer
 

@@ -9,9 +9,9 @@ from tqdm import tqdm
 
 from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.distributed import hidden_progress, mean_over_processes
+from lerobot_wmrl.common.errors import TrainingStopped
 from lerobot_wmrl.common.pipeline import Pipeline
 from lerobot_wmrl.envs.tensor_env import NanActionError, TensorEnv
-from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.observations import ObservationBuffer, as_read_back, at_rows
 from lerobot_wmrl.rl.protocol import ActionSample, StochasticPolicy
 from lerobot_wmrl.rl.seeds import seeded_noise, start_seeds
@@ -108,10 +108,10 @@ class RolloutBuffer:
         ended = self.finished.long()
         return ended.cumsum(0) == ended
 
-    def executed(self) -> Tensor | None:
-        """Return which actions of each chunk were executed. (T, B, n, 1) bool; None without chunks"""
+    def executed(self) -> Tensor:
+        """Return which actions of each chunk were executed. (T, B, n, 1) bool; without chunks (T, B, 1)"""
         if self.raw_action.ndim < 4:
-            return None
+            return torch.ones_like(self.decided)[..., None]
         length = torch.ones_like(self.age)  # (T, B), steps until the next decision or the rollout's end
         for step in reversed(range(self.steps - 1)):
             length[step] += torch.where(self.decided[step + 1], 0, length[step + 1])

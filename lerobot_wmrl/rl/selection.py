@@ -6,9 +6,9 @@ from pathlib import Path
 
 from lerobot_wmrl.common.checkpoints import BEST_CHECKPOINT_LINK, checkpoint_dir, link_checkpoint
 from lerobot_wmrl.common.distributed import is_first_process
+from lerobot_wmrl.common.errors import TrainingStopped
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.evaluation.agreement import Evaluated
-from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.callbacks import REAL_STEPS, Record
 
 REAL, IMAGINED = "real", "imagined"

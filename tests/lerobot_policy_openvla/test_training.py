@@ -32,7 +32,7 @@ from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.improve.configuration_improve import ImproveConfig
 from lerobot_wmrl.improve.findings import look
 from lerobot_wmrl.improve.improvement import Improvement
-from lerobot_wmrl.rl.algorithm import frozen_copy
+from lerobot_wmrl.rl.policy_gradient import frozen_copy
 from lerobot_wmrl.scripts.convert_openvla import ConvertOpenVLAConfig, convert
 from lerobot_wmrl.scripts.train import main
 from tests.commands import run_here

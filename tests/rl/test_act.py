@@ -18,8 +18,8 @@ from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.evaluation.agreement import policy_outcomes
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
+from lerobot_wmrl.rl.minibatches import read_batch
 from lerobot_wmrl.rl.policy_adapters import INITIAL_STD, ActAdapter
-from lerobot_wmrl.rl.policy_gradient import read_batch
 from lerobot_wmrl.rl.ppo import PPO
 from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
 from lerobot_wmrl.rl.trainer import Schedule, train

@@ -5,7 +5,7 @@ import torch
 
 from lerobot_wmrl.common.pipeline import Pipeline
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
-from lerobot_wmrl.rl.policy_gradient import read_batch
+from lerobot_wmrl.rl.minibatches import read_batch
 from lerobot_wmrl.rl.ppo import PPO, generalised_advantages
 from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
 from tests.rl.chunk_policy import ChunkPolicy

@@ -11,11 +11,11 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from safetensors.torch import load_file
 
+from lerobot_wmrl.common.errors import TrainingStopped
 from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rl import dyna
-from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.callbacks import Callbacks
 from lerobot_wmrl.rl.configuration_callbacks import DynaConfig, NewRollouts
 from lerobot_wmrl.rl.dyna import DynaRounds, round_iterations

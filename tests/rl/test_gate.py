@@ -10,6 +10,7 @@ import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wmrl.common.constants import GATE_SEED
+from lerobot_wmrl.common.errors import TrainingStopped
 from lerobot_wmrl.common.lerobot_commands import env_flags
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.data.dataset import DatasetSource
@@ -18,7 +19,6 @@ from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelE
 from lerobot_wmrl.evaluation.gate import Gate, gate_at, labelled_recording, predict_outcomes
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rl import recorders
-from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.configuration_callbacks import GateConfig
 from lerobot_wmrl.rl.gate import SuccessGate
 from lerobot_wmrl.rl.recorders import ManiSkillRecorder

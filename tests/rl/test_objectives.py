@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from lerobot_wmrl.rl.policy_gradient import clipped_objective, kl_estimate, log_ratios, outside_clip
+from lerobot_wmrl.rl.objective import clipped_objective, kl_estimate, log_ratios, outside_clip
 from lerobot_wmrl.rl.ppo import generalised_advantages, value_loss
 
 STEPS, ENVS, PARTS = 23, 6, 4

@@ -10,9 +10,8 @@ import torch
 from torch import nn
 
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
-from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.errors import FieldError, TrainingStopped
 from lerobot_wmrl.common.pipeline import Pipeline
-from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.ppo import PPO
 from lerobot_wmrl.rl.rollout import RolloutBuffer, collect

@@ -9,17 +9,12 @@ import pytest
 import torch
 
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
+from lerobot_wmrl.common.errors import TrainingStopped
 from lerobot_wmrl.common.pipeline import Pipeline
 from lerobot_wmrl.rewards.general import default_discount
-from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
-from lerobot_wmrl.rl.policy_gradient import (
-    Minibatches,
-    clipped_objective,
-    kl_estimate,
-    read_batch,
-    reference_penalty,
-)
+from lerobot_wmrl.rl.minibatches import Minibatches, read_batch
+from lerobot_wmrl.rl.objective import clipped_objective, kl_estimate, reference_penalty
 from lerobot_wmrl.rl.ppo import PPO, generalised_advantages, normalised
 from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
 from tests.rl.learning import assert_it_learns, update

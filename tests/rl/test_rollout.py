@@ -11,8 +11,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_wmrl.common.pipeline import Pipeline
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
+from lerobot_wmrl.rl.minibatches import Minibatches, read_batch
 from lerobot_wmrl.rl.observations import ObservationBuffer
-from lerobot_wmrl.rl.policy_gradient import Minibatches, read_batch
 from lerobot_wmrl.rl.rollout import Actor, RolloutBuffer, collect
 from tests.read_backs import ReadBacks
 from tests.rl.chunk_policy import ChunkPolicy

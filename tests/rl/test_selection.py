@@ -9,11 +9,11 @@ import pytest
 from lerobot.envs.configs import EnvConfig, PushtEnv
 
 from lerobot_wmrl.common.constants import SELECTION_SEED
+from lerobot_wmrl.common.errors import TrainingStopped
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.evaluation.agreement import Evaluated
 from lerobot_wmrl.rl import make_callbacks
-from lerobot_wmrl.rl.algorithm import TrainingStopped
 from lerobot_wmrl.rl.callbacks import Record
 from lerobot_wmrl.rl.configuration_callbacks import CallbackSettings
 from lerobot_wmrl.rl.selection import Measure, Selection, best_iteration, diverged
