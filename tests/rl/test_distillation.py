@@ -41,6 +41,7 @@ from lerobot_wmrl.world_models.configuration_planner import PlannerSettings
 from lerobot_wmrl.world_models.planning import Planner
 from tests.rl.act_checkpoint import IMAGE, STATE, save_small_act
 from tests.rl.checkpoints import save_untrained_policy
+from tests.rl.small_smolvla import save_small_smolvlm, small_smolvla
 
 FAST = [
     "--algorithm.type=distillation", "--algorithm.planner.horizon=6", "--algorithm.planner.samples=4",
@@ -271,6 +272,28 @@ def test_policies_of_several_observations_learn_from_as_many(
     assert read_metrics(output_dir)[-1]["labels"] >= 3 * 4
     before = load_file(policy / "model.safetensors")
     assert any(not torch.equal(before[name], value) for name, value in weights(output_dir).items())
+
+
+def test_a_vla_with_action_chunks_learns_from_the_planner(
+    imagined: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """SmolVLA has a language model, whose weights stay as they are, and reads the task."""
+    features = {name: FEATURES[name] for name in ("device", "input_features", "output_features")}
+    made = small_smolvla(save_small_smolvlm(tmp_path / "smolvlm"), **features)
+    policy, output_dir = tmp_path / "policy", tmp_path / "rl"
+    made.save_pretrained(policy)
+    stats = {key: {"mean": torch.zeros(size), "std": torch.ones(size)} for key, size in (
+        (STATE, 8), (ACTION, 7)
+    )}  # fmt: skip
+    for processor in make_pre_post_processors(made.config, dataset_stats=stats):
+        processor.save_pretrained(policy)
+    flags = [*FAST, "--algorithm.recorded=true", *imagined, f"--output_dir={output_dir}"]
+    train(monkeypatch, f"--policy.path={policy}", *flags)
+    assert read_metrics(output_dir)[-1]["labels"] >= 3 * 4
+    before, after = load_file(policy / "model.safetensors"), weights(output_dir)
+    learnt = {name for name in before if not torch.equal(before[name], after[name])}
+    assert any(".lm_expert." in name for name in learnt)
+    assert not any(".vlm." in name for name in learnt)
 
 
 def test_what_hardly_varied_where_the_policy_was_trained_is_left_as_it_is(
