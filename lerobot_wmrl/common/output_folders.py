@@ -16,26 +16,49 @@ CONFIG_FILE: Final = "train_config.json"
 """The settings of a run, in its folder."""
 
 
-def claim_output_dir(output_dir: Path, config: Mapping[str, Any], free: Collection[str] = ()) -> None:
-    """Mark a new folder as this run's, or recognise it. Raises FieldError if it holds something else."""
-    require_free(output_dir, config, free)
-    if not (output_dir / CONFIG_FILE).is_file():
-        write_json(output_dir / CONFIG_FILE, dict(config))
+LOCK: Final = ".lock"
+"""The file that a command locks while it writes the folder."""
 
 
-def require_free(output_dir: Path, config: Mapping[str, Any], free: Collection[str] = ()) -> None:
+@contextmanager
+def claimed(
+    output_dir: Path, settings: Mapping[str, Any], free: Collection[str] = (), marker: str = CONFIG_FILE
+) -> Iterator[None]:
+    """Mark a new folder as this run's, or recognise it, and hold it against other commands.
+
+    Args:
+        output_dir: the folder.
+        settings: of the run, as JSON.
+        free: settings that may differ between the first call and its continuation.
+        marker: file of the settings.
+
+    Raises:
+        FieldError: it holds something else, or another command writes there.
+    """
+    require_free(output_dir, settings, free, marker)
+    output_dir.mkdir(parents=True, exist_ok=True)
+    with locked(output_dir, output_dir / LOCK):
+        require_free(output_dir, settings, free, marker)  # another command may have begun there meanwhile
+        if not (output_dir / marker).is_file():
+            write_json(output_dir / marker, dict(settings))
+        yield
+
+
+def require_free(
+    output_dir: Path, settings: Mapping[str, Any], free: Collection[str] = (), marker: str = CONFIG_FILE
+) -> None:
     """Raise FieldError unless the folder is new, empty or this run's; leave it as it is.
 
     `output_dir` (a run may be moved) and the settings called `free` may differ between the first call and its
     continuation.
     """
-    marker = output_dir / CONFIG_FILE
+    stored = output_dir / marker
     if output_dir.exists() and not output_dir.is_dir():
         raise FieldError("output_dir", output_dir, "is a file", "choose a new folder")
-    if marker.is_file():
-        require_same(output_dir, json.loads(marker.read_text()), config, {"output_dir", *free})
+    if stored.is_file():
+        require_same(output_dir, json.loads(stored.read_text()), settings, {"output_dir", *free})
     else:
-        require_empty(output_dir, CONFIG_FILE)
+        require_empty(output_dir, marker, LOCK)
 
 
 def require_empty(output_dir: Path, *own: str) -> None:

@@ -16,9 +16,8 @@ import shutil
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -31,12 +30,11 @@ from lerobot.configs import parser
 
 from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.files import write_json
-from lerobot_wmrl.common.output_folders import locked, require_empty, require_same
 from lerobot_wmrl.common.precision import keep_freed_memory
 from lerobot_wmrl.common.processes import die_with, find_program, not_installed, own_progress_lock
 
 MARKER = "settings.json"
-LOCK = ".lock"
+"""File of the settings that stages are made from, in their folder."""
 
 FAILED = "failed"
 """In the record of an optional stage that failed: the last line of its output."""
@@ -94,25 +92,6 @@ def run_stage_command[Config: RunConfig](
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
         sys.exit("\nstopped: run the same command again to continue where it stopped")
-
-
-@contextmanager
-def claimed(output_dir: Path, settings: Mapping[str, Any]) -> Iterator[None]:
-    """Hold a folder for stages that are made from `settings` (name → text or number).
-
-    Raises:
-        FieldError: the folder holds other things, was claimed with other settings, or is in use.
-    """
-    marker = output_dir / MARKER
-    if not marker.exists():
-        require_empty(output_dir, MARKER, LOCK)
-        output_dir.mkdir(parents=True, exist_ok=True)
-    with locked(output_dir, output_dir / LOCK):
-        if marker.exists():
-            require_same(output_dir, json.loads(marker.read_text()), settings)
-        else:
-            write_json(marker, dict(settings))
-        yield
 
 
 def run_stages(

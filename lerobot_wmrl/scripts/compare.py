@@ -25,7 +25,7 @@ from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
 from lerobot_wmrl.common.files import write_json, writing
-from lerobot_wmrl.common.output_folders import claim_output_dir, require_free
+from lerobot_wmrl.common.output_folders import claimed, require_free
 
 if TYPE_CHECKING:
     from lerobot.configs import PreTrainedConfig
@@ -136,8 +136,8 @@ def run(cfg: CompareConfig, comparison: "Comparison", configs: "dict[str, PreTra
     ):
         require_new_starts(envs[0], cfg.env, cfg.n_episodes)
         policies = load_policies(configs)
-        claim_output_dir(cfg.output_dir, settings, may_differ(cfg))
-        run_comparison(comparison, envs, cfg.env, policies, cfg.batch_size, cfg.seed, save)
+        with claimed(cfg.output_dir, settings, may_differ(cfg)):
+            run_comparison(comparison, envs, cfg.env, policies, cfg.batch_size, cfg.seed, save)
 
 
 def main() -> None:

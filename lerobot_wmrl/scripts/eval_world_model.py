@@ -26,12 +26,14 @@ from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least
-from lerobot_wmrl.common.output_folders import claim_output_dir
+from lerobot_wmrl.common.output_folders import claimed
 from lerobot_wmrl.common.presets import expand_preset
 from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from lerobot_wmrl.data.episodes import EpisodeTable
     from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
     from lerobot_wmrl.evaluation.agreement import Agreement
@@ -118,14 +120,10 @@ class EvalWorldModelConfig(RunConfig):
 
 
 def eval_world_model(cfg: EvalWorldModelConfig) -> None:
-    """Replay, measure, and write metrics.json, metrics.md and the pictures."""
+    """Check that all fits, then measure."""
     from lerobot_wmrl.common.constants import START_SCENE
-    from lerobot_wmrl.common.files import write_json, write_text
     from lerobot_wmrl.common.hub import check_login
     from lerobot_wmrl.data.episodes import choose_episodes, read_episodes
-    from lerobot_wmrl.evaluation.reconstruction import reconstruction_metrics
-    from lerobot_wmrl.evaluation.replay import Recording
-    from lerobot_wmrl.evaluation.report import evaluate, report_action_model, report_agreement
     from lerobot_wmrl.maniskill.recordings import scene_splits
     from lerobot_wmrl.world_models.checkpoint import check_dataset, load_model
 
@@ -142,7 +140,24 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     scenes = scene_splits(table.column(START_SCENE), cfg.split)
     chosen = table.among(cfg.dataset.episodes)
     episodes = choose_episodes(table, cfg.split, cfg.max_episodes, scenes, chosen)
-    claim_output_dir(cfg.output_dir, draccus.encode(cfg))
+    with claimed(cfg.output_dir, draccus.encode(cfg)):
+        measure(cfg, model, text_model, table, episodes, imagination)
+
+
+def measure(
+    cfg: EvalWorldModelConfig,
+    model: "ActionWorldModelRewardModel",
+    text_model: "TextWorldModelRewardModel | None",
+    table: "EpisodeTable",
+    episodes: "np.ndarray",
+    imagination: "WorldModelEnv | None",
+) -> None:
+    """Replay episodes, evaluate policies in imagination, write metrics.json, metrics.md and pictures."""
+    from lerobot_wmrl.common.files import write_json, write_text
+    from lerobot_wmrl.evaluation.reconstruction import reconstruction_metrics
+    from lerobot_wmrl.evaluation.replay import Recording
+    from lerobot_wmrl.evaluation.report import evaluate, report_action_model, report_agreement
+
     recording = Recording.read(table, model)
     evaluation = evaluate(model, recording, episodes, cfg.episode_length)
     reports = [

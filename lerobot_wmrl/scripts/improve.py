@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 
 def improve(cfg: ImproveConfig) -> None:
     """Run every stage, write the report, and say what came of it."""
-    from lerobot_wmrl.common.stages import claimed, run_stages
+    from lerobot_wmrl.common.output_folders import claimed
+    from lerobot_wmrl.common.stages import MARKER, run_stages
     from lerobot_wmrl.data.dataset import fingerprint
     from lerobot_wmrl.improve import commands
     from lerobot_wmrl.improve.report.page import Page
@@ -39,7 +40,7 @@ def improve(cfg: ImproveConfig) -> None:
     print(f"{cfg.dataset.name}:\n{improvement.found}\n  {improvement.duration}")
     stages = commands.stages(improvement)
     given = {**settings(cfg, stages), "the dataset's content": fingerprint(improvement.found.root)}
-    with claimed(cfg.output_dir, given):
+    with claimed(cfg.output_dir, given, marker=MARKER):
         improvement.copy_policy()
         run_stages(stages, cfg.output_dir)
         page = Page.of(improvement)

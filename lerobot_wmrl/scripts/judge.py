@@ -36,7 +36,7 @@ from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.errors import FieldError, Stopped, regrouped, renamed, require_at_least
 from lerobot_wmrl.common.files import write_json, writing
-from lerobot_wmrl.common.output_folders import claim_output_dir, require_free
+from lerobot_wmrl.common.output_folders import claimed, require_free
 from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
@@ -253,16 +253,16 @@ def imagine(
     group = regrouped("dataset", "starts") if cfg.starts_given else nullcontext()
     with group, opened(env, size, False, 1) as (envs,):
         starts = starts_of_one_task(envs, cfg)
-        claim_output_dir(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER)
-        for name, config in tqdm(missing.items(), desc="Imagining", unit="policy"):
-            with about_policy(name):
-                policies = load_policies({name: config})
-                blocks = [  # the seed of an episode is the number of its start
-                    run_block([envs], env, policies, min(size, starts - begin), begin)
-                    for begin in range(0, starts, size)
-                ]
-            judgement.outcomes[name] = [episode.successes[0] for block in blocks for episode in block]
-            write()
+        with claimed(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER):
+            for name, config in tqdm(missing.items(), desc="Imagining", unit="policy"):
+                with about_policy(name):
+                    policies = load_policies({name: config})
+                    blocks = [  # the seed of an episode is the number of its start
+                        run_block([envs], env, policies, min(size, starts - begin), begin)
+                        for begin in range(0, starts, size)
+                    ]
+                judgement.outcomes[name] = [episode.successes[0] for block in blocks for episode in block]
+                write()
 
 
 def even_batch(episodes: int, most: int) -> int:

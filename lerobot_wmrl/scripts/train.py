@@ -18,6 +18,7 @@ Running the same command again continues from the last checkpoint. `--preset=dem
 """
 
 import logging
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ import draccus
 from lerobot_wmrl.common.command_line import run_command
 from lerobot_wmrl.common.distributed import LONGEST_WAIT, is_first_process, rank_and_size, wait_for_all
 from lerobot_wmrl.common.errors import FieldError, within
-from lerobot_wmrl.common.output_folders import claim_output_dir, require_free
+from lerobot_wmrl.common.output_folders import claimed, require_free
 from lerobot_wmrl.common.precision import keep_freed_memory
 from lerobot_wmrl.common.presets import expand_preset
 from lerobot_wmrl.common.tracking import make_wandb
@@ -66,7 +67,7 @@ def train_policy(cfg: TrainConfig) -> None:
     done = finished(cfg)
     wait_for_all()  # no process has written anything before all have looked
     if done:
-        claim_output_dir(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER)
+        require_free(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER)
         print(f"{cfg.output_dir}: already trained for {cfg.iterations} iterations")
     else:
         set_seed(cfg.seed)
@@ -139,21 +140,21 @@ def train_in(
     buffer = RolloutBuffer(rollout_length(cfg, longest), cfg.num_envs, config.device, longest)
     trained = Trained(policy, processors, env, cfg.env)
     callbacks = make_callbacks(cfg, trained, cfg.output_dir, cfg.iterations, cfg.seed)
-    if is_first_process():
-        claim_output_dir(cfg.output_dir, settings, MAY_DIFFER)
-        if cfg.budget is not None and not isinstance(cfg.env, WorldModelEnv):
-            steps = cfg.iterations * cfg.num_envs * rank_and_size()[1] * buffer.steps
-            charge_steps(cfg.budget, cfg.output_dir, steps, env.max_episode_steps)
 
     def save_pretrained(folder: Path) -> None:
         for part in (policy, config, *processors, cfg):
             part.save_pretrained(folder)
 
     schedule = Schedule(cfg.iterations, cfg.save_freq, cfg.seed, cfg.log_freq)
-    train(
-        env, algorithm, pipeline, buffer, schedule, cfg.output_dir, save_pretrained, callbacks,
-        make_wandb(cfg),
-    )  # fmt: skip
+    first = is_first_process()
+    with claimed(cfg.output_dir, settings, MAY_DIFFER) if first else nullcontext():
+        if first and cfg.budget is not None and not isinstance(cfg.env, WorldModelEnv):
+            steps = cfg.iterations * cfg.num_envs * rank_and_size()[1] * buffer.steps
+            charge_steps(cfg.budget, cfg.output_dir, steps, env.max_episode_steps)
+        train(
+            env, algorithm, pipeline, buffer, schedule, cfg.output_dir, save_pretrained, callbacks,
+            make_wandb(cfg),
+        )  # fmt: skip
 
 
 def check_tasks(cfg: TrainConfig, env: TensorEnv) -> None:

@@ -12,6 +12,7 @@ new data.
 
 import json
 import shlex
+from contextlib import ExitStack
 from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import partial
@@ -28,7 +29,7 @@ from lerobot_wmrl.common.command_line import RunConfig, run_command, settings_be
 from lerobot_wmrl.common.distributed import LONGEST_WAIT, is_first_process
 from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least, require_choice, within
 from lerobot_wmrl.common.files import write_json
-from lerobot_wmrl.common.output_folders import CONFIG_FILE, claim_output_dir, require_free
+from lerobot_wmrl.common.output_folders import CONFIG_FILE, claimed, require_free
 from lerobot_wmrl.common.precision import PRECISIONS, keep_freed_memory, training_dtype
 from lerobot_wmrl.common.presets import expand_preset, format_flags
 from lerobot_wmrl.common.tracking import make_wandb
@@ -174,7 +175,6 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
     model: Any = build_model(cfg.model, table, cfg.output_dir)
     require_same_data(cfg, table)
     if checkpoint is not None and int(checkpoint.name) >= cfg.steps:
-        claim_output_dir(cfg.output_dir, given, MAY_DIFFER)
         print(f"{cfg.output_dir}: already trained for {cfg.steps} steps")
     else:
         run_training(begun, model, table, processes)
@@ -216,14 +216,15 @@ def run_training(
     """Cache the data, in the first process before the others, and train."""
     from lerobot_wmrl.world_models.training import make_joint_sampler, train
 
-    with processes.main_process_first():
-        seed = cfg.seed + processes.process_index
-        sampler = make_joint_sampler(model, table, cfg.dataset, cfg.batch_size, seed)
-        if is_first_process():
-            claim_output_dir(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER)
-            if not (cfg.output_dir / DATA_FILE).is_file():
-                write_json(cfg.output_dir / DATA_FILE, fingerprints(cfg, table))
-    train(model, sampler, cfg, cfg.save_pretrained, make_wandb(cfg))
+    with ExitStack() as held:
+        with processes.main_process_first():
+            seed = cfg.seed + processes.process_index
+            sampler = make_joint_sampler(model, table, cfg.dataset, cfg.batch_size, seed)
+            if is_first_process():
+                held.enter_context(claimed(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER))
+                if not (cfg.output_dir / DATA_FILE).is_file():
+                    write_json(cfg.output_dir / DATA_FILE, fingerprints(cfg, table))
+        train(model, sampler, cfg, cfg.save_pretrained, make_wandb(cfg))
 
 
 def conclusion(cfg: TrainWorldModelConfig, model: Any, table: EpisodeTable) -> str:

@@ -1,32 +1,42 @@
-"""An output folder belongs to the settings of one run."""
+"""An output folder belongs to the settings of one run, and to one command at a time."""
 
 from pathlib import Path
 
 import pytest
 
-from lerobot_wmrl.common.output_folders import CONFIG_FILE, claim_output_dir, locked
+from lerobot_wmrl.common.output_folders import CONFIG_FILE, claimed
 
 
 def test_a_run_that_was_killed_while_it_claimed_its_folder_claims_it_again(tmp_path: Path) -> None:
     (tmp_path / f".{CONFIG_FILE}.partial").write_text("{")
-    claim_output_dir(tmp_path, {"seed": 1})
-    claim_output_dir(tmp_path, {"seed": 1})
-    with pytest.raises(ValueError, match=r"was begun with other settings \(seed 1 → 2\)"):
-        claim_output_dir(tmp_path, {"seed": 2})
+    for _ in range(2):
+        with claimed(tmp_path, {"seed": 1}):
+            assert (tmp_path / CONFIG_FILE).is_file()
+
+
+def test_other_settings_are_refused_by_name_but_for_those_that_may_differ(tmp_path: Path) -> None:
+    with claimed(tmp_path, {"seed": 1, "steps": 5}):
+        pass
+    with claimed(tmp_path, {"seed": 1, "steps": 9}, free=["steps"]):
+        pass
+    with (
+        pytest.raises(ValueError, match=r"^output_dir=.* was begun with other settings \(seed 1 → 2\)"),
+        claimed(tmp_path, {"seed": 2, "steps": 5}),
+    ):
+        pass
 
 
 def test_a_file_and_a_foreign_folder_are_left_alone(tmp_path: Path) -> None:
     file = tmp_path / "thesis.txt"
     file.write_text("mine")
     for place, problem in ((file, "is a file"), (tmp_path, "holds something else")):
-        with pytest.raises(ValueError, match=problem):
-            claim_output_dir(place, {"seed": 1})
+        with pytest.raises(ValueError, match=problem), claimed(place, {"seed": 1}):
+            pass
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
 
 
-def test_a_folder_is_held_by_one_run_at_a_time(tmp_path: Path) -> None:
-    file = tmp_path / "lock"
-    with locked(tmp_path, file), pytest.raises(ValueError, match="another command"), locked(tmp_path, file):
+def test_a_folder_is_held_by_one_command_at_a_time(tmp_path: Path) -> None:
+    with claimed(tmp_path, {}), pytest.raises(ValueError, match="another command"), claimed(tmp_path, {}):
         pass
-    with locked(tmp_path, file):
+    with claimed(tmp_path, {}):
         pass

@@ -19,7 +19,6 @@ from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.stages import (
     Stage,
     StageError,
-    claimed,
     entry_point,
     in_fork,
     read_record,
@@ -158,28 +157,6 @@ def wait_until(condition: Callable[[], bool], seconds: float = 20.0) -> None:
     while not condition():
         assert time.monotonic() < end, "it did not happen in time"
         time.sleep(0.05)
-
-
-def test_a_foreign_folder_is_refused_and_left_alone(tmp_path: Path) -> None:
-    (tmp_path / "thesis.txt").write_text("mine")
-    with pytest.raises(ValueError, match="holds something else"), claimed(tmp_path, {}):
-        pass
-    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
-
-
-def test_other_settings_are_refused_by_name(tmp_path: Path) -> None:
-    with claimed(tmp_path, {"seed": 1}):
-        pass
-    with (
-        pytest.raises(ValueError, match=r"^output_dir=.* was begun with other settings \(seed 1 → 2\)"),
-        claimed(tmp_path, {"seed": 2}),
-    ):
-        pass
-
-
-def test_two_runs_do_not_share_a_folder(tmp_path: Path) -> None:
-    with claimed(tmp_path, {}), pytest.raises(ValueError, match="another command"), claimed(tmp_path, {}):
-        pass
 
 
 @pytest.mark.parametrize(

@@ -17,8 +17,9 @@ from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_wmrl.common.checkpoints import link_checkpoint
 from lerobot_wmrl.common.errors import STOPPED
 from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.common.output_folders import claimed
 from lerobot_wmrl.common.presets import preset_settings
-from lerobot_wmrl.common.stages import claimed
+from lerobot_wmrl.common.stages import MARKER
 from lerobot_wmrl.data.dataset import ChosenEpisodes, open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
@@ -329,8 +330,8 @@ def test_a_run_that_selects_nothing_goes_on_where_there_was_no_selection(tmp_pat
     improvement = improvement_of(tmp_path, failures=2)
     given = settings(improvement.config, commands.stages(improvement))
     older = {name: value for name, value in given.items() if name != "selection_episodes"}
-    write_json(tmp_path / "settings.json", older)
-    with claimed(tmp_path, given):
+    write_json(tmp_path / MARKER, older)
+    with claimed(tmp_path, given, marker=MARKER):
         pass
 
 
@@ -338,8 +339,8 @@ def test_a_folder_that_was_begun_with_other_stages_is_refused(tmp_path: Path) ->
     """As by a version that did not clone."""
     improvement = improvement_of(tmp_path, failures=2)
     given = settings(improvement.config, commands.stages(improvement))
-    write_json(tmp_path / "settings.json", {**given, "stages": ["tokenizer", "world_model", "check", "rl"]})
-    with pytest.raises(ValueError, match="stages"), claimed(tmp_path, given):
+    write_json(tmp_path / MARKER, {**given, "stages": ["tokenizer", "world_model", "check", "rl"]})
+    with pytest.raises(ValueError, match="stages"), claimed(tmp_path, given, marker=MARKER):
         pass
 
 

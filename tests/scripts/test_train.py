@@ -12,6 +12,7 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from safetensors.torch import load_file
 
+from lerobot_wmrl.common.output_folders import LOCK, locked
 from lerobot_wmrl.common.presets import PRESETS
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
@@ -92,6 +93,19 @@ def test_a_finished_training_is_left_alone(tmp_path: Path, monkeypatch: pytest.M
         improve(monkeypatch, *flags, *POINT, "--seed=5")
     assert stopped.value.code == 1
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
+
+
+def test_a_training_that_another_command_continues_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    policy, output_dir = save_untrained_policy(tmp_path / "policy"), tmp_path / "rl"
+    flags = [f"--policy.path={policy}", *SHORT, f"--output_dir={output_dir}", *POINT]
+    improve(monkeypatch, *flags)
+    shutil.rmtree(output_dir / "checkpoints" / "000002")
+    with locked(output_dir, output_dir / LOCK), pytest.raises(SystemExit):
+        improve(monkeypatch, *flags)
+    assert "another command writes there" in capsys.readouterr().err
+    assert not (output_dir / "checkpoints" / "000002").exists()
 
 
 def test_an_interrupted_training_ends_as_if_nothing_had_happened(
