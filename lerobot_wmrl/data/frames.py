@@ -1,5 +1,6 @@
 """Frames at which imaginations begin, and the context of their episodes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -24,6 +25,11 @@ class Context:
 
     def __len__(self) -> int:
         return len(self.maps[0]) if self.maps else 0
+
+    @classmethod
+    def joined(cls, parts: Sequence["Context"]) -> "Context":
+        """Put the contexts of several parts together."""
+        return cls(tuple(torch.cat(each) for each in zip(*(part.maps for part in parts), strict=True)))
 
     @property
     def features(self) -> Tensor:

@@ -5,7 +5,7 @@ world model then tokenises them (`Starts`), and the text world model imagines th
 (`GoalFeatures`). K is the number of starts, N the number of cameras.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,7 +23,7 @@ from lerobot_wmrl.common.statistics import evenly_spaced
 from lerobot_wmrl.data.budget import Ledger
 from lerobot_wmrl.data.episodes import EpisodeTable, choose_episodes, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames, frames_to_tensor
-from lerobot_wmrl.data.frames import Frames
+from lerobot_wmrl.data.frames import Context, Frames
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.maniskill.recordings import require_unreported, scene_splits
@@ -41,8 +41,8 @@ from lerobot_wmrl.world_models.modeling_world_model import (
     WorldModelRewardModel,
 )
 
-GOAL_BATCH = 64
-"""Goal frames that are imagined at once."""
+STARTS_AT_ONCE = 64
+"""Starts that are tokenised, and goal frames that are imagined, at once."""
 
 
 class StartImages(NamedTuple):
@@ -354,16 +354,33 @@ def load_starts(
     """Tokenise the starts and, with a text model, imagine each one's goal frame once (eq. 6)."""
     device = model.state_mean.device
     state = torch.from_numpy(frames.state).to(device)
-    context = model.tokenizer.context(frames_to_tensor(frames.first_images).to(device))
-    tokens = model.tokenizer.encode(frames_to_tensor(frames.images).to(device), context)
-    begin = Frames(tokens, state[:, : model.config.state_size], context, frames.depth(model))
-    decoded = model.tokenizer.decode_with_features(tokens, context)
-    starts = Starts(begin, decoded.images, frames.instructions)
+    tokens, images, contexts, features = [], [], [], []
+    for part in in_parts(len(state)):
+        first, shown = (frames_to_tensor(of[part]).to(device) for of in (frames.first_images, frames.images))
+        contexts.append(model.tokenizer.context(first))
+        tokens.append(model.tokenizer.encode(shown, contexts[-1]))
+        decoded = model.tokenizer.decode_with_features(tokens[-1], contexts[-1])
+        images.append(decoded.images)
+        if text_model is not None:
+            features.append(measure.features(decoded))
+    begin = Frames(torch.cat(tokens), state, Context.joined(contexts))
+    own = replace(begin, state=state[:, : model.config.state_size], depth=frames.depth(model))
+    starts = Starts(own, torch.cat(images), frames.instructions)
     if text_model is None:
         return starts, None
-    begin = Frames(tokens, state, context, frames.depth(text_model))
-    goals = imagine_goal_features(text_model, begin, frames.instructions, measure.features(decoded), measure)
+    begin = replace(begin, depth=frames.depth(text_model))
+    goals = imagine_goal_features(text_model, begin, frames.instructions, joined(features), measure)
     return starts, goals
+
+
+def in_parts(count: int) -> list[slice]:
+    """Cut `count` starts into parts of at most `STARTS_AT_ONCE`."""
+    return [slice(begin, begin + STARTS_AT_ONCE) for begin in range(0, count, STARTS_AT_ONCE)]
+
+
+def joined(parts: Sequence[Features]) -> Features:
+    """Put the features of several parts together."""
+    return [torch.cat(each) for each in zip(*parts, strict=True)]
 
 
 @torch.no_grad()
@@ -371,18 +388,14 @@ def imagine_goal_features(
     model: TextWorldModelRewardModel, frames: Frames, instructions: list[str], features: Features,
     measure: Similarity,
 ) -> GoalFeatures:  # fmt: skip
-    """Imagine the goal frame of every start, GOAL_BATCH at once.
+    """Imagine the goal frame of every start.
 
     Args:
         frames: the first frames of the K starts, as the text model is given them.
         instructions: one for each.
         features: features of the first frames, as `measure` computes them, [(K·N, …)].
     """
-    goals = [
-        imagine_goal(model, frames[part], instructions[part])
-        for part in (slice(i, i + GOAL_BATCH) for i in range(0, len(frames), GOAL_BATCH))
-    ]
-    parts = zip(*(measure.features(goal.decoded) for goal in goals), strict=True)
-    goal_features = [torch.cat(part) for part in parts]
+    goals = [imagine_goal(model, frames[part], instructions[part]) for part in in_parts(len(frames))]
+    goal_features = joined([measure.features(goal.decoded) for goal in goals])
     similarity = measure(features, goal_features, model.tokenizer.num_cameras)
     return GoalFeatures(goal_features, measure, similarity, torch.cat([goal.reached for goal in goals]))

@@ -8,6 +8,7 @@ import torch
 from lpips import LPIPS
 from torch import Tensor
 
+from lerobot_wmrl.envs import start_frames
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
@@ -61,6 +62,20 @@ def paid_along(env: WorldModelVectorEnv, way: list[Tensor], done: float = -20.0)
         paid.append(env.step(STILL)[1].item())
     env.model.step = step
     return paid
+
+
+def test_starts_are_the_same_however_many_are_tokenised_at_once(config, monkeypatch):
+    """So that memory does not grow with their number."""
+    config = replace(config, dataset=StartFrames(root=config.dataset.root))
+    whole = config.create_tensor_env(1)
+    monkeypatch.setattr(start_frames, "STARTS_AT_ONCE", 4)
+    cut = config.create_tensor_env(1)
+    assert len(cut.starts) == 6
+    assert torch.equal(cut.starts.frames.tokens, whole.starts.frames.tokens)
+    torch.testing.assert_close(cut.starts.images, whole.starts.images)
+    torch.testing.assert_close(cut.goals.similarity, whole.goals.similarity)
+    for one, other in zip(cut.goals[0], whole.goals[0], strict=True):
+        torch.testing.assert_close(one, other)
 
 
 def test_going_to_the_goal_pays_and_leaving_it_costs(config, measure):
