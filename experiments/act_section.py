@@ -3,10 +3,12 @@
 from typing import Final
 
 from experiments.cells import Load
-from experiments.value_cells import SCENES, Cell, against, groups, measured, minutes, shares
+from experiments.value_cells import SCENES, Cell, against, groups, measured, minutes, published, shares
+from experiments.value_sections import CONTROLS, UNCHANGED
 from lerobot_wmrl.common.files import markdown_table as table
 
 STUDY: Final = "value_act"
+CONTROLS_STUDY: Final = "value_act_controls"
 BEFORE: Final = "filtered"
 """What all others begin from."""
 
@@ -25,8 +27,7 @@ cell of [value_push](#value_push). PPO's standard deviation and size of minibatc
 imagination in pilots of 14 to 24 iterations with seed 0; `minutes` after PPO and distillation include the
 world model's. In those pilots the first step of the optimizer, at a learning rate of 1e-5 and a standard
 deviation of 0.1, moved the policy by more than a nat a decision, and PPO ended there: such steps are undone
-since. No control with shuffled labels or actions was run with ACT. That lerobot-wmrl-improve distils ACT was
-decided on these starts, before PPO was measured."""
+since. That lerobot-wmrl-improve distils ACT was decided on these starts, before PPO was measured."""
 
 
 def section(load: Load) -> str:
@@ -55,3 +56,18 @@ def changed(cell: Cell, methods: list[str]) -> list[list[str]]:
         for method in methods
         if method != BEFORE
     ]
+
+
+def controls(load: Load) -> str:
+    """Return the section: success after distillation in every world model, against the policy before it."""
+    rows = []
+    for cell in (cell for each in groups(load, STUDY, ()).values() for cell in each):
+        name = "demonstrations{demonstrations}_rollouts{rollouts}_seed{seed}".format_map(cell)
+        found = {CONTROLS[each]: published(load, CONTROLS_STUDY, f"{name}_{each}") for each in CONTROLS}
+        changed = [(learnt, control) for learnt, control in found.items() if control]
+        for learnt, compared in [(UNCHANGED, cell), *changed] if changed else []:
+            after, before = compared["methods"]["distilled"], cell["methods"][BEFORE]
+            rows.append([cell["seed"], learnt, *(against(after[d], before[d]) for d in SCENES)])
+    return f"""Success of the planner distilled, against the BC that it begins from, on the same starts:
+
+{table(["seed", "the world model learnt from", "known scenes", "unseen scenes"], rows)}"""

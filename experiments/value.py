@@ -87,8 +87,8 @@ def policy_name(checkpoint: str) -> str:
 
 
 def control(study: Study) -> Results:
-    """Return the success of PPO and of planning in a world model that learnt from changed data."""
-    found = {name: success(study, name) for name in ("imagined_ppo", "planned")}
+    """Return the success of methods in a world model that learnt from changed data."""
+    found = {name: success(study, name) for name in study.variables["methods"]}
     settings = {
         name: study.variables[name] for name in ("control", "demonstrations", "rollouts", "seed", "starts")
     }

@@ -133,22 +133,29 @@ MAY_DIFFER = {
 """Flags of a control that name its own dataset and models."""
 
 
-def test_a_control_differs_from_the_study_in_nothing_but_the_world_model() -> None:
+@pytest.mark.parametrize(("studies", "controls", "begins", "number"), [
+    (["value_push"], "value_controls", "start", 7),
+    (["value_push", "value_act"], "value_act_controls", "filtered", 5),
+])  # fmt: skip
+def test_a_control_differs_from_the_study_in_nothing_but_the_world_model(
+    studies: list[str], controls: str, begins: str, number: int
+) -> None:
     """Its PPO and its planner have the settings of the rows that they are compared with."""
-    (cell,) = read_cells(STUDY, ["demonstrations=8", "rollouts=300", "seed=0"])
-    control, *_ = read_cells(ROOT / "experiments" / "value_controls.yaml", ["demonstrations=8", "seed=0"])
-    run = control.variables["run"]
-    assert run == str(cell.folder)
+    given = ["demonstrations=8", "rollouts=300", "seed=0"]
+    cells = [read_cells(STUDY.parent / f"{name}.yaml", given)[0] for name in studies]
+    control, *_ = read_cells(STUDY.parent / f"{controls}.yaml", ["demonstrations=8", "seed=0"])
+    assert control.variables["run"] == str(cells[0].folder)
     steps = {step.name: set(step.command.split()) for step in control.steps}
-    compared = [step for step in cell.steps if step.name in steps and step.name != "dataset"]
-    assert len(compared) == 7
-    assert "start" not in steps, "the policy that PPO begins from is the study's"
-    for step in compared:
-        words, budget = set(step.command.split()), {f"--budget={cell.budget}"}
-        for word in steps[step.name] ^ words - budget:
+    compared = {step.name: step for cell in cells for step in cell.steps}
+    compared = {name: compared[name] for name in steps if name != "dataset" and name in compared}
+    assert len(compared) == number
+    assert begins not in steps, "the policy that the methods begin from is the study's"
+    for name, step in compared.items():
+        words, budgets = set(step.command.split()), {f"--budget={cell.budget}" for cell in cells}
+        for word in steps[name] ^ words - budgets:
             flag = word[2:].partition("=")[0]
-            own = flag == "policy.path" and step.name.startswith("eval_imagined_ppo")
-            assert own or flag in MAY_DIFFER, (step.name, word)
+            own = flag == "policy.path" and name.startswith("eval_")
+            assert own or flag in MAY_DIFFER, (name, word)
 
 
 def test_a_figure_is_drawn(docs: Path) -> None:
