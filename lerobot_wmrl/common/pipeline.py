@@ -27,14 +27,19 @@ class Pipeline:
         prepare: turns a stored observation into the policy's.
         to_action: turns raw actions into the environment's.
         store: turns the environment's observation into the stored one.
+        shown: turns stored frames into those of the size that the policy sees, the first step of `prepare`.
     """
 
     prepare: Callable[[Observation], Observation]
     to_action: Callable[[Tensor], Tensor]
     store: Callable[[Observation], Observation] = unchanged
+    shown: Callable[[Observation], Observation] = unchanged
 
 
-def make_pipeline(config: PreTrainedConfig, preprocessor: Any, postprocessor: Any) -> Pipeline:
+def make_pipeline(
+    config: PreTrainedConfig, preprocessor: Any, postprocessor: Any,
+    shown: Callable[[Observation], Observation] = unchanged,
+) -> Pipeline:  # fmt: skip
     """Wrap a policy's processors. Observations that the policy has no input for are left out. Actions stay on
     the policy's device, where LeRobot's postprocessors would move them to the CPU."""
     known = {*(config.input_features or {}), INSTRUCTIONS, ACTION, ACTION_IS_PAD}
@@ -45,9 +50,9 @@ def make_pipeline(config: PreTrainedConfig, preprocessor: Any, postprocessor: An
     on_device = replace(postprocessor, steps=steps)
 
     def prepare(observation: Observation) -> Observation:
-        return preprocessor({name: value for name, value in observation.items() if name in known})
+        return preprocessor(shown({name: value for name, value in observation.items() if name in known}))
 
     def to_action(raw_action: Tensor) -> Tensor:
         return on_device(raw_action)
 
-    return Pipeline(prepare, to_action)
+    return Pipeline(prepare, to_action, shown=shown)

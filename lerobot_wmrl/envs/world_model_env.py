@@ -22,7 +22,7 @@ from lerobot_wmrl.envs.start_frames import GoalFeatures, StartImages, Starts, lo
 from lerobot_wmrl.envs.tensor_env import Outcome, TensorEnv
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rewards.general import consecutive_count, is_done
-from lerobot_wmrl.rewards.loading import Reward, load_reward
+from lerobot_wmrl.rewards.loading import LeRobotReward, Reward, load_reward
 from lerobot_wmrl.rewards.similarity import Similarity, make_similarity
 from lerobot_wmrl.world_models.checkpoint import check_same_tokenizer, load_model
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig
@@ -46,6 +46,10 @@ class WorldModelVectorEnv(TensorEnv):
     """
 
     refuses_nan_first = False
+
+    compact = False
+    """Whether observations have squares in place of frames of the dataset's size, which may be much larger to
+    store. `model.shown` makes them what a policy sees."""
 
     def __init__(
         self, model: ActionWorldModelRewardModel, starts: Starts, goals: GoalFeatures | None,
@@ -103,7 +107,8 @@ class WorldModelVectorEnv(TensorEnv):
         decoded = self.model.decode(imagined.tokens, self._imagination.context)
         observation = self._observe(decoded.images, imagined.state)
         parts = {"success": terminated.float(), **self._progress(decoded)}
-        reward = self.reward.compute_reward({**observation, **parts, "hidden": imagined.hidden})
+        seen = self.model.shown(observation) if isinstance(self.reward, LeRobotReward) else observation
+        reward = self.reward.compute_reward({**seen, **parts, "hidden": imagined.hidden})
         parts |= {**entropies(imagined), "done_probability": imagined.done_logit.sigmoid()}
         return Outcome(observation, reward, terminated, truncated, terminated, self._elapsed, parts)
 
@@ -201,9 +206,8 @@ class WorldModelVectorEnv(TensorEnv):
     def _observe(
         self, images: Tensor, state: Tensor, instructions: Sequence[str] | None = None
     ) -> Observation:
-        return self.model.observation(
-            images, state, self._instructions if instructions is None else instructions
-        )
+        made = self.model.compact_observation if self.compact else self.model.observation
+        return made(images, state, self._instructions if instructions is None else instructions)
 
 
 class WorldModels(NamedTuple):

@@ -287,8 +287,8 @@ class Improvement:
         """How large frames, batches and rollouts are."""
         assert self.config.policy is not None
         observations = len(self.config.policy.observation_delta_indices or [0])
-        found = self.found
-        return Sizes(self.config.preset, found.frame_side, found.pixels, self.length, observations)
+        found, cameras = self.found, len(self.found.cameras)
+        return Sizes(self.config.preset, found.frame_side, found.pixels, cameras, self.length, observations)
 
     def strict_criterion(self) -> Flags:
         """Return when the check sees success, and imagination too unless that recognises nothing."""

@@ -15,14 +15,17 @@ SIDE_STEP: Final = 32
 """A side is a multiple of this: at any of the sizes, the transformer's patches divide the token grid."""
 
 ROLLOUT_BYTES: Final = 2**31
-"""Bytes of frames, in the policy's size, that RL keeps at most: PPO those of an iteration, distillation those
-of all iterations."""
+"""Bytes of frames that RL keeps at most: PPO those of an iteration, distillation those of all iterations.
+Imagined ones are kept as small as they are imagined, recorded ones in the policy's size."""
 
 CHANNELS: Final = 3
 """Of a frame, a byte each."""
 
 PASS_PIXELS: Final = 2**23
 """Pixels of observations in one forward and backward pass at most."""
+
+ACTING_PIXELS: Final = 4 * PASS_PIXELS
+"""Pixels that a policy acts on at once at most. Without a backward pass less is kept of each."""
 
 MINIBATCH: Final = PPOConfig.minibatch_size
 """Decisions in an optimizer step of PPO."""
@@ -39,6 +42,7 @@ class Sizes:
         preset: the stages' preset.
         frame_side: the shorter side of the frames that the policy sees, in pixels.
         pixels: pixels of all its cameras' frames.
+        cameras: how many cameras there are.
         length: frames of an imagined episode.
         observations: how many observations it learns from at once.
     """
@@ -46,6 +50,7 @@ class Sizes:
     preset: str
     frame_side: int
     pixels: int
+    cameras: int
     length: int
     observations: int
 
@@ -77,22 +82,23 @@ class Sizes:
         return int(training.get("iterations", self._preset(training)["iterations"]))
 
     def rl_flags(self, training: Flags, success_frames: Callable[[], int]) -> Flags:
-        """Return the flags that limit the memory of the frames that a policy sees, where they are large.
+        """Return the flags that limit the memory of frames, where those that the policy sees are large.
 
         Args:
             training: other flags of RL.
             success_frames: returns the frames of all successful episodes. Called only for a distillation that
                 labels recorded episodes.
         """
-        preset, frame = self._preset(training), self.pixels * CHANNELS
+        preset, frame = self._preset(training), self.cameras * self.side**2 * CHANNELS
         distils = training["algorithm.type"] == "distillation"
         kept = self.iterations(training) if distils else 1
         flags: dict[str, bool | int] = {}
-        envs = max(1, ROLLOUT_BYTES // (kept * self.length * frame))
+        remembered = ROLLOUT_BYTES // (kept * self.length * frame)
+        envs = max(1, min(remembered, ACTING_PIXELS // (self.pixels * self.observations)))
         if envs < preset["num_envs"]:
             flags["num_envs"] = envs
         labels = distils and "algorithm.recorded" not in training
-        if labels and success_frames() * frame > ROLLOUT_BYTES:
+        if labels and success_frames() * self.pixels * CHANNELS > ROLLOUT_BYTES:
             flags["algorithm.recorded"] = False
         fits = self.pass_observations
         if distils and fits < preset.get("algorithm.batch_size", DistillationConfig.batch_size):

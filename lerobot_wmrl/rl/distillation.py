@@ -220,7 +220,7 @@ class Distillation(RLAlgorithm):
     def batches(self, updates: int, pipeline: Pipeline) -> Iterator[dict[str, Any]]:
         """Draw that many batches of labels."""
         for _ in tqdm(range(updates), "update", leave=False, unit="step", disable=hidden_progress()):
-            yield pipeline.prepare(self.labels.draw(self.config.batch_size))
+            yield pipeline.prepare(self.labels.draw(self.config.batch_size, pipeline.shown))
 
     def update(self, batch_iterator: Iterator[dict[str, Any]]) -> TrainingStats:
         """Take one optimizer step on each batch.

@@ -1,7 +1,7 @@
 """Observations labelled with actions to imitate, on the CPU and on disk. N labels, n steps of a window."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from lerobot_wmrl.common.constants import INSTRUCTIONS
+from lerobot_wmrl.common.constants import INSTRUCTIONS, Observation
 from lerobot_wmrl.common.images import stretch
 from lerobot_wmrl.common.pipeline import ACTION_IS_PAD
 from lerobot_wmrl.data.episodes import read_episodes
@@ -118,8 +118,11 @@ class Labels:
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
                 self._append(tensors, json.loads(file.metadata()["instructions"]))
 
-    def draw(self, count: int) -> dict[str, Any]:
-        """Draw a batch of labels at random, as LeRobot's datasets would give them: images in [0, 1]."""
+    def draw(self, count: int, shown: Callable[[Observation], Observation]) -> dict[str, Any]:
+        """Draw a batch of labels at random, as LeRobot's datasets would give them: images in [0, 1].
+
+        `shown` makes frames of the size that the policy sees, where imagined ones are stored smaller.
+        """
         parts = [*self.recorded, *self.imagined]
         ends = torch.tensor([len(part) for part in parts]).cumsum(0)
         drawn = torch.randint(int(ends[-1]), (count,))
@@ -127,7 +130,7 @@ class Labels:
         taken: list[dict[str, Any]] = []
         for index in part_of.unique().tolist():
             part, begin = parts[index], int(ends[index - 1]) if index else 0
-            taken.append(part.batch(drawn[part_of == index] - begin))
+            taken.append(shown(part.batch(drawn[part_of == index] - begin)))
         return {
             name: [text for batch in taken for text in batch[name]] if name == INSTRUCTIONS
             else torch.cat([batch[name] for batch in taken])
@@ -148,7 +151,8 @@ def recorded_successes(
 
     Args:
         source: the episodes, those of its split, tasks and scenes.
-        frame_shapes: camera → shape (3, H, W) of imagined images, to which recorded ones are stretched.
+        frame_shapes: camera → shape (3, H, W) of the images that the policy sees, to which recorded ones are
+            stretched.
         state_size: components of the state, 0 for observations without it.
         windows: what the policy learns from.
     """

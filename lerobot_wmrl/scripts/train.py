@@ -18,6 +18,7 @@ Running the same command again continues from the last checkpoint. `--preset=dem
 """
 
 import logging
+from collections.abc import Callable
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
@@ -26,6 +27,7 @@ from typing import Any
 import draccus
 
 from lerobot_wmrl.common.command_line import run_command
+from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.distributed import LONGEST_WAIT, is_first_process, rank_and_size, wait_for_all
 from lerobot_wmrl.common.errors import FieldError, within
 from lerobot_wmrl.common.output_folders import claimed, require_free
@@ -133,7 +135,7 @@ def train_in(
     if cfg.peft is not None:
         policy = with_new_adapters(policy, cfg.peft)
     algorithm = make_algorithm(policy, cfg.algorithm, cfg.output_dir)
-    pipeline = make_pipeline(config, *processors)
+    pipeline = make_pipeline(config, *processors, shown=compacted(env))
     if isinstance(algorithm, Distillation):
         algorithm.check_recorded(env, pipeline)
     longest = env.max_episode_steps
@@ -155,6 +157,17 @@ def train_in(
             env, algorithm, pipeline, buffer, schedule, cfg.output_dir, save_pretrained, callbacks,
             make_wandb(cfg),
         )  # fmt: skip
+
+
+def compacted(env: TensorEnv) -> Callable[[Observation], Observation]:
+    """Let imagined frames stay as small as they are imagined, and return what makes them a policy's."""
+    from lerobot_wmrl.common.pipeline import unchanged
+    from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
+
+    if not isinstance(env, WorldModelVectorEnv):
+        return unchanged
+    env.compact = True
+    return lambda observation: env.model.shown(observation)  # of the model that Dyna may have refreshed
 
 
 def check_tasks(cfg: TrainConfig, env: TensorEnv) -> None:

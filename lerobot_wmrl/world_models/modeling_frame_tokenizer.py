@@ -1,7 +1,7 @@
 """The frame tokenizer as a LeRobot reward model: trained, saved and published like one."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -49,10 +49,19 @@ def stack_cameras(batch: dict[str, Tensor], keys: Sequence[str], size: int) -> T
     return torch.stack([stretch(batch[key], size, size) for key in keys], dim=-4)
 
 
-def split_cameras(images: Tensor, shapes: dict[str, tuple[int, int, int]]) -> dict[str, Tensor]:
+def split_cameras(images: Tensor, shapes: Mapping[str, tuple[int, int, int]]) -> dict[str, Tensor]:
     """Return decoded images (…, N, 3, S, S) by camera, stretched to the shapes (3, H, W) of its frames."""
-    views = zip(shapes.items(), images.unbind(-4), strict=True)
-    return {key: stretch(view, height, width) for (key, (_, height, width)), view in views}
+    return stretch_cameras(dict(zip(shapes, images.unbind(-4), strict=True)), shapes)
+
+
+def stretch_cameras(
+    observation: Mapping[str, Any], shapes: Mapping[str, tuple[int, int, int]]
+) -> dict[str, Any]:
+    """Return an observation whose cameras' frames (…, 3, S, S) are stretched to their shapes (3, H, W)."""
+    return {
+        name: stretch(value, *shapes[name][1:]) if name in shapes else value
+        for name, value in observation.items()
+    }
 
 
 def with_frame_sizes(tokenizer: TokenizerConfig, features: dict[str, Any]) -> TokenizerConfig:

@@ -5,7 +5,7 @@ checkpoint holds tokenizer, dynamics and statistics.
 """
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -40,8 +40,8 @@ from lerobot_wmrl.world_models.hub_card import HubCard
 from lerobot_wmrl.world_models.imagination import ImaginationMixin
 from lerobot_wmrl.world_models.layers import Condition, FrameSizes, Prediction
 from lerobot_wmrl.world_models.modeling_frame_tokenizer import (
-    split_cameras,
     stack_cameras,
+    stretch_cameras,
     with_frame_sizes,
 )
 from lerobot_wmrl.world_models.text import CHECKPOINT_FOLDER, FrozenT5, check_one_each, make_text_encoder
@@ -285,10 +285,20 @@ class ActionWorldModelRewardModel(WorldModelRewardModel):
             state: (B, P); left out if it is not predicted.
             instructions: B of them, `task`.
         """
-        shown = {**split_cameras(images, self.config.trained_tokenizer.frame_shapes)}
+        return self.shown(self.compact_observation(images, state, instructions))
+
+    def compact_observation(
+        self, images: Tensor, state: Tensor, instructions: Sequence[str]
+    ) -> dict[str, Any]:
+        """Return B frames as in `observation`, but as squares: what is worth storing of large frames."""
+        seen = dict(zip(self.config.trained_tokenizer.frame_shapes, images.unbind(1), strict=True))
         if self.config.state_size:
-            shown[OBS_STATE] = state
-        return {**shown, "task": list(instructions)}
+            seen[OBS_STATE] = state
+        return {**seen, "task": list(instructions)}
+
+    def shown(self, observation: Mapping[str, Any]) -> dict[str, Any]:
+        """Return a compact observation with frames of the dataset's sizes; those that have them stay."""
+        return stretch_cameras(observation, self.config.trained_tokenizer.frame_shapes)
 
     def encode_actions(self, actions: Tensor) -> Condition:
         if actions.shape[-1] != self.config.action_size:

@@ -293,6 +293,23 @@ def test_a_refreshed_model_shows_frames_of_the_size_that_the_policy_knows(config
     assert image.shape == env.step(torch.zeros(B, 7))[0][IMAGE].shape == (B, 3, 32, 32)
 
 
+def test_compact_frames_become_those_that_a_policy_sees(config):
+    """They are stored as small as they are imagined."""
+    seen = []
+    for compact in (False, True):
+        env = config.create_tensor_env(B)
+        env.model.config.tokenizer = replace(env.model.config.tokenizer, frame_sizes=[[48, 80]])
+        env.compact = compact
+        first, _ = env.reset(seed=0)
+        later = env.step(torch.zeros(B, 7))[0]
+        assert {each[IMAGE].shape[1:] for each in (first, later)} == {(3, 32, 32) if compact else (3, 48, 80)}
+        seen.append([env.model.shown(each) for each in (first, later)])
+    for full, stored in zip(*seen, strict=True):
+        assert full.keys() == stored.keys()
+        assert full[IMAGE].shape == (B, 3, 48, 80)
+        assert torch.equal(full[IMAGE], stored[IMAGE])
+
+
 def test_episodes_last_as_long_as_the_world_model_has_learnt(config, trained_models, caplog):
     path = str(trained_models["action_world_model"])
     by_default = replace(config, episode_length=None)

@@ -107,13 +107,14 @@ def test_frames_of_any_size_make_a_grid_that_the_transformer_divides(
 
 @pytest.mark.parametrize(("kind", "pixels", "flags"), [
     (CnnConfig, 2 * 64**2, set()),
-    (CnnConfig, 480 * 640, {"--num_envs=23", "--algorithm.micro_batch_size=27"}),
-    (VQBeTConfig, 480 * 640, {"--num_envs=3", "--algorithm.recorded=false", "--algorithm.batch_size=5"}),
+    (CnnConfig, 480 * 640, {"--algorithm.micro_batch_size=27"}),
+    (CnnConfig, 1080 * 1920, {"--num_envs=16", "--algorithm.micro_batch_size=4"}),
+    (VQBeTConfig, 480 * 640, {"--num_envs=21", "--algorithm.recorded=false", "--algorithm.batch_size=5"}),
 ])  # fmt: skip
 def test_large_frames_are_trained_on_in_smaller_numbers(
     kind: type[PreTrainedConfig], pixels: int, flags: set[str], tmp_path: Path
 ) -> None:
-    """A rollout holds at most 2 GiB of frames, all labels of a distillation too, and a pass 2²³ pixels.
+    """A policy acts on 2²⁵ pixels at once and learns from 2²³ in a pass; recorded labels are at most 2 GiB.
 
     VQ-BeT learns from five observations at once.
     """
@@ -127,10 +128,14 @@ def test_large_frames_are_trained_on_in_smaller_numbers(
     assert {flag for flag in command if flag.startswith(limits)} == flags
 
 
-def test_labels_of_large_frames_are_those_of_fewer_episodes_after_ppo_too(tmp_path: Path) -> None:
-    """Distillation keeps those of all six iterations, PPO the frames of one."""
-    command = made_commands(tmp_path, pixels=480 * 640, longest=98, usual=98)["distilled"]
-    assert {"--num_envs=3", "--algorithm.batch_size=27"} <= {*command}
+@pytest.mark.parametrize(("stage", "flags"), [("rl", []), ("distilled", ["--num_envs=37"])])
+def test_imagined_frames_of_a_training_are_2_gib_at_most(
+    stage: str, flags: list[str], tmp_path: Path
+) -> None:
+    """Distillation keeps those of all six iterations, PPO those of one, as small as they are imagined."""
+    cameras = {"cameras": ["top", "wrist"], "frame_side": 480, "pixels": 2 * 128**2}
+    command = made_commands(tmp_path, "cpu", **cameras, longest=98, usual=98)[stage]
+    assert [flag for flag in command if flag.startswith("--num_envs=")] == flags
 
 
 @pytest.mark.parametrize(("held_out", "split"), [(0, "all"), (9, "all"), (10, "validation")])

@@ -1,5 +1,6 @@
 """Distillation of the planner: labels, and lerobot-wmrl-train with it."""
 
+import json
 import shutil
 import sys
 from collections.abc import Callable
@@ -21,7 +22,11 @@ from lerobot.utils.constants import ACTION
 from safetensors.torch import load_file
 from torch import Tensor
 
+from lerobot_policy_cnn.modeling_cnn import CnnPolicy
+from lerobot_wmrl.common.checkpoints import resolve_checkpoint
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.common.pipeline import unchanged
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
@@ -94,6 +99,31 @@ def test_it_trains_on_the_planners_successes_and_resumes_as_if_nothing_had_happe
         shutil.rmtree(output_dir / "checkpoints" / step)
     train(monkeypatch, *flags)
     assert all(torch.equal(value, after[name]) for name, value in weights(output_dir).items())
+
+
+def test_imagined_frames_are_kept_as_small_as_they_are_imagined(
+    imagined: list[str], trained_models: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The policy sees them in the size of its camera's, and recorded ones in full."""
+    world_model = tmp_path / "world_model"
+    shutil.copytree(resolve_checkpoint(trained_models["action_world_model"]), world_model)
+    config = json.loads((world_model / "config.json").read_text())
+    config["tokenizer"]["frame_sizes"] = [[48, 80]]
+    write_json(world_model / "config.json", config)
+    policy = save_untrained_policy(tmp_path / "policy", size=(48, 80), actions=7)
+    given = [flag for flag in imagined if "world_model_path" not in flag]
+    flags = [f"--policy.path={policy}", f"--env.world_model_path={world_model}", *given]
+    own = [*FAST, "--algorithm.recorded=true", f"--output_dir={tmp_path / 'distilled'}"]
+    train(monkeypatch, *flags, *own)
+    for file in (tmp_path / "distilled" / "labels").iterdir():
+        assert load_file(file)[IMAGE].shape[1:] == (3, 32, 32)
+    seen = []
+    evaluate = CnnPolicy.evaluate
+    monkeypatch.setattr(CnnPolicy, "evaluate", lambda self, observation, raw: (
+        seen.append(observation[IMAGE].shape[1:]) or evaluate(self, observation, raw)
+    ))  # fmt: skip
+    train(monkeypatch, *flags, "--num_envs=2", "--iterations=1", f"--output_dir={tmp_path / 'ppo'}")
+    assert {*seen} == {(3, 48, 80)}
 
 
 def test_a_limit_of_zero_limits_no_gradient(
@@ -394,7 +424,7 @@ def test_labels_are_the_same_when_they_are_read_again(tmp_path: Path):
     assert len(again) == len(labels) == 6
     for store in (labels, again):
         torch.manual_seed(0)
-        batch = store.draw(40)
+        batch = store.draw(40, unchanged)
         values = batch["action"][:, 0]
         assert set(values.tolist()) == set(torch.tensor([1, 1.1, 2, 2.1, 2.2, 2.3]).tolist())
         assert torch.allclose(batch["observation.images.top"].mean((1, 2, 3)), values.floor() / 5)
