@@ -43,18 +43,21 @@ def read_policy_config(path: str, overrides: list[str]) -> PreTrainedConfig:
     return config
 
 
-def copy_checkpoint(config: PreTrainedConfig, folder: Path) -> None:
+def copy_checkpoint(config: PreTrainedConfig, folder: Path, preprocessor: Any = None) -> None:
     """Make a checkpoint that acts as `config` says, with links to its policy's weights and processors.
 
-    A checkpoint that is there already stays. That of a name on the hub is downloaded into its cache.
+    A checkpoint that is there already stays. That of a name on the hub is downloaded into its cache. A
+    `preprocessor` takes the place of the policy's.
     """
     if folder.exists():
         return
     source = local_checkpoint(str(config.pretrained_path))
     with whole_folder(folder) as partial:
         config.save_pretrained(partial)
+        if preprocessor is not None:
+            preprocessor.save_pretrained(partial)
         for file in source.iterdir():
-            if file.name != "config.json":
+            if not (partial / file.name).exists():
                 (partial / file.name).symlink_to(file.resolve())
 
 

@@ -26,6 +26,7 @@ from lerobot_wmrl.envs.start_frames import chosen_episodes
 from lerobot_wmrl.evaluation.comparison import RESULTS, chosen_policy, most_successful
 from lerobot_wmrl.improve.configuration_improve import ImproveConfig
 from lerobot_wmrl.improve.findings import LONGEST_IMAGINATION, Findings, look, require_mergeable, usual_length
+from lerobot_wmrl.improve.own_cameras import with_own_cameras, without_renaming
 from lerobot_wmrl.improve.sizes import Sizes
 from lerobot_wmrl.maniskill.recordings import require_unreported
 from lerobot_wmrl.rewards.general import default_discount
@@ -66,10 +67,17 @@ DONE_THRESHOLD: Final = 0.95
 
 @dataclass(frozen=True)
 class Improvement:
-    """The improvement of one policy with one dataset; paths are relative to where the command runs."""
+    """The improvement of one policy with one dataset; paths are relative to where the command runs.
+
+    Args:
+        config: the command's configuration.
+        found: what was found in the dataset.
+        preprocessor: the policy's, where a copy of the policy has the dataset's cameras in place of its own.
+    """
 
     config: ImproveConfig
     found: Findings
+    preprocessor: Any = None
 
     @classmethod
     def of(cls, config: ImproveConfig) -> "Improvement":
@@ -80,6 +88,10 @@ class Improvement:
         """
         assert config.policy is not None
         table = read_episodes(config.dataset.open())
+        preprocessor, postprocessor = load_processors(config.policy)
+        own = with_own_cameras(config.policy, preprocessor, table.dataset.features)
+        adapted = without_renaming(preprocessor, own) if own is not config.policy else None
+        config.policy = own
         found = look(table, config.policy, config.dataset.episodes, config.rollouts)
         chosen = np.flatnonzero(table.among(config.dataset.episodes))
         require_unreported(table, chosen, "choose others with `dataset.episodes`")
@@ -87,14 +99,14 @@ class Improvement:
             require_mergeable(table.dataset, config.real_env)
         robot = read_embodiment(table.dataset.meta, Embodiment())
         check_units(
-            config.policy, load_processors(config.policy)[1], robot.action_names,
+            config.policy, postprocessor, robot.action_names,
             torch.tensor(robot.action_low), torch.tensor(robot.action_high), "the dataset",
         )  # fmt: skip
         if config.real_env is not None:
             starts = max(config.eval_episodes, config.selection_episodes)
             # not in this process: stages are forks of it that render too
             in_fork(check_real_env, config.policy, config.real_env, starts)
-        return cls(config, found)
+        return cls(config, found, adapted)
 
     @property
     def duration(self) -> str:
@@ -109,20 +121,25 @@ class Improvement:
 
     @property
     def policy(self) -> str:
-        """Path or name of the policy that is improved: with settings of the command line, that of a copy.
+        """Path or name of the policy that is improved, or that of its copy if there is one.
 
         It is a checkpoint's, and not the link `last`, which a longer training moves on.
         """
         assert self.config.policy is not None
-        if self.config.policy_flags:
+        if self.copies:
             return str(self.out / "policy")
         return resolved_path(str(self.config.policy.pretrained_path))
 
+    @property
+    def copies(self) -> bool:
+        """Whether every stage reads a copy of the policy: with settings that were given, or other cameras."""
+        return bool(self.config.policy_flags) or self.preprocessor is not None
+
     def copy_policy(self) -> None:
-        """Make the copy of the policy that every stage reads, if the command line changes its settings."""
+        """Make that copy, if there is to be one."""
         assert self.config.policy is not None
-        if self.config.policy_flags:
-            copy_checkpoint(self.config.policy, self.out / "policy")
+        if self.copies:
+            copy_checkpoint(self.config.policy, self.out / "policy", self.preprocessor)
 
     @property
     def clones(self) -> bool:
