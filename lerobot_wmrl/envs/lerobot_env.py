@@ -111,6 +111,16 @@ def check_real_env(policy: PreTrainedConfig, config: EnvConfig, starts: int = 0)
     check_fit(policy, sized, env.single_action_space.shape[0], "real_env")
 
 
+def check_frame_rate(config: EnvConfig, fps: int, where: str) -> None:
+    """Raise FieldError unless `real_env` has as many frames a second as the data that is learnt from."""
+    if config.fps != fps:
+        raise FieldError(
+            "real_env.fps", config.fps, f"{where} has {fps} frames a second, and what is recorded in both is "
+            "learnt from, or checked on, together",
+            f"set it to {fps} if the environment has that, or resample the dataset (lerobot-wmrl-resample)",
+        )  # fmt: skip
+
+
 class LeRobotTensorEnv(TensorEnv):
     """B environments of LeRobot's, stepped one after the other.
 

@@ -9,7 +9,7 @@ import torch
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from lerobot_wmrl.common.statistics import Estimate, Proportion, bootstrap_ratio
+from lerobot_wmrl.common.statistics import Estimate, Proportion, bootstrap_ratio, evenly_spaced
 from lerobot_wmrl.data.embodiment import POSITION_NAMES, component_names
 from lerobot_wmrl.data.episodes import EpisodeTable
 from lerobot_wmrl.data.frames import Context
@@ -230,7 +230,7 @@ def robustness(
         For each kind, the share of episodes predicted as successes, and the PSNR (dB) of the last against the
         first frame, both decoded.
     """
-    episodes, device = episodes[:BATCH], model.state_mean.device
+    episodes, device = episodes[evenly_spaced(len(episodes), BATCH)], model.state_mean.device
     table, horizon = recording.table, recording.steps(HORIZON_SECONDS)
     starts, own = recording.starts(model, episodes), recording.actions(episodes, horizon, device)
     absolute = absolute_control(table)

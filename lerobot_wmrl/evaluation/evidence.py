@@ -1,10 +1,12 @@
 """What a judgement rests on: labelled rollouts, policies of known success, and where models come from."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from lerobot.utils.constants import CHECKPOINTS_DIR, PRETRAINED_MODEL_DIR
 
 from lerobot_wmrl.common.checkpoints import resolve_checkpoint
@@ -12,8 +14,8 @@ from lerobot_wmrl.common.constants import DYNA, START_SCENE
 from lerobot_wmrl.common.errors import FieldError, first_line
 from lerobot_wmrl.common.output_folders import CONFIG_FILE
 from lerobot_wmrl.common.statistics import Proportion
-from lerobot_wmrl.data.dataset import ChosenEpisodes
-from lerobot_wmrl.data.episodes import choose_episodes
+from lerobot_wmrl.data.dataset import ChosenEpisodes, DatasetSource, open_dataset
+from lerobot_wmrl.data.episodes import EpisodeTable, choose_episodes, read_episodes
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.evaluation.calibration import Confusion
 from lerobot_wmrl.evaluation.gate import Outcomes, gate_at, labelled_recording, predict_outcomes
@@ -127,10 +129,12 @@ def trained_inside(policy: str, world_model: str) -> str | None:
     return None
 
 
-def learnt_from(world_model: str, rollouts: ChosenEpisodes, split: str) -> list[str]:
-    """Return a warning if the world model has learnt from the rollouts that it is checked on.
+def learnt_from(
+    world_model: str, rollouts: DatasetSource, split: str = "all", episodes: Sequence[int] | None = None
+) -> list[str]:
+    """Return a warning if the world model has learnt from the rollouts that it is checked on, or from copies.
 
-    Trainings that it was continued from count too, as far as their settings lie on this machine.
+    Trainings that it was continued from count too, as far as their settings and data lie on this machine.
     """
     sources = [settings.get("dataset") or {} for _, settings in _trainings(world_model, "model")]
     roots = [
@@ -138,13 +142,34 @@ def learnt_from(world_model: str, rollouts: ChosenEpisodes, split: str) -> list[
         for source in sources
         for root in (source.get("root") or source.get("repo_id"), *source.get("more", ()))
     ]
-    known = any(root and (root == rollouts.name or _same(Path(root), Path(rollouts.name))) for root in roots)
-    if not known or "validation" in split.split(","):
+    roots = [str(root) for root in roots if root]
+    if any(root == rollouts.name or _same(Path(root), Path(rollouts.name)) for root in roots):
+        seen = "" if "validation" in split.split(",") else "these episodes"
+    else:
+        table = read_episodes(rollouts.open())
+        own = action_digests(table, np.flatnonzero(table.among(episodes)))
+        copies = len(own & {digest for root in roots for digest in learnt_digests(Path(root))})
+        seen = f"{copies} of these episodes" if copies else ""
+    if not seen:
         return []
     return [
-        f"The world model has learnt from {rollouts.name} and predicts these episodes better than others, so "
-        "estimates and intervals are wrong. Take those that were held out (--split=validation), or others."
+        f"The world model has learnt from {seen} ({rollouts.name}) and predicts them better than others, so "
+        "estimates and intervals are wrong. Take those that were held out (--split=validation of the dataset "
+        "that it was trained on), or others."
     ]
+
+
+def learnt_digests(root: Path) -> set[str]:
+    """Return `action_digests` of a dataset's episodes that are not held out; none if it is not here."""
+    if not (root / "meta" / "info.json").is_file():
+        return set()
+    table = read_episodes(open_dataset(root))
+    return action_digests(table, np.flatnonzero(~table.validation))
+
+
+def action_digests(table: EpisodeTable, episodes: np.ndarray) -> set[str]:
+    """Return digests of the actions of these episodes (E,): copies keep them, whatever columns they lose."""
+    return {sha256(table.action[rows].astype("<f4").tobytes()).hexdigest() for rows in table.rows(episodes)}
 
 
 def _trainings(checkpoint: str, trained: str) -> Iterator[tuple[str, Mapping[str, Any]]]:

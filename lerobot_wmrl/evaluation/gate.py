@@ -59,12 +59,14 @@ class Outcomes:
         done: recorded success after each action (E, T).
         held: median of the frames for which successes hold at the end of their episodes. It is that of all
             episodes, also of a part of them.
+        goes_on: episodes of which only the first frames are looked at, (E,) bool; none by default.
     """
 
     episodes: np.ndarray
     probability: np.ndarray
     done: np.ndarray
     held: float | None = None
+    goes_on: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         if self.held is None:
@@ -97,12 +99,18 @@ class Outcomes:
 
     def where(self, kept: np.ndarray) -> "Outcomes":
         """Return the episodes where `kept` (E,) is True."""
-        return Outcomes(self.episodes[kept], self.probability[kept], self.done[kept], self.held)
+        goes_on = None if self.goes_on is None else self.goes_on[kept]
+        return Outcomes(self.episodes[kept], self.probability[kept], self.done[kept], self.held, goes_on)
 
     def within(self, frames: int | None) -> "Outcomes":
         """Return the outcomes by the first frames of every episode, by all if `frames` is None. A later
         success does not count, and neither does what is predicted for later frames."""
-        return Outcomes(self.episodes, self.probability[:, :frames], self.done[:, :frames], self.held)
+        if frames is None:
+            return self
+        goes_on = (self.length > frames) | (False if self.goes_on is None else self.goes_on)
+        return Outcomes(
+            self.episodes, self.probability[:, :frames], self.done[:, :frames], self.held, goes_on
+        )
 
     @property
     def length(self) -> np.ndarray:
@@ -135,12 +143,13 @@ class Outcomes:
         """Return the predicted probabilities. (E, T')
 
         Where episodes end at success, the prediction for the last frame is repeated, in failures as well, so
-        that it can hold for `frames` frames.
+        that it can hold for `frames` frames; not in episodes that go on.
         """
         if not self.ends_at_success(frames):
             return self.probability
         probability = np.pad(self.probability, ((0, 0), (0, frames - 1)), constant_values=np.nan)
-        for row, end in enumerate(self.length):
+        ends = np.ones(len(probability), bool) if self.goes_on is None else ~self.goes_on
+        for row, end in zip(np.flatnonzero(ends), self.length[ends], strict=True):
             probability[row, end : end + frames - 1] = probability[row, end - 1]
         return probability
 

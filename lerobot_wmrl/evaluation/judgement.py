@@ -45,7 +45,7 @@ class Judgement:
     coverage: float
     warnings: Sequence[str] = ()
     outcomes: dict[str, list[bool]] = field(default_factory=dict)
-    earlier: Mapping[str, list[bool]] = field(default_factory=dict)
+    earlier: dict[str, list[bool]] = field(default_factory=dict)
 
     def imagined(self, name: str) -> Proportion:
         """Return how often a policy succeeds in the world model."""

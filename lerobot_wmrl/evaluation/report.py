@@ -11,7 +11,7 @@ import numpy as np
 from lerobot_wmrl.common.constants import KINDS, PLAY, START_KIND
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.files import markdown_table
-from lerobot_wmrl.common.statistics import Estimate
+from lerobot_wmrl.common.statistics import Estimate, evenly_spaced
 from lerobot_wmrl.data.frames import NO_CONTEXT
 from lerobot_wmrl.evaluation import pictures
 from lerobot_wmrl.evaluation.accuracy import (
@@ -210,7 +210,8 @@ def report_goals(
     text_model: TextWorldModelRewardModel, recording: Recording, evaluation: Evaluation, folder: Path
 ) -> Report:
     """Report goal frames from the starts of the evaluated episodes, and save goal_frames.png in `folder`."""
-    goals = imagine_goals(text_model, recording, evaluation.attempts[:MAX_GOALS])
+    attempts = evaluation.attempts
+    goals = imagine_goals(text_model, recording, attempts[evenly_spaced(len(attempts), MAX_GOALS)])
     quality = goal_quality(goals, train_probe(text_model.tokenizer, recording))
     pictures.save_goals(goals, folder / "goal_frames.png")
     return Report({"goal_frames": quality}, goal_table(quality))

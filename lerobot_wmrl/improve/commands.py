@@ -193,6 +193,7 @@ def compare(
     imagined = env["env.type"] == "world_model"
     if imagined:  # none twice: there are at least as many as episodes
         starts = min(starts, improvement.fewest_starts())
+        env = {**env, "env.dataset.max_starts": improvement.spread(starts)}
     at_once = 16 if imagined else MANISKILL_PROCESSES if improvement.in_maniskill else 1
     return ["lerobot-wmrl-compare", *format_flags({
         "policies": f"[{','.join(policies or improvement.policies.values())}]", "against": "all", **env,

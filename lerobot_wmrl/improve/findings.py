@@ -40,7 +40,8 @@ class Findings:
         frame_side: the shorter side of their frames in pixels.
         pixels: pixels of all these cameras' frames.
         held_out: how many of them are held out from training.
-        fewest: how many there are of the task that has the fewest.
+        tasks: how many tasks there are, as far as the dataset says.
+        fewest: how many episodes there are of the task that has the fewest.
         longest: frames of the longest episode.
         usual: length that nine of ten episodes do not exceed, of the task with the longest.
         success_frames: frames of all successful episodes.
@@ -57,6 +58,7 @@ class Findings:
     frame_side: int
     pixels: int
     held_out: int
+    tasks: int
     fewest: int
     longest: int
     usual: int
@@ -145,7 +147,7 @@ def look(
         ],
         cameras=camera_names(keys),
         frame_side=min(map(min, sizes.values())), pixels=sum(h * w for h, w in sizes.values()),
-        held_out=held_out, fewest=int(tasks.min()), longest=int(table.length.max()),
+        held_out=held_out, tasks=len(tasks), fewest=int(tasks.min()), longest=int(table.length.max()),
         usual=usual_length(table),
         success_frames=int(table.length[success].sum()), failures=int((~success).sum()),
         root=Path(root), total=total,

@@ -21,7 +21,7 @@ from lerobot_wmrl.data.embodiment import Embodiment, read_embodiment
 from lerobot_wmrl.data.episodes import SUCCESS, EpisodeTable, read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
-from lerobot_wmrl.envs.lerobot_env import check_real_env
+from lerobot_wmrl.envs.lerobot_env import check_frame_rate, check_real_env
 from lerobot_wmrl.envs.start_frames import chosen_episodes
 from lerobot_wmrl.evaluation.comparison import RESULTS, chosen_policy, most_successful
 from lerobot_wmrl.improve.configuration_improve import ImproveConfig
@@ -103,6 +103,7 @@ class Improvement:
             torch.tensor(robot.action_low), torch.tensor(robot.action_high), "the dataset",
         )  # fmt: skip
         if config.real_env is not None:
+            check_frame_rate(config.real_env, table.dataset.fps, "the dataset")
             starts = max(config.eval_episodes, config.selection_episodes)
             # not in this process: stages are forks of it that render too
             in_fork(check_real_env, config.policy, config.real_env, starts)
@@ -247,6 +248,12 @@ class Improvement:
         table = self.learnt()
         begun = chosen_episodes(table, StartFrames(max_starts=MAX_STARTS, branches=branches))
         return int(np.unique(table.column(START_TASK)[begun], return_counts=True)[1].min())
+
+    def spread(self, starts: int) -> int:
+        """Return how many starts imagination takes, evenly spread over the dataset: `starts`, which begin in
+        all parts of it. Of several tasks it takes all that it can, because some may have few."""
+        each = 1 + self.branches()
+        return -(-starts // each) * each if self.found.tasks == 1 else MAX_STARTS
 
     def checked(self) -> tuple[Flags, str]:
         """Return the flags of the dataset that the world model is checked on, and its split.

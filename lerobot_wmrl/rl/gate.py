@@ -18,6 +18,7 @@ from lerobot_wmrl.common.constants import GATE_SEED
 from lerobot_wmrl.common.errors import TrainingStopped
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
+from lerobot_wmrl.evaluation.evidence import learnt_from
 from lerobot_wmrl.evaluation.gate import Gate, Outcomes, gate_at, labelled_recording, predict_outcomes
 from lerobot_wmrl.evaluation.pictures import save_strip, side_by_side
 from lerobot_wmrl.evaluation.replay import Recording, replay_episodes
@@ -69,6 +70,8 @@ class SuccessGate:
         recordings: dict[str, Recording] = {}
         if self.config.dataset.given and self._new_model(iteration):
             recordings[LABELLED] = labelled_recording(self.env.model, self.config.dataset.open())
+            for warning in learnt_from(self.env.config.world_model_path, self.config.dataset):
+                logging.warning(colored(warning, "red", attrs=["bold"]))
         if self.recorder is not None:
             recordings[FRESH] = self._fresh(self.recorder, iteration, checkpoint, folder / "rollouts")
         verdicts = {}

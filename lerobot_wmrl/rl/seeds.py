@@ -12,9 +12,14 @@ NOISE_SEED = 2**31
 """Added to a rollout's seed for the policy's noise, so that it differs from the environment's."""
 
 
+SEED_STRIDE = 618_034
+"""Distance of the first seeds of trainings with consecutive seeds, of a million: by the golden ratio, so that
+few trainings share a start, however many there are."""
+
+
 def first_seed(seed: int, iteration: int, num_envs: int) -> int:
     """Return the first of an iteration's `num_envs` environment seeds, all of them below EVALUATION_SEED."""
-    return (seed + iteration * num_envs) % (EVALUATION_SEED - num_envs)
+    return (seed * SEED_STRIDE + iteration * num_envs) % (EVALUATION_SEED - num_envs)
 
 
 def start_seeds(first: int, num_envs: int, group_size: int) -> int | list[int]:

@@ -30,7 +30,7 @@ from lerobot_wmrl.common.output_folders import claimed, require_free
 if TYPE_CHECKING:
     from lerobot.configs import PreTrainedConfig
 
-    from lerobot_wmrl.evaluation.comparison import Comparison
+    from lerobot_wmrl.evaluation.comparison import Comparison, Episode
 
 
 @dataclass
@@ -91,20 +91,28 @@ class CompareConfig(RunConfig):
 def compare(cfg: CompareConfig) -> None:
     """Run the policies, or what is missing of their episodes; write comparison.json and comparison.png."""
     from lerobot_wmrl.evaluation.compare import read_policies
-    from lerobot_wmrl.evaluation.comparison import RESULTS, Comparison, read_episodes, save_picture
+    from lerobot_wmrl.evaluation.comparison import RESULTS, Comparison, save_picture
 
     cfg.validate()
     assert cfg.env is not None
     configs = read_policies(cfg.policies, cfg.env)
     cfg.policies = list(configs)
     require_free(cfg.output_dir, draccus.encode(cfg), may_differ(cfg))
-    results = cfg.output_dir / RESULTS
-    episodes = read_episodes(json.loads(results.read_text())) if results.is_file() else []
-    comparison = Comparison(cfg.policies, cfg.n_episodes, cfg.against, cfg.alpha, cfg.stop_early, episodes)
+    comparison = Comparison(
+        cfg.policies, cfg.n_episodes, cfg.against, cfg.alpha, cfg.stop_early, stored_episodes(cfg)
+    )
     if not comparison.finished:
         run(cfg, comparison, configs)
     save_picture(comparison, cfg.output_dir / "comparison.png")
     print(f"{comparison}\n{RESULTS} and comparison.png are in {cfg.output_dir}")
+
+
+def stored_episodes(cfg: CompareConfig) -> "list[Episode]":
+    """Return the episodes that have run before."""
+    from lerobot_wmrl.evaluation.comparison import RESULTS, read_episodes
+
+    results = cfg.output_dir / RESULTS
+    return read_episodes(json.loads(results.read_text())) if results.is_file() else []
 
 
 def may_differ(cfg: CompareConfig) -> list[str]:
@@ -137,6 +145,7 @@ def run(cfg: CompareConfig, comparison: "Comparison", configs: "dict[str, PreTra
         require_new_starts(envs[0], cfg.env, cfg.n_episodes)
         policies = load_policies(configs)
         with claimed(cfg.output_dir, settings, may_differ(cfg)):
+            comparison.episodes[:] = stored_episodes(cfg)  # another command may have added some meanwhile
             run_comparison(comparison, envs, cfg.env, policies, cfg.batch_size, cfg.seed, save)
 
 

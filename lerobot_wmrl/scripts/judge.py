@@ -177,10 +177,9 @@ def judge(cfg: JudgeConfig) -> None:
     before = imagined_before(cfg, confusion)
     judgement = Judgement(
         confusion, references, {name: why for name, why in reasons.items() if why}, cfg.coverage,
-        [*learnt_from(cfg.world_model.path, cfg.dataset, cfg.split), *warnings],
-        {name: found for name, found in before.items() if name in configs},
-        {name: found for name, found in before.items() if name not in configs},
+        [*learnt_from(cfg.world_model.path, cfg.dataset, cfg.split, cfg.dataset.episodes), *warnings],
     )  # fmt: skip
+    remember(judgement, before, configs)
     with writing("output_dir", cfg.output_dir):
         imagine(cfg, env, judgement, configs)
         save_picture(judgement, cfg.output_dir / "judgement.png")
@@ -210,6 +209,14 @@ def read_both(
             "leave it out of one of the two",
         )  # fmt: skip
     return others | judged, dict(zip(others, known.values(), strict=True))
+
+
+def remember(
+    judgement: "Judgement", before: Mapping[str, list[bool]], configs: "Mapping[str, PreTrainedConfig]"
+) -> None:
+    """Take over what earlier calls have imagined, of the policies of this one and of others."""
+    for name, outcomes in before.items():
+        (judgement.outcomes if name in configs else judgement.earlier)[name] = outcomes
 
 
 def imagined_before(cfg: JudgeConfig, confusion: "Confusion") -> dict[str, list[bool]]:
@@ -245,15 +252,17 @@ def imagine(
         finished = configs.keys() == judgement.outcomes.keys()
         write_json(cfg.output_dir / RESULTS, judgement.as_json(finished))
 
-    missing = {name: config for name, config in configs.items() if name not in judgement.outcomes}
-    if not missing:
-        write()
+    if not configs.keys() - judgement.outcomes.keys():
+        with claimed(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER):
+            write()
         return
     size = even_batch(env.dataset.max_starts, cfg.batch_size)
     group = regrouped("dataset", "starts") if cfg.starts_given else nullcontext()
     with group, opened(env, size, False, 1) as (envs,):
         starts = starts_of_one_task(envs, cfg)
         with claimed(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER):
+            remember(judgement, imagined_before(cfg, judgement.confusion), configs)  # what another has added
+            missing = {name: config for name, config in configs.items() if name not in judgement.outcomes}
             for name, config in tqdm(missing.items(), desc="Imagining", unit="policy"):
                 with about_policy(name):
                     policies = load_policies({name: config})

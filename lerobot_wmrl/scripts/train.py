@@ -114,7 +114,8 @@ def train_in(
     """Check that policy and environment fit, then train. `settings` are the configuration's, as JSON."""
     from lerobot_wmrl.common.pipeline import make_pipeline
     from lerobot_wmrl.common.policies import adopt_features, check_fit, with_new_adapters
-    from lerobot_wmrl.envs.lerobot_env import check_real_env, shapes_of
+    from lerobot_wmrl.envs.lerobot_env import check_frame_rate, check_real_env, shapes_of
+    from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
     from lerobot_wmrl.rl.budget import charge_steps
     from lerobot_wmrl.rl.distillation import Distillation
     from lerobot_wmrl.rl.make_callbacks import Trained, make_callbacks
@@ -132,6 +133,8 @@ def train_in(
         env.model.check_units(config, processors[1])
     if cfg.real_env is not None:
         check_real_env(config, cfg.real_env)
+        if isinstance(env, WorldModelVectorEnv):
+            check_frame_rate(cfg.real_env, env.model.config.embodiment.fps, "the world model's dataset")
     if cfg.peft is not None:
         policy = with_new_adapters(policy, cfg.peft)
     algorithm = make_algorithm(policy, cfg.algorithm, cfg.output_dir)

@@ -16,7 +16,12 @@ from lerobot.utils.constants import OBS_IMAGE, OBS_STATE
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.common.tracking import read_metrics
-from lerobot_wmrl.envs.lerobot_env import LeRobotTensorEnv, check_real_env, make_tensor_env
+from lerobot_wmrl.envs.lerobot_env import (
+    LeRobotTensorEnv,
+    check_frame_rate,
+    check_real_env,
+    make_tensor_env,
+)
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 from lerobot_wmrl.rl.configuration_train import TrainConfig
 from lerobot_wmrl.scripts.train import check_tasks, main
@@ -74,6 +79,12 @@ def test_rewards_and_success_are_the_environments_own(
     assert terminated.tolist() == info["final_info"]["is_success"].tolist() == [False, True]
     assert not truncated.any()
     bare.close()
+
+
+def test_another_frame_rate_than_that_of_the_data_is_refused() -> None:
+    check_frame_rate(PushtEnv(), 10, "the dataset")
+    with pytest.raises(FieldError, match=r"^real_env.fps=10: the dataset has 30 frames a second"):
+        check_frame_rate(PushtEnv(), 30, "the dataset")
 
 
 def test_seeds_decide_where_episodes_begin(env: LeRobotTensorEnv) -> None:

@@ -232,6 +232,24 @@ def test_a_comparison_that_stopped_continues_to_the_same_result(config, stop, tm
     assert {True, False} == {success for episode in whole["episodes"] for success in episode["successes"]}
 
 
+def test_what_another_command_has_run_meanwhile_is_kept(config, monkeypatch):
+    """It ended while this one made its environments."""
+    whole = compare(replace(config)) or results_of(config)
+    results = config.output_dir / "comparison.json"
+    finished = results.read_text()
+    results.unlink()
+    make = running.opened
+
+    def opened(*args: Any) -> Any:
+        results.write_text(finished)
+        return make(*args)
+
+    monkeypatch.setattr(running, "opened", opened)
+    monkeypatch.setattr(running, "run_block", None)
+    compare(config)
+    assert results_of(config) == whole
+
+
 def kill_in_third_block(config: CompareConfig, monkeypatch: pytest.MonkeyPatch) -> None:
     """Interrupt a comparison after two blocks."""
     run_block, blocks = running.run_block, []

@@ -97,6 +97,16 @@ def test_what_comes_later_than_an_imagined_episode_is_not_judged():
     assert whole.within(None).length.tolist() == [3, 3, 3]
 
 
+def test_what_is_cut_where_imagination_ends_does_not_last():
+    """Episodes end at success here, and a failure goes on after a frame that looks like one."""
+    probability = np.array([[0.1, 0.9, np.nan, np.nan], [0.1, 0.9, 0.1, 0.1]])
+    done = np.array([[False, True, False, False], [False] * 4])
+    for outcomes in (whole := Outcomes(np.arange(2), probability, done), whole.within(2)):
+        gate = gate_at(outcomes, 0.5, 3)
+        assert (gate.recall.k, gate.false_positives.k) == (1, 0)
+    assert gate_at(whole.within(2).where(np.array([False, True])), 0.5, 3).false_positives.k == 0
+
+
 def test_auc_is_the_share_of_pairs_in_the_right_order(outcomes):
     """Scores over three frames: successes 0.9, 0.8, 0.1; failures 0.7, 0.1. One pair ties."""
     assert outcomes.scores(3).tolist() == [0.9, 0.8, 0.1, 0.7, 0.1]

@@ -291,23 +291,30 @@ def test_a_planner_in_the_world_model_is_refused(tmp_path, trained_models):
 
 
 def test_rollouts_that_the_world_model_has_learnt_from_are_warned_about(
-    config, seeing, capsys, tmp_path, trained_models
+    config, seeing, capsys, tmp_path, make_synthetic_dataset, small_dataset
 ):
     (warning,) = results_of(config)["warnings"]
     assert "has learnt from" in warning
     assert warning in capsys.readouterr().out
     assert learnt_from(config.world_model.path, config.dataset, "validation,ind") == []
-    assert learnt_from(config.world_model.path, ChosenEpisodes(str(tmp_path)), "all") == []
+    others = ChosenEpisodes(str(make_synthetic_dataset(tmp_path / "others", episodes=3, length=5).root))
+    assert learnt_from(config.world_model.path, others) == []
+    again = ChosenEpisodes(str(tmp_path / "copy"))
+    shutil.copytree(small_dataset.root, again.root)
+    (warning,) = learnt_from(config.world_model.path, again)
+    assert "6 of these episodes" in warning
+    (warning,) = learnt_from(config.world_model.path, again, episodes=[0, 3])
+    assert "2 of these episodes" in warning
     copy = tmp_path / "model"
     shutil.copytree(resolve_checkpoint(config.world_model.path), copy)
-    write(copy / "train_config.json", {"dataset": {"root": "demonstrations", "more": [str(tmp_path)]}})
-    assert learnt_from(str(copy), ChosenEpisodes(str(tmp_path)), "all") != []
+    write(copy / "train_config.json", {"dataset": {"root": "demonstrations", "more": [others.root]}})
+    assert learnt_from(str(copy), others) != []
     (tmp_path / "further").mkdir()
     further = write(tmp_path / "further" / "train_config.json", {
         "dataset": {"root": "rollouts"}, "model": {"pretrained_path": str(copy)},
     })  # fmt: skip
     write(further.parent / "config.json", {})
-    assert learnt_from(str(further.parent), ChosenEpisodes(str(tmp_path)), "all") != [], "from the first on"
+    assert learnt_from(str(further.parent), others) != [], "from the first on"
 
 
 def test_rollouts_count_within_the_length_of_an_episode_and_must_both_succeed_and_fail(

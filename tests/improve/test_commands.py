@@ -138,6 +138,17 @@ def test_imagined_frames_of_a_training_are_2_gib_at_most(
     assert [flag for flag in command if flag.startswith("--num_envs=")] == flags
 
 
+@pytest.mark.parametrize(("found", "taken"), [
+    ({"total": 500, "fewest": 500, "tasks": 1}, 100), ({"total": 60, "fewest": 60, "tasks": 1}, 60),
+    ({"total": 500, "fewest": 120, "tasks": 4}, 1024), ({"total": 500, "fewest": 500, "longest": 300}, 100),
+])  # fmt: skip
+def test_imagined_comparisons_begin_in_all_parts_of_a_dataset(
+    found: dict[str, int], taken: int, tmp_path: Path
+) -> None:
+    """Not in neighbouring episodes, which may be of one task, or of demonstrations alone."""
+    assert f"--env.dataset.max_starts={taken}" in made_commands(tmp_path, **found)["comparison"]
+
+
 @pytest.mark.parametrize(("held_out", "split"), [(0, "all"), (9, "all"), (10, "validation")])
 def test_the_check_takes_held_out_episodes_where_there_are_enough(
     tmp_path: Path, held_out: int, split: str

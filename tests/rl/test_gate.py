@@ -99,10 +99,12 @@ def test_at_the_limit_training_goes_on(
     make_gate: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     gate = make_gate(BELIEVES_NONE)
-    record = gate.run(0, tmp_path, tmp_path / "gate")
-    assert record["labelled"]["false_positive_rate"]["k"] == 0
     with caplog.at_level(logging.WARNING):
+        record = gate.run(0, tmp_path, tmp_path / "gate")
+        assert "The world model has learnt from these episodes" in caplog.text
+        caplog.clear()
         gate.apply({0: record})
+    assert record["labelled"]["false_positive_rate"]["k"] == 0
     assert not [entry for entry in caplog.records if entry.levelno >= logging.WARNING]
 
 

@@ -107,3 +107,10 @@ def test_training_seeds_are_apart_from_evaluation_seeds() -> None:
             assert first >= 0
             assert first + num_envs <= EVALUATION_SEED
     assert first_seed(5, 2, 64) != first_seed(5, 3, 64)
+
+
+def test_trainings_of_neighbouring_seeds_begin_at_starts_of_their_own() -> None:
+    """A thousand iterations each."""
+    used = [{first_seed(seed, i, 64) + row for i in range(1000) for row in range(64)} for seed in range(5)]
+    assert len(set().union(*used)) == 5 * 64_000
+    assert first_seed(0, 3, 64) == 3 * 64
