@@ -36,6 +36,7 @@ from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.ppo import PPO
 from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
+from lerobot_wmrl.scripts.train import compacted
 from lerobot_wmrl.world_models.checkpoint import read_config
 
 RESULTS: Final = Path(__file__).parents[1] / "docs" / "results" / "ppo_speed.json"
@@ -87,7 +88,7 @@ def untrained_policy(env: gym.vector.VectorEnv, device: str) -> tuple[CnnPolicy,
         for name, shape in {ACTION: (size,), OBS_STATE: state}.items()
     }
     processors = make_cnn_pre_post_processors(config, stats)
-    return CnnPolicy(config).to(device).eval(), make_pipeline(config, *processors)
+    return CnnPolicy(config).to(device).eval(), make_pipeline(config, *processors, shown=compacted(env))
 
 
 def buffer_bytes(buffer: RolloutBuffer) -> int:

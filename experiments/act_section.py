@@ -70,4 +70,7 @@ def controls(load: Load) -> str:
             rows.append([cell["seed"], learnt, *(against(after[d], before[d]) for d in SCENES)])
     return f"""Success of the planner distilled, against the BC that it begins from, on the same starts:
 
-{table(["seed", "the world model learnt from", "known scenes", "unseen scenes"], rows)}"""
+{table(["seed", "the world model learnt from", "known scenes", "unseen scenes"], rows)}
+
+In the world model of other episodes' labels the planner succeeded in none of 64 imagined episodes, so that the
+training stopped and the policy stayed as it was."""

@@ -49,14 +49,15 @@ def require_free(
 ) -> None:
     """Raise FieldError unless the folder is new, empty or this run's; leave it as it is.
 
-    `output_dir` (a run may be moved) and the settings called `free` may differ between the first call and its
-    continuation.
+    The settings called `free` may differ between the first call and its continuation. So may `output_dir`: a
+    run may be moved, but not one of stages, which name its folder.
     """
     stored = output_dir / marker
     if output_dir.exists() and not output_dir.is_dir():
         raise FieldError("output_dir", output_dir, "is a file", "choose a new folder")
     if stored.is_file():
-        require_same(output_dir, json.loads(stored.read_text()), settings, {"output_dir", *free})
+        free = {"output_dir", *free} if marker == CONFIG_FILE else free
+        require_same(output_dir, json.loads(stored.read_text()), settings, free)
     else:
         require_empty(output_dir, marker, LOCK)
 

@@ -1,7 +1,8 @@
 """The world model as a natively batched environment: many imagined episodes, one forward pass a step."""
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -111,6 +112,15 @@ class WorldModelVectorEnv(TensorEnv):
         reward = self.reward.compute_reward({**seen, **parts, "hidden": imagined.hidden})
         parts |= {**entropies(imagined), "done_probability": imagined.done_logit.sigmoid()}
         return Outcome(observation, reward, terminated, truncated, terminated, self._elapsed, parts)
+
+    @contextmanager
+    def in_full(self) -> Iterator[None]:
+        """Show frames of the dataset's size within the block, also if they are compact outside it."""
+        compact, self.compact = self.compact, False
+        try:
+            yield
+        finally:
+            self.compact = compact
 
     def newest_frames(self) -> Frames:
         """Return the newest imagined frames, from which a planner can look ahead."""

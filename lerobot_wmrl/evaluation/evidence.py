@@ -33,9 +33,7 @@ def replayed_rollouts(env: WorldModelEnv, rollouts: ChosenEpisodes, split: str) 
     model = load_model(env.world_model_path, "action_world_model", env.device)
     recording = labelled_recording(model, rollouts.open())
     table = recording.table
-    scenes = scene_splits(table.column(START_SCENE), split)
-    chosen = choose_episodes(table, split, len(table.length), scenes, table.among(rollouts.episodes))
-    recording = Recording(table.subset(chosen), recording.frames)
+    recording = Recording(table.subset(replayed_episodes(table, split, rollouts.episodes)), recording.frames)
     outcomes = predict_outcomes(model, recording).within(env.horizon)
     for found, kind in ((outcomes.success, "succeeds"), (~outcomes.success, "fails")):
         if not found.any():
@@ -45,6 +43,12 @@ def replayed_rollouts(env: WorldModelEnv, rollouts: ChosenEpisodes, split: str) 
                 "often the world model errs", "give rollouts that both succeed and fail",
             )  # fmt: skip
     return outcomes
+
+
+def replayed_episodes(table: EpisodeTable, split: str, episodes: Sequence[int] | None) -> np.ndarray:
+    """Return the chosen episodes of a split. (E,)"""
+    scenes = scene_splits(table.column(START_SCENE), split)
+    return choose_episodes(table, split, len(table.length), scenes, table.among(episodes))
 
 
 def confusion_of(outcomes: Outcomes, env: WorldModelEnv) -> tuple[Confusion, list[str]]:
@@ -137,18 +141,23 @@ def learnt_from(
     Trainings that it was continued from count too, as far as their settings and data lie on this machine.
     """
     sources = [settings.get("dataset") or {} for _, settings in _trainings(world_model, "model")]
-    roots = [
-        root
+    learnt = [
+        (str(root), chosen)
         for source in sources
-        for root in (source.get("root") or source.get("repo_id"), *source.get("more", ()))
+        for root, chosen in (
+            (source.get("root") or source.get("repo_id"), source.get("episodes")),
+            *((more, None) for more in source.get("more", ())),
+        )
+        if root
     ]
-    roots = [str(root) for root in roots if root]
-    if any(root == rollouts.name or _same(Path(root), Path(rollouts.name)) for root in roots):
+    if any(root == rollouts.name or _same(Path(root), Path(rollouts.name)) for root, _ in learnt):
         seen = "" if "validation" in split.split(",") else "these episodes"
     else:
         table = read_episodes(rollouts.open())
-        own = action_digests(table, np.flatnonzero(table.among(episodes)))
-        copies = len(own & {digest for root in roots for digest in learnt_digests(Path(root))})
+        own = action_digests(table, replayed_episodes(table, split, episodes))
+        copies = len(
+            own & {digest for root, chosen in learnt for digest in learnt_digests(Path(root), chosen)}
+        )
         seen = f"{copies} of these episodes" if copies else ""
     if not seen:
         return []
@@ -159,12 +168,14 @@ def learnt_from(
     ]
 
 
-def learnt_digests(root: Path) -> set[str]:
-    """Return `action_digests` of a dataset's episodes that are not held out; none if it is not here."""
-    if not (root / "meta" / "info.json").is_file():
+def learnt_digests(root: Path, episodes: Sequence[int] | None) -> set[str]:
+    """Return `action_digests` of a dataset's chosen episodes that are not held out. There are none if it is
+    not here, or not whole."""
+    try:
+        table = read_episodes(open_dataset(root))
+    except FieldError:
         return set()
-    table = read_episodes(open_dataset(root))
-    return action_digests(table, np.flatnonzero(~table.validation))
+    return action_digests(table, np.flatnonzero(table.among(episodes) & ~table.validation))
 
 
 def action_digests(table: EpisodeTable, episodes: np.ndarray) -> set[str]:

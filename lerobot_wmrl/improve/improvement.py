@@ -103,10 +103,10 @@ class Improvement:
             torch.tensor(robot.action_low), torch.tensor(robot.action_high), "the dataset",
         )  # fmt: skip
         if config.real_env is not None:
-            check_frame_rate(config.real_env, table.dataset.fps, "the dataset")
             starts = max(config.eval_episodes, config.selection_episodes)
             # not in this process: stages are forks of it that render too
             in_fork(check_real_env, config.policy, config.real_env, starts)
+            check_frame_rate(config.real_env, table.dataset.fps, "the dataset")
         return cls(config, found, adapted)
 
     @property
@@ -250,10 +250,10 @@ class Improvement:
         return int(np.unique(table.column(START_TASK)[begun], return_counts=True)[1].min())
 
     def spread(self, starts: int) -> int:
-        """Return how many starts imagination takes, evenly spread over the dataset: `starts`, which begin in
-        all parts of it. Of several tasks it takes all that it can, because some may have few."""
-        each = 1 + self.branches()
-        return -(-starts // each) * each if self.found.tasks == 1 else MAX_STARTS
+        """Return how many starts imagination takes in a comparison on `starts` of them: those of as many
+        episodes, spread evenly over the dataset. Of several tasks it takes all, because some may have few."""
+        tasks = len(np.unique(self.learnt().column(START_TASK))) if self.config.rollouts else self.found.tasks
+        return min(starts * (1 + self.branches()), MAX_STARTS) if tasks == 1 else MAX_STARTS
 
     def checked(self) -> tuple[Flags, str]:
         """Return the flags of the dataset that the world model is checked on, and its split.

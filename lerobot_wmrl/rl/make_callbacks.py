@@ -80,16 +80,17 @@ def make_measures(settings: CallbackSettings, trained: Trained) -> dict[str, Mea
     def measure_in_training_env() -> Any:
         if not is_own(config):
             return evaluate_policy(config, policy, processors, episodes, SELECTION_SEED, num_envs=1)
-        measured_env, count = env, episodes
-        if isinstance(env, WorldModelVectorEnv):
-            own = env.config.dataset
-            if dataset.given:
-                source = StartFrames(**vars(dataset), max_starts=own.max_starts, branches=own.branches)
-                measured_env = make_success_env(env, source, episodes)
-            elif not own.resets:
-                measured_env = make_success_env(env, own, episodes)
-            count = min(count, len(measured_env.starts))
-        return evaluate_within(measured_env, config, policy, processors, count, SELECTION_SEED)
+        if not isinstance(env, WorldModelVectorEnv):
+            return evaluate_within(env, config, policy, processors, episodes, SELECTION_SEED)
+        own, measured_env = env.config.dataset, env
+        if dataset.given:
+            source = StartFrames(**vars(dataset), max_starts=own.max_starts, branches=own.branches)
+            measured_env = make_success_env(env, source, episodes)
+        elif not own.resets:
+            measured_env = make_success_env(env, own, episodes)
+        count = min(episodes, len(measured_env.starts))
+        with measured_env.in_full():
+            return evaluate_within(measured_env, config, policy, processors, count, SELECTION_SEED)
 
     if isinstance(env, WorldModelVectorEnv):
         measures[IMAGINED] = measure_in_training_env

@@ -8,6 +8,7 @@ import pytest
 import torch
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.policies.factory import make_pre_post_processors
+from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
@@ -22,17 +23,31 @@ from lerobot_wmrl.improve.own_cameras import with_own_cameras, without_renaming
 from tests.rl.act_checkpoint import IMAGE, small_act
 from tests.rl.small_smolvla import save_small_smolvlm, small_smolvla
 
-TOP = "observation.images.top"
+TOP, WRIST = "observation.images.top", "observation.images.wrist"
+CAMERAS = [f"observation.images.camera{number}" for number in (1, 2, 3)]
 COLUMNS = {
-    TOP: {"dtype": "video", "shape": (48, 80, 3), "names": ["height", "width", "channels"]},
-    OBS_STATE: {"dtype": "float32", "shape": (4,)},
-}
+    **{name: {"dtype": "video", "shape": (48, 80, 3), "names": ["height", "width", "channels"]}
+       for name in (TOP, WRIST)},
+    OBS_STATE: {"dtype": "float32", "shape": (7,)},
+}  # fmt: skip
+SHOWN = {TOP: (3, 48, 80), WRIST: (3, 48, 80), OBS_STATE: (7,)}
 
 
-def save(policy: Any, folder: Path, renames: dict[str, str]) -> Path:
-    """Save a policy as lerobot-train leaves it with `--rename_map`: it normalises what it renames."""
+@pytest.fixture
+def base(tmp_path: Path) -> SmolVLAPolicy:
+    """As lerobot/smolvla_base: three cameras of 256x256, one more that is kept free, and a state of six."""
+    inputs = {name: PolicyFeature(FeatureType.VISUAL, (3, 256, 256)) for name in CAMERAS}
+    inputs[OBS_STATE] = PolicyFeature(FeatureType.STATE, (6,))
+    return small_smolvla(
+        save_small_smolvlm(tmp_path / "smolvlm"), device="cpu", empty_cameras=1, input_features=inputs,
+        output_features={ACTION: PolicyFeature(FeatureType.ACTION, (3,))},
+    )  # fmt: skip
+
+
+def fine_tuned(policy: Any, folder: Path, renames: dict[str, str]) -> Path:
+    """Save a policy as lerobot-train leaves it: with statistics of the dataset's columns by their names."""
     policy.save_pretrained(folder)
-    sizes = {IMAGE: (3, 1, 1), OBS_STATE: (4,), ACTION: (3,)}
+    sizes = {TOP: (3, 1, 1), WRIST: (3, 1, 1), OBS_STATE: (7,), ACTION: (3,)}
     stats = {
         name: {"mean": torch.full(size, 0.2), "std": torch.full(size, 0.5)} for name, size in sizes.items()
     }
@@ -43,62 +58,47 @@ def save(policy: Any, folder: Path, renames: dict[str, str]) -> Path:
     return folder
 
 
-def adapted(folder: Path) -> Path:
-    """Make a copy for the columns of the dataset."""
-    config = read_policy_config(str(folder), [])
-    preprocessor, _ = load_processors(config)
-    own = with_own_cameras(config, preprocessor, COLUMNS)
-    copy = folder.with_name("copy")
-    copy_checkpoint(own, copy, without_renaming(preprocessor, own))
-    return copy
-
-
-def action(folder: Path, observation: dict[str, Any]) -> Tensor:
+def action(folder: Path) -> Tensor:
+    """What a policy does in some state."""
     config = read_policy_config(str(folder), [])
     before, after = load_processors(config)
-    torch.manual_seed(0)  # of what a flow begins at
-    found: Tensor = after(load_policy(config).select_action(before({**observation})))
+    policy = load_policy(config)
+    torch.manual_seed(0)  # of what it sees, and of what a flow begins at
+    observation = {name: torch.rand(1, *shape) for name, shape in SHOWN.items()}
+    found: Tensor = after(policy.select_action(before({**observation, "task": ["push"]})))
     return found
 
 
-def observed(height: int, width: int) -> dict[str, Any]:
-    torch.manual_seed(1)
-    return {TOP: torch.rand(1, 3, height, width), OBS_STATE: torch.rand(1, 4), "task": ["push"]}
+def test_a_vla_of_other_cameras_and_sizes_acts_as_before(base: SmolVLAPolicy, tmp_path: Path) -> None:
+    original = fine_tuned(base, tmp_path / "tuned", {TOP: CAMERAS[0], WRIST: CAMERAS[1]})
+    config = read_policy_config(str(original), [])
+    assert len(config.image_features) == 4
+    preprocessor, _ = load_processors(config)
+    own = with_own_cameras(config, preprocessor, COLUMNS)
+    copy_checkpoint(own, tmp_path / "copy", without_renaming(preprocessor, own))
+    copied = read_policy_config(str(tmp_path / "copy"), [])
+    assert {name: feature.shape for name, feature in copied.input_features.items()} == SHOWN
+    check_fit(copied, SHOWN, 3)
+    torch.testing.assert_close(action(original), action(tmp_path / "copy"))
 
 
-def test_an_act_of_another_camera_acts_as_before(tmp_path: Path) -> None:
-    """Its statistics go by the camera's name too."""
-    original = save(small_act(), tmp_path / "act", {TOP: IMAGE})
-    copy = adapted(original)
-    assert list(read_policy_config(str(copy), []).image_features) == [TOP]
-    seen = observed(32, 32)
-    assert torch.equal(action(original, seen), action(copy, seen))
-    with pytest.raises(ValueError, match=r"the policy needs observation.images.top of shape \(3, 32, 32\)"):
-        check_fit(read_policy_config(str(copy), []), {TOP: (3, 48, 80), OBS_STATE: (4,)}, 3)
-
-
-def test_a_vla_of_other_cameras_and_sizes_acts_as_before(tmp_path: Path) -> None:
-    """As after fine-tuning lerobot/smolvla_base, which knows 256x256, with a camera that is kept free."""
-    policy = small_smolvla(
-        save_small_smolvlm(tmp_path / "smolvlm"), device="cpu", empty_cameras=1,
-        input_features={
-            IMAGE: PolicyFeature(FeatureType.VISUAL, (3, 256, 256)),
-            OBS_STATE: PolicyFeature(FeatureType.STATE, (4,)),
-        },
-        output_features={ACTION: PolicyFeature(FeatureType.ACTION, (3,))},
-    )  # fmt: skip
-    original = save(policy, tmp_path / "smolvla", {TOP: IMAGE})
-    assert len(read_policy_config(str(original), []).image_features) == 2
-    copy = adapted(original)
-    check_fit(read_policy_config(str(copy), []), {TOP: (3, 48, 80), OBS_STATE: (4,)}, 3)
-    seen = observed(48, 80)
-    torch.testing.assert_close(action(original, seen), action(copy, seen))
-
-
-def test_a_policy_of_the_datasets_cameras_stays_as_it_is(tmp_path: Path) -> None:
-    """Also one whose preprocessor would rename a column that the dataset lacks."""
-    config = read_policy_config(
-        str(save(small_act(), tmp_path / "act", {"observation.images.old": IMAGE})), []
+def test_a_camera_that_it_was_trained_with_and_the_data_lacks_is_missed(
+    base: SmolVLAPolicy, tmp_path: Path
+) -> None:
+    original = fine_tuned(base, tmp_path / "tuned", {TOP: CAMERAS[0], WRIST: CAMERAS[1]})
+    config = read_policy_config(str(original), [])
+    own = with_own_cameras(
+        config, load_processors(config)[0], {TOP: COLUMNS[TOP], OBS_STATE: {"shape": (7,)}}
     )
-    columns = {IMAGE: {**COLUMNS[TOP], "shape": (32, 32, 3)}, OBS_STATE: COLUMNS[OBS_STATE]}
-    assert with_own_cameras(config, load_processors(config)[0], columns) is config
+    with pytest.raises(ValueError, match=r"the policy needs observation.images.camera2"):
+        check_fit(own, {TOP: (3, 48, 80), OBS_STATE: (7,)}, 3)
+
+
+def test_a_policy_of_the_datasets_cameras_stays_as_it_is(base: SmolVLAPolicy, tmp_path: Path) -> None:
+    """And one that sees frames as they are, such as ACT, whatever its preprocessor renames."""
+    seen = {name: PolicyFeature(FeatureType.VISUAL, SHOWN[name]) for name in (TOP, WRIST)}
+    base.config.input_features = seen | {OBS_STATE: PolicyFeature(FeatureType.STATE, (7,))}
+    base.config.empty_cameras = 0
+    for policy, renames in ((base, {}), (small_act(), {TOP: IMAGE})):
+        config = read_policy_config(str(fine_tuned(policy, tmp_path / policy.name, renames)), [])
+        assert with_own_cameras(config, load_processors(config)[0], COLUMNS) is config
