@@ -304,6 +304,9 @@ def test_compact_frames_become_those_that_a_policy_sees(config):
         later = env.step(torch.zeros(B, 7))[0]
         assert {each[IMAGE].shape[1:] for each in (first, later)} == {(3, 32, 32) if compact else (3, 48, 80)}
         seen.append([env.model.shown(each) for each in (first, later)])
+        with env.in_full():
+            assert env.reset(seed=0)[0][IMAGE].shape == (B, 3, 48, 80)
+        assert env.compact == compact
     for full, stored in zip(*seen, strict=True):
         assert full.keys() == stored.keys()
         assert full[IMAGE].shape == (B, 3, 48, 80)

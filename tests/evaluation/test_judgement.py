@@ -315,6 +315,8 @@ def test_rollouts_that_the_world_model_has_learnt_from_are_warned_about(
     })  # fmt: skip
     write(further.parent / "config.json", {})
     assert learnt_from(str(further.parent), others) != [], "from the first on"
+    shutil.rmtree(Path(others.root) / "data")
+    assert learnt_from(str(copy), again) == [], "what is not whole tells nothing"
 
 
 def test_rollouts_count_within_the_length_of_an_episode_and_must_both_succeed_and_fail(
