@@ -6,7 +6,7 @@ model was not trained on. A false positive is a recorded failure that the model 
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -111,6 +111,14 @@ class Outcomes:
         return Outcomes(
             self.episodes, self.probability[:, :frames], self.done[:, :frames], self.held, goes_on
         )
+
+    def as_taught(self, table: EpisodeTable) -> "Outcomes":
+        """Return the outcomes with success where models learn it, also where that is inferred
+        (`EpisodeTable.success_target`): frame by frame, that is what they predict."""
+        done = self.done.copy()
+        for row, (rows, end) in enumerate(zip(table.rows(self.episodes), self.length, strict=True)):
+            done[row, :end] = table.success_target[rows][:end]
+        return replace(self, done=done)
 
     @property
     def length(self) -> np.ndarray:
@@ -374,7 +382,10 @@ def done_log_loss(outcomes: Outcomes) -> Estimate:
 
 
 def done_accuracy(outcomes: Outcomes, threshold: float, frames: int) -> dict[str, Estimate]:
-    """Measure the done signal: `done_*` over frames, `episode_*` as the environment ends episodes, delay."""
+    """Measure the done signal: `done_*` over frames, `episode_*` as the environment ends episodes, delay.
+
+    outcomes: with success as the model was taught it (`Outcomes.as_taught`).
+    """
     fired = outcomes.probability >= threshold
     predicted = outcomes.first_predicted_success(threshold, frames) >= 0
     per_frame = precision_recall_f1(fired, outcomes.done)

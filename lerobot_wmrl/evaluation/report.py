@@ -158,7 +158,8 @@ def report_action_model(
     """Report accuracy, done, gate and robustness, and save their pictures in `folder`."""
     outcomes = evaluation.outcomes
     horizon = recording.steps(HORIZON_SECONDS)
-    estimates = headline(evaluation.accuracy, horizon) | done_accuracy(outcomes, threshold, frames)
+    taught = outcomes.as_taught(recording.table)
+    estimates = headline(evaluation.accuracy, horizon) | done_accuracy(taught, threshold, frames)
     play = [
         e for e in evaluation.accuracy if recording.table.column(START_KIND)[e.episode] == KINDS.index(PLAY)
     ]

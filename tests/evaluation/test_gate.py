@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from lerobot_wmrl.common.statistics import Proportion
+from lerobot_wmrl.data.episodes import solved_at_end
 from lerobot_wmrl.evaluation.gate import (
     Gate,
     Outcomes,
@@ -95,6 +96,24 @@ def test_what_comes_later_than_an_imagined_episode_is_not_judged():
         assert (gate.false_positives.n, gate.false_positives.k) == (failures, mistakes)
         assert (gate.recall.n, gate.recall.k) == (3 - failures, found)
     assert whole.within(None).length.tolist() == [3, 3, 3]
+
+
+def test_frames_are_scored_by_what_the_model_was_taught():
+    """Where episodes end at success, their last frames are taken for solved; a model that has learnt it is
+    right."""
+    done = np.array([False, False, False, True, False, False, False])
+    start, length = np.array([0, 4]), np.array([4, 3])
+    table = SimpleNamespace(
+        success_target=solved_at_end(done, start[:1], length[:1]),
+        rows=lambda episodes: [slice(start[each], start[each] + length[each]) for each in episodes],
+    )
+    probability = np.array([[0.1, 0.9, 0.9, 0.9], [0.1, 0.1, 0.1, np.nan]])
+    outcomes = Outcomes(np.arange(2), probability, np.array([[False] * 3 + [True], [False] * 4]))
+    taught = outcomes.as_taught(table)
+    quality = {name: each.value for name, each in done_accuracy(taught, 0.5, 3).items()}
+    assert (quality["done_precision"], quality["done_recall"], quality["done_delay_frames"]) == (1, 1, 0)
+    assert done_accuracy(outcomes, 0.5, 3)["done_precision"].value == pytest.approx(1 / 3)
+    assert taught.held == outcomes.held == 1
 
 
 def test_what_is_cut_where_imagination_ends_does_not_last():
