@@ -72,5 +72,5 @@ def controls(load: Load) -> str:
 
 {table(["seed", "the world model learnt from", "known scenes", "unseen scenes"], rows)}
 
-In the world model of other episodes' labels the planner succeeded in none of 64 imagined episodes. The training
-stopped there, and the policy stayed as it was."""
+In the world model of other episodes' labels the planner succeeded in none of 64 imagined episodes. The
+training stopped there, and the policy stayed as it was."""
