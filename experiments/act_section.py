@@ -24,10 +24,11 @@ LIMITS: Final = """\
 ACT has a ResNet-18 that begins untrained (no weights are downloaded), a width of 256, and chunks of 16
 actions of which it executes 8. The second seed has no BC of 6,000 steps. The rollouts are those of a cnn
 policy, and the world model is that of the cell of [value_push](#value_push). PPO's standard deviation and
-size of minibatches were chosen by success in imagination in pilots of 14 to 24 iterations with seed 0; `minutes` after PPO and distillation include the
-world model's. In those pilots the first step of the optimizer, at a learning rate of 1e-5 and a standard
-deviation of 0.1, moved the policy by more than a nat a decision, and PPO ended there: such steps are undone
-since. That lerobot-wmrl-improve distils ACT was decided on the starts of seed 0, before PPO was measured."""
+size of minibatches were chosen by success in imagination in pilots of 14 to 24 iterations with seed 0;
+`minutes` after PPO and distillation include the world model's. In those pilots the first step of the
+optimizer, at a learning rate of 1e-5 and a standard deviation of 0.1, moved the policy by more than a nat a
+decision, and PPO ended there: such steps are undone since. That lerobot-wmrl-improve distils ACT was
+decided on the starts of seed 0, before PPO was measured."""
 
 
 def section(load: Load) -> str:
