@@ -370,8 +370,8 @@ def value_controls(load: Load) -> str:
 
 {table([*BUDGET, "the world model learnt from", "method", "known scenes", "unseen scenes"], rows)}
 
-One seed. The distilled planner has controls [with ACT](#value_act_controls). PPO in a world model of the demonstrations alone
-is a [pilot](pilots.md#a-world-model-of-demonstrations-alone)."""
+One seed. The distilled planner has controls [with ACT](#value_act_controls). PPO in a world model of the
+demonstrations alone is a [pilot](pilots.md#a-world-model-of-demonstrations-alone)."""
 
 
 def improved(load: Load) -> Iterator[tuple[str, list[Any], Cell]]:
