@@ -3,8 +3,9 @@
 from typing import Final
 
 from experiments.cells import Load
+from experiments.study import ROOT, read_cells
 from experiments.value_cells import SCENES, Cell, against, groups, measured, minutes, published, shares
-from experiments.value_sections import CONTROLS, UNCHANGED
+from experiments.value_sections import controls
 from lerobot_wmrl.common.files import markdown_table as table
 
 STUDY: Final = "value_act"
@@ -59,16 +60,15 @@ def changed(cell: Cell, methods: list[str]) -> list[list[str]]:
     ]
 
 
-def controls(load: Load) -> str:
+def controls_section(load: Load) -> str:
     """Return the section: success after distillation in every world model, against the policy before it."""
-    rows = []
-    for cell in (cell for each in groups(load, STUDY, ()).values() for cell in each):
-        name = "demonstrations{demonstrations}_rollouts{rollouts}_seed{seed}".format_map(cell)
-        found = {CONTROLS[each]: published(load, CONTROLS_STUDY, f"{name}_{each}") for each in CONTROLS}
-        changed = [(learnt, control) for learnt, control in found.items() if control]
-        for learnt, compared in [(UNCHANGED, cell), *changed] if changed else []:
-            after, before = compared["methods"]["distilled"], cell["methods"][BEFORE]
-            rows.append([cell["seed"], learnt, *(against(after[d], before[d]) for d in SCENES)])
+    names = [each.variables["cell"] for each in read_cells(ROOT / "experiments" / f"{STUDY}.yaml")]
+    rows = [
+        [cell["seed"], learnt, *(against(found["distilled"][d], cell["methods"][BEFORE][d]) for d in SCENES)]
+        for name in names
+        if (cell := published(load, STUDY, name))
+        for learnt, found in controls(load, name, STUDY, CONTROLS_STUDY)
+    ]
     return f"""Success of the planner distilled, against the BC that it begins from, on the same starts:
 
 {table(["seed", "the world model learnt from", "known scenes", "unseen scenes"], rows)}

@@ -68,7 +68,7 @@ SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     "value_distilled_ppo": ("Policies", partial(value.rows_above, ["distilled_ppo"])),
     "value_ppo_distilled": ("Policies", partial(value.rows_above, ["ppo_distilled"])),
     "value_act": ("Policies", act_section.section),
-    "value_act_controls": ("Policies", act_section.controls),
+    "value_act_controls": ("Policies", act_section.controls_section),
     "value_controls": ("Policies", value.value_controls),
     "driven": ("Policies", policies.driven),
     "demo": ("Policies", policies.demo),

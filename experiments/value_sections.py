@@ -383,8 +383,10 @@ def improved(load: Load) -> Iterator[tuple[str, list[Any], Cell]]:
             yield name, budget, cell["methods"][cell["start"]]
 
 
-def controls(load: Load, cell: str) -> list[tuple[str, Cell]]:
+def controls(
+    load: Load, cell: str, study: str = STUDY, controls_of: str = "value_controls"
+) -> list[tuple[str, Cell]]:
     """Return what a cell's world models learnt from and the methods in them; none without a control."""
-    found = [(title, published(load, "value_controls", f"{cell}_{name}")) for name, title in CONTROLS.items()]
+    found = [(title, published(load, controls_of, f"{cell}_{name}")) for name, title in CONTROLS.items()]
     changed = [(title, control["methods"]) for title, control in found if control]
-    return changed and [(UNCHANGED, load(f"{STUDY}/{cell}")["methods"]), *changed]
+    return changed and [(UNCHANGED, load(f"{study}/{cell}")["methods"]), *changed]

@@ -6,7 +6,7 @@ model was not trained on. A false positive is a recorded failure that the model 
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -59,18 +59,19 @@ class Outcomes:
         done: recorded success after each action (E, T).
         held: median of the frames for which successes hold at the end of their episodes. It is that of all
             episodes, also of a part of them.
-        goes_on: episodes of which only the first frames are looked at, (E,) bool; none by default.
+        cut: episodes of which only the first frames are looked at, (E,) bool; by default none.
     """
 
     episodes: np.ndarray
     probability: np.ndarray
     done: np.ndarray
     held: float | None = None
-    goes_on: np.ndarray | None = None
+    cut: np.ndarray = field(default_factory=lambda: np.array(False))
 
     def __post_init__(self) -> None:
         if self.held is None:
             object.__setattr__(self, "held", self._median_held())
+        object.__setattr__(self, "cut", np.broadcast_to(self.cut, len(self.episodes)))
 
     def _median_held(self) -> float:
         """Return infinity without a success; one that ends before its episode counts as infinite too."""
@@ -99,18 +100,19 @@ class Outcomes:
 
     def where(self, kept: np.ndarray) -> "Outcomes":
         """Return the episodes where `kept` (E,) is True."""
-        goes_on = None if self.goes_on is None else self.goes_on[kept]
-        return Outcomes(self.episodes[kept], self.probability[kept], self.done[kept], self.held, goes_on)
+        return Outcomes(
+            self.episodes[kept], self.probability[kept], self.done[kept], self.held, self.cut[kept]
+        )
 
     def within(self, frames: int | None) -> "Outcomes":
         """Return the outcomes by the first frames of every episode, by all if `frames` is None. A later
         success does not count, and neither does what is predicted for later frames."""
         if frames is None:
             return self
-        goes_on = (self.length > frames) | (False if self.goes_on is None else self.goes_on)
         return Outcomes(
-            self.episodes, self.probability[:, :frames], self.done[:, :frames], self.held, goes_on
-        )
+            self.episodes, self.probability[:, :frames], self.done[:, :frames], self.held,
+            self.cut | (self.length > frames),
+        )  # fmt: skip
 
     def as_taught(self, table: EpisodeTable) -> "Outcomes":
         """Return the outcomes with success where models learn it, also where that is inferred
@@ -156,8 +158,9 @@ class Outcomes:
         if not self.ends_at_success(frames):
             return self.probability
         probability = np.pad(self.probability, ((0, 0), (0, frames - 1)), constant_values=np.nan)
-        ends = np.ones(len(probability), bool) if self.goes_on is None else ~self.goes_on
-        for row, end in zip(np.flatnonzero(ends), self.length[ends], strict=True):
+        for row, end in enumerate(self.length):
+            if self.cut[row]:
+                continue
             probability[row, end : end + frames - 1] = probability[row, end - 1]
         return probability
 
