@@ -5,14 +5,14 @@ from typing import Any
 
 from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
 from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
-from tokenizers import Tokenizer, models, pre_tokenizers
 from transformers import (
-    PreTrainedTokenizerFast,
     SmolVLMConfig,
     SmolVLMImageProcessor,
     SmolVLMProcessor,
     SmolVLMVideoProcessor,
 )
+
+from tests.rl.byte_tokenizer import byte_tokenizer
 
 SIDE = 16
 """Pixels on each side of what the vision encoder sees."""
@@ -24,23 +24,17 @@ def save_small_smolvlm(folder: Path) -> Path:
         "fake_image_token": "<fake_token_around_image>", "image_token": "<image>",
         "global_image_token": "<global-img>", "end_of_utterance_token": "<end_of_utterance>",
     }  # fmt: skip
-    letters = sorted(pre_tokenizers.ByteLevel.alphabet())
-    vocabulary = {name: index for index, name in enumerate(["<pad>", *special.values(), *letters])}
-    tokenizer = Tokenizer(models.BPE(vocab=vocabulary, merges=[]))
-    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
-    fast = PreTrainedTokenizerFast(
-        tokenizer_object=tokenizer, pad_token="<pad>", extra_special_tokens=special
-    )
-    SmolVLMProcessor(SmolVLMImageProcessor(), fast, SmolVLMVideoProcessor()).save_pretrained(folder)
+    tokenizer = byte_tokenizer(**special)
+    SmolVLMProcessor(SmolVLMImageProcessor(), tokenizer, SmolVLMVideoProcessor()).save_pretrained(folder)
     SmolVLMConfig(
-        image_token_id=vocabulary["<image>"], pad_token_id=0, scale_factor=2,
+        image_token_id=tokenizer.convert_tokens_to_ids("<image>"), pad_token_id=0, scale_factor=2,
         vision_config={
             "hidden_size": 16, "intermediate_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2,
             "image_size": SIDE, "patch_size": 4,
         },
         text_config={
             "model_type": "llama", "hidden_size": 32, "intermediate_size": 32, "num_hidden_layers": 2,
-            "num_attention_heads": 2, "num_key_value_heads": 1, "head_dim": 16, "vocab_size": len(vocabulary),
+            "num_attention_heads": 2, "num_key_value_heads": 1, "head_dim": 16, "vocab_size": len(tokenizer),
         },
     ).save_pretrained(folder)  # fmt: skip
     return folder

@@ -44,8 +44,11 @@ from lerobot_wmrl.rl.observations import ObservationBuffer
 from lerobot_wmrl.scripts.train import main
 from lerobot_wmrl.world_models.configuration_planner import PlannerSettings
 from lerobot_wmrl.world_models.planning import Planner
+from tests.hub_client import hub as hub
+from tests.hub_server import Hub
 from tests.rl.act_checkpoint import IMAGE, STATE, save_small_act
 from tests.rl.checkpoints import save_untrained_policy
+from tests.rl.small_pi0 import publish_tokenizer, shrink_pi0, small_pi0
 from tests.rl.small_smolvla import save_small_smolvlm, small_smolvla
 
 FAST = [
@@ -304,12 +307,18 @@ def test_policies_of_several_observations_learn_from_as_many(
     assert any(not torch.equal(before[name], value) for name, value in weights(output_dir).items())
 
 
+@pytest.mark.parametrize("kind", ["smolvla", "pi0"])
 def test_a_vla_with_action_chunks_learns_from_the_planner(
-    imagined: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    kind: str, imagined: list[str], hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """SmolVLA has a language model, whose weights stay as they are, and reads the task."""
+    """It reads the task. The weights of SmolVLA's language model stay as they are."""
     features = {name: FEATURES[name] for name in ("device", "input_features", "output_features")}
-    made = small_smolvla(save_small_smolvlm(tmp_path / "smolvlm"), **features)
+    if kind == "smolvla":
+        made: Any = small_smolvla(save_small_smolvlm(tmp_path / "smolvlm"), **features)
+    else:
+        shrink_pi0(monkeypatch)
+        publish_tokenizer(hub, tmp_path / "tokenizer")
+        made = small_pi0(**features)
     policy, output_dir = tmp_path / "policy", tmp_path / "rl"
     made.save_pretrained(policy)
     stats = {key: {"mean": torch.zeros(size), "std": torch.ones(size)} for key, size in (
@@ -322,7 +331,8 @@ def test_a_vla_with_action_chunks_learns_from_the_planner(
     assert read_metrics(output_dir)[-1]["labels"] >= 3 * 4
     before, after = load_file(policy / "model.safetensors"), weights(output_dir)
     learnt = {name for name in before if not torch.equal(before[name], after[name])}
-    assert any(".lm_expert." in name for name in learnt)
+    expert = ".lm_expert." if kind == "smolvla" else ".gemma_expert."
+    assert any(expert in name for name in learnt)
     assert not any(".vlm." in name for name in learnt)
 
 
