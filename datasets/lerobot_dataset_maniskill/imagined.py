@@ -18,6 +18,7 @@ from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.exploration import ExplorationNoise
 from lerobot_wmrl.common.pipeline import make_pipeline
 from lerobot_wmrl.common.policies import fit_to_environment, load_policy, load_processors
+from lerobot_wmrl.data.dataset import save_episode
 from lerobot_wmrl.envs.evaluation_adapter import images_to_numpy
 from lerobot_wmrl.envs.start_frames import maniskill_side
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW, ACTION_NAMES, STATE_NAMES, TRANSLATION
@@ -62,7 +63,7 @@ class ImaginedPartRecorder:
                 start = StartColumns(instruction, task_of(plan.task).index, plan)
                 for before, action, outcome in rows:
                     add_step(dataset, start, before, action, outcome)
-                dataset.save_episode()
+                save_episode(dataset)
                 report(EpisodeResult(plan.kind, not rows[-1][-1].truncated, clipped))
 
     @torch.no_grad()

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import av
-import datasets
 import numpy as np
 import torch
 from lerobot.configs.policies import PreTrainedConfig
@@ -30,6 +29,7 @@ from lerobot_wmrl.common.constants import KINDS, PLAY
 from lerobot_wmrl.common.exploration import ExplorationNoise
 from lerobot_wmrl.common.policies import load_policy, load_processors
 from lerobot_wmrl.common.processes import own_progress_lock
+from lerobot_wmrl.data.dataset import save_episode
 from lerobot_wmrl.maniskill.backend import leave_with_command
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW, TRANSLATION
 from lerobot_wmrl.maniskill.episode import Frame
@@ -195,7 +195,7 @@ class PartRecorder:
             outcome = Outcome(following, truncated=steps_left == 0 and not succeeded)
             add_step(dataset, start, frame, action, outcome)
             frame = following
-        dataset.save_episode()
+        save_episode(dataset)
         return succeeded
 
 
@@ -227,5 +227,4 @@ def serve_parts(config: RecordConfig, folder: Path, parts: Any, results: Any) ->
 def silence_libraries() -> None:
     """Turn off FFmpeg's reports, Hugging Face's progress bars and LeRobot's information messages."""
     av.logging.set_libav_level(av.logging.ERROR)
-    datasets.disable_progress_bars()
     logging.getLogger("lerobot").setLevel(logging.ERROR)

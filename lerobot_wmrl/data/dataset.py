@@ -9,6 +9,7 @@ import pyarrow.dataset
 from lerobot.datasets.io_utils import load_info
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.utils import EPISODES_DIR, BackwardCompatibilityError
+from lerobot.utils.utils import SuppressProgressBars
 
 from lerobot_wmrl.common.errors import FieldError, first_line, renamed
 from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
@@ -128,6 +129,12 @@ def open_dataset(root: str | Path, repo_id: str | None = None) -> LeRobotDataset
         "dataset.root", root, f"{len(missing)} files are missing, the first is {missing[0]}",
         "copy or download the dataset again, and only if there is no other copy, record it again",
     )  # fmt: skip
+
+
+def save_episode(dataset: LeRobotDataset) -> None:
+    """Save the episode whose frames were added, without a progress bar of its own, which datasets shows."""
+    with SuppressProgressBars():
+        dataset.save_episode()
 
 
 def download_dataset(repo_id: str, revision: str | None = None, root: str | None = None) -> LeRobotDataset:

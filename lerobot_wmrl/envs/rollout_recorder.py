@@ -24,6 +24,7 @@ from lerobot_wmrl.common.exploration import ExplorationNoise
 from lerobot_wmrl.common.files import whole_folder
 from lerobot_wmrl.common.images import to_bytes
 from lerobot_wmrl.common.policies import load_policy, load_processors
+from lerobot_wmrl.data.dataset import save_episode
 from lerobot_wmrl.data.embodiment import (
     Embodiment,
     component_names,
@@ -178,7 +179,7 @@ class RolloutRecorder:
             }  # fmt: skip
             kept = {key: value for key, value in frame.items() if key in dataset.features}
             dataset.add_frame({**kept, "task": (observation.get("task") or [""])[row]})
-        dataset.save_episode()
+        save_episode(dataset)
         return success
 
 

@@ -13,7 +13,7 @@ from lerobot.utils.constants import ACTION, DEFAULT_FEATURES
 
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.output_folders import locked
-from lerobot_wmrl.data.dataset import open_dataset
+from lerobot_wmrl.data.dataset import open_dataset, save_episode
 from lerobot_wmrl.data.embodiment import Embodiment, check_same_robot
 from lerobot_wmrl.data.features import episode_features, observation_row
 from lerobot_wmrl.play.drive import Step
@@ -75,7 +75,7 @@ class SavedEpisodes:
                 }  # fmt: skip
                 dataset.add_frame(frame)
             assert dataset is not None, "there are steps"
-            dataset.save_episode()
+            save_episode(dataset)
             dataset.finalize()
             self.count = dataset.meta.total_episodes
         return self.count - 1

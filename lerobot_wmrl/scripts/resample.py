@@ -19,7 +19,7 @@ import numpy as np
 
 from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.errors import FieldError, require_at_least
-from lerobot_wmrl.data.dataset import DatasetSource
+from lerobot_wmrl.data.dataset import DatasetSource, save_episode
 from lerobot_wmrl.data.episodes import SUCCESS_COLUMNS
 
 if TYPE_CHECKING:
@@ -131,7 +131,7 @@ def write_resampled(dataset: "LeRobotDataset", cfg: ResampleConfig, summed: np.n
         for episode in trange(dataset.num_episodes, unit="episode", desc="Copying"):
             for row in episode_rows(dataset, episode, copy.features, cfg.every, summed):
                 copy.add_frame(row)
-            copy.save_episode()
+            save_episode(copy)
         copy.finalize()
 
 

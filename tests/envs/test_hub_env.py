@@ -1,6 +1,7 @@
 """Environments of Hugging Face's hub, from a hub on the loopback: PushT, as somebody might publish it."""
 
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -102,6 +103,11 @@ def test_commands_take_it_lerobots_too(
     run_here("lerobot-wmrl-record", *flags, "--num_episodes=2", f"--output_dir={tmp_path / 'rollouts'}")
     run_here("lerobot-wmrl-record", *flags, "--num_episodes=2", f"--output_dir={tmp_path / 'rollouts'}")
     assert "is already recorded: 2 episodes" in capsys.readouterr().out
+    like = [f"--like.root={tmp_path / 'rollouts'}", "--video=false", f"--output_dir={tmp_path / 'images'}"]
+    run_here("lerobot-wmrl-record", *flags, "--num_episodes=2", *like)
+    shown = capsys.readouterr().err
+    assert "record: 100%" in shown
+    assert not re.search(rf"Map: .*/{STEPS} ", shown), "datasets' progress bar for each episode"
     recorded = open_dataset(tmp_path / "rollouts")
     assert (recorded.num_episodes, recorded.num_frames, recorded.fps) == (2, 2 * STEPS, 10)
 
