@@ -3,8 +3,9 @@
 from typing import Final
 
 from experiments.cells import Load
+from experiments.from_one_policy import tables
 from experiments.study import ROOT, read_cells
-from experiments.value_cells import SCENES, Cell, against, groups, measured, minutes, published, shares
+from experiments.value_cells import SCENES, against, published
 from experiments.value_sections import controls
 from lerobot_wmrl.common.files import markdown_table as table
 
@@ -34,30 +35,7 @@ decided on the starts of seed 0, before PPO was measured."""
 
 def section(load: Load) -> str:
     """Return the section: success after every method, and what each gains on the policy before it."""
-    cells = [cell for each in groups(load, STUDY, ()).values() for cell in each]
-    methods = measured(cells, TITLES)
-    rates = [
-        [TITLES[method], *(shares(cells, method, domain) for domain in SCENES), minutes(cells, method)]
-        for method in methods
-    ]
-    changes = [[cell["seed"], *row] for cell in cells for row in changed(cell, methods)]
-    return f"""{table(["method", "known scenes", "unseen scenes", "minutes"], rates)}
-
-Against the BC of 3,000 steps, on the same {cells[0]["starts"]} starts:
-
-{table(["seed", "method", "known scenes", "unseen scenes"], changes)}
-
-{LIMITS}"""
-
-
-def changed(cell: Cell, methods: list[str]) -> list[list[str]]:
-    """Return a row for each method that was measured: its success, and the starts gained and lost."""
-    found = cell["methods"]
-    return [
-        [TITLES[method], *(against(found[method][domain], found[BEFORE][domain]) for domain in SCENES)]
-        for method in methods
-        if method != BEFORE and method in found
-    ]
+    return f"{tables(load, STUDY, TITLES, BEFORE)}\n\n{LIMITS}"
 
 
 def controls_section(load: Load) -> str:

@@ -15,7 +15,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from experiments import act_section, foreign, four_tasks_section, judged, value_cells, value_figure
+from experiments import (
+    act_section,
+    foreign,
+    four_tasks_section,
+    judged,
+    rewards_section,
+    value_cells,
+    value_figure,
+)
 from experiments import policy_sections as policies
 from experiments import value_sections as value
 from experiments import world_model_sections as world_models
@@ -69,6 +77,7 @@ SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     "value_ppo_distilled": ("Policies", partial(value.rows_above, ["ppo_distilled"])),
     "value_act": ("Policies", act_section.section),
     "value_act_controls": ("Policies", act_section.controls_section),
+    "value_rewards": ("Policies", rewards_section.section),
     "value_controls": ("Policies", value.value_controls),
     "driven": ("Policies", policies.driven),
     "demo": ("Policies", policies.demo),

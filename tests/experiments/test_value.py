@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments import four_tasks_section, value
+from experiments import four_tasks_section, rewards_section, value
 from experiments.run import record_path
 from experiments.study import ROOT, Study, read_cells
 from experiments.tables import loader
@@ -124,6 +124,21 @@ def test_ppo_without_a_reward_is_compared_with_the_policy_before_it(docs: Path) 
     assert (
         lines[-1] == "| 8 | 300 | 0 | 40 %: 3 gained, 6 lost (p = 0.5) | 40 %: 3 gained, 6 lost (p = 0.5) |"
     )
+
+
+def test_methods_of_one_beginning_are_compared_with_it_seed_by_seed(docs: Path) -> None:
+    """Those that were not run are left out."""
+    for cell in read_cells(ROOT / "experiments" / "value_rewards.yaml", ["seed=[0,100000]"]):
+        content = {**made_up_cell(8, cell.variables["seed"]), "starts": 10}
+        content["methods"]["success"] = {"ind": FAILING, "ood": FAILING, "minutes": 7.0}
+        if cell.variables["seed"]:
+            content["methods"]["grpo"] = content["methods"]["filtered"]
+        write_json(docs / cell.results[0], content)
+    lines = rewards_section.section(loader(docs)).splitlines()
+    title = rewards_section.TITLES["success"]
+    assert f"| {title} | 40, 40 → 40 % (10–70) | 40, 40 → 40 % (10–70) | 7 |" in lines
+    assert len([line for line in lines if line.startswith("| 0 |")]) == 1
+    assert len([line for line in lines if line.startswith("| 100000 |")]) == 2
 
 
 MAY_DIFFER = {

@@ -1,0 +1,32 @@
+"""What PPO in imagination gains with each reward: the section of docs/results.md."""
+
+from typing import Final
+
+from experiments.cells import Load
+from experiments.from_one_policy import tables
+
+STUDY: Final = "value_rewards"
+BEFORE: Final = "filtered"
+"""What all others begin from."""
+
+TITLES: Final = {
+    BEFORE: "filtered BC",
+    "success": "PPO, reward: success (done alone)",
+    "general": "PPO, reward: general, alpha 0.9, potential",
+    "absolute": "PPO, reward: general, alpha 0.9, absolute, as in RoboScape-R",
+    "similarity": "PPO, reward: similarity to the goal frame alone (alpha 0, potential)",
+    "embedding": "PPO, reward: learnt from the world model's hidden state (embedding)",
+    "proxy": "PPO, reward: learnt from frames (proxy)",
+    "grpo": "GRPO, reward: success (done alone)",
+}
+"""Methods in the order of the table."""
+
+LIMITS: Final = """\
+Everything is as in [value_push](#value_push), where the reward is success; only the reward differs, or the
+algorithm. Imagined episodes end with success under every reward. The learnt rewards have seen ManiSkill's
+rule-based one in the recorded episodes, the others have not."""
+
+
+def section(load: Load) -> str:
+    """Return the section: success with every reward, and what each gains on the policy before it."""
+    return f"{tables(load, STUDY, TITLES, BEFORE)}\n\n{LIMITS}"
