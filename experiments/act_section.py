@@ -24,7 +24,7 @@ TITLES: Final = {
 
 LIMITS: Final = """\
 ACT has a ResNet-18 that begins untrained (no weights are downloaded), a width of 256, and chunks of 16
-actions of which it executes 8. The second seed has no BC of 6,000 steps. The rollouts are those of a cnn
+actions of which it executes 8. The rollouts are those of a cnn
 policy, and the world model is that of the cell of [value_push](#value_push). PPO's standard deviation and
 size of minibatches were chosen by success in imagination in pilots of 14 to 24 iterations with seed 0;
 `minutes` after PPO and distillation include the world model's. In those pilots the first step of the
