@@ -1,7 +1,7 @@
-"""gym-hil's cube, to be picked up, as an environment of LeRobot's commands: `--env.type=gym_hil_pick`.
+"""gym-hil's cube, to be picked up, as an environment of LeRobot's commands: `--env.type=hil_pick`.
 
     pip install examples/gym_hil
-    MUJOCO_GL=egl lerobot-eval --env.type=gym_hil_pick --policy.path=FOLDER --eval.batch_size=1
+    MUJOCO_GL=egl lerobot-eval --env.type=hil_pick --policy.path=FOLDER --eval.batch_size=1
 
 LeRobot drives gym-hil by its HIL-SERL scripts alone. Any Gymnasium environment becomes one of LeRobot's in
 this way: a wrapper whose `info` has `is_success` and whose starts follow from the seed, and a configuration
@@ -20,7 +20,11 @@ from lerobot.envs.configs import EnvConfig
 TASK: Final = "pick up the cube"
 FPS: Final = 10
 STEPS: Final = 60
-"""Longest episode. An episode ends as soon as the cube is 10 cm above the table."""
+"""Longest episode."""
+
+HELD: Final = 8
+"""Frames in a row in which the cube is 10 cm above the table, after which an episode ends. gym-hil ends it at
+the first of them, so that no recorded frame shows success: each is from before its action."""
 
 SIDE: Final = 64
 """Height and width of the frames in pixels; gym-hil has 128."""
@@ -54,7 +58,7 @@ class PickCube(gym.Wrapper):
         for camera in CAMERAS:
             env.observation_space["pixels"][camera] = gym.spaces.Box(0, 255, (SIDE, SIDE, 3), np.uint8)
         super().__init__(wrap_env(env, gripper_penalty=0.0, reset_delay_seconds=0.0))
-        self._max_episode_steps, self._steps = steps, 0
+        self._max_episode_steps, self._steps, self._held = steps, 0, 0
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -62,16 +66,18 @@ class PickCube(gym.Wrapper):
         """Put the cube where the seed says. gym-hil draws from numpy's global generator."""
         if seed is not None:
             np.random.seed(seed % 2**32)  # noqa: NPY002
-        self._steps = 0
+        self._steps = self._held = 0
         observation, _ = self.env.reset(seed=seed)
         return observation, {"is_success": False}
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Move the gripper by an action (4,)."""
-        observation, reward, terminated, _, info = self.env.step(np.asarray(action, np.float64))
-        self._steps += 1
+        observation, reward, ended, _, info = self.env.step(np.asarray(action, np.float64))
+        success = bool(info["succeed"])
+        self._steps, self._held = self._steps + 1, self._held + 1 if success else 0
+        terminated = self._held >= HELD or (ended and not success)  # the cube is off the table
         truncated = self._steps >= self._max_episode_steps and not terminated
-        return observation, float(reward), terminated, truncated, {"is_success": bool(info["succeed"])}
+        return observation, float(reward), terminated, truncated, {"is_success": success}
 
     def render(self) -> np.ndarray:
         """Return what the front camera sees, (SIDE, SIDE, 3)."""
@@ -81,7 +87,7 @@ class PickCube(gym.Wrapper):
 gym.register("gym_hil_pick/PickCube-v0", entry_point=PickCube, disable_env_checker=True)
 
 
-@EnvConfig.register_subclass("gym_hil_pick")
+@EnvConfig.register_subclass("hil_pick")
 @dataclass
 class GymHilPick(EnvConfig):
     """Its observations by gym-hil's names, and the columns of a dataset that they become."""

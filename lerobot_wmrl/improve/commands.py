@@ -37,9 +37,9 @@ def stages(improvement: Improvement) -> list[Stage]:
     ) -> list[Stage]:  # fmt: skip
         return [Stage(name, title, partial(command, improvement), optional)] if needed else []
 
-    def leaves_checkpoint(status: int) -> bool:
-        """Return whether RL stopped by a rule of its own, and left a checkpoint."""
-        return status == STOPPED and improvement.rl_checkpoint.exists()
+    def leaves_policies(status: int) -> bool:
+        """Return whether RL stopped by a rule of its own, and there are policies to compare."""
+        return status == STOPPED and (improvement.clones or improvement.rl_checkpoint.exists())
 
     records, clones = config.rollouts > 0, improvement.clones
     return [
@@ -51,7 +51,7 @@ def stages(improvement: Improvement) -> list[Stage]:
         *stage("world_model", "Train the world model", world_model),
         *stage("check", "Check the world model on recorded episodes", check),
         *stage("start", "Choose in imagination which policy to improve", start, clones),
-        *stage("rl", "Train the policy in imagination", rl, optional=leaves_checkpoint),
+        *stage("rl", "Train the policy in imagination", rl, optional=leaves_policies),
         *stage("distilled", "Fit the policy to a planner in imagination", distilled, config.distils,
                optional=lambda status: True),
         *stage("choice", "Choose the policy to use", choice, config.selects),
@@ -159,7 +159,7 @@ def rl(improvement: Improvement) -> list[str]:
 
 
 def distilled(improvement: Improvement) -> list[str]:
-    return train(improvement, "distilled", str(improvement.rl_checkpoint), {
+    return train(improvement, "distilled", improvement.fitted(), {
         "gate.action": "off", "algorithm.type": "distillation", "algorithm.recorded": False,
     })  # fmt: skip
 

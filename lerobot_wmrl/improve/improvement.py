@@ -148,6 +148,11 @@ class Improvement:
         return bool(self.config.rollouts or self.found.failures)
 
     @property
+    def has_trained(self) -> bool:
+        """Whether RL leaves a checkpoint, as it does unless it has stopped by a rule of its own before."""
+        return not read_record(self.out, "rl").get(FAILED) or self.rl_checkpoint.exists()
+
+    @property
     def has_distilled(self) -> bool:
         """Whether the policy is fitted to a planner after PPO, and that has not failed."""
         return self.config.distils and not read_record(self.out, "distilled").get(FAILED)
@@ -158,8 +163,9 @@ class Improvement:
         trained = {SFT: self.policy}
         if self.clones:
             trained[CLONED] = str(last_checkpoint(self.out / "cloned"))
-        fitted = self.config.algorithm["algorithm.type"] == "distillation"
-        trained[FITTED if fitted else PPO] = str(self.rl_checkpoint)
+        if self.has_trained:
+            fitted = self.config.algorithm["algorithm.type"] == "distillation"
+            trained[FITTED if fitted else PPO] = str(self.rl_checkpoint)
         if self.has_distilled:
             trained[DISTILLED] = str(last_checkpoint(self.out / "distilled"))
         return trained
@@ -191,6 +197,10 @@ class Improvement:
             return SFT
         found = json.loads((self.out / "start" / RESULTS).read_text())
         return (CLONED, SFT)[list(found["policies"]).index(chosen_policy(found))]
+
+    def fitted(self) -> str:
+        """Return the policy that is fitted to a planner after PPO: PPO's, or that before if it left none."""
+        return str(self.rl_checkpoint) if self.has_trained else self.policies[self.start()]
 
     @property
     def extra_columns(self) -> list[str]:

@@ -27,6 +27,8 @@ class PolicyGradientConfig(RLAlgorithmConfig):
             Above it, the updates of this iteration end early. A step of the optimiser that moves the policy
             ten times as far is undone, and the learning rate falls.
         max_reference_kl: KL to the SFT policy, in the same unit. Above it, the training stops.
+        patience: iterations in a row without any reward, after which the training stops: there is nothing to
+            learn from.
         initial_std: standard deviation of exploration in normalised actions; by default the policy's own.
         train_encoder: train the policy's encoder of observations too. `false` keeps it as it was cloned, so
             that every frame is encoded once, and an update takes a small part of the time. For the policy
@@ -41,12 +43,14 @@ class PolicyGradientConfig(RLAlgorithmConfig):
     reference_coefficient: float = 0.02
     target_kl: float = 0.015
     max_reference_kl: float = 20.0
+    patience: int = 5
     initial_std: float | None = None
     train_encoder: bool = True
 
     def __post_init__(self) -> None:
         require_positive(self, "epochs", "minibatch_size", "policy_lr", "target_kl", "max_reference_kl")
         require_at_least(self, 0, "reference_coefficient")
+        require_at_least(self, 1, "patience")
         require_choice(self, "ratio", ("action", "token"))
         if self.micro_batch_size is not None:
             require_at_least(self, 1, "micro_batch_size")

@@ -85,9 +85,12 @@ class PolicyGradient(RLAlgorithm):
     iteration: int
     """Rollouts that were trained on."""
 
+    unrewarded: int
+    """Rollouts in a row, up to the latest, without any reward."""
+
     def __init__(self, policy: Any, config: PolicyGradientConfig) -> None:
         self.lerobot_policy, self.policy = policy, as_stochastic(policy)
-        self.config, self.iteration = config, 0
+        self.config, self.iteration, self.unrewarded = config, 0, 0
         if config.initial_std is not None:
             if not hasattr(self.policy, "set_std"):
                 raise FieldError(
@@ -181,6 +184,18 @@ class PolicyGradient(RLAlgorithm):
                 "`algorithm.reference_coefficient` or lower `algorithm.policy_lr`"
             )
 
+    def check_rewarded(self, rollout: RolloutBuffer) -> None:
+        """Raise TrainingStopped after `patience` rollouts in a row without any reward."""
+        rewarded = largest_over_processes(rollout.reward.abs().max()).item() > 0
+        self.unrewarded = 0 if rewarded else self.unrewarded + 1
+        if self.unrewarded >= self.config.patience:
+            raise TrainingStopped(
+                f"iteration {self.iteration + 1}: no episode was rewarded in {self.unrewarded} iterations, "
+                "so there is nothing to learn from. If imagination sees no success, lower "
+                "`env.done_threshold`, or train the world model longer or on more successes; if the policy "
+                "has none, take one that has, or raise `algorithm.initial_std`"
+            )
+
     def trained_groups(self) -> list[str]:
         """Return the names of the parameter groups that this iteration trains."""
         return list(self.parameter_groups())
@@ -202,6 +217,7 @@ class PolicyGradient(RLAlgorithm):
         pipeline = self.encoding(pipeline)
         collected = collect(env, self.policy, pipeline, rollout, seed, self.group_size)
         rollout_end = time.perf_counter()
+        self.check_rewarded(rollout)
         minibatches, targets = self.prepare(rollout, pipeline)
         progress = tqdm(minibatches, "update", leave=False, unit="minibatch", disable=hidden_progress())
         stats = self.update(iter(progress))

@@ -26,7 +26,7 @@ from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.improve import commands
 from lerobot_wmrl.improve import improvement as decisions
 from lerobot_wmrl.improve.findings import few_decisions, usual_length
-from lerobot_wmrl.improve.improvement import DISTILLED, FITTED, PPO, SFT
+from lerobot_wmrl.improve.improvement import CLONED, DISTILLED, FITTED, PPO, SFT
 from lerobot_wmrl.scripts.improve import settings
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 from lerobot_wmrl.world_models.configuration_world_model import AnchoredConfig
@@ -290,6 +290,23 @@ def test_rl_may_stop_by_its_own_rules_if_it_leaves_a_checkpoint(
     (tmp_path / "rl" / "checkpoints" / link / "pretrained_model").mkdir(parents=True)
     assert rl.optional(STOPPED)
     assert not rl.optional(1)
+
+
+def test_rl_that_left_nothing_leaves_the_policy_of_further_bc_to_the_planner(tmp_path: Path) -> None:
+    """It may find what PPO's noise does not."""
+    improvement = improvement_of(tmp_path, failures=10)
+    assert [*improvement.policies] == [SFT, CLONED, PPO, DISTILLED]
+    (rl,) = (stage for stage in commands.stages(improvement) if stage.name == "rl")
+    assert rl.optional(STOPPED)
+    write_json(tmp_path / "stages" / "rl.json", {"failed": "stopped: no episode was rewarded"})
+    results = {"finished": True, "policies": {"a": {"share": 0.0}, "b": {"share": 0.0}}, "pairs": []}
+    write_json(tmp_path / "start" / "comparison.json", results)
+    assert [*improvement.policies] == [SFT, CLONED, DISTILLED]
+    (distilled,) = commands_of(improvement, "distilled").values()
+    assert f"--policy.path={improvement.policies[CLONED]}" in distilled
+    write_json(tmp_path / "stages" / "distilled.json", {"failed": "stopped: no success"})
+    assert [*improvement.policies] == [SFT, CLONED]
+    assert improvement.chosen() == CLONED
 
 
 @pytest.mark.parametrize(("kind", "iterations", "freq"), [

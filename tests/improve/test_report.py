@@ -4,6 +4,7 @@ import html
 import json
 import re
 import shlex
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,7 +24,7 @@ from lerobot_wmrl.improve.improvement import CLONED, DISTILLED, PPO, SFT, Improv
 from lerobot_wmrl.improve.report import figures
 from lerobot_wmrl.improve.report.page import Page
 from lerobot_wmrl.improve.report.results import curve, lerobot_train_curve, training_curves
-from lerobot_wmrl.improve.report.words import compared, trust, verdict
+from lerobot_wmrl.improve.report.words import compared, reservations, trust, verdict
 from tests.experiments.typed import check
 from tests.improve.made_up import improvement_of
 
@@ -146,8 +147,13 @@ def test_rl_that_stopped_early_is_named(finished: Improvement) -> None:
     assert warned not in text_of(finished)
     record = json.loads((finished.out / "stages" / "rl.json").read_text())
     write_json(finished.out / "stages" / "rl.json", {**record, "failed": "error: too far"})
+    finished.rl_checkpoint.mkdir(parents=True)
     assert warned in text_of(finished)
     assert warned in verdict(finished, [compared(finished)])
+    shutil.rmtree(finished.rl_checkpoint)
+    assert [*finished.policies] == [SFT, CLONED, DISTILLED]
+    left_none = f"RL stopped ({finished.out}/logs/rl.log). It left no policy. error: too far"
+    assert left_none in reservations(finished)
 
 
 @pytest.mark.usefixtures("without_drawing")

@@ -181,6 +181,26 @@ def test_training_stops_far_from_the_reference(make_policy: MakePolicy, pipeline
         algorithm.prepare(buffer, pipeline)
 
 
+def test_training_stops_where_nothing_is_rewarded(make_policy: MakePolicy, pipeline: Pipeline) -> None:
+    """The count begins again with any reward."""
+    rewards = iter([0.0, 1.0, 0.0, 0.0])
+
+    class Paid(PointEnv):
+        def step(self, actions: Any) -> Any:
+            observation, reward, *rest = super().step(actions)
+            return observation, reward * paid, *rest
+
+    algorithm, buffer = PPO(make_policy(), PPOConfig(patience=2)), RolloutBuffer(6, 16, "cpu")
+    for _ in range(3):
+        paid = next(rewards)
+        algorithm.iterate(Paid(16, horizon=6), pipeline, buffer, seed=0, last=False)
+    paid = next(rewards)
+    with pytest.raises(
+        TrainingStopped, match=r"no episode was rewarded in 2 iterations.*env\.done_threshold"
+    ):
+        algorithm.iterate(Paid(16, horizon=6), pipeline, buffer, seed=0, last=False)
+
+
 def test_a_policy_without_log_probs_is_refused() -> None:
     policy = SimpleNamespace(config=SimpleNamespace(type="diffusion"))
     with pytest.raises(ValueError, match=r"policy\.type=diffusion: .*for example cnn, or one of act"):

@@ -137,15 +137,13 @@ def reservations(improvement: Improvement) -> list[str]:
             "there, label what they did, and run the command again on all episodes."
         )
     if reason := read_record(improvement.out, "rl").get(FAILED):
-        found.append(
-            f"RL stopped ({improvement.out / 'logs' / 'rl.log'}). A checkpoint from before that is compared. "
-            f"{reason}"
-        )
+        left = "A checkpoint from before that is compared" if improvement.has_trained else "It left no policy"
+        found.append(f"RL stopped ({improvement.out / 'logs' / 'rl.log'}). {left}. {reason}")
     if improvement.config.distils and not improvement.has_distilled:
         log = improvement.out / "logs" / "distilled.log"
         found.append(
-            f"Fitting the policy to a planner failed ({log}), so PPO's policy is the last one. To try again, "
-            "choose another output_dir."
+            f"Fitting the policy to a planner failed ({log}), and left no policy. To try again, choose "
+            "another output_dir."
         )
     return found
 
