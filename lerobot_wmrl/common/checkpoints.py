@@ -150,6 +150,14 @@ def latest_checkpoint(output_dir: Path) -> Path | None:
     return max(steps, key=lambda path: int(path.name), default=None)
 
 
+def link_latest(output_dir: Path) -> None:
+    """Point `last` at the latest checkpoint, if there is one: a kill may have come between the two."""
+    checkpoint = latest_checkpoint(output_dir)
+    linked = (output_dir / CHECKPOINTS_DIR / LAST_CHECKPOINT_LINK).resolve()
+    if checkpoint is not None and linked != checkpoint.resolve():
+        link_checkpoint(checkpoint, LAST_CHECKPOINT_LINK)
+
+
 def require_resumable(output_dir: Path) -> None:
     """Raise FieldError if `resume` is asked for and there is no checkpoint to go on from."""
     if latest_checkpoint(output_dir) is None:

@@ -4,8 +4,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
+import torch
 from lerobot.configs import PreTrainedConfig
-from lerobot.processor import DeviceProcessorStep
+from lerobot.configs.types import FeatureType, NormalizationMode
+from lerobot.processor import DeviceProcessorStep, TransitionKey, UnnormalizerProcessorStep, create_transition
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
@@ -28,12 +30,15 @@ class Pipeline:
         to_action: turns raw actions into the environment's.
         store: turns the environment's observation into the stored one.
         shown: turns stored frames into those of the size that the policy sees, the first step of `prepare`.
+        action_unit: what 1 in a normalised action is in the environment's units, (A,); None where actions are
+            not normalised.
     """
 
     prepare: Callable[[Observation], Observation]
     to_action: Callable[[Tensor], Tensor]
     store: Callable[[Observation], Observation] = unchanged
     shown: Callable[[Observation], Observation] = unchanged
+    action_unit: Tensor | None = None
 
 
 def make_pipeline(
@@ -55,4 +60,19 @@ def make_pipeline(
     def to_action(raw_action: Tensor) -> Tensor:
         return on_device(raw_action)
 
-    return Pipeline(prepare, to_action, shown=shown)
+    return Pipeline(prepare, to_action, shown=shown, action_unit=action_unit(config, postprocessor))
+
+
+def action_unit(config: PreTrainedConfig, postprocessor: Any) -> Tensor | None:
+    """Return what 1 in a policy's normalised actions is in the environment's units, (A,), if they are."""
+    for step in postprocessor.steps:
+        if isinstance(step, UnnormalizerProcessorStep) and ACTION in (step.stats or {}):
+            mode = step.norm_map.get(FeatureType.ACTION, NormalizationMode.IDENTITY)
+            if mode is not NormalizationMode.IDENTITY:
+                size = config.output_features[ACTION].shape
+                none, one = (
+                    step(create_transition(action=torch.full((1, *size), each)))[TransitionKey.ACTION]
+                    for each in (0.0, 1.0)
+                )
+                return (one - none)[0].abs()
+    return None

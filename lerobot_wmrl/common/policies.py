@@ -127,11 +127,14 @@ def require_trained(config: PreTrainedConfig) -> None:
         )
 
 
-def require_past_observations(config: PreTrainedConfig) -> None:
-    """Raise FieldError for a policy that learns from what follows a step: later observations, or rewards.
-
-    The labels of a planner have neither.
-    """
+def require_distillable(config: PreTrainedConfig) -> None:
+    """Raise FieldError for a policy that learns from what the labels of a planner lack, later observations or
+    rewards, or whose actions are relative to a state that later actions of a chunk no longer have."""
+    if getattr(config, "use_relative_actions", False):
+        raise FieldError(
+            "policy.path", config.pretrained_path, f"this {config.type} predicts relative actions",
+            "take one that was trained with `use_relative_actions=false`",
+        )  # fmt: skip
     ahead = max(config.observation_delta_indices or [0]) > 0
     if ahead or config.reward_delta_indices is not None:
         raise FieldError(

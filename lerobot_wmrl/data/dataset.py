@@ -113,7 +113,7 @@ def open_dataset(root: str | Path, repo_id: str | None = None) -> LeRobotDataset
     try:
         missing = missing_files(Path(root))
         if not missing:
-            return LeRobotDataset(name, root=root, video_backend=VIDEO_BACKEND)
+            dataset = LeRobotDataset(name, root=root, video_backend=VIDEO_BACKEND)
     except OLDER_FORMAT as error:
         raise older_format("dataset.root", root, name, root) from error
     except Exception as error:  # parquet, JSON, datasets and the hub each raise their own
@@ -125,10 +125,27 @@ def open_dataset(root: str | Path, repo_id: str | None = None) -> LeRobotDataset
             "see that its files may be read and are whole; what is torn, copy or download again, and only if "
             "there is no other copy, record it again",
         ) from error
-    raise FieldError(
-        "dataset.root", root, f"{len(missing)} files are missing, the first is {missing[0]}",
-        "copy or download the dataset again, and only if there is no other copy, record it again",
-    )  # fmt: skip
+    if missing:
+        raise FieldError(
+            "dataset.root", root, f"{len(missing)} files are missing, the first is {missing[0]}",
+            "copy or download the dataset again, and only if there is no other copy, record it again",
+        )  # fmt: skip
+    return with_whole_rate(dataset, "dataset.root", root)
+
+
+def with_whole_rate(dataset: LeRobotDataset, field: str, value: object) -> LeRobotDataset:
+    """Return the dataset with its frame rate as the whole number that it is.
+
+    LeRobot converted older datasets to 30.0 frames a second for a time. FieldError for 29.97, of `field`.
+    """
+    rate = dataset.meta.info.fps
+    if rate != round(rate):
+        raise FieldError(
+            field, value, f"has {rate} frames a second, which is no whole number",
+            "record or convert it at a rate that is",
+        )  # fmt: skip
+    dataset.meta.info.fps = round(rate)
+    return dataset
 
 
 def save_episode(dataset: LeRobotDataset) -> None:
@@ -140,7 +157,7 @@ def save_episode(dataset: LeRobotDataset) -> None:
 def download_dataset(repo_id: str, revision: str | None = None, root: str | None = None) -> LeRobotDataset:
     """Download a dataset of the hub, to `root` or LeRobot's cache, and open it. FieldError if that fails."""
     try:
-        return LeRobotDataset(repo_id, root=root, revision=revision, video_backend=VIDEO_BACKEND)
+        dataset = LeRobotDataset(repo_id, root=root, revision=revision, video_backend=VIDEO_BACKEND)
     except Exception as error:  # the hub's client, parquet and JSON each raise their own
         if isinstance(error, OLDER_FORMAT) and revision is None:
             copy = Path("data") / repo_id.rpartition("/")[2]
@@ -150,6 +167,7 @@ def download_dataset(repo_id: str, revision: str | None = None, root: str | None
             "correct the name, log in with `hf auth login` if it is private, or give a folder on disk, "
             "`dataset.root`",
         ) from error  # fmt: skip
+    return with_whole_rate(dataset, "dataset.repo_id", repo_id)
 
 
 def older_format(field: str, value: object, repo_id: str, root: str | Path) -> FieldError:

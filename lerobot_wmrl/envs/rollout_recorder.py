@@ -15,11 +15,12 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION
 from lerobot.scripts.lerobot_eval import rollout
 from lerobot.utils.constants import ACTION, OBS_IMAGE
+from lerobot.utils.random_utils import seeded_context
 from torch import Tensor
 
 from lerobot_wmrl.common.actions import clip_actions, warn_of_clipped
 from lerobot_wmrl.common.constants import KINDS, POLICY, START_KIND, START_SEED, Observation
-from lerobot_wmrl.common.errors import FieldError, renamed
+from lerobot_wmrl.common.errors import FieldError, first_line, renamed
 from lerobot_wmrl.common.exploration import ExplorationNoise
 from lerobot_wmrl.common.files import whole_folder
 from lerobot_wmrl.common.images import to_bytes
@@ -76,6 +77,13 @@ class RolloutRecorder:
             freeze_finished(each)
         self.robot = robot or robot_of(env, self.envs[0], like)
         self.range_is_guessed = robot is None and like is None and not isinstance(env, WorldModelEnv)
+        try:
+            self.encoder = encoder_of(self.columns or {})
+        except ValueError as error:  # LeRobot reads more codecs than it writes
+            raise FieldError(
+                "like.root", like.root, f"its videos cannot be encoded alike ({first_line(error)})",
+                "give `like_columns=false` if nothing is to be merged",
+            ) from error  # fmt: skip
         if like is not None and like_columns and like.fps != env.fps:
             raise FieldError(
                 "like.root", like.root, f"has {like.fps} frames a second, the environment {env.fps}",
@@ -131,9 +139,11 @@ class RolloutRecorder:
         spare = [seeds[-1]] * (env.num_envs - len(seeds))
         noises = [ExplorationNoise(self.exploration, seed, self._scale()) for seed in [*seeds, *spare]]
         seen = RecordingProcessors(*self.processors, noises, self.robot)
-        taken = rollout(
-            env, self.policy, *self.env_processors, seen.preprocess, seen.postprocess, seeds=[*seeds, *spare]
-        )
+        with seeded_context(seeds[0]):  # of a policy that draws its actions, as flows and diffusion do
+            taken = rollout(
+                env, self.policy, *self.env_processors, seen.preprocess, seen.postprocess,
+                seeds=[*seeds, *spare],
+            )  # fmt: skip
         return seen, taken
 
     def _scale(self) -> np.ndarray:
@@ -149,7 +159,7 @@ class RolloutRecorder:
         features = own if self.columns is None else matched(own, self.columns)
         return LeRobotDataset.create(
             f"local/{folder.name.strip('.')}", self.config.fps, features, root=folder,
-            robot_type=self.robot_type, rgb_encoder=encoder_of(self.columns or {}),
+            robot_type=self.robot_type, rgb_encoder=self.encoder,
             use_videos=any(feature["dtype"] == "video" for feature in features.values()),
             image_writer_threads=IMAGE_WRITERS,
         )  # fmt: skip

@@ -147,6 +147,8 @@ def rl(improvement: Improvement) -> list[str]:
     algorithm = {**config.algorithm, **given}
     if algorithm["algorithm.type"] == "ppo":
         algorithm = {**algorithm, "algorithm.gamma": improvement.discount}
+        if config.policy is not None and config.policy.use_peft:  # the standard deviation is in no adapter
+            algorithm = {**algorithm, "algorithm.initial_std": "null"}
     selection: Flags = {
         "selection.freq": ceil(improvement.sizes.iterations(algorithm) / SELECTIONS),
         "selection.n_episodes": improvement.rl_selection_episodes,

@@ -14,7 +14,7 @@ from lerobot_wmrl.common.errors import FieldError, require_at_least, require_cho
 from lerobot_wmrl.common.policies import (
     read_policy_config,
     require_chunks,
-    require_past_observations,
+    require_distillable,
     require_trained,
 )
 from lerobot_wmrl.common.presets import Flags
@@ -108,7 +108,7 @@ class ImproveConfig(RunConfig):
             raise FieldError("policy.path", None, "is missing", "give the policy to improve")
         require_trained(self.policy)
         if self.policy.type not in ALGORITHMS:
-            require_past_observations(self.policy)
+            require_distillable(self.policy)
         if self.policy.type == "act":
             require_chunks(self.policy)
         if not self.dataset.given:

@@ -3,6 +3,7 @@
 import json
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import ceil
 from pathlib import Path
 from typing import Any, Final
 
@@ -306,10 +307,14 @@ class Improvement:
         return min(self.found.longest, LONGEST_IMAGINATION)
 
     def branches(self) -> int:
-        """Return the number of frames beyond the first from which imagination of a recorded episode begins:
-        as far apart as an imagined episode is long."""
+        """Return the number of frames beyond the first from which imagination of a recorded episode begins.
+
+        They are no farther apart than an imagined episode is long, so that it can end as the recorded one
+        does. Where it is as long as the dataset's longest, a rollout of a few more frames has none.
+        """
         usual = usual_length(self.learnt()) if self.config.rollouts else self.found.usual
-        return max(0, round(usual / self.length) - 1)
+        parts = usual / self.length
+        return max(0, (ceil(parts) if self.length == LONGEST_IMAGINATION else round(parts)) - 1)
 
     @property
     def discount(self) -> float:

@@ -200,9 +200,10 @@ class Distillation(RLAlgorithm):
 
     def learnt_components(self, env: WorldModelVectorEnv, pipeline: Pipeline) -> Tensor:
         """Return which components of actions the policy's normalisation lets it learn (LEAST_SPREAD). (A,)"""
-        none = torch.zeros(1, len(env.action_low), device=self.lerobot_policy.config.device)
-        unit = (pipeline.to_action(none + 1) - pipeline.to_action(none)).abs()[0].to(env.device)
-        return unit >= LEAST_SPREAD * env.model.action_spread()
+        spread = env.model.action_spread()
+        if pipeline.action_unit is None:
+            return torch.ones_like(spread, dtype=torch.bool)
+        return pipeline.action_unit.to(env.device) >= LEAST_SPREAD * spread
 
     def check_recorded(self, env: WorldModelVectorEnv, pipeline: Pipeline) -> None:
         """Raise FieldError if recorded episodes are learnt from, and vary in what the policy cannot learn."""

@@ -85,12 +85,13 @@ class PolicyGradient(RLAlgorithm):
     iteration: int
     """Rollouts that were trained on."""
 
-    unrewarded: int
-    """Rollouts in a row, up to the latest, without any reward."""
+    unrewarded: Tensor
+    """Rollouts in a row, up to the latest, without any reward. () int64"""
 
     def __init__(self, policy: Any, config: PolicyGradientConfig) -> None:
         self.lerobot_policy, self.policy = policy, as_stochastic(policy)
-        self.config, self.iteration, self.unrewarded = config, 0, 0
+        self.config, self.iteration = config, 0
+        self.unrewarded = torch.zeros((), dtype=torch.int64)
         if config.initial_std is not None:
             if not hasattr(self.policy, "set_std"):
                 raise FieldError(
@@ -151,9 +152,10 @@ class PolicyGradient(RLAlgorithm):
         load_trained_weights(self.lerobot_policy, weights)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return the tensors that the policy's own checkpoint lacks: its adapter's. Subclasses add theirs."""
+        """Return the tensors that the policy's own checkpoint lacks, its adapter's among them. Subclasses add
+        theirs."""
         added = {} if self.policy is self.lerobot_policy else self.policy.own_tensors()
-        return {f"adapter.{name}": value for name, value in added.items()}
+        return {"unrewarded": self.unrewarded, **{f"adapter.{name}": value for name, value in added.items()}}
 
     @torch.no_grad()
     def load_state_dict(self, state_dict: dict[str, Tensor], device: str | torch.device = "cpu") -> None:
@@ -187,7 +189,7 @@ class PolicyGradient(RLAlgorithm):
     def check_rewarded(self, rollout: RolloutBuffer) -> None:
         """Raise TrainingStopped after `patience` rollouts in a row without any reward."""
         rewarded = largest_over_processes(rollout.reward.abs().max()).item() > 0
-        self.unrewarded = 0 if rewarded else self.unrewarded + 1
+        self.unrewarded.copy_(0 if rewarded else self.unrewarded + 1)
         if self.unrewarded >= self.config.patience:
             raise TrainingStopped(
                 f"iteration {self.iteration + 1}: no episode was rewarded in {self.unrewarded} iterations, "

@@ -146,8 +146,8 @@ class JudgeConfig(RunConfig):
             )  # fmt: skip
 
 
-MAY_DIFFER = ("policies", "references", "coverage", "batch_size", "device")
-"""Settings that change no imagined episode of a policy."""
+MAY_DIFFER = ("policies", "references", "coverage")
+"""Settings that change no imagined episode of a policy. Device and batch size do: by its number format."""
 
 
 def judge(cfg: JudgeConfig) -> None:

@@ -51,7 +51,8 @@ def train_policy(cfg: TrainConfig) -> None:
     from accelerate import PartialState
     from lerobot.utils.random_utils import set_seed
 
-    from lerobot_wmrl.common.policies import load_policy, load_processors, require_past_observations
+    from lerobot_wmrl.common.checkpoints import link_latest
+    from lerobot_wmrl.common.policies import load_policy, load_processors, require_distillable
     from lerobot_wmrl.envs.lerobot_env import make_tensor_env
     from lerobot_wmrl.rl.budget import check_data
 
@@ -64,12 +65,14 @@ def train_policy(cfg: TrainConfig) -> None:
             "set `policy.device` instead",
         )  # fmt: skip
     if isinstance(cfg.algorithm, DistillationConfig):
-        require_past_observations(config)
+        require_distillable(config)
     PartialState(cpu=config.device == "cpu", timeout=LONGEST_WAIT)
     done = finished(cfg)
     wait_for_all()  # no process has written anything before all have looked
     if done:
         require_free(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER)
+        if is_first_process():
+            link_latest(cfg.output_dir)
         print(f"{cfg.output_dir}: already trained for {cfg.iterations} iterations")
     else:
         set_seed(cfg.seed)

@@ -152,7 +152,7 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
     """Build or reload the model, train it, measure it on held-out episodes, publish it."""
     from lerobot.utils.random_utils import set_seed
 
-    from lerobot_wmrl.common.checkpoints import latest_checkpoint, require_resumable
+    from lerobot_wmrl.common.checkpoints import latest_checkpoint, link_latest, require_resumable
     from lerobot_wmrl.data.episodes import read_episodes
     from lerobot_wmrl.world_models.checkpoint import config_to_continue
     from lerobot_wmrl.world_models.training import build_model
@@ -172,6 +172,8 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
     checkpoint = latest_checkpoint(cfg.output_dir)
     set_seed(cfg.seed)
     require_free(cfg.output_dir, given, MAY_DIFFER)
+    if is_first_process():
+        link_latest(cfg.output_dir)
     model: Any = build_model(cfg.model, table, cfg.output_dir)
     require_same_data(cfg, table)
     if checkpoint is not None and int(checkpoint.name) >= cfg.steps:

@@ -50,17 +50,12 @@ def read_config(
                 field, path, f"no {expected_type} there", "give its training's output folder, or a hub id"
             )
     else:
-        found = _stored_type(folder / "config.json")
-        if found != expected_type:
-            raise FieldError(
-                field, path, f"is a checkpoint of type {found!r}, but {expected_type!r} is needed here",
-                "give the output folder of a training with that type",
-            )  # fmt: skip
+        require_type(_stored_type(folder / "config.json"), expected_type, field, path)
     if device is None:
         accelerator = torch.accelerator.current_accelerator(check_available=True)
         device = accelerator.type if accelerator else "cpu"
     try:
-        return RewardModelConfig.from_pretrained(str(folder), cli_overrides=[f"--device={device}"])
+        config = RewardModelConfig.from_pretrained(str(folder), cli_overrides=[f"--device={device}"])
     except FileNotFoundError as error:
         raise FieldError(
             field, path, f"no {expected_type} there, nor on the hub ({first_line(error)})",
@@ -71,6 +66,17 @@ def read_config(
             field, path, f"its configuration is of an earlier version of this package ({first_line(error)})",
             "train the model again",
         ) from error  # fmt: skip
+    require_type(config.type, expected_type, field, path)  # one of the hub
+    return config
+
+
+def require_type(found: Any, expected: str, field: str, path: str | Path) -> None:
+    """Raise FieldError unless the checkpoint at `path` is of the expected type."""
+    if found != expected:
+        raise FieldError(
+            field, path, f"is a checkpoint of type {found!r}, but {expected!r} is needed here",
+            "give the output folder of a training with that type",
+        )  # fmt: skip
 
 
 def config_to_continue(path: str, overrides: Sequence[str]) -> RewardModelConfig:

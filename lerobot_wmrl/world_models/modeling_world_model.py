@@ -20,7 +20,7 @@ from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.policies import check_units
 from lerobot_wmrl.data.checks import check_cameras, check_depth, check_episode_lengths, check_statistics
 from lerobot_wmrl.data.clips import Clip, clip_from_windows
-from lerobot_wmrl.data.embodiment import read_embodiment
+from lerobot_wmrl.data.embodiment import check_range, read_embodiment
 from lerobot_wmrl.data.episodes import success_column
 from lerobot_wmrl.data.frame_cache import depth_of_windows
 from lerobot_wmrl.world_models.anchored.dynamics import AnchoredDynamics
@@ -251,6 +251,8 @@ class ActionWorldModelRewardModel(WorldModelRewardModel):
         self.config.action_size = meta.features[ACTION]["shape"][0]
         if not self.config.pretrained_path:
             self.config.embodiment = read_embodiment(meta, self.config.embodiment)
+        own = self.config.embodiment  # may have been given beside a model that is trained further
+        check_range(own.action_low, own.action_high, own.action_names)
 
     def check_units(self, policy: PreTrainedConfig, postprocessor: Any) -> None:
         """Raise FieldError if a policy's actions are in other units than those that the model learnt from."""
@@ -348,6 +350,11 @@ class TextWorldModelRewardModel(WorldModelRewardModel):
     ) -> "TextWorldModelRewardModel":
         """Load a checkpoint: a folder or a hub id, with its frozen T5 if it was trained with one."""
         config = config or RewardModelConfig.from_pretrained(pretrained_name_or_path, **kwargs)
+        if config.text_encoder not in (None, CHECKPOINT_FOLDER):
+            raise FieldError(
+                "text_encoder", config.text_encoder, "a trained model keeps the text encoder that it has",
+                "leave it out, or train a new model with `model.type`",
+            )  # fmt: skip
         if config.text_encoder is not None:
             kwargs["t5"] = FrozenT5.load_carried(pretrained_name_or_path, kwargs.get("revision"))
         return super().from_pretrained(pretrained_name_or_path, config=config, **kwargs)

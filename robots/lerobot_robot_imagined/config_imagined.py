@@ -1,11 +1,15 @@
 """Configuration of the imagined robot, `--robot.type=imagined`."""
 
 from dataclasses import dataclass, field
+from typing import Final
 
 from lerobot.robots import RobotConfig
 
 from lerobot_wmrl.common.errors import FieldError, require_positive
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
+
+MAX_STARTS: Final = 100_000
+"""Episodes begin in the first frame of every episode of a dataset with so many at most."""
 
 
 @RobotConfig.register_subclass("imagined")
@@ -21,7 +25,8 @@ class ImaginedRobotConfig(RobotConfig):
 
     Args:
         world_model_path: the action world model, a checkpoint or the output folder of its training.
-        dataset: dataset in whose frames episodes begin, one after the other.
+        dataset: dataset in whose frames episodes begin, one after the other: in those of every episode,
+            unless `dataset.max_starts` is less than there are.
         first_start: number of the frame in which the first episode begins.
         episode_time_s: seconds after which the next episode begins, `dataset.episode_time_s` of the command.
             None if keys alone end one.
@@ -33,7 +38,7 @@ class ImaginedRobotConfig(RobotConfig):
     """
 
     world_model_path: str = ""
-    dataset: StartFrames = field(default_factory=StartFrames)
+    dataset: StartFrames = field(default_factory=lambda: StartFrames(max_starts=MAX_STARTS))
     first_start: int = 0
     episode_time_s: float | None = None
     done_threshold: float = 0.5

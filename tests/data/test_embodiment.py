@@ -1,5 +1,6 @@
 """What a dataset says about its robot, and what is refused."""
 
+import json
 import logging
 from pathlib import Path
 
@@ -8,6 +9,8 @@ import pytest
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.embodiment import (
     Embodiment,
     check_same_robot,
@@ -58,6 +61,20 @@ def test_names_range_and_rate_come_from_the_dataset(tmp_path: Path, caplog: pyte
     assert found.action_low == pytest.approx([-90, 0, 0])
     assert found.action_high == pytest.approx([90, 45, 30])
     assert "shoulder -90 to 90" in caplog.text
+
+
+@pytest.mark.parametrize(("rate", "whole"), [(50.0, True), (29.97, False)])
+def test_a_rate_of_frames_is_a_whole_number(rate: float, whole: bool, tmp_path: Path) -> None:
+    """LeRobot's converter of older datasets wrote 50.0, which no setting of whole frames can hold."""
+    record(tmp_path / "data", degrees())
+    path = tmp_path / "data" / "meta" / "info.json"
+    path.write_text(path.read_text().replace('"fps": 50', f'"fps": {rate}'))
+    if whole:
+        found = read_embodiment(open_dataset(tmp_path / "data").meta, Embodiment())
+        assert json.dumps(found.fps) == "50"
+    else:
+        with pytest.raises(FieldError, match=r"dataset.root=.*has 29\.97 frames a second"):
+            open_dataset(tmp_path / "data")
 
 
 def test_one_wrong_value_does_not_widen_the_range(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

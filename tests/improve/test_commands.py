@@ -34,7 +34,10 @@ from tests.improve.made_up import commands_of, improvement_of, made_commands
 from tests.rl.checkpoints import save_untrained_policy
 
 
-@pytest.mark.parametrize(("longest", "clip", "length", "branches"), [(40, 42, 40, 0), (300, 100, 98, 2)])
+@pytest.mark.parametrize(
+    ("longest", "clip", "length", "branches"),
+    [(40, 42, 40, 0), (98, 100, 98, 0), (120, 100, 98, 1), (300, 100, 98, 3)],
+)
 def test_long_episodes_are_imagined_in_parts(
     longest: int, clip: int, length: int, branches: int, tmp_path: Path
 ) -> None:
@@ -48,7 +51,7 @@ def test_long_episodes_are_imagined_in_parts(
 
 
 def test_one_long_recording_does_not_divide_all_the_others(tmp_path: Path) -> None:
-    assert "--env.dataset.branches=2" in made_commands(tmp_path, longest=9000, usual=300)["rl"]
+    assert "--env.dataset.branches=3" in made_commands(tmp_path, longest=9000, usual=300)["rl"]
 
 
 @pytest.mark.parametrize(("longest", "branches"), [(5, 3), (19, 0)])

@@ -290,7 +290,7 @@ def test_without_demonstrations_the_environment_says_what_the_actions_are(
     ("depth", True, "depth=True: can be chosen in ManiSkill alone"),
     ("shard", "0/2", "shard=0/2: divides recordings in ManiSkill alone"),
     ("max_frames", 0, "max_frames=0: must be at least 1"),
-    ("like", DatasetSource("nowhere"), "like.*root=nowhere: no LeRobotDataset there"),
+    ("like", DatasetSource("nowhere"), r"^like\.root=nowhere: no LeRobotDataset there"),
 ])  # fmt: skip
 def test_bad_settings_are_named_and_nothing_is_left(
     setting: str, value: object, message: str, config: RecordConfig

@@ -6,27 +6,32 @@ import sys
 from collections.abc import Callable
 from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
-from lerobot.configs.types import FeatureType, PolicyFeature
+from lerobot.configs.types import FeatureType, NormalizationMode, PolicyFeature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
 from lerobot.policies.factory import make_pre_post_processors
+from lerobot.policies.pi0.configuration_pi0 import PI0Config
 from lerobot.policies.tdmpc.configuration_tdmpc import TDMPCConfig
 from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
 from lerobot.policies.vqbet.modeling_vqbet import VQBeTPolicy
+from lerobot.processor import UnnormalizerProcessorStep
 from lerobot.utils.constants import ACTION
 from safetensors.torch import load_file
 from torch import Tensor
 
+from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_wmrl.common.checkpoints import resolve_checkpoint
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.files import write_json
-from lerobot_wmrl.common.pipeline import unchanged
+from lerobot_wmrl.common.pipeline import action_unit, unchanged
+from lerobot_wmrl.common.policies import require_distillable
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
@@ -46,6 +51,7 @@ from lerobot_wmrl.world_models.configuration_planner import PlannerSettings
 from lerobot_wmrl.world_models.planning import Planner
 from tests.hub_client import hub as hub
 from tests.hub_server import Hub
+from tests.lerobot_policy_openvla.small import small_policy
 from tests.rl.act_checkpoint import IMAGE, STATE, save_small_act
 from tests.rl.checkpoints import save_untrained_policy
 from tests.rl.small_pi0 import publish_tokenizer, shrink_pi0, small_pi0
@@ -305,6 +311,44 @@ def test_policies_of_several_observations_learn_from_as_many(
     assert read_metrics(output_dir)[-1]["labels"] >= 3 * 4
     before = load_file(policy / "model.safetensors")
     assert any(not torch.equal(before[name], value) for name, value in weights(output_dir).items())
+
+
+def test_openvla_learns_from_the_planner(
+    imagined: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its actions are tokens, not normalised numbers."""
+    action = PolicyFeature(type=FeatureType.ACTION, shape=(7,))
+    made = small_policy(output_features={"action": action})
+    policy, output_dir = tmp_path / "policy", tmp_path / "rl"
+    made.save_pretrained(policy)
+    limits = {"min": torch.full((7,), -1.0), "max": torch.ones(7)}
+    stats = {ACTION: {**limits, "q01": limits["min"], "q99": limits["max"]}}
+    for processor in make_pre_post_processors(made.config, dataset_stats=stats):
+        processor.save_pretrained(policy)
+    flags = [*FAST, "--algorithm.recorded=true", *imagined, f"--output_dir={output_dir}"]
+    train(monkeypatch, f"--policy.path={policy}", *flags)
+    assert read_metrics(output_dir)[-1]["labels"] >= 3 * 4
+    before = load_file(policy / "model.safetensors")
+    assert any(not torch.equal(before[name], value) for name, value in weights(output_dir).items())
+
+
+def test_a_unit_is_what_the_policys_normalisation_makes_of_one() -> None:
+    features = {ACTION: PolicyFeature(FeatureType.ACTION, (2,))}
+    config = CnnConfig(device="cpu", output_features=features)
+    stats = {ACTION: {"mean": torch.tensor([5.0, 0.0]), "std": torch.tensor([0.5, 2.0])}}
+    unnormalised = UnnormalizerProcessorStep(
+        features, {FeatureType.ACTION: NormalizationMode.MEAN_STD}, stats=stats
+    )
+    plain = UnnormalizerProcessorStep(features, {FeatureType.ACTION: NormalizationMode.IDENTITY}, stats=stats)
+    unit = action_unit(config, SimpleNamespace(steps=[unnormalised]))
+    torch.testing.assert_close(unit, torch.tensor([0.5, 2.0]), atol=1e-4, rtol=1e-4)
+    assert action_unit(config, SimpleNamespace(steps=[plain])) is None
+
+
+def test_policies_of_relative_actions_are_refused() -> None:
+    """Those that are taken later in a chunk would be relative to another state."""
+    with pytest.raises(FieldError, match="this pi0 predicts relative actions"):
+        require_distillable(PI0Config(use_relative_actions=True))
 
 
 @pytest.mark.parametrize("kind", ["smolvla", "pi0"])

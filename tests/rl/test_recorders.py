@@ -18,11 +18,12 @@ from lerobot.scripts.lerobot_eval import rollout
 from lerobot.utils.constants import OBS_IMAGE
 
 from lerobot_wmrl.common.constants import KINDS, POLICY, START_KIND
+from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.embodiment import Embodiment, check_same_robot
 from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
 from lerobot_wmrl.envs import rollout_recorder
-from lerobot_wmrl.envs.rollout_recorder import robot_of
+from lerobot_wmrl.envs.rollout_recorder import RolloutRecorder, robot_of
 from lerobot_wmrl.evaluation.agreement import policy_outcomes
 from lerobot_wmrl.rl.recorders import EnvRecorder
 from tests.rl.checkpoints import save_untrained_policy
@@ -81,6 +82,25 @@ def test_seeds_decide_the_start_and_noise_stays_in_range(checkpoint: Path, tmp_p
     assert other.action.std() > 1
     assert (other.action >= 0).all()
     assert (other.action <= 512).all()
+
+
+def test_a_policy_that_draws_its_actions_draws_the_same_from_a_seed(checkpoint: Path, tmp_path: Path) -> None:
+    """As flows and diffusion do. What is drawn elsewhere stays as it was."""
+    made = []
+    for name in ("first", "again"):
+        config = read_policy_config(str(checkpoint / "pretrained_model"), [])
+        recorder = RolloutRecorder(PushtEnv(episode_length=STEPS), config, ROBOT)
+        chosen = recorder.policy.select_action
+        recorder.policy.select_action = lambda seen, chosen=chosen: chosen(seen) + torch.randn(1, 2)
+        torch.manual_seed(len(name))
+        expected = torch.rand(1)
+        torch.manual_seed(len(name))
+        recorder.record(tmp_path / name, [7, 8], lambda success: None)
+        assert torch.equal(torch.rand(1), expected)
+        recorder.close()
+        made.append(read_episodes(open_dataset(tmp_path / name)).action)
+    assert np.array_equal(*made)
+    assert not np.array_equal(made[0][:STEPS], made[0][STEPS:])
 
 
 def test_what_the_policy_does_out_of_range_is_reported_and_noise_is_not(
