@@ -62,6 +62,10 @@ def test_a_path_without_a_model_is_named(
     (["--model.dynamics.width=64"], r"weights do not fit the settings \(.*size mismatch.*leave the sizes"),
     (["--model.shifts=1"], r"(?s)unrecognized arguments: --shifts=1.*has not all of the settings"),
     (["--model.dynamics.type=autoregressive"], r"cannot be trained further with --dynamics\.type=autoreg"),
+    (
+        [f"--model.embodiment.action_low={[1] * 7}", f"--model.embodiment.action_high={[0] * 7}"],
+        r"embodiment\.action_low=.* would range from 1.0 to 0.0; give finite numbers",
+    ),
 ])  # fmt: skip
 def test_settings_that_do_not_fit_the_weights_are_refused(
     settings: list[str], message: str, trained_models: dict[str, Path], small_dataset, tmp_path: Path,

@@ -53,6 +53,15 @@ def test_a_model_that_is_nowhere_is_named(hub):
         read_config("somebody/nothing", "action_world_model")
 
 
+def test_a_model_of_another_type_is_named(hub, small_dataset, tmp_path):
+    config = tokenizer_config()
+    config.push_to_hub, config.repo_id = True, "somebody/tokenizer"
+    run_training(config, Path(small_dataset.root), tmp_path / "run", steps=1)
+    message = r"^world_model_path=somebody/tokenizer: is a checkpoint of type 'frame_tokenizer'"
+    with pytest.raises(FieldError, match=message):
+        read_config("somebody/tokenizer", "action_world_model")
+
+
 def test_what_was_trained_but_not_published_is_published_by_the_same_command(hub, small_dataset, tmp_path):
     config = tokenizer_config()
     config.push_to_hub, config.repo_id = True, "somebody/later"

@@ -14,9 +14,10 @@ from safetensors.torch import load_file
 from transformers import BertConfig
 
 from lerobot_wmrl.common.checkpoints import resolve_checkpoint
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.output_folders import CONFIG_FILE
 from lerobot_wmrl.world_models import losses
-from lerobot_wmrl.world_models.checkpoint import load_model
+from lerobot_wmrl.world_models.checkpoint import config_to_continue, load_model, load_model_to_continue
 from lerobot_wmrl.world_models.goal import imagine_goal
 from tests.hub_server import WRITE_TOKEN, running_hub
 from tests.trained import run_training, text_config
@@ -100,6 +101,12 @@ def test_training_goes_on_where_the_t5s_own_folder_is_gone(trained, small_datase
     run_training(config, Path(small_dataset.root), output_dir, steps=2)
     expected, resumed = load_file(trained / WEIGHTS), load_file(output_dir / WEIGHTS)
     assert all(torch.equal(expected[name], resumed[name]) for name in expected)
+
+
+def test_a_trained_model_keeps_its_text_encoder(trained, small_dataset):
+    config = config_to_continue(str(trained), ["--text_encoder=google/flan-t5-small"])
+    with pytest.raises(FieldError, match=r"^text_encoder=google/flan-t5-small: a trained model keeps"):
+        load_model_to_continue(config, small_dataset.meta)
 
 
 def test_it_loads_from_the_hub_by_its_id(trained, tmp_path, monkeypatch):
