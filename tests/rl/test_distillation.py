@@ -82,6 +82,16 @@ def train(monkeypatch: pytest.MonkeyPatch, *flags: str) -> None:
     main()
 
 
+def distil(
+    made: Any, stats: dict[str, Any], policy: Path, flags: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Save a policy with processors for data of these statistics, and fit it to recorded episodes too."""
+    made.save_pretrained(policy)
+    for processor in make_pre_post_processors(made.config, dataset_stats=stats):
+        processor.save_pretrained(policy)
+    train(monkeypatch, f"--policy.path={policy}", *FAST, "--algorithm.recorded=true", *flags)
+
+
 def weights(output_dir: Path) -> dict[str, Tensor]:
     return load_file(output_dir / "checkpoints" / "last" / "pretrained_model" / "model.safetensors")
 
@@ -299,15 +309,11 @@ def test_policies_of_several_observations_learn_from_as_many(
 ) -> None:  # fmt: skip
     """VQ-BeT learns from observations (B, n, …), also where n is 1."""
     made, policy, output_dir = make(observations), tmp_path / "policy", tmp_path / "rl"
-    made.save_pretrained(policy)
     stats = {key: {"min": torch.full(size, -1.0), "max": torch.ones(size)} for key, size in (
         (STATE, (8,)), (ACTION, (7,))
     )}  # fmt: skip
     stats[IMAGE] = {"mean": torch.zeros(3, 1, 1), "std": torch.ones(3, 1, 1)}
-    for processor in make_pre_post_processors(made.config, dataset_stats=stats):
-        processor.save_pretrained(policy)
-    flags = [*FAST, "--algorithm.recorded=true", *imagined, f"--output_dir={output_dir}"]
-    train(monkeypatch, f"--policy.path={policy}", *flags)
+    distil(made, stats, policy, [*imagined, f"--output_dir={output_dir}"], monkeypatch)
     assert read_metrics(output_dir)[-1]["labels"] >= 3 * 4
     before = load_file(policy / "model.safetensors")
     assert any(not torch.equal(before[name], value) for name, value in weights(output_dir).items())
@@ -320,13 +326,9 @@ def test_openvla_learns_from_the_planner(
     action = PolicyFeature(type=FeatureType.ACTION, shape=(7,))
     made = small_policy(output_features={"action": action})
     policy, output_dir = tmp_path / "policy", tmp_path / "rl"
-    made.save_pretrained(policy)
     limits = {"min": torch.full((7,), -1.0), "max": torch.ones(7)}
     stats = {ACTION: {**limits, "q01": limits["min"], "q99": limits["max"]}}
-    for processor in make_pre_post_processors(made.config, dataset_stats=stats):
-        processor.save_pretrained(policy)
-    flags = [*FAST, "--algorithm.recorded=true", *imagined, f"--output_dir={output_dir}"]
-    train(monkeypatch, f"--policy.path={policy}", *flags)
+    distil(made, stats, policy, [*imagined, f"--output_dir={output_dir}"], monkeypatch)
     assert read_metrics(output_dir)[-1]["labels"] >= 3 * 4
     before = load_file(policy / "model.safetensors")
     assert any(not torch.equal(before[name], value) for name, value in weights(output_dir).items())
@@ -364,14 +366,10 @@ def test_a_vla_with_action_chunks_learns_from_the_planner(
         publish_tokenizer(hub, tmp_path / "tokenizer")
         made = small_pi0(**features)
     policy, output_dir = tmp_path / "policy", tmp_path / "rl"
-    made.save_pretrained(policy)
     stats = {key: {"mean": torch.zeros(size), "std": torch.ones(size)} for key, size in (
         (STATE, 8), (ACTION, 7)
     )}  # fmt: skip
-    for processor in make_pre_post_processors(made.config, dataset_stats=stats):
-        processor.save_pretrained(policy)
-    flags = [*FAST, "--algorithm.recorded=true", *imagined, f"--output_dir={output_dir}"]
-    train(monkeypatch, f"--policy.path={policy}", *flags)
+    distil(made, stats, policy, [*imagined, f"--output_dir={output_dir}"], monkeypatch)
     assert read_metrics(output_dir)[-1]["labels"] >= 3 * 4
     before, after = load_file(policy / "model.safetensors"), weights(output_dir)
     learnt = {name for name in before if not torch.equal(before[name], after[name])}
