@@ -80,6 +80,7 @@ class RolloutRecorder:
         try:
             self.encoder = encoder_of(self.columns or {})
         except ValueError as error:  # LeRobot reads more codecs than it writes
+            assert like is not None, "columns are those of `like`"
             raise FieldError(
                 "like.root", like.root, f"its videos cannot be encoded alike ({first_line(error)})",
                 "give `like_columns=false` if nothing is to be merged",

@@ -189,7 +189,9 @@ class PolicyGradient(RLAlgorithm):
     def check_rewarded(self, rollout: RolloutBuffer) -> None:
         """Raise TrainingStopped after `patience` rollouts in a row without any reward."""
         rewarded = largest_over_processes(rollout.reward.abs().max()).item() > 0
-        self.unrewarded.copy_(0 if rewarded else self.unrewarded + 1)
+        self.unrewarded += 1
+        if rewarded:
+            self.unrewarded.zero_()
         if self.unrewarded >= self.config.patience:
             raise TrainingStopped(
                 f"iteration {self.iteration + 1}: no episode was rewarded in {self.unrewarded} iterations, "

@@ -46,9 +46,10 @@ UNDOCUMENTED = {
     "lerobot.utils.keyboard_input": {"apply_recording_control"},
     "lerobot.utils.logging_utils": {"MetricsTracker"},
     "lerobot.utils.random_utils": {
-        "deserialize_rng_state", "get_rng_state", "serialize_rng_state", "set_rng_state", "set_seed",
+        "deserialize_rng_state", "get_rng_state", "seeded_context", "serialize_rng_state", "set_rng_state",
+        "set_seed",
     },
-    "lerobot.utils.utils": {"flatten_dict", "init_logging"},
+    "lerobot.utils.utils": {"SuppressProgressBars", "flatten_dict", "init_logging"},
 }  # fmt: skip
 """May change with any release: whoever adds one writes it down, and whoever raises the version reads this."""
 
