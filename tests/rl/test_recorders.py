@@ -18,6 +18,7 @@ from lerobot.scripts.lerobot_eval import rollout
 from lerobot.utils.constants import OBS_IMAGE
 
 from lerobot_wmrl.common.constants import KINDS, POLICY, START_KIND
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.embodiment import Embodiment, check_same_robot
@@ -101,6 +102,14 @@ def test_a_policy_that_draws_its_actions_draws_the_same_from_a_seed(checkpoint: 
         made.append(read_episodes(open_dataset(tmp_path / name)).action)
     assert np.array_equal(*made)
     assert not np.array_equal(made[0][:STEPS], made[0][STEPS:])
+
+
+def test_videos_that_lerobot_cannot_encode_alike_are_refused_before_a_rollout(checkpoint: Path) -> None:
+    config = read_policy_config(str(checkpoint / "pretrained_model"), [])
+    videos = {"dtype": "video", "shape": (96, 96, 3), "info": {"video.codec": "vp9"}}
+    like: Any = SimpleNamespace(features={OBS_IMAGE: videos}, root="data/web", fps=10, robot_type=None)
+    with pytest.raises(FieldError, match=r"^like\.root=data/web: its videos cannot be encoded alike .*vp9"):
+        RolloutRecorder(PushtEnv(episode_length=STEPS), config, ROBOT, like=like)
 
 
 def test_what_the_policy_does_out_of_range_is_reported_and_noise_is_not(
