@@ -41,6 +41,9 @@ from lerobot_wmrl.world_models.modeling_world_model import (
     WorldModelRewardModel,
 )
 
+GOLDEN_RATIO = (5**0.5 - 1) / 2
+"""Its multiples, modulo 1, are spread over the unit interval, any of them in a row."""
+
 STARTS_AT_ONCE = 64
 """Starts that are tokenised, and goal frames that are imagined, at once."""
 
@@ -182,8 +185,11 @@ def branch_frames(table: EpisodeTable, episodes: np.ndarray, branches: int) -> n
     """Return the rows of each episode's first frame and `branches` later ones. (K,), without repetitions
 
     They are spread evenly over the frames before its success, and before its last frame, and follow the first
-    frame: any starts in a row are as many first frames as others.
+    frame: any starts in a row are as many first frames as others. With branches the episodes are in an order
+    in which any in a row are spread over all of them (a golden-ratio sequence).
     """
+    if branches:
+        episodes = episodes[np.argsort(np.arange(len(episodes)) * GOLDEN_RATIO % 1)]
     last = np.minimum(undecided_frames(table, episodes), table.length[episodes] - 1)
     offsets = np.maximum(last, 1)[:, None] * np.arange(1 + branches) // (1 + branches)
     rows = (table.start[episodes, None] + offsets).flatten()

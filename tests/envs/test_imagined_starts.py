@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -124,3 +126,14 @@ def test_starts_in_a_row_are_first_and_later_frames_alike(small_dataset: LeRobot
     assert rows.tolist() == [first, first + (table.length[0] - 1) // 2, second, second + 1]
     table.done[second + 1] = True
     assert branch_frames(table, np.array([1]), branches=1).tolist() == [second]
+
+
+def test_with_branches_any_starts_in_a_row_are_of_episodes_all_over_the_dataset() -> None:
+    """A comparison takes some in a row."""
+    length = np.full(300, 20)
+    table: Any = SimpleNamespace(
+        start=np.cumsum(length) - length, length=length, success_target=np.zeros(length.sum(), bool)
+    )
+    for begun in (0, 100, 411):
+        episodes = branch_frames(table, np.arange(300), branches=1)[begun : begun + 60] // 20
+        assert np.histogram(episodes, 5, (0, 300))[0].min() >= 9, "of 12 if they were spread exactly"
