@@ -13,7 +13,7 @@ from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames, cached_tokens, frames_to_tensor
 from lerobot_wmrl.data.frames import NO_CONTEXT
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
-from lerobot_wmrl.envs.start_frames import read_start_images
+from lerobot_wmrl.envs.start_frames import GOLDEN_RATIO, read_start_images
 from lerobot_wmrl.evaluation.pictures import side_by_side
 from lerobot_wmrl.evaluation.replay import Recording, replay_episodes
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
@@ -177,7 +177,8 @@ def test_environments_decode_beside_their_own_start_also_after_a_restart(models,
 
 
 def test_imagined_episodes_branch_off_from_recorded_ones_before_their_success(models, small_dataset, table):
-    """From frames spread over what comes before it, each beside the first frame of its episode."""
+    """From frames spread over what comes before it, each beside the first frame of its episode; the episodes
+    in an order that spreads over the dataset."""
     starts = StartFrames(root=str(Path(small_dataset.root)), branches=2)
     path = str(models["action_world_model"])
     reward = GeneralConfig(alpha=1.0)
@@ -187,13 +188,15 @@ def test_imagined_episodes_branch_off_from_recorded_ones_before_their_success(mo
     for start, length in zip(table.start, table.length, strict=True):
         solved = np.flatnonzero(table.done[start : start + length])
         last.append(min([length - 1, *solved[:1]]))
-    expected = (table.start[:, None] + np.array(last)[:, None] * np.arange(3) // 3).flatten()
+    order = np.argsort(np.arange(len(last)) * GOLDEN_RATIO % 1)
+    begun = table.start[order]
+    expected = (begun[:, None] + np.array(last)[order, None] * np.arange(3) // 3).flatten()
     np.testing.assert_array_equal(frames.state, table.state[expected])
     assert not table.done[expected].any()
     tensor_env = env.create_tensor_env(len(expected))
     observation, _ = tensor_env.reset(seed=list(range(len(expected))))
     torch.testing.assert_close(observation["observation.state"], torch.from_numpy(table.state[expected]))
-    first = frames_to_tensor(cached_frames(small_dataset, [CAMERA], 32)[np.repeat(table.start, 3)])
+    first = frames_to_tensor(cached_frames(small_dataset, [CAMERA], 32)[np.repeat(begun, 3)])
     torch.testing.assert_close(
         tensor_env.starts.frames.context.maps, tensor_env.model.tokenizer.context(first).maps
     )
