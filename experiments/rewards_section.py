@@ -26,7 +26,7 @@ Everything is as in [value_push](#value_push), where the reward is success; only
 algorithm. Imagined episodes end with success under every reward. The learnt rewards have seen ManiSkill's
 rule-based one in the recorded episodes, the others have not.
 
-Under the absolute form PPO of seed 0 learns to put success off: imagined success rises from 55 to 81 % by
+Under the absolute form PPO of seed 0 learns to delay success: imagined success rises from 55 to 81 % by
 iteration 41 and falls to 66 % by iteration 80, while the reward goes on rising. Success ends an episode, and
 with it the similarity that each step pays."""
 

@@ -249,10 +249,11 @@ class ActionWorldModelRewardModel(WorldModelRewardModel):
         super()._adopt_dataset(meta)
         check_statistics(meta, ACTION)
         self.config.action_size = meta.features[ACTION]["shape"][0]
-        if not self.config.pretrained_path:
-            self.config.embodiment = read_embodiment(meta, self.config.embodiment)
-        own = self.config.embodiment  # may have been given beside a model that is trained further
-        check_range(own.action_low, own.action_high, own.action_names)
+        own = self.config.embodiment
+        if self.config.pretrained_path:  # another range may have been given beside it
+            check_range(own.action_low, own.action_high, own.action_names)
+        else:
+            self.config.embodiment = read_embodiment(meta, own)
 
     def check_units(self, policy: PreTrainedConfig, postprocessor: Any) -> None:
         """Raise FieldError if a policy's actions are in other units than those that the model learnt from."""
