@@ -39,7 +39,11 @@ def stages(improvement: Improvement) -> list[Stage]:
 
     def leaves_policies(status: int) -> bool:
         """Return whether RL stopped by a rule of its own, and there are policies to compare."""
-        return status == STOPPED and (improvement.clones or improvement.rl_checkpoint.exists())
+        return status == STOPPED and (others() or config.distils)
+
+    def others() -> bool:
+        """Return whether there is a policy to compare with the one before."""
+        return improvement.clones or improvement.rl_checkpoint.exists()
 
     records, clones = config.rollouts > 0, improvement.clones
     return [
@@ -53,7 +57,7 @@ def stages(improvement: Improvement) -> list[Stage]:
         *stage("start", "Choose in imagination which policy to improve", start, clones),
         *stage("rl", "Train the policy in imagination", rl, optional=leaves_policies),
         *stage("distilled", "Fit the policy to a planner in imagination", distilled, config.distils,
-               optional=lambda status: True),
+               optional=lambda status: others()),
         *stage("choice", "Choose the policy to use", choice, config.selects),
         *stage("comparison", "Compare the policies", comparison),
     ]  # fmt: skip

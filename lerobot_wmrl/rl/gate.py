@@ -70,7 +70,8 @@ class SuccessGate:
         recordings: dict[str, Recording] = {}
         if self.config.dataset.given and self._new_model(iteration):
             recordings[LABELLED] = labelled_recording(self.env.model, self.config.dataset.open())
-            for warning in learnt_from(self.env.config.world_model_path, self.config.dataset):
+            path = str(self.env.model.config.pretrained_path)  # of the newest one after Dyna rounds
+            for warning in learnt_from(path, self.config.dataset):
                 logging.warning(colored(warning, "red", attrs=["bold"]))
         if self.recorder is not None:
             recordings[FRESH] = self._fresh(self.recorder, iteration, checkpoint, folder / "rollouts")

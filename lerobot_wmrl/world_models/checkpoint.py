@@ -159,17 +159,21 @@ def load_model(
 ) -> Any:
     """Load a checkpoint in evaluation mode; arguments as of `read_config`.
 
+    Its `config.pretrained_path` says where it lies.
+
     Raises:
         ValueError: not found, of another type or version, truncated, or with other tensors than its config.
     """
     config = read_config(path, expected_type, device, field)
     folder = resolve_checkpoint(path)
     try:
-        return get_reward_model_class(config.type).from_pretrained(str(folder), config=config, strict=True)
+        model = get_reward_model_class(config.type).from_pretrained(str(folder), config=config, strict=True)
     except torch.OutOfMemoryError:
         raise
     except (SafetensorError, RuntimeError, OSError) as error:
         raise unreadable_weights(path, error) from error
+    model.config.pretrained_path = str(folder)
+    return model
 
 
 def unreadable_weights(path: object, error: Exception) -> ValueError:

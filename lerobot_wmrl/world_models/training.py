@@ -67,8 +67,9 @@ def build_model(config: RewardModelConfig, table: EpisodeTable, output_dir: Path
     """Return a fresh model with the dataset's statistics, or the latest checkpoint of this run."""
     checkpoint, meta = latest_checkpoint(output_dir), table.dataset.meta
     if checkpoint is not None:
-        model = load_model(checkpoint, config.type, config.device or "cpu")
+        model: PreTrainedRewardModel = load_model(checkpoint, config.type, config.device or "cpu")
         check_dataset(model.config, meta)
+        model.config.pretrained_path = config.pretrained_path  # as of a run that was never interrupted
         return model
     if not config.pretrained_path:
         return make_reward_model(config, dataset_stats=meta.stats, dataset_meta=meta)

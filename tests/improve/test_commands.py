@@ -283,8 +283,8 @@ def test_without_starts_to_select_on_the_last_checkpoint_and_policy_are_taken(tm
 def test_rl_may_stop_by_its_own_rules_if_it_leaves_a_checkpoint(
     real: PushtEnv | None, link: str, tmp_path: Path
 ) -> None:
-    """After any other error it is tried again."""
-    improvement = improvement_of(tmp_path)
+    """After any other error it is tried again. No planner is fitted to this policy, which could go on."""
+    improvement = improvement_of(tmp_path, policy=VQBeTConfig(device="cpu", pretrained_path=tmp_path))
     improvement.config.real_env = real
     (rl,) = (stage for stage in commands.stages(improvement) if stage.name == "rl")
     for other in {"last", "best"} - {link}:
@@ -310,6 +310,19 @@ def test_rl_that_left_nothing_leaves_the_policy_of_further_bc_to_the_planner(tmp
     write_json(tmp_path / "stages" / "distilled.json", {"failed": "stopped: no success"})
     assert [*improvement.policies] == [SFT, CLONED]
     assert improvement.chosen() == CLONED
+
+
+def test_rl_that_left_nothing_leaves_a_policy_of_successes_to_the_planner(tmp_path: Path) -> None:
+    """If the planner finds nothing either, there is nothing to compare."""
+    improvement = improvement_of(tmp_path)
+    rl, distilled = (stage for stage in commands.stages(improvement) if stage.name in ("rl", "distilled"))
+    assert rl.optional(STOPPED)
+    write_json(tmp_path / "stages" / "rl.json", {"failed": "stopped: no episode was rewarded"})
+    assert f"--policy.path={improvement.policy}" in distilled.command()
+    assert [*improvement.policies] == [SFT, DISTILLED]
+    assert not distilled.optional(1)
+    (tmp_path / "rl" / "checkpoints" / "last" / "pretrained_model").mkdir(parents=True)
+    assert distilled.optional(1)
 
 
 @pytest.mark.parametrize(("kind", "iterations", "freq"), [

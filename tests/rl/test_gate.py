@@ -9,8 +9,10 @@ from typing import Any, ClassVar
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from lerobot_wmrl.common.checkpoints import resolve_checkpoint
 from lerobot_wmrl.common.constants import GATE_SEED
 from lerobot_wmrl.common.errors import TrainingStopped
+from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.lerobot_commands import env_flags
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.data.dataset import DatasetSource
@@ -22,6 +24,7 @@ from lerobot_wmrl.rl import recorders
 from lerobot_wmrl.rl.configuration_callbacks import GateConfig
 from lerobot_wmrl.rl.gate import SuccessGate
 from lerobot_wmrl.rl.recorders import ManiSkillRecorder
+from lerobot_wmrl.world_models.checkpoint import load_model
 
 BELIEVES_ALL, BELIEVES_NONE = 0.0001, 0.9999
 """Done thresholds."""
@@ -106,6 +109,24 @@ def test_at_the_limit_training_goes_on(
         gate.apply({0: record})
     assert record["labelled"]["false_positive_rate"]["k"] == 0
     assert not [entry for entry in caplog.records if entry.levelno >= logging.WARNING]
+
+
+def test_rollouts_that_a_dyna_round_has_learnt_from_are_warned_about(
+    make_gate: Any, make_synthetic_dataset: Any, env: Any, tmp_path: Path,
+    trained_models: dict[str, Path], caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    root = str(make_synthetic_dataset(tmp_path / "recorded", episodes=3, length=5).root)
+    newer = tmp_path / "newer"
+    shutil.copytree(resolve_checkpoint(trained_models["action_world_model"]), newer)
+    write_json(newer / "train_config.json", {"dataset": {"root": "elsewhere", "more": [root]}})
+    gate = make_gate(BELIEVES_NONE)
+    gate.config.dataset = DatasetSource(root)
+    with caplog.at_level(logging.WARNING):
+        gate.run(0, tmp_path, tmp_path / "gate")
+        assert "has learnt from" not in caplog.text
+        monkeypatch.setattr(env, "model", load_model(newer, "action_world_model"))
+        gate.run(3, tmp_path, tmp_path / "gate")
+    assert f"The world model has learnt from these episodes ({root})" in caplog.text
 
 
 def test_what_nobody_has_asked_about_has_not_passed(

@@ -206,6 +206,8 @@ def test_training_goes_on_bit_for_bit_after_a_stop(build, precision, small_datas
     assert all(torch.equal(random[name], again[name]) for name in random)
     used = json.loads((partial / WEIGHTS).with_name("train_config.json").read_text())
     assert used["precision"] == precision
+    described = [(folder / WEIGHTS).with_name("config.json").read_text() for folder in (whole, partial)]
+    assert described[0] == described[1]
 
 
 def test_a_world_model_learns_one_batch_by_heart(sampler, trained_models):
