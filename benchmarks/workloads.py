@@ -1,4 +1,4 @@
-"""What `world_model.py` measures: a world model that imagines, and one that learns."""
+"""What `world_model.py` and `training_memory.py` measure: world models that imagine, and that learn."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,8 +13,10 @@ from lerobot_wmrl.data.clips import Clip
 from lerobot_wmrl.data.frames import Context, Frames
 from lerobot_wmrl.world_models.anchored.imagination import AnchoredImagination
 from lerobot_wmrl.world_models.autoregressive.dynamics import AutoregressiveImagination
+from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig
 from lerobot_wmrl.world_models.dynamics import Imagination as RunningImagination
-from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
+from lerobot_wmrl.world_models.modeling_frame_tokenizer import FrameTokenizerRewardModel
+from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel, WorldModelRewardModel
 from lerobot_wmrl.world_models.success import num_features
 
 STEPS = 8
@@ -120,21 +122,28 @@ def black_context(model: ActionWorldModelRewardModel, batch: int, device: torch.
     return model.tokenizer.context(torch.zeros(batch, cameras, 3, size, size, device=device))
 
 
-def random_clip(model: ActionWorldModelRewardModel, batch: int, device: torch.device) -> Clip:
+def random_frames(model: FrameTokenizerRewardModel, batch: int, device: torch.device) -> dict[str, Tensor]:
+    """A batch of pictures of noise, each with its episode's first one."""
+    sizes = model.config.tokenizer
+    shape = (batch, 3, sizes.image_size, sizes.image_size)
+    names = [*sizes.camera_keys, *(f"reference.{camera}" for camera in sizes.cameras)]
+    return {**{name: torch.rand(shape, device=device) for name in names}, "success": torch.arange(batch) == 0}
+
+
+def random_clip(model: WorldModelRewardModel, batch: int, device: torch.device) -> Clip:
     """A batch of clips of the length the model is trained on."""
     config, shape = model.config, (batch, model.config.clip_length)
     tokens = torch.randint(0, 2, (*shape, model.tokenizer.tokens_per_frame), device=device)
-    state, action = (
-        torch.randn(*shape, size, device=device) for size in (config.state_size, config.action_size)
-    )
+    components = config.action_size if isinstance(config, ActionWorldModelConfig) else 0
+    state, action = (torch.randn(*shape, size, device=device) for size in (config.state_size, components))
     yes = torch.ones(shape, dtype=torch.bool, device=device)
     done, depth = torch.zeros(shape, device=device), torch.ones(tokens.shape, device=device)
     features = None
     if model.config.predicts_success:
         features = torch.zeros(*shape, num_features(model.tokenizer.num_cameras), device=device)
     return Clip(
-        tokens, state, action, done, yes, yes, [""] * batch, depth, black_context(model, batch, device),
-        features,
+        tokens, state, action, done, yes, yes, ["push the cube"] * batch, depth,
+        black_context(model, batch, device), features,
     )  # fmt: skip
 
 

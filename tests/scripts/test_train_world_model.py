@@ -1,6 +1,7 @@
 """Training by the command: further with `--model.path`, resumed, tracked, and concluded."""
 
 import json
+import math
 import re
 import shutil
 import sys
@@ -13,11 +14,33 @@ from safetensors.torch import load_file
 
 from lerobot_wmrl.common import precision
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.presets import PRESETS
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.scripts.train_world_model import main
 from lerobot_wmrl.world_models.checkpoint import config_to_continue, load_model, load_model_to_continue
+from tests.commands import run_here
 
 TRAINED = "checkpoints/last/pretrained_model"
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_preset_trains_for_four_steps_on_few_small_frames(
+    preset: str, small_dataset, tmp_path: Path
+) -> None:
+    """The world models with the tokenizer of the same preset."""
+    few = [f"--preset={preset}", f"--dataset.root={small_dataset.root}", "--steps=4"]
+    tokenizer = tmp_path / "frame_tokenizer"
+    frames = ["--model.tokenizer.image_size=32", "--model.tokenizer.cameras=[third_view]"]
+    kinds: dict[str, list[str]] = {
+        "frame_tokenizer": [*frames, "--batch_size=2"],
+        "action_world_model": [f"--model.tokenizer_path={tokenizer}", "--batch_size=1"],
+        "text_world_model": [f"--model.tokenizer_path={tokenizer}", "--batch_size=1"],
+    }
+    for kind, flags in kinds.items():
+        out = f"--output_dir={tmp_path / kind}"
+        run_here("lerobot-wmrl-train-world-model", *few, f"--model.type={kind}", *flags, out)
+        (line,) = read_metrics(tmp_path / kind)
+        assert (line["step"], math.isfinite(line["loss"])) == (4, True)
 
 
 @pytest.mark.parametrize("model", ["action_world_model", "text_world_model"])
