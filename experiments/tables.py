@@ -105,6 +105,7 @@ SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     "control": ("Recording, algorithms, speed", world_models.control),
     "speed": ("Recording, algorithms, speed", world_models.speed),
     "speed_gpu": ("Recording, algorithms, speed", world_models.speed_gpu),
+    "training_memory": ("Recording, algorithms, speed", world_models.training_memory),
 }
 """Study → chapter and section, in the order of the page."""
 

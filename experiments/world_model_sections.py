@@ -387,3 +387,31 @@ computes without a GPU, and the peak there:
 
 One step of a rollout decodes the actions of {decoding["environments"]} environments,
 {decoding["a second"]:.0f} a second, in {decoding["GB"]:.1f} GB at most."""
+
+
+def training_memory(load: Load) -> str:
+    """Return the section: memory that the presets' world models take in training."""
+    found = load("training_memory")
+    models = {
+        "frame_tokenizer": "frame tokenizer", "action_world_model": "action world model",
+        "text_world_model": "text world model",
+    }  # fmt: skip
+    rows = [
+        [
+            row["preset"], models[row["model"]], f"{row['trained parameters'] / 1e6:.1f}", row["batch_size"],
+            f"{row['fixed']:.2f}", f"{1000 * row['activations of a sample']:,.0f}",
+            f"{row['in training']:.1f}", f"{row['losses'][0]:.1f} → {row['losses'][-1]:.1f}",
+        ]
+        for row in found["models"]
+    ]  # fmt: skip
+    head = ["preset", "model", "trained parameters (millions)", "batch", "weights, gradients, moments (GB)",
+            "activations of a sample (MB)", "in training (GB)", "loss, four steps"]  # fmt: skip
+    return f"""Each preset's models with its sizes and cameras, random weights and random frames. What
+autograd keeps of a batch for the backward pass was counted at two small batches; it is linear in the batch.
+A sample is a frame, or a clip of the preset's length. Not counted: the workspace of kernels, and what an
+allocator loses. Every model then took four optimizer steps on the smaller batch.
+
+{table(head, rows)}
+
+The published sizes (`paper`) need a GPU of more than 80 GB for a batch of 16 clips; in several processes
+([many GPUs](many_gpus.md)) each holds a share of the batch."""

@@ -1,6 +1,6 @@
 """Checkpoints of policies, with adapters (PEFT) or without, loaded to act in an environment."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -229,11 +229,8 @@ def check_units(
         low, high: the range of the environment's actions. (A,), (A,)
         where: what the error calls the environment.
     """
-    for step in postprocessor.steps:
-        known = (getattr(step, "stats", None) or {}).get(ACTION, {}).get("mean")
-        if known is None:
-            continue
-        mean, least, most = (torch.as_tensor(each).flatten().cpu().double() for each in (known, low, high))
+    for known in _action_statistics(postprocessor, "mean"):
+        mean, least, most = (torch.as_tensor(each).flatten().cpu().double() for each in (*known, low, high))
         width = (most - least).clamp_min(1e-3 * most.abs())  # a constant component's mean was rounded
         strange = (mean < least - width) | (mean > most + width)
         for component in strange.nonzero().flatten().tolist()[:1]:
@@ -243,6 +240,22 @@ def check_units(
                 f"{where} it is between {least[component]:.4g} and {most[component]:.4g}",
                 "use a policy with the same actions in the same units",
             )  # fmt: skip
+
+
+def learnt_range(postprocessor: Any) -> tuple[Tensor, Tensor] | None:
+    """Return the least and the greatest actions that a policy has learnt from, if its postprocessor says it.
+    (A,), (A,)"""
+    for low, high in _action_statistics(postprocessor, "min", "max"):
+        return torch.as_tensor(low).flatten().cpu().float(), torch.as_tensor(high).flatten().cpu().float()
+    return None
+
+
+def _action_statistics(postprocessor: Any, *names: str) -> Iterator[list[Any]]:
+    """Yield these statistics of actions from every step of a postprocessor that has them all."""
+    for step in postprocessor.steps:
+        found = (getattr(step, "stats", None) or {}).get(ACTION, {})
+        if all(found.get(name) is not None for name in names):
+            yield [found[name] for name in names]
 
 
 def with_new_adapters(policy: Any, settings: AdapterSettings) -> Any:

@@ -12,10 +12,13 @@ from lerobot.datasets.utils import EPISODES_DIR, BackwardCompatibilityError
 from lerobot.utils.utils import SuppressProgressBars
 
 from lerobot_wmrl.common.errors import FieldError, first_line, renamed
-from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
+from lerobot_wmrl.data.episodes import EpisodeTable, parquet_files, read_episodes
 
 VIDEO_BACKEND: Final = "pyav"
 """pyav ships its own FFmpeg, torchcodec needs the system's. Speed matters little: frames are decoded once."""
+
+HASHED_ROWS: Final = 65_536
+"""Rows that are hashed at a time."""
 
 OLDER_FORMAT: Final = (BackwardCompatibilityError, NotImplementedError)
 """What LeRobot raises for version 2.1, and for those before."""
@@ -183,9 +186,18 @@ def older_format(field: str, value: object, repo_id: str, root: str | Path) -> F
 
 
 def fingerprint(root: Path) -> str:
-    """Return a short hash of a dataset's folder `meta`, which changes with episodes, columns and values."""
+    """Return a short hash of a dataset's folder `meta` and of all its columns but pictures.
+
+    `meta` alone says nothing of labels: LeRobot keeps no statistics of a column that was added.
+    """
     files = sorted(path for suffix in ("json", "parquet") for path in (root / "meta").rglob(f"*.{suffix}"))
-    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:12]
+    digest = hashlib.sha256(b"".join(path.read_bytes() for path in files))
+    pictures = {name for name, each in load_info(root).features.items() if each["dtype"] == "image"}
+    rows = pyarrow.dataset.dataset(parquet_files(root), format="parquet")
+    kept = [name for name in sorted(rows.schema.names) if name not in pictures]
+    for batch in rows.to_batches(columns=kept, batch_size=HASHED_ROWS):
+        digest.update(batch.replace_schema_metadata(None).serialize())
+    return digest.hexdigest()[:12]
 
 
 def is_whole(root: Path) -> bool:

@@ -1,5 +1,6 @@
 """Any environment of LeRobot's for reinforcement learning: tensors in, tensors out."""
 
+import logging
 from math import ceil
 from typing import Any, Final
 
@@ -130,7 +131,7 @@ class LeRobotTensorEnv(TensorEnv):
 
     def __init__(self, config: EnvConfig, n_envs: int, device: str) -> None:
         tasks = _members(config, 1)
-        self.tasks = len(tasks)
+        self.kind, self.tasks = config.type, len(tasks)
         if n_envs > self.tasks:
             for (env,) in tasks:
                 env.close()
@@ -149,6 +150,25 @@ class LeRobotTensorEnv(TensorEnv):
         self.max_episode_steps = max(self._limits)
         self.metadata = {"render_fps": config.fps, "autoreset_mode": AutoresetMode.SAME_STEP}
         self._length = np.zeros(n_envs, np.int64)
+
+    def widen(self, low: Tensor, high: Tensor) -> None:
+        """Let actions reach as far as those that a policy has learnt from, (A,) each; warn where that is new.
+
+        LeRobot does not clip actions, and an environment may take more than its action space says: Aloha
+        takes joint angles, and its space is that from −1 to 1.
+        """
+        beyond = ((low < self.action_low) | (high > self.action_high)).nonzero().flatten().tolist()
+        if beyond:
+            logging.warning(
+                "env.type=%s: the policy has learnt actions beyond the environment's action space, and may "
+                "take them: %s. Are they in the same units?", self.kind, ", ".join(
+                    f"component {at} {low[at]:.4g} to {high[at]:.4g} (in the environment "
+                    f"{self.action_low[at]:.4g} to {self.action_high[at]:.4g})"
+                    for at in beyond
+                ),
+            )  # fmt: skip
+        self.action_low = torch.minimum(self.action_low, low)
+        self.action_high = torch.maximum(self.action_high, high)
 
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None

@@ -133,7 +133,8 @@ def make_vector_env(
 class ManiSkillTensorEnv(TensorEnv):
     """B simulators, each in a process of its own, with tensors on `device`.
 
-    Row b has task b mod their number.
+    Row b has task b mod their number. With several tasks `reset` deals out the seeds from the one that is
+    given at random: a seed decides the scene, and in their order each task would meet the same few scenes.
     """
 
     metadata = {"render_fps": FPS, "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012 (gymnasium's own)
@@ -154,6 +155,8 @@ class ManiSkillTensorEnv(TensorEnv):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
+        if isinstance(seed, int) and self.tasks > 1:
+            seed = (seed + np.random.default_rng(seed).permutation(self.num_envs)).tolist()
         observation, info = self.envs.reset(seed=seed, options=options)
         self._instructions = [str(text) for text in info["instruction"]]
         return self._tensors(observation, self._instructions), {}

@@ -116,8 +116,8 @@ def train_in(
 ) -> None:
     """Check that policy and environment fit, then train. `settings` are the configuration's, as JSON."""
     from lerobot_wmrl.common.pipeline import make_pipeline
-    from lerobot_wmrl.common.policies import adopt_features, check_fit, with_new_adapters
-    from lerobot_wmrl.envs.lerobot_env import check_frame_rate, check_real_env, shapes_of
+    from lerobot_wmrl.common.policies import adopt_features, check_fit, learnt_range, with_new_adapters
+    from lerobot_wmrl.envs.lerobot_env import LeRobotTensorEnv, check_frame_rate, check_real_env, shapes_of
     from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
     from lerobot_wmrl.rl.budget import charge_steps
     from lerobot_wmrl.rl.distillation import Distillation
@@ -134,6 +134,8 @@ def train_in(
     check_fit(config, shown, env.single_action_space.shape[-1])
     if isinstance(cfg.env, WorldModelEnv):
         env.model.check_units(config, processors[1])
+    if isinstance(env, LeRobotTensorEnv) and (learnt := learnt_range(processors[1])):
+        env.widen(*learnt)
     if cfg.real_env is not None:
         check_real_env(config, cfg.real_env)
         if isinstance(env, WorldModelVectorEnv):

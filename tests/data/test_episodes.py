@@ -78,7 +78,7 @@ def test_a_folder_is_the_same_with_and_without_a_slash() -> None:
     assert not DatasetSource().given
 
 
-def test_the_fingerprint_changes_with_labels_and_not_with_a_copy(
+def test_the_fingerprint_changes_with_columns_and_not_with_a_copy(
     make_synthetic_dataset: Callable[..., LeRobotDataset], tmp_path: Path
 ) -> None:
     root = Path(make_synthetic_dataset(tmp_path / "one").root)

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 import torch
 from lerobot.envs.configs import EnvConfig, LiberoEnv, PushtEnv
-from lerobot.utils.constants import OBS_IMAGE, OBS_STATE
+from lerobot.processor import PolicyProcessorPipeline, UnnormalizerProcessorStep
+from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.policies import read_policy_config
+from lerobot_wmrl.common.policies import learnt_range, read_policy_config
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.envs.lerobot_env import (
     LeRobotTensorEnv,
@@ -92,6 +93,21 @@ def test_seeds_decide_where_episodes_begin(env: LeRobotTensorEnv) -> None:
     other, _ = env.reset(seed=[6, 5])
     assert torch.equal(first[OBS_STATE][0], other[OBS_STATE][1])
     assert torch.equal(first[OBS_STATE][1], other[OBS_STATE][0])
+
+
+def test_actions_that_the_policy_has_learnt_are_not_clipped(
+    env: LeRobotTensorEnv, caplog: pytest.LogCaptureFixture
+) -> None:
+    env.widen(torch.tensor([0.0, 100.0]), torch.tensor([512.0, 500.0]))
+    assert not caplog.records
+    stats = {ACTION: {"mean": [1.0, 1.0], "min": [-3.0, 0.0], "max": [500.0, 600.0]}}
+    learnt = learnt_range(PolicyProcessorPipeline([UnnormalizerProcessorStep({}, {}, stats)]))
+    assert learnt is not None
+    env.widen(*learnt)
+    assert "component 0 -3 to 500 (in the environment 0 to 512), component 1 0 to 600" in caplog.text
+    env.reset(seed=5)
+    *_, info = env.step(torch.tensor([[-3.0, 600.0], [-4.0, 0.0]]))
+    assert info["reward_parts"]["clipped"].tolist() == [0, 0.5]
 
 
 def test_actions_out_of_range_are_counted_and_nan_is_refused(env: LeRobotTensorEnv) -> None:

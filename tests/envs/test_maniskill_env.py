@@ -159,6 +159,28 @@ def test_tasks_are_shared_out_among_the_environments_of_the_trainer() -> None:
         env.close()
 
 
+def test_every_task_meets_every_scene_of_a_seed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Trainings give seeds in steps of the number of environments, and 64 scenes follow from the seed."""
+    env = ManiSkillTensorEnv(WmrlManiSkillEnv(task="push,pick_place", image_size=32), 2, "cpu")
+    given: list[list[int]] = []
+
+    def begin(seed: list[int], options: object) -> None:
+        given.append(seed)
+        raise StopIteration
+
+    monkeypatch.setattr(env.envs, "reset", begin)
+    try:
+        for first in [*range(0, 1000, 2), 0]:
+            with pytest.raises(StopIteration):
+                env.reset(seed=first)
+    finally:
+        env.close()
+    seeds = np.array(given)
+    assert sorted(seeds[:-1].flatten()) == [*range(1000)]
+    assert seeds[-1].tolist() == seeds[0].tolist()
+    assert [len(np.unique(each % 64)) for each in seeds.T] == [64, 64]
+
+
 def test_the_longest_task_decides_the_horizon() -> None:
     assert WmrlManiSkillEnv(task="push,pick_place").horizon == TASKS["pick_place"].horizon
     assert WmrlManiSkillEnv(task="push,pick_place", episode_length=7).horizon == 7

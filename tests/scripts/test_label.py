@@ -12,7 +12,7 @@ from lerobot.rewards.factory import make_reward_pre_post_processors
 from lerobot.rewards.sarm.configuration_sarm import SARMConfig
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.dataset import open_dataset
+from lerobot_wmrl.data.dataset import fingerprint, open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.rewards.configuration_rewards import ProxyConfig
 from lerobot_wmrl.rewards.modeling_rewards import ProxyRewardModel
@@ -56,6 +56,20 @@ def test_demonstrations_succeed_at_their_ends(
     for row in (0, len(before) - 1):
         np.testing.assert_array_equal(before[row][IMAGE], after[row][IMAGE])
         np.testing.assert_array_equal(before[row]["action"], after[row]["action"])
+
+
+def test_other_labels_are_other_data(
+    unlabelled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """LeRobot keeps no statistics of the column: `meta` is the same."""
+    found = []
+    for name, episodes in {"some": "[0,1]", "others": "[2,3]", "again": "[0,1]"}.items():
+        label(
+            monkeypatch, unlabelled, tmp_path / name / "labelled", "--success.type=ends",
+            f"--success.episodes={episodes}",
+        )  # fmt: skip
+        found.append(fingerprint(tmp_path / name / "labelled"))
+    assert found[0] == found[2] != found[1]
 
 
 def test_numbers_in_the_place_of_labels_are_named_and_become_labels(
