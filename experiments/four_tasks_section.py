@@ -50,8 +50,8 @@ the BC of 5,000 steps: 88 and 78 % in known and unseen scenes of push, 73 and 70
 pick_place, 78 and 78 of move_to_aim, 76 and 67 of all (docs/results of commit 1e99306). From the better
 policy PPO ends no higher on average, and 20 points lower in pick_place; in training, imagined success ends
 at 67 % in both runs. PPO in ManiSkill began the first of about eight episodes of each rollout in a quarter
-of a task's scenes, which has been mended since; the later ones began in any. Not compared: filtered BC for more than 8,000 steps where the table has no column of
-it, weighted BC, RECAP, iterated BC and planning."""
+of a task's scenes, which has been mended since; the later ones began in any. Not compared: filtered BC for
+more than 8,000 steps where the table has no column of it, weighted BC, RECAP, iterated BC and planning."""
 """What the section says of its limits."""
 
 

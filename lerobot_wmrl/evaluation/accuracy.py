@@ -67,8 +67,8 @@ def measure(
         steps["tcp_error_mm"] = tcp_error_mm(recording, replay)
     if replay.depth is not None:
         steps |= depth_accuracy(imagined=replay.depth[1], recorded=replay.depth[0])
-    if replay.shuffled is not None:
-        step = recording.steps(DELTA_PSNR_SECONDS)
+    step = recording.steps(DELTA_PSNR_SECONDS)
+    if replay.shuffled is not None and len(steps["psnr"]) >= step:
         target = images[step : step + 1]
         other = psnr(model.tokenizer.decode(replay.shuffled[None], replay.context), target)
         whole["delta_psnr_0_6s"] = float(steps["psnr"][step - 1] - other)

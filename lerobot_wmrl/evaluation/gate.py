@@ -37,6 +37,9 @@ DOUBTFUL_AUC: Final = 0.8
 SWEEP_THRESHOLDS = tuple(round(0.3 + 0.05 * step, 2) for step in range(14))
 SWEEP_FRAMES = tuple(range(1, 7))
 
+MOST_DELAY: Final = 2
+"""Frames by which a success may be predicted late and counts, although its episode ends."""
+
 MIN_PROBABILITY: Final = 1e-6
 """Keeps the log loss of an event finite that was predicted as impossible."""
 
@@ -145,9 +148,11 @@ class Outcomes:
         return at_end & (first_run(self.done, frames) < 0)
 
     def ends_at_success(self, frames: int) -> bool:
-        """Whether successes mostly end before this, as in environments that end at the first success."""
+        """Whether successes mostly end before a model can predict them for `frames` frames: before they have
+        held so long, as in environments that end at the first success, or hardly later, so that one that is
+        seen `MOST_DELAY` frames late could not count."""
         assert self.held is not None
-        return self.held < frames
+        return self.held < frames + MOST_DELAY
 
     def padded_probability(self, frames: int) -> np.ndarray:
         """Return the predicted probabilities. (E, T')

@@ -58,8 +58,11 @@ def masked_psnr(images: Tensor, target: Tensor, mask: Tensor) -> Tensor:
 def ssim(images: Tensor, target: Tensor) -> Tensor:
     """Return the structural similarity (Wang et al. 2004, eq. 13), averaged over colours and cameras.
 
-    It uses their Gaussian window of 11 pixels, without padding. (T, N, 3, H, W) in [0, 1], H, W ≥ 11 → (T,)
+    It uses their Gaussian window of 11 pixels, without padding. (T, N, 3, H, W) in [0, 1] → (T,), NaN for
+    images smaller than the window.
     """
+    if min(images.shape[-2:]) < SSIM_WINDOW:
+        return torch.full((len(images),), torch.nan, device=images.device)
     x, y = images.flatten(0, 2)[:, None], target.flatten(0, 2)[:, None]
     mean_x, mean_y = _blur(x), _blur(y)
     var_x, var_y = _blur(x * x) - mean_x**2, _blur(y * y) - mean_y**2

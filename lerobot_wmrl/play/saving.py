@@ -61,20 +61,21 @@ class SavedEpisodes:
         """
         if not count:
             raise FieldError("save", 0, "nothing has been driven yet", "drive first")
-        driven = list(steps)  # imagined before anybody else has to wait
+        features, driven = None, []  # imagined before anybody else has to wait, and kept as uint8
+        for index, step in enumerate(steps):
+            features = features or episode_features(step.before, self.robot, "image")
+            solved = success and index >= count - self.held
+            frame: dict[str, Any] = {
+                **observation_row(step.before, 0), ACTION: step.action, "task": instruction,
+                "next.reward": np.array([step.reward], np.float32),
+                "next.success": np.array([solved]), "next.done": np.array([index == count - 1]),
+            }  # fmt: skip
+            driven.append(frame)
+        assert features is not None, "there are steps"
         with replacing(self.folder) as folder:
-            dataset = None
-            for index, step in enumerate(driven):
-                if dataset is None:
-                    dataset = self._open(folder, episode_features(step.before, self.robot, "image"))
-                solved = success and index >= count - self.held
-                frame: dict[str, Any] = {
-                    **observation_row(step.before, 0), ACTION: step.action, "task": instruction,
-                    "next.reward": np.array([step.reward], np.float32),
-                    "next.success": np.array([solved]), "next.done": np.array([index == count - 1]),
-                }  # fmt: skip
+            dataset = self._open(folder, features)
+            for frame in driven:
                 dataset.add_frame(frame)
-            assert dataset is not None, "there are steps"
             save_episode(dataset)
             dataset.finalize()
             self.count = dataset.meta.total_episodes

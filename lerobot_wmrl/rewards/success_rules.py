@@ -1,7 +1,7 @@
 """What counts as success in a dataset that does not say so. N frames, E episodes."""
 
 from collections.abc import Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -32,7 +32,8 @@ class EndsRule(SuccessRule):
     """The last frames of episodes that are known to succeed, such as demonstrations.
 
     Args:
-        episodes: the episodes that succeed, by their indices; by default all. The others fail.
+        episodes: the episodes that succeed, by their indices; by default all. The others fail: all of them
+            with `[]`.
         last: how many of their last frames count. World models ask for `done_frames` (3) in a row. Frames in
             which the task is not solved yet would teach a wrong success.
     """
@@ -59,13 +60,22 @@ class FirstFramesRule(SuccessRule):
 
     Args:
         first: episode → the first frame in which the task is solved, both from 0 on: `{0: 120, 3: 95}`.
-            Episodes that are not named fail.
+            Episodes that are not named fail: all of them with `{}`.
     """
 
-    first: dict[int, int] = field(default_factory=dict)
+    first: dict[int, int] | None = None
 
     def labels(self, dataset: "LeRobotDataset") -> np.ndarray:
         episode, frame, length = frame_positions(dataset)
+        if self.first is None:
+            raise FieldError(
+                "first", None, "names no episode that succeeds", "name those that do, or {} if none does"
+            )
+        if None in self.first.values():  # YAML reads `1:45` as one number of base 60
+            raise FieldError(
+                "first", self.first, "does not say from which frame on an episode is solved",
+                "write a space after each colon: {0: 120, 3: 95}",
+            )  # fmt: skip
         require_episodes("first", self.first, dataset)
         solved = np.zeros(len(episode), bool)
         for index, first in self.first.items():
@@ -151,10 +161,8 @@ def next_frame_solved(solved: np.ndarray, dataset: "LeRobotDataset") -> np.ndarr
 
 
 def require_episodes(name: str, episodes: Collection[int], dataset: "LeRobotDataset") -> None:
-    """Raise FieldError unless there are some, and the dataset has them."""
+    """Raise FieldError unless the dataset has them."""
     value = episodes if isinstance(episodes, dict) else list(episodes)
-    if not episodes:
-        raise FieldError(name, value, "names no episode that succeeds", "name those that do")
     wrong = [each for each in episodes if not 0 <= each < dataset.meta.total_episodes]
     if wrong:
         raise FieldError(
@@ -171,6 +179,7 @@ def reach(values: np.ndarray, threshold: float) -> np.ndarray:
     if not (values >= threshold).any():
         raise FieldError(
             "threshold", threshold, f"no frame reaches it: the values go from {values.min():.3g} to "
-            f"{values.max():.3g}", "lower it",
+            f"{values.max():.3g}",
+            "lower it, or say that every episode fails: --success.type=ends --success.episodes=[]",
         )  # fmt: skip
     return np.asarray(values >= threshold)

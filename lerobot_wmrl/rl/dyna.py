@@ -109,7 +109,7 @@ class DynaRounds:
     def start(self, number: int, half: int) -> int:
         """Return the seed of the first episode of one half, 0 or 1, of a round's recording."""
         n_episodes = self.config.n_episodes
-        place = self.seed * self.config.rounds + number * n_episodes + half * (n_episodes // 2)
+        place = (self.seed * self.config.rounds + number) * n_episodes + half * (n_episodes // 2)
         return EVALUATION_SEED - DYNA_SEEDS + place % (DYNA_SEEDS - n_episodes)
 
     def _earlier(self, iteration: int) -> list[str]:

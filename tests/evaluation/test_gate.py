@@ -50,7 +50,7 @@ def test_the_first_run_is_of_consecutive_frames():
 
 
 @pytest.mark.parametrize(("threshold", "frames", "false", "recognised"), [
-    (0.5, 3, 1, 2), (0.5, 1, 2, 2), (0.75, 3, 0, 2), (0.85, 3, 0, 1), (0.75, 4, 0, 1), (0.95, 1, 0, 0),
+    (0.5, 3, 1, 2), (0.5, 1, 2, 2), (0.75, 3, 0, 2), (0.85, 3, 0, 1), (0.85, 4, 0, 1), (0.95, 1, 0, 0),
 ])  # fmt: skip
 def test_the_gate_counts_as_the_environment_ends_episodes(outcomes, threshold, frames, false, recognised):
     gate = gate_at(outcomes, threshold, frames)
@@ -84,6 +84,18 @@ def test_where_episodes_end_at_success_their_last_frames_count_as_lasting():
     )
     seen_out = Outcomes(np.arange(3), np.nan_to_num(probability), done)
     assert gate_at(seen_out, 0.5, 3).recall.k == 0
+
+
+@pytest.mark.parametrize(("held", "late"), [(3, 1), (3, 2), (5, 2)])
+def test_a_success_that_is_seen_late_counts_although_its_episode_ends(held, late):
+    """However many frames are asked for: a stricter criterion does not recognise more."""
+    done = np.arange(12) >= 12 - held
+    probability = np.where(np.arange(12) >= 12 - held + late, 0.9, 0.1)
+    outcomes = Outcomes(
+        np.arange(2), np.stack([probability, np.full(12, 0.1)]), np.stack([done, done & False])
+    )
+    found = [gate_at(outcomes, 0.5, frames).recall.k for frames in range(1, 8)]
+    assert found == [1] * 7
 
 
 def test_what_comes_later_than_an_imagined_episode_is_not_judged():

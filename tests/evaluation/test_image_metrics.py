@@ -58,6 +58,7 @@ def test_ssim_is_that_of_wang_et_al():
     images, real = (torch.from_numpy(a).expand(1, 2, 3, 24, 24) for a in (x, y))
     assert ssim(images, real).item() == pytest.approx(expected.mean(), rel=1e-6)
     assert ssim(real, real).item() == pytest.approx(1)
+    assert ssim(real[..., :10], real[..., :10]).isnan().tolist() == [True]
 
 
 def test_overlap_of_motion_in_space_and_time():

@@ -83,7 +83,7 @@ def test_replays_do_not_depend_on_the_batch(source, model, monkeypatch):
         assert len(run.done) == source.table.length[run.episode]
 
 
-def test_delta_psnr_compares_with_the_actions_of_another_episode(source, model):
+def test_delta_psnr_compares_with_the_actions_of_another_episode(source, model, monkeypatch):
     alone = next(replay_episodes(model, source, np.array([2])))
     assert alone.shuffled is None
     compared = {run.episode: run for run in replay_episodes(model, source, np.array([2, 5]))}[2]
@@ -91,6 +91,9 @@ def test_delta_psnr_compares_with_the_actions_of_another_episode(source, model):
     same = replace(compared, shuffled=compared.tokens[14])
     assert measure(model, source, same, None).whole["delta_psnr_0_6s"] == pytest.approx(0, abs=1e-5)
     assert "delta_psnr_0_6s" not in measure(model, source, alone, None).whole
+    monkeypatch.setattr(replay_module, "COMPARED_FRAMES", 14)  # as of data with 500 frames a second
+    short = {run.episode: run for run in replay_episodes(model, source, np.array([2, 5]))}[2]
+    assert "delta_psnr_0_6s" not in measure(model, source, short, None).whole
 
 
 def test_depth_is_measured_where_a_replay_has_it(source, model):

@@ -101,6 +101,18 @@ def test_the_others_fail_where_successes_are_named(
     assert "There is no failure" not in said
 
 
+@pytest.mark.parametrize("flags", [
+    ["--success.type=ends", "--success.episodes=[]"], ["--success.type=first_frames", "--success.first={}"],
+])  # fmt: skip
+def test_all_may_fail_where_that_is_said(
+    flags: list[str], unlabelled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    found = label(monkeypatch, unlabelled, tmp_path / "labelled", *flags)
+    assert not any(chain(*found))
+    assert "There is no success" in capsys.readouterr().out
+
+
 def test_success_may_begin_at_a_frame(
     unlabelled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -162,12 +174,15 @@ def test_a_reward_model_may_say_it(unlabelled: Path, tmp_path: Path, monkeypatch
 
 @pytest.mark.parametrize(("flags", "message"), [
     (["--success.type=ends", "--success.episodes=[6]"], "no episode 6 in .*; it has episodes 0 to 5"),
-    (["--success.type=ends", "--success.episodes=[]"], "names no episode that succeeds"),
     (["--success.type=ends", "--success.last=0"], "--success.last=0: must be at least 1"),
-    (["--success.type=first_frames"], "--success.first={}: names no episode"),
+    (["--success.type=first_frames"], "--success.first: names no episode that succeeds"),
+    (["--success.type=first_frames", "--success.first={1:3}"], "write a space after each colon"),
     (["--success.type=first_frames", "--success.first={1: 99}"], "episode 1 has no frame 99; its frames are"),
     (["--success.type=column", "--success.column=score"], "no column of one number .*next.reward"),
-    (["--success.type=column", "--success.threshold=7"], "--success.threshold=7.0: no frame reaches it"),
+    (
+        ["--success.type=column", "--success.threshold=7"],
+        "--success.threshold=7.0: no frame reaches it.*every episode fails: --success.type=ends",
+    ),
     (["--success.type=reward_model"], "--success.path.*: no reward model of LeRobot there"),
 ])  # fmt: skip
 def test_mistakes_are_named_and_nothing_is_written(
