@@ -3,7 +3,7 @@
 import json
 import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -115,10 +115,13 @@ def synthetic_dataset(
     length: int = 20,
     size: int = 32,
     cameras: tuple[str, ...] = ("third_view",),
-    instruction: str = "push the red square forward",
+    instructions: Sequence[str] = ("push the red square forward",),
     depth: bool = False,
 ) -> LeRobotDataset:
-    """A LeRobotDataset at `root` (must not exist) with the contract's columns; every third episode fails."""
+    """A LeRobotDataset at `root` (must not exist) with the contract's columns; every third episode fails.
+
+    Episodes have the instructions in turn.
+    """
     dataset = LeRobotDataset.create(
         "local/synthetic", FPS, dataset_features(cameras, size, depth), root=root, robot_type="panda"
     )
@@ -126,6 +129,7 @@ def synthetic_dataset(
     for episode in range(episodes):
         fails = episode % 3 == 2
         kind = KINDS.index("near_miss" if fails else "optimal")
+        task = instructions[episode % len(instructions)]
         start = {"start.task": 0, "start.scene": episode % 2, "start.seed": episode, "start.kind": kind}
         for row in synthetic_episode(rng, fails, length):
             image = draw(row.pop("gripper"), row.pop("object"), size)
@@ -135,7 +139,7 @@ def synthetic_dataset(
                 frame[key] = value if isinstance(value, np.ndarray) else np.array([value], dtype)
             pictures = {f"observation.images.{camera}": image for camera in cameras}
             maps = {f"{key}_depth": measure_depth(image) for key in pictures if depth}
-            dataset.add_frame({**frame, **pictures, **maps, "task": instruction})
+            dataset.add_frame({**frame, **pictures, **maps, "task": task})
         dataset.save_episode()
     dataset.finalize()
     vocabulary = {

@@ -19,6 +19,9 @@ from lerobot_wmrl.common.errors import FieldError
 ADAPTERS_FILE = "adapter_model.safetensors"
 """PEFT's: where a policy has adapters, its checkpoints hold them alone."""
 
+MODEL_FILES: Final = ("config.json", "adapter_config.json", "*processor.json", "*.safetensors")
+"""A checkpoint's files that say how its model acts: settings, processors with their numbers, weights."""
+
 LAST_CHECKPOINT = f"{CHECKPOINTS_DIR}/{LAST_CHECKPOINT_LINK}"
 
 UNPUBLISHED: Final = ("--push_to_hub=false", "--repo_id=null")
@@ -125,6 +128,19 @@ def weights_digest(state: Mapping[str, Tensor]) -> str:
         found.update(name.encode())
         found.update(tensor.detach().cpu().contiguous().numpy().tobytes())
     return found.hexdigest()[:16]
+
+
+def checkpoint_digest(path: str | Path) -> str:
+    """Return a short digest of the files that a checkpoint's model is loaded from.
+
+    Unlike the name it changes where another model was trained in the same folder.
+    """
+    folder, found = local_checkpoint(path), hashlib.sha256()
+    for file in sorted(each for pattern in MODEL_FILES for each in folder.glob(pattern)):
+        found.update(file.name.encode())
+        with file.open("rb") as content:
+            found.update(hashlib.file_digest(content, "sha256").digest())
+    return found.hexdigest()[:12]
 
 
 def read_weights(checkpoint: Path, folder: str = PRETRAINED_MODEL_DIR) -> dict[str, Any]:

@@ -100,7 +100,7 @@ def run_command[Config: RunConfig](
     init_logging()
     logging.getLogger("lerobot.configs").setLevel(logging.ERROR)
     try:
-        sys.argv[1:] = expand(sys.argv[1:])
+        sys.argv[1:] = expand(with_equals_signs(sys.argv[1:]))
         if {"--help", "-h"} & set(sys.argv[1:]):
             print(help_of(function, config_class))
             return
@@ -109,6 +109,22 @@ def run_command[Config: RunConfig](
         kind, status = ("stopped", STOPPED) if isinstance(error, Stopped) else ("error", 1)
         print(f"{kind}: {said_in_flags(cause(error), config_class, sys.argv[1:])}", file=sys.stderr)
         sys.exit(status)
+
+
+def with_equals_signs(argv: Sequence[str]) -> list[str]:
+    """Write `--name value` as `--name=value`, as presets and LeRobot's `--policy.path` are read."""
+    written: list[str] = []
+    for argument in argv:
+        if written and not argument.startswith("--") and argument != "-h" and is_name(written[-1]):
+            written[-1] += f"={argument}"
+        else:
+            written.append(argument)
+    return written
+
+
+def is_name(argument: str) -> bool:
+    """Return whether an argument is a flag's name, without its value."""
+    return argument.startswith("--") and "=" not in argument and argument != "--help"
 
 
 def help_of(function: Callable[..., None], config_class: type) -> str:

@@ -84,17 +84,24 @@ class Estimate:
         value, low, high = map(float, bootstrap_ratio(numerator, denominator))
         return cls(value, low, high, int((np.asarray(denominator) > 0).sum()))
 
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """Its ends; None for a single episode, which says nothing of others."""
+        return (self.low, self.high) if self.n > 1 else None
+
     def __str__(self) -> str:
         if math.isnan(self.value):
             return "not measured"
-        return f"{self.value:.3g} ({self.low:.3g} to {self.high:.3g})"
+        return f"{self.value:.3g} " + (
+            f"({self.low:.3g} to {self.high:.3g})" if self.interval else "(1 episode)"
+        )
 
     def as_json(self) -> dict[str, float | int | list[float] | None]:
         """Return the estimate as JSON; the value is None where there is no episode."""
         known = not math.isnan(self.value)
         return {
             "value": self.value if known else None,
-            "bootstrap_95": [self.low, self.high] if known else None,
+            "bootstrap_95": list(self.interval) if known and self.interval else None,
             "episodes": self.n,
         }
 

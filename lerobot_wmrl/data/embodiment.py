@@ -22,10 +22,16 @@ LOW, HIGH = "low", "high"
 """Keys of the recorded range of a feature, lists of one number a component, in the feature's `info`."""
 
 QUANTILES: Final = (0.01, 0.99)
-"""Quantiles of the actions from which the range is guessed."""
+"""Quantiles of the actions between which the most of them lie."""
+
+ISOLATED: Final = 0.001
+"""Share of the values, at each end, that may be wrong ones. What is more frequent is a rare action."""
+
+FEW: Final = 3
+"""The least number of such values."""
 
 MARGIN: Final = 0.1
-"""How far the range may reach beyond these quantiles, as a share of the distance between them."""
+"""How far the range may reach beyond what is certain, as a share of the distance between the quantiles."""
 
 
 @dataclass
@@ -112,9 +118,10 @@ def recorded_range(feature: Mapping[str, Any]) -> tuple[list[float], list[float]
 def observed_range(meta: Any) -> tuple[list[float], list[float]]:
     """Guess the range of each component from the recorded actions.
 
-    It is that of the recorded values, but does not reach beyond the 1 % and 99 % quantiles by more than a
-    tenth of their distance: a single wrong value would widen it at will. A component whose quantiles are the
-    same, such as a gripper that hardly ever moves, keeps its extremes.
+    It is that of the recorded values but the few greatest and least (`ISOLATED`), which may be wrong and
+    would widen it at will: it reaches as far as these, but not beyond the others by more than a tenth of the
+    distance between the 1 % and the 99 % quantile. A component whose quantiles are the same, such as a
+    gripper that hardly ever moves, keeps its extremes.
     """
     actions = read_actions(Path(meta.root))
     finite = actions[np.isfinite(actions).all(1)]
@@ -123,10 +130,19 @@ def observed_range(meta: Any) -> tuple[list[float], list[float]]:
     least, most = finite.min(0), finite.max(0)
     low, high = np.quantile(finite, QUANTILES, axis=0)
     margin = np.where(high > low, MARGIN * (high - low), np.inf)
+    few = max(FEW, int(ISOLATED * len(finite)))
+    if few < len(finite):
+        ordered = np.sort(finite, axis=0)
+        low, high = np.minimum(low, ordered[few]), np.maximum(high, ordered[-1 - few])
     low, high = np.maximum(least, low - margin), np.minimum(most, high + margin)
-    outside = ((finite < low) | (finite > high)).any(1).mean()
-    if outside:
-        logging.info("%.1f %% of the recorded actions lie outside of the range below", 100 * outside)
+    names = component_names(meta.features[ACTION])
+    for component in np.flatnonzero((least < low) | (most > high)).tolist():
+        logging.warning(
+            "action %s: %d of %d recorded values lie outside of the range that is taken, %.4g to %.4g (they "
+            "reach from %.4g to %.4g). If they are meant, set `embodiment.action_low` and `action_high`",
+            names[component], ((finite < low) | (finite > high)).sum(0)[component], len(finite),
+            low[component], high[component], least[component], most[component],
+        )  # fmt: skip
     return low.tolist(), high.tolist()
 
 

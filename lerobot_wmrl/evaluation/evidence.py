@@ -71,6 +71,19 @@ def confusion_of(outcomes: Outcomes, env: WorldModelEnv) -> tuple[Confusion, lis
     return Confusion(gate.recall, gate.false_positives), warnings
 
 
+def pooled_instructions(rollouts: ChosenEpisodes, split: str) -> list[str]:
+    """Return a warning if the rollouts have several instructions, which may be of several tasks."""
+    table = read_episodes(rollouts.open())
+    found = sorted({table.instructions[each] for each in replayed_episodes(table, split, rollouts.episodes)})
+    if len(found) < 2:
+        return []
+    return [
+        f"The rollouts have {len(found)} instructions ({found[0]!r}, {found[1]!r} …), over which successes "
+        "and errors are averaged. If they are of different tasks, judge each by itself: choose its rollouts "
+        "with --dataset.episodes."
+    ]
+
+
 def read_references(path: Path | None) -> dict[str, Proportion]:
     """Read real success of policies from a comparison, or from a file that is written like it.
 
@@ -150,21 +163,21 @@ def learnt_from(
         )
         if root
     ]
-    if any(root == rollouts.name or _same(Path(root), Path(rollouts.name)) for root, _ in learnt):
-        seen = "" if "validation" in split.split(",") else "these episodes"
+    table = read_episodes(rollouts.open())
+    judged = replayed_episodes(table, split, episodes)
+    same = [root == rollouts.name or _same(Path(root), Path(rollouts.name)) for root, _ in learnt]
+    if any(same):
+        chosen = [table.among(each) for (_, each), own in zip(learnt, same, strict=True) if own]
+        seen = int((np.any(chosen, axis=0) & ~table.validation)[judged].sum())
     else:
-        table = read_episodes(rollouts.open())
-        own = action_digests(table, replayed_episodes(table, split, episodes))
-        copies = len(
-            own & {digest for root, chosen in learnt for digest in learnt_digests(Path(root), chosen)}
-        )
-        seen = f"{copies} of these episodes" if copies else ""
+        others = (digest for root, chosen in learnt for digest in learnt_digests(Path(root), chosen))
+        seen = len(action_digests(table, judged) & {*others})
     if not seen:
         return []
     return [
-        f"The world model has learnt from {seen} ({rollouts.name}) and predicts them better than others, so "
-        "estimates and intervals are wrong. Take those that were held out (--split=validation of the dataset "
-        "that it was trained on), or others."
+        f"The world model has learnt from {seen} of these episodes ({rollouts.name}) and predicts them "
+        "better than others, so estimates and intervals are wrong. Take those that were held out "
+        "(--split=validation of the dataset that it was trained on), or others."
     ]
 
 

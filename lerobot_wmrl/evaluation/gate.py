@@ -37,6 +37,9 @@ DOUBTFUL_AUC: Final = 0.8
 SWEEP_THRESHOLDS = tuple(round(0.3 + 0.05 * step, 2) for step in range(14))
 SWEEP_FRAMES = tuple(range(1, 7))
 
+MOST_TASKS: Final = 20
+"""More instructions than these are taken for other words of the same tasks."""
+
 MOST_DELAY: Final = 2
 """Frames by which a success may be predicted late and counts, although its episode ends."""
 
@@ -313,9 +316,16 @@ def gate_at(outcomes: Outcomes, threshold: float, frames: int) -> Gate:
 
 
 def by_task(outcomes: Outcomes, table: EpisodeTable) -> dict[str, Outcomes]:
-    """Return the outcomes of each task in the dataset; none if it has no column `start.task`."""
+    """Return the outcomes of each task in the dataset: by its column `start.task`, else by the instructions;
+    none if there is but one instruction, or more than `MOST_TASKS`."""
     tasks = table.column(START_TASK)[outcomes.episodes]
-    return {TASKS[task]: outcomes.where(tasks == task) for task in np.unique(tasks[tasks >= 0])}
+    if (tasks >= 0).any():
+        return {TASKS[task]: outcomes.where(tasks == task) for task in np.unique(tasks[tasks >= 0])}
+    instructions = np.array([table.instructions[each] for each in outcomes.episodes])
+    distinct = np.unique(instructions).tolist()
+    if not 1 < len(distinct) <= MOST_TASKS:
+        return {}
+    return {each: outcomes.where(instructions == each) for each in distinct}
 
 
 def sweep(outcomes: Outcomes) -> list[Gate]:

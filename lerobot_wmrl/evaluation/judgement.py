@@ -37,6 +37,7 @@ class Judgement:
         warnings: what is wrong with the rollouts.
         outcomes: success of each policy's imagined episodes, those of the references included.
         earlier: the same of policies that an earlier call has judged and this one does not.
+        checkpoints: digests of the policies' checkpoints, by name, of these too.
     """
 
     confusion: Confusion
@@ -46,6 +47,7 @@ class Judgement:
     warnings: Sequence[str] = ()
     outcomes: dict[str, list[bool]] = field(default_factory=dict)
     earlier: dict[str, list[bool]] = field(default_factory=dict)
+    checkpoints: dict[str, str] = field(default_factory=dict)
 
     def imagined(self, name: str) -> Proportion:
         """Return how often a policy succeeds in the world model."""
@@ -93,6 +95,7 @@ class Judgement:
             **confusion_json(self.confusion),
             "warnings": list(self.warnings),
             "references": len(self.usable_references),
+            "checkpoints": self.checkpoints,
             "policies": {name: self._policy_json(name) for name in self.outcomes},
             "outcomes": {**self.earlier, **self.outcomes},
         }

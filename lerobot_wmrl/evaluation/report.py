@@ -359,5 +359,7 @@ def _share(rate: Mapping[str, Any]) -> str:
 def _value(estimate: Mapping[str, Any]) -> str:
     if estimate["value"] is None:
         return "not measured"
+    if estimate["bootstrap_95"] is None:
+        return f"{estimate['value']:.3g} (1 episode)"
     low, high = estimate["bootstrap_95"]
     return f"{estimate['value']:.3g} ({low:.3g} to {high:.3g})"

@@ -1,11 +1,13 @@
 """Observations labelled with actions to imitate, on the CPU and on disk. N labels, n steps of a window."""
 
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import psutil
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.utils.constants import ACTION, OBS_STATE
@@ -14,6 +16,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from lerobot_wmrl.common.constants import INSTRUCTIONS, Observation
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.images import stretch
 from lerobot_wmrl.common.pipeline import ACTION_IS_PAD
 from lerobot_wmrl.data.episodes import read_episodes
@@ -170,12 +173,15 @@ def recorded_successes(
     actions = action_windows(taken, acting, windows.actions)
     begin = length.cumsum(0) - length  # where the frames of each episode begin below
     episode = torch.arange(len(episodes)).repeat_interleave(length)  # (F,), of each frame
+    count = len(episode)
+    require_memory(count * sum(math.prod(shape) for shape in frame_shapes.values()))
     observations = {
-        camera: torch.cat(
-            [stretch(decode_episode(table.dataset, int(each), camera), height, width) for each in episodes]
-        )
-        for camera, (_, height, width) in frame_shapes.items()
+        camera: torch.empty(count, *shape, dtype=torch.uint8) for camera, shape in frame_shapes.items()
     }
+    for first, rows, each in zip(begin.tolist(), length.tolist(), episodes.tolist(), strict=True):
+        for camera, (_, height, width) in frame_shapes.items():
+            frames = decode_episode(table.dataset, each, camera)
+            observations[camera][first : first + rows] = stretch(frames, height, width)
     if state_size:
         rows = (start - begin)[episode] + torch.arange(len(episode))
         observations[OBS_STATE] = torch.from_numpy(table.state[rows.numpy()])
@@ -185,6 +191,18 @@ def recorded_successes(
         observed_rows(begin[labelled], step, windows.observations),
         [table.instructions[each] for each in episodes],
     )]  # fmt: skip
+
+
+def require_memory(size: int) -> None:
+    """Raise FieldError if that many bytes of frames do not fit into the free memory."""
+    free = psutil.virtual_memory().available
+    if size > free:
+        raise FieldError(
+            "algorithm.recorded", True,
+            f"the frames of the recorded successes take {size / 1e9:.1f} GB of memory, and "
+            f"{free / 1e9:.1f} GB are free",
+            "set it to false, or choose fewer episodes (`env.dataset.episodes`)",
+        )  # fmt: skip
 
 
 def imagined_labels(

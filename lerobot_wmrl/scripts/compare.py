@@ -97,14 +97,26 @@ def compare(cfg: CompareConfig) -> None:
     assert cfg.env is not None
     configs = read_policies(cfg.policies, cfg.env)
     cfg.policies = list(configs)
-    require_free(cfg.output_dir, draccus.encode(cfg), may_differ(cfg))
+    settings = settings_of(cfg)
+    require_free(cfg.output_dir, settings, may_differ(cfg))
     comparison = Comparison(
         cfg.policies, cfg.n_episodes, cfg.against, cfg.alpha, cfg.stop_early, stored_episodes(cfg)
     )
     if not comparison.finished:
-        run(cfg, comparison, configs)
+        run(cfg, settings, comparison, configs)
     save_picture(comparison, cfg.output_dir / "comparison.png")
     print(f"{comparison}\n{RESULTS} and comparison.png are in {cfg.output_dir}")
+
+
+def settings_of(cfg: CompareConfig) -> dict[str, Any]:
+    """Return what decides the result, as JSON: the settings, and what policies and world model are."""
+    from lerobot_wmrl.common.checkpoints import checkpoint_digest
+    from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
+    from lerobot_wmrl.evaluation.compare import imagination_content
+
+    settings: dict[str, Any] = draccus.encode(cfg)
+    imagined = imagination_content(cfg.env) if isinstance(cfg.env, WorldModelEnv) else {}
+    return settings | {"content of": {name: checkpoint_digest(name) for name in cfg.policies} | imagined}
 
 
 def stored_episodes(cfg: CompareConfig) -> "list[Episode]":
@@ -121,7 +133,10 @@ def may_differ(cfg: CompareConfig) -> list[str]:
     return ["n_episodes"] if cfg.stop_early else []
 
 
-def run(cfg: CompareConfig, comparison: "Comparison", configs: "dict[str, PreTrainedConfig]") -> None:
+def run(
+    cfg: CompareConfig, settings: dict[str, Any], comparison: "Comparison",
+    configs: "dict[str, PreTrainedConfig]",
+) -> None:  # fmt: skip
     """Run the episodes that are missing; write the results after every batch."""
     from lerobot_wmrl.evaluation.compare import (
         load_policies,
@@ -132,7 +147,6 @@ def run(cfg: CompareConfig, comparison: "Comparison", configs: "dict[str, PreTra
     from lerobot_wmrl.evaluation.comparison import RESULTS
 
     assert cfg.env is not None
-    settings: dict[str, Any] = draccus.encode(cfg)
 
     def save() -> None:
         content = {"env": settings["env"], "seed": cfg.seed, **comparison.as_json()}

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 def improve(cfg: ImproveConfig) -> None:
     """Run every stage, write the report, and say what came of it."""
+    from lerobot_wmrl.common.checkpoints import checkpoint_digest
     from lerobot_wmrl.common.output_folders import claimed
     from lerobot_wmrl.common.stages import MARKER, run_stages
     from lerobot_wmrl.data.dataset import fingerprint
@@ -39,7 +40,11 @@ def improve(cfg: ImproveConfig) -> None:
     improvement = Improvement.of(cfg)
     print(f"{cfg.dataset.name}:\n{improvement.found}\n  {improvement.duration}")
     stages = commands.stages(improvement)
-    given = {**settings(cfg, stages), "the dataset's content": fingerprint(improvement.found.root)}
+    assert cfg.policy is not None
+    given = {
+        **settings(cfg, stages), "the dataset's content": fingerprint(improvement.found.root),
+        "the policy's content": checkpoint_digest(str(cfg.policy.pretrained_path)),
+    }  # fmt: skip
     with claimed(cfg.output_dir, given, marker=MARKER):
         improvement.copy_policy()
         run_stages(stages, cfg.output_dir)

@@ -45,7 +45,6 @@ if TYPE_CHECKING:
     from lerobot.configs import PreTrainedConfig
 
     from lerobot_wmrl.common.statistics import Proportion
-    from lerobot_wmrl.evaluation.calibration import Confusion
     from lerobot_wmrl.evaluation.compare import Envs
     from lerobot_wmrl.evaluation.judgement import Judgement
 
@@ -152,10 +151,11 @@ MAY_DIFFER = ("policies", "references", "coverage")
 
 def judge(cfg: JudgeConfig) -> None:
     """Replay the rollouts and imagine what is missing of the episodes; write the results."""
-    from lerobot_wmrl.common.checkpoints import resolved_name
+    from lerobot_wmrl.common.checkpoints import checkpoint_digest, resolved_name
     from lerobot_wmrl.evaluation.evidence import (
         confusion_of,
         learnt_from,
+        pooled_instructions,
         replayed_rollouts,
         trained_inside,
     )
@@ -165,7 +165,8 @@ def judge(cfg: JudgeConfig) -> None:
     cfg.world_model.path = resolved_name(cfg.world_model.path)
     env = cfg.imagination()
     configs, references = read_both(cfg, env)
-    require_free(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER)
+    settings = settings_of(cfg, env)
+    require_free(cfg.output_dir, settings, MAY_DIFFER)
     confusion, warnings = confusion_of(replayed_rollouts(env, cfg.dataset, cfg.split), env)
     if not confusion.youden >= LEAST_YOUDEN:
         raise Stopped(
@@ -174,14 +175,17 @@ def judge(cfg: JudgeConfig) -> None:
             "more failures"
         )
     reasons = {name: trained_inside(name, cfg.world_model.path) for name in configs}
-    before = imagined_before(cfg, confusion)
     judgement = Judgement(
         confusion, references, {name: why for name, why in reasons.items() if why}, cfg.coverage,
-        [*learnt_from(cfg.world_model.path, cfg.dataset, cfg.split, cfg.dataset.episodes), *warnings],
+        [
+            *learnt_from(cfg.world_model.path, cfg.dataset, cfg.split, cfg.dataset.episodes),
+            *pooled_instructions(cfg.dataset, cfg.split), *warnings,
+        ],
+        checkpoints={name: checkpoint_digest(name) for name in configs},
     )  # fmt: skip
-    remember(judgement, before, configs)
+    remember(judgement, cfg)
     with writing("output_dir", cfg.output_dir):
-        imagine(cfg, env, judgement, configs)
+        imagine(cfg, env, judgement, configs, settings)
         save_picture(judgement, cfg.output_dir / "judgement.png")
     print(
         f"{judgement}\n\njudgement.json and judgement.png are in {cfg.output_dir}. Next: try the best in "
@@ -211,39 +215,52 @@ def read_both(
     return others | judged, dict(zip(others, known.values(), strict=True))
 
 
-def remember(
-    judgement: "Judgement", before: Mapping[str, list[bool]], configs: "Mapping[str, PreTrainedConfig]"
-) -> None:
-    """Take over what earlier calls have imagined, of the policies of this one and of others."""
-    for name, outcomes in before.items():
-        (judgement.outcomes if name in configs else judgement.earlier)[name] = outcomes
+def settings_of(cfg: JudgeConfig, env: WorldModelEnv) -> dict[str, Any]:
+    """Return what decides the imagined episodes, as JSON: the settings, and what world model and episodes
+    are."""
+    from lerobot_wmrl.data.dataset import fingerprint
+    from lerobot_wmrl.evaluation.compare import imagination_content
+
+    rollouts = {"rollouts": fingerprint(Path(cfg.dataset.open().root))}
+    settings: dict[str, Any] = draccus.encode(cfg)
+    with regrouped("dataset", "starts") if cfg.starts_given else nullcontext():
+        content = rollouts | imagination_content(env)
+    return settings | {"content of": content}
 
 
-def imagined_before(cfg: JudgeConfig, confusion: "Confusion") -> dict[str, list[bool]]:
-    """Return what earlier calls have imagined, by policy.
+def remember(judgement: "Judgement", cfg: JudgeConfig) -> None:
+    """Take over what earlier calls have imagined, of the policies of this one and of others.
 
     Raises:
-        ValueError: the rollouts or the world model are not what they were then.
+        ValueError: the rollouts, the world model or a policy are not what they were then.
     """
     from lerobot_wmrl.evaluation.judgement import RESULTS, confusion_json
 
     results = cfg.output_dir / RESULTS
     if not results.is_file():
-        return {}
-    found = json.loads(results.read_text())
-    for name, rate in confusion_json(confusion).items():
-        if found[name] != rate:
-            raise ValueError(
-                f"--output_dir={cfg.output_dir}: {cfg.dataset.name} or the world model has changed since its "
-                "episodes were imagined; choose another folder"
-            )
-    outcomes: dict[str, list[bool]] = found["outcomes"]
-    return outcomes
+        return
+    found, given = json.loads(results.read_text()), judgement.checkpoints
+    changed = [
+        f"{cfg.dataset.name} or the world model"
+        for name, rate in confusion_json(judgement.confusion).items()
+        if found[name] != rate
+    ]
+    before = found["checkpoints"]
+    changed += [name for name in before.keys() & given.keys() if before[name] != given[name]]
+    if changed:
+        raise ValueError(
+            f"--output_dir={cfg.output_dir}: {changed[0]} has changed since its episodes were imagined; "
+            "choose another folder"
+        )
+    for name, outcomes in found["outcomes"].items():
+        (judgement.outcomes if name in given else judgement.earlier)[name] = outcomes
+    judgement.checkpoints |= before
 
 
 def imagine(
-    cfg: JudgeConfig, env: WorldModelEnv, judgement: "Judgement", configs: "Mapping[str, PreTrainedConfig]"
-) -> None:
+    cfg: JudgeConfig, env: WorldModelEnv, judgement: "Judgement", configs: "Mapping[str, PreTrainedConfig]",
+    settings: dict[str, Any],
+) -> None:  # fmt: skip
     """Imagine the episodes of the policies that have none yet; write the results after every policy."""
     from lerobot_wmrl.evaluation.compare import about_policy, load_policies, opened, run_block
     from lerobot_wmrl.evaluation.judgement import RESULTS
@@ -253,15 +270,15 @@ def imagine(
         write_json(cfg.output_dir / RESULTS, judgement.as_json(finished))
 
     if not configs.keys() - judgement.outcomes.keys():
-        with claimed(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER):
+        with claimed(cfg.output_dir, settings, MAY_DIFFER):
             write()
         return
     size = even_batch(env.dataset.max_starts, cfg.batch_size)
     group = regrouped("dataset", "starts") if cfg.starts_given else nullcontext()
     with group, opened(env, size, False, 1) as (envs,):
         starts = starts_of_one_task(envs, cfg)
-        with claimed(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER):
-            remember(judgement, imagined_before(cfg, judgement.confusion), configs)  # what another has added
+        with claimed(cfg.output_dir, settings, MAY_DIFFER):
+            remember(judgement, cfg)  # what another has added
             missing = {name: config for name, config in configs.items() if name not in judgement.outcomes}
             for name, config in tqdm(missing.items(), desc="Imagining", unit="policy"):
                 with about_policy(name):

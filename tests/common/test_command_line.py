@@ -9,6 +9,7 @@ from lerobot_wmrl.common.command_line import (
     near_flag,
     parse_flags,
     said_in_flags,
+    with_equals_signs,
 )
 from lerobot_wmrl.common.errors import FieldError, Stopped
 from lerobot_wmrl.common.output_folders import different_settings
@@ -111,6 +112,13 @@ def test_what_cannot_be_parsed_is_said_in_one_line(
         parse_flags(TrainConfig)
     assert message in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_flags_may_be_written_with_a_space() -> None:
+    argv = ["--preset", "tiny", "--resume", "--a.b=1", "--c", "-1", "--help", "-h", "--d=x y"]
+    assert with_equals_signs(argv) == [
+        "--preset=tiny", "--resume", "--a.b=1", "--c=-1", "--help", "-h", "--d=x y",
+    ]  # fmt: skip
 
 
 def test_a_setting_that_another_version_lacks_is_off_there():

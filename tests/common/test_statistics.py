@@ -78,6 +78,12 @@ def test_bootstraps_by_column_are_those_of_each_column() -> None:
     assert low[1] == pytest.approx(Estimate.mean(values[:, 1]).low)
 
 
+def test_a_single_episode_has_no_interval() -> None:
+    alone = Estimate.mean(np.array([0.5, np.nan]))
+    assert alone.as_json() == {"value": 0.5, "bootstrap_95": None, "episodes": 1}
+    assert str(alone) == "0.5 (1 episode)"
+
+
 def test_a_mean_of_nothing_is_no_number() -> None:
     for nothing in (np.array([]), np.array([np.nan, np.nan])):
         assert Estimate.mean(nothing).as_json() == {"value": None, "bootstrap_95": None, "episodes": 0}

@@ -289,6 +289,14 @@ def test_results_of_other_settings_are_not_mixed(config, changed, message):
     assert json.loads((config.output_dir / "comparison.json").read_text()) == before
 
 
+def test_another_policy_of_the_same_name_is_not_mixed_with_the_first(config):
+    config.n_episodes = 4
+    results_of(config)
+    save_untrained_policy(Path(config.policies[1]), actions=3, constant=0.9)
+    with pytest.raises(ValueError, match=rf"content of\.{config.policies[1]} '\w+' → '\w+'"):
+        compare(replace(config, n_episodes=8))
+
+
 def test_with_mcnemars_test_the_number_of_starts_is_fixed(config):
     config.stop_early, config.n_episodes = False, 4
     results_of(config)

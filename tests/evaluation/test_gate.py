@@ -230,6 +230,16 @@ def test_every_task_has_a_gate_of_its_own(outcomes):
     assert "| 0.5, 3: 0 % (0 of 1;" in task_table({"pull": gates["pull"]}, {"pull": gates["pull"]})
 
 
+def test_tasks_of_own_data_are_told_by_their_instructions(outcomes):
+    unknown: Any = SimpleNamespace(
+        column=lambda _: np.full(5, -1), instructions=["pull", "push", "push", "pull", "push"]
+    )
+    tasks = by_task(outcomes, unknown)
+    assert {task: own.episodes.tolist() for task, own in tasks.items()} == {"pull": [0, 3], "push": [1, 2, 4]}
+    unknown.instructions = ["push"] * 5
+    assert by_task(outcomes, unknown) == {}
+
+
 def gate_of(false: int, failures: int, recognised: int, successes: int) -> Gate:
     return Gate(
         threshold=0.5, frames=2, false_positives=Proportion(false, failures),

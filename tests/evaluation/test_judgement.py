@@ -14,12 +14,14 @@ from lerobot_wmrl.common.checkpoints import Checkpoint, resolve_checkpoint
 from lerobot_wmrl.common.errors import Stopped
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.data.dataset import ChosenEpisodes
+from lerobot_wmrl.data.episodes import EpisodeTable
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.evaluation import evidence
 from lerobot_wmrl.evaluation.calibration import Confusion
 from lerobot_wmrl.evaluation.evidence import (
     confusion_of,
     learnt_from,
+    pooled_instructions,
     read_references,
     replayed_rollouts,
     trained_inside,
@@ -237,6 +239,22 @@ def test_episodes_of_other_rollouts_or_another_world_model_are_not_mixed(config,
         judge(config)
 
 
+def test_another_policy_of_the_same_name_is_not_judged_by_the_first_one_s_episodes(config, seeing):
+    judge(config)
+    save_untrained_policy(Path(config.policies[1]), actions=7, constant=0.01)
+    with pytest.raises(
+        ValueError, match=f"{config.policies[1]} has changed since its episodes were imagined"
+    ):
+        judge(config)
+
+
+def test_instructions_of_several_tasks_are_not_averaged_silently(make_synthetic_dataset, tmp_path):
+    two = make_synthetic_dataset(tmp_path / "two", episodes=3, length=5, instructions=["push", "pull"])
+    (warning,) = pooled_instructions(ChosenEpisodes(str(two.root)), "all")
+    assert "2 instructions ('pull', 'push' …)" in warning
+    assert pooled_instructions(ChosenEpisodes(str(two.root), episodes=[0, 2]), "all") == []
+
+
 def test_a_policy_is_not_also_a_reference(config, seeing, tmp_path):
     config.references = write(tmp_path / "known.json", {"policies": {config.policies[0]: {"k": 1, "n": 2}}})
     with pytest.raises(ValueError, match=r"policies=.*its real success is known"):
@@ -291,12 +309,16 @@ def test_a_planner_in_the_world_model_is_refused(tmp_path, trained_models):
 
 
 def test_rollouts_that_the_world_model_has_learnt_from_are_warned_about(
-    config, seeing, capsys, tmp_path, make_synthetic_dataset, small_dataset
+    config, seeing, capsys, tmp_path, make_synthetic_dataset, small_dataset, monkeypatch
 ):
     (warning,) = results_of(config)["warnings"]
     assert "has learnt from" in warning
     assert warning in capsys.readouterr().out
-    assert learnt_from(config.world_model.path, config.dataset, "validation,ind") == []
+    with monkeypatch.context() as held_out:
+        held_out.setattr(EpisodeTable, "validation", property(lambda table: np.arange(6) % 3 == 1))
+        assert learnt_from(config.world_model.path, config.dataset, "validation,ind") == []
+        (warning,) = learnt_from(config.world_model.path, config.dataset)
+        assert "4 of these episodes" in warning
     others = ChosenEpisodes(str(make_synthetic_dataset(tmp_path / "others", episodes=3, length=5).root))
     assert learnt_from(config.world_model.path, others) == []
     again = ChosenEpisodes(str(tmp_path / "copy"))
@@ -305,6 +327,12 @@ def test_rollouts_that_the_world_model_has_learnt_from_are_warned_about(
     assert "6 of these episodes" in warning
     (warning,) = learnt_from(config.world_model.path, again, episodes=[0, 3])
     assert "2 of these episodes" in warning
+    copy = tmp_path / "parts"
+    shutil.copytree(resolve_checkpoint(config.world_model.path), copy)
+    write(copy / "train_config.json", {"dataset": {"root": config.dataset.root, "episodes": [0, 1]}})
+    assert learnt_from(str(copy), config.dataset, episodes=[2, 3]) == []
+    (warning,) = learnt_from(str(copy), config.dataset, episodes=[1, 2])
+    assert "1 of these episodes" in warning
     copy = tmp_path / "model"
     shutil.copytree(resolve_checkpoint(config.world_model.path), copy)
     write(copy / "train_config.json", {"dataset": {"root": "demonstrations", "more": [others.root]}})

@@ -229,6 +229,15 @@ def test_recorded_successes_are_labels_as_lerobots_datasets_give_them(
                 assert torch.equal(label["action_is_pad"], item["action_is_pad"])
 
 
+def test_recorded_frames_that_do_not_fit_into_memory_are_refused(
+    small_dataset: LeRobotDataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=1000))
+    source, camera = StartFrames(root=str(small_dataset.root)), "observation.images.third_view"
+    with pytest.raises(FieldError, match=r"recorded=True: .* 0.0 GB of memory, and 0.0 GB are free"):
+        recorded_successes(source, {camera: (3, 32, 32)}, state_size=8, windows=Windows())
+
+
 def test_windows_of_imagined_observations_end_with_the_step_itself() -> None:
     """Before the episode, the first is repeated. What was done before the planner took over is no label."""
     buffer = ObservationBuffer(steps=3, num_envs=2)

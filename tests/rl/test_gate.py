@@ -104,7 +104,7 @@ def test_at_the_limit_training_goes_on(
     gate = make_gate(BELIEVES_NONE)
     with caplog.at_level(logging.WARNING):
         record = gate.run(0, tmp_path, tmp_path / "gate")
-        assert "The world model has learnt from these episodes" in caplog.text
+        assert "The world model has learnt from 6 of these episodes" in caplog.text
         caplog.clear()
         gate.apply({0: record})
     assert record["labelled"]["false_positive_rate"]["k"] == 0
@@ -126,7 +126,7 @@ def test_rollouts_that_a_dyna_round_has_learnt_from_are_warned_about(
         assert "has learnt from" not in caplog.text
         monkeypatch.setattr(env, "model", load_model(newer, "action_world_model"))
         gate.run(3, tmp_path, tmp_path / "gate")
-    assert f"The world model has learnt from these episodes ({root})" in caplog.text
+    assert f"The world model has learnt from 3 of these episodes ({root})" in caplog.text
 
 
 def test_what_nobody_has_asked_about_has_not_passed(

@@ -163,7 +163,7 @@ def test_what_is_no_t5_is_named_and_nothing_is_written(small_dataset, trained_mo
 def test_a_dataset_with_a_bad_instruction_is_named_and_nothing_is_written(
     task, message, make_synthetic_dataset, trained_models, tmp_path
 ):
-    root = Path(make_synthetic_dataset(tmp_path / "data", episodes=1, instruction=task).root)
+    root = Path(make_synthetic_dataset(tmp_path / "data", episodes=1, instructions=[task]).root)
     with pytest.raises(ValueError, match=message):
         run_training(text_config(trained_models["frame_tokenizer"]), root, tmp_path / "out")
     assert not (tmp_path / "out").exists()
