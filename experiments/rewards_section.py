@@ -28,7 +28,9 @@ rule-based one in the recorded episodes, the others have not.
 
 Under the absolute form PPO of seed 0 learns to delay success: imagined success rises from 55 to 81 % by
 iteration 41 and falls to 66 % by iteration 80, while the reward goes on rising. Success ends an episode, and
-with it the similarity that each step pays."""
+with it the similarity that each step pays. The learnt rewards are paid at every step too: with seed 100000
+imagined success falls from 77 to 20 % under the one of the hidden state, while the reward rises from 0.35 to
+0.38 a step. The potential form pays for each step nearer to the goal, and nothing for staying."""
 
 
 def section(load: Load) -> str:
