@@ -11,6 +11,7 @@ BEFORE: Final = "filtered"
 
 TITLES: Final = {
     BEFORE: "filtered BC",
+    "longer_filtered": "filtered BC, three times as many steps",
     "success": "PPO, reward: success (done alone)",
     "general": "PPO, reward: general, alpha 0.9, potential",
     "absolute": "PPO, reward: general, alpha 0.9, absolute, as in RoboScape-R",
@@ -18,6 +19,7 @@ TITLES: Final = {
     "embedding": "PPO, reward: learnt from the world model's hidden state (embedding)",
     "proxy": "PPO, reward: learnt from frames (proxy)",
     "grpo": "GRPO, reward: success (done alone)",
+    "distilled": "planner distilled after the PPO whose reward is success",
 }
 """Methods in the order of the table."""
 

@@ -141,7 +141,10 @@ def having(found: Groups, method: str) -> Groups:
 
 
 def gain(cells: Sequence[Cell], method: str, baseline: str, domain: str) -> RunsMean:
-    """Return how much more often a method succeeds than a baseline on the same data and starts."""
+    """Return how much more often a method succeeds than a baseline on the same starts.
+
+    Both have the same budget of real episodes, but may have other recordings (`recorded_anew`).
+    """
     both = [cell for cell in cells if {method, baseline} <= cell["methods"].keys()]
     pairs = zip(outcomes(both, method, domain), outcomes(both, baseline, domain), strict=True)
     return RunsMean.over([[a - b for a, b in zip(*pair, strict=True)] for pair in pairs])
