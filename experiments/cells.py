@@ -35,6 +35,8 @@ def estimate(number: Mapping[str, Any] | None, digits: int = 1) -> str:
     """`5.7 (5.4–6.1)`: a mean over episodes with its bootstrap 95 % interval."""
     if number is None or number["value"] is None:
         return "–"
+    if number["bootstrap_95"] is None:
+        return f"{number['value']:.{digits}f} (one episode)"
     low, high = number["bootstrap_95"]
     return f"{number['value']:.{digits}f} ({low:.{digits}f}–{high:.{digits}f})"
 

@@ -14,7 +14,7 @@ from lerobot.configs.rewards import RewardModelConfig
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_dataset_maniskill.planners import MOTIONS
-from lerobot_wmrl.common.checkpoints import resolved_name
+from lerobot_wmrl.common.checkpoints import checkpoint_digest, resolved_name
 from lerobot_wmrl.common.command_line import RunConfig, settings_beside
 from lerobot_wmrl.common.constants import EVALUATION_SEED, KINDS, POLICY
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
@@ -312,7 +312,10 @@ class RecordConfig(RunConfig):
             return {"policy": None}
         if self.policy.pretrained_path:
             path = resolved_name(str(self.policy.pretrained_path))
-            return {"policy": path, "policy_settings": settings_beside("policy")}
+            return {
+                "policy": path, "policy_settings": settings_beside("policy"),
+                "policy_content": checkpoint_digest(path),
+            }  # fmt: skip
         own = {each.name for each in fields(self.policy)} - {each.name for each in fields(PreTrainedConfig)}
         settings = draccus.encode(self.policy)
         return {"policy": self.policy.type, **{f"policy.{name}": settings[name] for name in sorted(own)}}
@@ -331,6 +334,7 @@ class RecordConfig(RunConfig):
 
 def imagined_content(env: WorldModelEnv) -> dict[str, Any]:
     """Return the settings that decide the frames of imagined episodes, beside the policy."""
+    from lerobot_wmrl.envs.content import content_of
     from lerobot_wmrl.world_models.checkpoint import read_config
 
     model: Any = read_config(env.world_model_path, "action_world_model")
@@ -346,4 +350,5 @@ def imagined_content(env: WorldModelEnv) -> dict[str, Any]:
         "reward": env.reward.type,
         "reward_settings": {name: value for name, value in reward.items() if name not in general},
         "text_world_model": env.text_world_model_path,
+        "content": content_of(env),
     }

@@ -14,6 +14,10 @@ from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 from lerobot_wmrl.maniskill.scenes import SCENES, Scene, scene_for_seed
 
+MOST_VISITS = 1000
+"""Imagined episodes of one recording that begin in the same start, at most: recordings with other seeds have
+other random numbers."""
+
 
 @dataclass(frozen=True)
 class EpisodePlan:
@@ -96,10 +100,11 @@ def imagined_episodes(config: RecordConfig) -> list[EpisodePlan]:
     starts, real = chosen_episodes(table, source), recorded_episodes(Path(table.dataset.root))
     plans = []
     for number in range(config.num_episodes):
-        visit, start = number // len(starts), (config.seed + number) % len(starts)
+        start = (config.seed + number) % len(starts)
+        visit = config.seed * MOST_VISITS + number // len(starts)
         task, scene, seed = (int(real[name][starts[start]]) for name in ("task", "scene", "seed"))
         plans.append(EpisodePlan(TASKS[task], POLICY, SCENES[scene], seed, start, visit))
-    if plans and plans[-1].visit and not config.exploration:
+    if len(plans) > len(starts) and not config.exploration:
         logging.warning(
             "%d episodes begin from %d starts: without --exploration a policy whose actions are not random "
             "repeats itself in them", config.num_episodes, len(starts),

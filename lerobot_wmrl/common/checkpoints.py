@@ -1,8 +1,9 @@
 """Checkpoints that are either whole or absent, in LeRobot's layout."""
 
 import hashlib
+import json
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -19,7 +20,13 @@ from lerobot_wmrl.common.errors import FieldError
 ADAPTERS_FILE = "adapter_model.safetensors"
 """PEFT's: where a policy has adapters, its checkpoints hold them alone."""
 
-MODEL_FILES: Final = ("config.json", "adapter_config.json", "*processor.json", "*.safetensors")
+SETTINGS: Final = ("config.json", "adapter_config.json")
+"""A checkpoint's files of settings."""
+
+PARTS: Final = ("base_model_name_or_path", "world_model_path", "proposal_path")
+"""Settings in them that name further checkpoints."""
+
+MODEL_FILES: Final = (*SETTINGS, "*processor.json", "*.safetensors")
 """A checkpoint's files that say how its model acts: settings, processors with their numbers, weights."""
 
 LAST_CHECKPOINT = f"{CHECKPOINTS_DIR}/{LAST_CHECKPOINT_LINK}"
@@ -70,10 +77,11 @@ def resolved_name(path: str) -> str:
     return str(folder.parent if folder.name == PRETRAINED_MODEL_DIR else folder)
 
 
-def local_checkpoint(path: str | Path) -> Path:
-    """Return the folder with a checkpoint's model. One on the hub is downloaded into its cache."""
+def local_checkpoint(path: str | Path, files: Sequence[str] | None = None) -> Path:
+    """Return the folder with a checkpoint's model. One on the hub is downloaded into its cache, all of it or
+    the files of some patterns."""
     folder = resolve_checkpoint(path)
-    return folder if folder.is_dir() else Path(snapshot_download(str(path)))
+    return folder if folder.is_dir() else Path(snapshot_download(str(path), allow_patterns=files))
 
 
 def last_checkpoint(folder: Path) -> Path:
@@ -133,14 +141,28 @@ def weights_digest(state: Mapping[str, Tensor]) -> str:
 def checkpoint_digest(path: str | Path) -> str:
     """Return a short digest of the files that a checkpoint's model is loaded from.
 
-    Unlike the name it changes where another model was trained in the same folder.
+    Unlike the name it changes where another model was trained in the same folder. Models on this machine that
+    it is made of count too: what an adapter was trained on, the world model of a planner.
     """
-    folder, found = local_checkpoint(path), hashlib.sha256()
+    folder, found = local_checkpoint(path, MODEL_FILES), hashlib.sha256()
     for file in sorted(each for pattern in MODEL_FILES for each in folder.glob(pattern)):
-        found.update(file.name.encode())
-        with file.open("rb") as content:
-            found.update(hashlib.file_digest(content, "sha256").digest())
+        found.update(f"{file.name} {file_digest(file)}".encode())
+    for part in parts_of(folder):
+        found.update(checkpoint_digest(part).encode())
     return found.hexdigest()[:12]
+
+
+def file_digest(path: Path) -> str:
+    """Return a short digest of a file."""
+    with path.open("rb") as content:
+        return hashlib.file_digest(content, "sha256").hexdigest()[:12]
+
+
+def parts_of(folder: Path) -> list[Path]:
+    """Return the checkpoints on this machine that a checkpoint's settings name."""
+    settings = [json.loads(path.read_text()) for name in SETTINGS if (path := folder / name).is_file()]
+    named = [resolve_checkpoint(each[key]) for each in settings for key in PARTS if each.get(key)]
+    return [part for part in named if part.is_dir() and part != folder]
 
 
 def read_weights(checkpoint: Path, folder: str = PRETRAINED_MODEL_DIR) -> dict[str, Any]:

@@ -16,14 +16,18 @@ CONFIG_FILE: Final = "train_config.json"
 """The settings of a run, in its folder."""
 
 
+CONTENT_FILE: Final = "content.json"
+"""Digests of what the settings name."""
+
 LOCK: Final = ".lock"
 """The file that a command locks while it writes the folder."""
 
 
 @contextmanager
 def claimed(
-    output_dir: Path, settings: Mapping[str, Any], free: Collection[str] = (), marker: str = CONFIG_FILE
-) -> Iterator[None]:
+    output_dir: Path, settings: Mapping[str, Any], free: Collection[str] = (), marker: str = CONFIG_FILE,
+    content: Mapping[str, str] | None = None,
+) -> Iterator[None]:  # fmt: skip
     """Mark a new folder as this run's, or recognise it, and hold it against other commands.
 
     Args:
@@ -31,22 +35,27 @@ def claimed(
         settings: of the run, as JSON.
         free: settings that may differ between the first call and its continuation.
         marker: file of the settings.
+        content: digests of what settings name, which may be made anew under the same name.
 
     Raises:
         FieldError: it holds something else, or another command writes there.
     """
-    require_free(output_dir, settings, free, marker)
+    require_free(output_dir, settings, free, marker, content)
     output_dir.mkdir(parents=True, exist_ok=True)
     with locked(output_dir, output_dir / LOCK):
-        require_free(output_dir, settings, free, marker)  # another command may have begun there meanwhile
+        # another command may have begun there meanwhile
+        require_free(output_dir, settings, free, marker, content)
         if not (output_dir / marker).is_file():
+            if content:
+                write_json(output_dir / CONTENT_FILE, dict(content))
             write_json(output_dir / marker, dict(settings))
         yield
 
 
 def require_free(
-    output_dir: Path, settings: Mapping[str, Any], free: Collection[str] = (), marker: str = CONFIG_FILE
-) -> None:
+    output_dir: Path, settings: Mapping[str, Any], free: Collection[str] = (), marker: str = CONFIG_FILE,
+    content: Mapping[str, str] | None = None,
+) -> None:  # fmt: skip
     """Raise FieldError unless the folder is new, empty or this run's; leave it as it is.
 
     The settings called `free` may differ between the first call and its continuation. So may `output_dir`: a
@@ -58,14 +67,26 @@ def require_free(
     if stored.is_file():
         free = {"output_dir", *free} if marker == CONFIG_FILE else free
         require_same(output_dir, json.loads(stored.read_text()), settings, free)
+        if content and (kept := output_dir / CONTENT_FILE).is_file():
+            require_same_content(output_dir, json.loads(kept.read_text()), content)
     else:
-        require_empty(output_dir, marker, LOCK)
+        require_empty(output_dir, marker, LOCK, CONTENT_FILE)
 
 
 def require_empty(output_dir: Path, *own: str) -> None:
     """Raise FieldError for a folder that holds anything but the files called `own`."""
     if foreign_files(output_dir, *own):
         raise FieldError("output_dir", output_dir, "holds something else", "choose a new folder")
+
+
+def require_same_content(output_dir: Path, stored: Mapping[str, str], given: Mapping[str, str]) -> None:
+    """Raise FieldError where a name stands for something else than when the folder was begun."""
+    if changed := [name for name in stored.keys() & given.keys() if stored[name] != given[name]]:
+        raise FieldError(
+            "output_dir", output_dir,
+            f"was begun with another content of {', '.join(sorted(changed))}, under the same name",
+            "choose another folder, or restore what was there to continue",
+        )  # fmt: skip
 
 
 def require_same(

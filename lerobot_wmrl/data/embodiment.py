@@ -42,8 +42,8 @@ class Embodiment:
         fps: frames a second.
         action_names: one name for each component of `action`.
         action_low: least value of each component, in the dataset's units. By default what the dataset says
-            (`low` and `high` in the `info` of its feature `action`), else the least recorded one, but not
-            far below the 1 % quantile.
+            (`low` and `high` in the `info` of its feature `action`), else the least recorded one, without
+            the few that lie far from all others.
         action_high: greatest value of each component, correspondingly.
         state_names: one name for each component of `observation.state`.
     """
@@ -139,7 +139,8 @@ def observed_range(meta: Any) -> tuple[list[float], list[float]]:
     for component in np.flatnonzero((least < low) | (most > high)).tolist():
         logging.warning(
             "action %s: %d of %d recorded values lie outside of the range that is taken, %.4g to %.4g (they "
-            "reach from %.4g to %.4g). If they are meant, set `embodiment.action_low` and `action_high`",
+            "reach from %.4g to %.4g). If they are meant, write the range into meta/info.json: lists `low` "
+            "and `high` in the `info` of the feature `action`",
             names[component], ((finite < low) | (finite > high)).sum(0)[component], len(finite),
             low[component], high[component], least[component], most[component],
         )  # fmt: skip

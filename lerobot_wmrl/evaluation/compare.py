@@ -4,7 +4,6 @@ import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from math import ceil
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -17,7 +16,7 @@ from lerobot.scripts.lerobot_eval import eval_policy
 from lerobot.utils.constants import ACTION
 from lerobot.utils.random_utils import set_seed
 
-from lerobot_wmrl.common.checkpoints import checkpoint_digest, resolved_name
+from lerobot_wmrl.common.checkpoints import resolved_name
 from lerobot_wmrl.common.errors import FieldError, first_line
 from lerobot_wmrl.common.policies import (
     check_weights,
@@ -26,7 +25,6 @@ from lerobot_wmrl.common.policies import (
     load_processors,
     read_policy_config,
 )
-from lerobot_wmrl.data.dataset import fingerprint
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.envs.lerobot_env import counts_resets, freeze_finished, is_own, runs_in_processes
 from lerobot_wmrl.evaluation.comparison import Comparison, Episode
@@ -89,16 +87,6 @@ def _check_environment(config: PreTrainedConfig, env: EnvConfig) -> None:
     action = features.pop(ACTION)
     shown = {name: tuple(feature.shape) for name, feature in features.items()}
     fit_to_environment(config, shown, action.shape[0])
-
-
-def imagination_content(env: WorldModelEnv) -> dict[str, str]:
-    """Return digests of what an imagined episode follows from, beside the policy: what its flags name may be
-    trained or recorded anew under the same name."""
-    models = {"world_model_path": env.world_model_path, "text_world_model_path": env.text_world_model_path}
-    content = {name: checkpoint_digest(path) for name, path in models.items() if path}
-    if env.dataset.given:
-        content["dataset"] = fingerprint(Path(env.dataset.open().root))
-    return content
 
 
 def load_policies(configs: Mapping[str, PreTrainedConfig]) -> list[LoadedPolicy]:

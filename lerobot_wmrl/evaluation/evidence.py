@@ -147,8 +147,9 @@ def trained_inside(policy: str, world_model: str) -> str | None:
 
 
 def learnt_from(
-    world_model: str, rollouts: DatasetSource, split: str = "all", episodes: Sequence[int] | None = None
-) -> list[str]:
+    world_model: str, rollouts: DatasetSource, remedy: str, split: str = "all",
+    episodes: Sequence[int] | None = None,
+) -> list[str]:  # fmt: skip
     """Return a warning if the world model has learnt from the rollouts that it is checked on, or from copies.
 
     Trainings that it was continued from count too, as far as their settings and data lie on this machine.
@@ -176,8 +177,7 @@ def learnt_from(
         return []
     return [
         f"The world model has learnt from {seen} of these episodes ({rollouts.name}) and predicts them "
-        "better than others, so estimates and intervals are wrong. Take those that were held out "
-        "(--split=validation of the dataset that it was trained on), or others."
+        f"better than others: {remedy}"
     ]
 
 

@@ -168,7 +168,7 @@ class Improvement:
             fitted = self.config.algorithm["algorithm.type"] == "distillation"
             trained[FITTED if fitted else PPO] = str(self.rl_checkpoint)
         if self.has_distilled:
-            trained[DISTILLED] = str(last_checkpoint(self.out / "distilled"))
+            trained[DISTILLED if self.has_trained else FITTED] = str(last_checkpoint(self.out / "distilled"))
         return trained
 
     @property

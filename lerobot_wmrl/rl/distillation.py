@@ -26,7 +26,7 @@ from lerobot_wmrl.common.pipeline import Pipeline
 from lerobot_wmrl.common.policies import load_trained_weights
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
-from lerobot_wmrl.rl.labels import Labels, Windows, imagined_labels, recorded_successes
+from lerobot_wmrl.rl.labels import Labels, Windows, imagined_labels, recorded_successes, require_memory
 from lerobot_wmrl.rl.observations import as_read_back
 from lerobot_wmrl.rl.rollout import RolloutBuffer
 from lerobot_wmrl.rl.seeds import seeded_noise
@@ -206,9 +206,13 @@ class Distillation(RLAlgorithm):
         return pipeline.action_unit.to(env.device) >= LEAST_SPREAD * spread
 
     def check_recorded(self, env: WorldModelVectorEnv, pipeline: Pipeline) -> None:
-        """Raise FieldError if recorded episodes are learnt from, and vary in what the policy cannot learn."""
+        """Raise FieldError if recorded episodes are learnt from, and do not fit into memory or vary in what
+        the policy cannot learn."""
+        if not self.config.recorded:
+            return
+        require_memory(env.config.dataset, env.model.config.tokenizer.frame_shapes)
         strange = (~self.learnt_components(env, pipeline)).nonzero().flatten().tolist()
-        if self.config.recorded and strange:
+        if strange:
             name = env.model.config.embodiment.action_names[strange[0]]
             raise FieldError(
                 "algorithm.recorded", True,

@@ -39,6 +39,12 @@ REMEDIES = (
 )
 
 
+OTHERS = (
+    "it takes fewer of their failures for successes. Give rollouts that it has not seen (`gate.dataset`)."
+)
+"""What follows where the world model has learnt from the rollouts."""
+
+
 @dataclass
 class SuccessGate:
     """Counts the world model's false positives at intervals.
@@ -71,7 +77,7 @@ class SuccessGate:
         if self.config.dataset.given and self._new_model(iteration):
             recordings[LABELLED] = labelled_recording(self.env.model, self.config.dataset.open())
             path = str(self.env.model.config.pretrained_path)  # of the newest one after Dyna rounds
-            for warning in learnt_from(path, self.config.dataset):
+            for warning in learnt_from(path, self.config.dataset, OTHERS):
                 logging.warning(colored(warning, "red", attrs=["bold"]))
         if self.recorder is not None:
             recordings[FRESH] = self._fresh(self.recorder, iteration, checkpoint, folder / "rollouts")

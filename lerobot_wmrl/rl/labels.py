@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import psutil
 import torch
 from lerobot.configs import PreTrainedConfig
@@ -19,7 +20,7 @@ from lerobot_wmrl.common.constants import INSTRUCTIONS, Observation
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.images import stretch
 from lerobot_wmrl.common.pipeline import ACTION_IS_PAD
-from lerobot_wmrl.data.episodes import read_episodes
+from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
 from lerobot_wmrl.data.frame_cache import decode_episode
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.envs.start_frames import every_chosen_episode
@@ -161,9 +162,7 @@ def recorded_successes(
     """
     if not source.given:
         return []
-    table = read_episodes(source.open())
-    episodes = every_chosen_episode(table, source)
-    episodes = episodes[table.success[episodes]]
+    table, episodes = successes(source)
     if not len(episodes):
         return []
     start, length = (torch.from_numpy(of_all[episodes]) for of_all in (table.start, table.length))
@@ -173,10 +172,8 @@ def recorded_successes(
     actions = action_windows(taken, acting, windows.actions)
     begin = length.cumsum(0) - length  # where the frames of each episode begin below
     episode = torch.arange(len(episodes)).repeat_interleave(length)  # (F,), of each frame
-    count = len(episode)
-    require_memory(count * sum(math.prod(shape) for shape in frame_shapes.values()))
     observations = {
-        camera: torch.empty(count, *shape, dtype=torch.uint8) for camera, shape in frame_shapes.items()
+        camera: torch.empty(len(episode), *shape, dtype=torch.uint8) for camera, shape in frame_shapes.items()
     }
     for first, rows, each in zip(begin.tolist(), length.tolist(), episodes.tolist(), strict=True):
         for camera, (_, height, width) in frame_shapes.items():
@@ -193,8 +190,19 @@ def recorded_successes(
     )]  # fmt: skip
 
 
-def require_memory(size: int) -> None:
-    """Raise FieldError if that many bytes of frames do not fit into the free memory."""
+def successes(source: StartFrames) -> tuple[EpisodeTable, np.ndarray]:
+    """Return a dataset's episodes, and which of those that `source` names succeed. (E,)"""
+    table = read_episodes(source.open())
+    episodes = every_chosen_episode(table, source)
+    return table, episodes[table.success[episodes]]
+
+
+def require_memory(source: StartFrames, frame_shapes: Mapping[str, tuple[int, int, int]]) -> None:
+    """Raise FieldError if the frames of `recorded_successes` do not fit into the free memory."""
+    if not source.given:
+        return
+    table, episodes = successes(source)
+    size = int(table.length[episodes].sum()) * sum(map(math.prod, frame_shapes.values()))
     free = psutil.virtual_memory().available
     if size > free:
         raise FieldError(

@@ -97,26 +97,23 @@ def compare(cfg: CompareConfig) -> None:
     assert cfg.env is not None
     configs = read_policies(cfg.policies, cfg.env)
     cfg.policies = list(configs)
-    settings = settings_of(cfg)
-    require_free(cfg.output_dir, settings, may_differ(cfg))
+    content = named_content(cfg)
+    require_free(cfg.output_dir, draccus.encode(cfg), may_differ(cfg), content=content)
     comparison = Comparison(
         cfg.policies, cfg.n_episodes, cfg.against, cfg.alpha, cfg.stop_early, stored_episodes(cfg)
     )
     if not comparison.finished:
-        run(cfg, settings, comparison, configs)
+        run(cfg, content, comparison, configs)
     save_picture(comparison, cfg.output_dir / "comparison.png")
     print(f"{comparison}\n{RESULTS} and comparison.png are in {cfg.output_dir}")
 
 
-def settings_of(cfg: CompareConfig) -> dict[str, Any]:
-    """Return what decides the result, as JSON: the settings, and what policies and world model are."""
+def named_content(cfg: CompareConfig) -> dict[str, str]:
+    """Return digests of the policies, and of what imagined episodes follow from."""
     from lerobot_wmrl.common.checkpoints import checkpoint_digest
-    from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
-    from lerobot_wmrl.evaluation.compare import imagination_content
+    from lerobot_wmrl.envs.content import content_of
 
-    settings: dict[str, Any] = draccus.encode(cfg)
-    imagined = imagination_content(cfg.env) if isinstance(cfg.env, WorldModelEnv) else {}
-    return settings | {"content of": {name: checkpoint_digest(name) for name in cfg.policies} | imagined}
+    return {name: checkpoint_digest(name) for name in cfg.policies} | content_of(cfg.env)
 
 
 def stored_episodes(cfg: CompareConfig) -> "list[Episode]":
@@ -134,7 +131,7 @@ def may_differ(cfg: CompareConfig) -> list[str]:
 
 
 def run(
-    cfg: CompareConfig, settings: dict[str, Any], comparison: "Comparison",
+    cfg: CompareConfig, content: dict[str, str], comparison: "Comparison",
     configs: "dict[str, PreTrainedConfig]",
 ) -> None:  # fmt: skip
     """Run the episodes that are missing; write the results after every batch."""
@@ -147,6 +144,7 @@ def run(
     from lerobot_wmrl.evaluation.comparison import RESULTS
 
     assert cfg.env is not None
+    settings: dict[str, Any] = draccus.encode(cfg)
 
     def save() -> None:
         content = {"env": settings["env"], "seed": cfg.seed, **comparison.as_json()}
@@ -158,7 +156,7 @@ def run(
     ):
         require_new_starts(envs[0], cfg.env, cfg.n_episodes)
         policies = load_policies(configs)
-        with claimed(cfg.output_dir, settings, may_differ(cfg)):
+        with claimed(cfg.output_dir, settings, may_differ(cfg), content=content):
             comparison.episodes[:] = stored_episodes(cfg)  # another command may have added some meanwhile
             run_comparison(comparison, envs, cfg.env, policies, cfg.batch_size, cfg.seed, save)
 

@@ -22,7 +22,7 @@ may be given then: what has been imagined is kept.
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from math import ceil
@@ -145,6 +145,12 @@ class JudgeConfig(RunConfig):
             )  # fmt: skip
 
 
+HELD_OUT = (
+    "estimates and intervals are wrong. Take those that were held out (--split=validation of the dataset "
+    "that it was trained on), or others."
+)
+"""What follows where the world model has learnt from the rollouts."""
+
 MAY_DIFFER = ("policies", "references", "coverage")
 """Settings that change no imagined episode of a policy. Device and batch size do: by its number format."""
 
@@ -165,8 +171,8 @@ def judge(cfg: JudgeConfig) -> None:
     cfg.world_model.path = resolved_name(cfg.world_model.path)
     env = cfg.imagination()
     configs, references = read_both(cfg, env)
-    settings = settings_of(cfg, env)
-    require_free(cfg.output_dir, settings, MAY_DIFFER)
+    content = named_content(cfg, env)
+    require_free(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER, content=content)
     confusion, warnings = confusion_of(replayed_rollouts(env, cfg.dataset, cfg.split), env)
     if not confusion.youden >= LEAST_YOUDEN:
         raise Stopped(
@@ -178,14 +184,14 @@ def judge(cfg: JudgeConfig) -> None:
     judgement = Judgement(
         confusion, references, {name: why for name, why in reasons.items() if why}, cfg.coverage,
         [
-            *learnt_from(cfg.world_model.path, cfg.dataset, cfg.split, cfg.dataset.episodes),
+            *learnt_from(cfg.world_model.path, cfg.dataset, HELD_OUT, cfg.split, cfg.dataset.episodes),
             *pooled_instructions(cfg.dataset, cfg.split), *warnings,
         ],
         checkpoints={name: checkpoint_digest(name) for name in configs},
     )  # fmt: skip
-    remember(judgement, cfg)
+    remember(judgement, cfg, configs)
     with writing("output_dir", cfg.output_dir):
-        imagine(cfg, env, judgement, configs, settings)
+        imagine(cfg, env, judgement, configs, content)
         save_picture(judgement, cfg.output_dir / "judgement.png")
     print(
         f"{judgement}\n\njudgement.json and judgement.png are in {cfg.output_dir}. Next: try the best in "
@@ -215,20 +221,17 @@ def read_both(
     return others | judged, dict(zip(others, known.values(), strict=True))
 
 
-def settings_of(cfg: JudgeConfig, env: WorldModelEnv) -> dict[str, Any]:
-    """Return what decides the imagined episodes, as JSON: the settings, and what world model and episodes
-    are."""
+def named_content(cfg: JudgeConfig, env: WorldModelEnv) -> dict[str, str]:
+    """Return digests of the rollouts, and of what imagined episodes follow from beside the policy."""
     from lerobot_wmrl.data.dataset import fingerprint
-    from lerobot_wmrl.evaluation.compare import imagination_content
+    from lerobot_wmrl.envs.content import content_of
 
     rollouts = {"rollouts": fingerprint(Path(cfg.dataset.open().root))}
-    settings: dict[str, Any] = draccus.encode(cfg)
     with regrouped("dataset", "starts") if cfg.starts_given else nullcontext():
-        content = rollouts | imagination_content(env)
-    return settings | {"content of": content}
+        return rollouts | content_of(env)
 
 
-def remember(judgement: "Judgement", cfg: JudgeConfig) -> None:
+def remember(judgement: "Judgement", cfg: JudgeConfig, configs: Collection[str]) -> None:
     """Take over what earlier calls have imagined, of the policies of this one and of others.
 
     Raises:
@@ -239,27 +242,27 @@ def remember(judgement: "Judgement", cfg: JudgeConfig) -> None:
     results = cfg.output_dir / RESULTS
     if not results.is_file():
         return
-    found, given = json.loads(results.read_text()), judgement.checkpoints
+    found, now = json.loads(results.read_text()), judgement.checkpoints
     changed = [
         f"{cfg.dataset.name} or the world model"
         for name, rate in confusion_json(judgement.confusion).items()
         if found[name] != rate
     ]
     before = found["checkpoints"]
-    changed += [name for name in before.keys() & given.keys() if before[name] != given[name]]
+    changed += [name for name in configs if before.get(name, now[name]) != now[name]]
     if changed:
         raise ValueError(
             f"--output_dir={cfg.output_dir}: {changed[0]} has changed since its episodes were imagined; "
             "choose another folder"
         )
     for name, outcomes in found["outcomes"].items():
-        (judgement.outcomes if name in given else judgement.earlier)[name] = outcomes
-    judgement.checkpoints |= before
+        (judgement.outcomes if name in configs else judgement.earlier)[name] = outcomes
+    judgement.checkpoints = before | now
 
 
 def imagine(
     cfg: JudgeConfig, env: WorldModelEnv, judgement: "Judgement", configs: "Mapping[str, PreTrainedConfig]",
-    settings: dict[str, Any],
+    content: dict[str, str],
 ) -> None:  # fmt: skip
     """Imagine the episodes of the policies that have none yet; write the results after every policy."""
     from lerobot_wmrl.evaluation.compare import about_policy, load_policies, opened, run_block
@@ -270,15 +273,15 @@ def imagine(
         write_json(cfg.output_dir / RESULTS, judgement.as_json(finished))
 
     if not configs.keys() - judgement.outcomes.keys():
-        with claimed(cfg.output_dir, settings, MAY_DIFFER):
+        with claimed(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER, content=content):
             write()
         return
     size = even_batch(env.dataset.max_starts, cfg.batch_size)
     group = regrouped("dataset", "starts") if cfg.starts_given else nullcontext()
     with group, opened(env, size, False, 1) as (envs,):
         starts = starts_of_one_task(envs, cfg)
-        with claimed(cfg.output_dir, settings, MAY_DIFFER):
-            remember(judgement, cfg)  # what another has added
+        with claimed(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER, content=content):
+            remember(judgement, cfg, configs)  # what another has added
             missing = {name: config for name, config in configs.items() if name not in judgement.outcomes}
             for name, config in tqdm(missing.items(), desc="Imagining", unit="policy"):
                 with about_policy(name):

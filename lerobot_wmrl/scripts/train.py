@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import draccus
+from lerobot.configs.policies import PreTrainedConfig
 
 from lerobot_wmrl.common.command_line import run_command
 from lerobot_wmrl.common.constants import Observation
@@ -70,7 +71,7 @@ def train_policy(cfg: TrainConfig) -> None:
     done = finished(cfg)
     wait_for_all()  # no process has written anything before all have looked
     if done:
-        require_free(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER)
+        require_free(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER, content=named_content(cfg, config))
         if is_first_process():
             link_latest(cfg.output_dir)
         print(f"{cfg.output_dir}: already trained for {cfg.iterations} iterations")
@@ -78,17 +79,29 @@ def train_policy(cfg: TrainConfig) -> None:
         set_seed(cfg.seed)
         policy, processors = load_policy(config), load_processors(config)
         settings = draccus.encode(cfg)  # an environment of the hub tells its configuration of its actions
-        require_free(cfg.output_dir, settings, MAY_DIFFER)
+        content = named_content(cfg, config)
+        require_free(cfg.output_dir, settings, MAY_DIFFER, content=content)
         with within("env"):
             env = make_tensor_env(cfg.env, cfg.num_envs, config.device or "cpu")
         try:
-            train_in(env, cfg, settings, policy, processors)
+            train_in(env, cfg, settings, content, policy, processors)
         finally:
             env.close()
     if is_first_process():
         lines = summary(cfg)
         print("\n".join(lines))
         publish(cfg, lines)
+
+
+def named_content(cfg: TrainConfig, policy: PreTrainedConfig) -> dict[str, str]:
+    """Return digests of the policy that is trained, and of what imagined episodes follow from."""
+    from lerobot_wmrl.common.checkpoints import checkpoint_digest
+    from lerobot_wmrl.envs.content import content_of
+
+    path = policy.pretrained_path
+    trained = {"policy": checkpoint_digest(path)} if path else {}
+    with within("env"):
+        return trained | content_of(cfg.env)
 
 
 def finished(cfg: TrainConfig) -> bool:
@@ -111,10 +124,12 @@ def train_in(
     env: TensorEnv,
     cfg: TrainConfig,
     settings: dict[str, Any],
+    content: dict[str, str],
     policy: Any,
     processors: tuple[Any, Any],
 ) -> None:
-    """Check that policy and environment fit, then train. `settings` are the configuration's, as JSON."""
+    """Check that policy and environment fit, then train. `settings` are the configuration's, as JSON, and
+    `content` says what they name."""
     from lerobot_wmrl.common.pipeline import make_pipeline
     from lerobot_wmrl.common.policies import adopt_features, check_fit, learnt_range, with_new_adapters
     from lerobot_wmrl.envs.lerobot_env import LeRobotTensorEnv, check_frame_rate, check_real_env, shapes_of
@@ -157,7 +172,7 @@ def train_in(
 
     schedule = Schedule(cfg.iterations, cfg.save_freq, cfg.seed, cfg.log_freq)
     first = is_first_process()
-    with claimed(cfg.output_dir, settings, MAY_DIFFER) if first else nullcontext():
+    with claimed(cfg.output_dir, settings, MAY_DIFFER, content=content) if first else nullcontext():
         if first and cfg.budget is not None and not isinstance(cfg.env, WorldModelEnv):
             steps = cfg.iterations * cfg.num_envs * rank_and_size()[1] * buffer.steps
             charge_steps(cfg.budget, cfg.output_dir, steps, env.max_episode_steps)

@@ -1,8 +1,11 @@
 """Checkpoints in LeRobot's layout."""
 
+import json
+import shutil
 from pathlib import Path
 
 from lerobot_wmrl.common.checkpoints import (
+    checkpoint_digest,
     checkpoint_dir,
     link_latest,
     should_save_checkpoint,
@@ -21,6 +24,21 @@ def test_a_kill_before_the_link_is_repaired(tmp_path: Path) -> None:
             last.symlink_to(left)
         link_latest(tmp_path)
         assert last.resolve() == checkpoint_dir(tmp_path, 2, 2).resolve()
+
+
+def test_a_digest_changes_with_whatever_a_model_is_loaded_from(tmp_path: Path) -> None:
+    base, planner = tmp_path / "base", tmp_path / "planner"
+    for folder, settings in ((base, {}), (planner, {"world_model_path": str(base)})):
+        folder.mkdir()
+        (folder / "config.json").write_text(json.dumps(settings))
+        (folder / "model.safetensors").write_bytes(b"weights")
+    first, planned = checkpoint_digest(base), checkpoint_digest(planner)
+    (base / "train_config.json").write_text("{}")
+    shutil.copytree(base, tmp_path / "copy")
+    assert checkpoint_digest(tmp_path / "copy") == checkpoint_digest(base) == first
+    (base / "model.safetensors").write_bytes(b"others")
+    assert checkpoint_digest(base) != first
+    assert checkpoint_digest(planner) != planned
 
 
 def test_checkpoints_are_named_and_due_as_lerobots() -> None:

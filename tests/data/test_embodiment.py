@@ -87,7 +87,7 @@ def test_one_wrong_value_does_not_widen_the_range(tmp_path: Path, caplog: pytest
     assert -10 < low[1] <= 0
     said = r"action shoulder: 1 of \d+ recorded values lie outside .* -90 to \d.* reach from -90 to 1e\+06"
     assert re.search(said, caplog.text)
-    assert "set `embodiment.action_low` and `action_high`" in caplog.text
+    assert "write the range into meta/info.json" in caplog.text
 
 
 def test_a_rare_action_stays_possible(tmp_path: Path) -> None:

@@ -211,11 +211,15 @@ def test_policies_references_and_coverage_may_be_added_and_what_was_imagined_is_
     results_of(config)
     path = config.output_dir / "judgement.json"
     stored = json.loads(path.read_text())
-    write(path, {**stored, "outcomes": {first: [True, False, False], "another": [True] * 3}})
+    earlier = {**stored["checkpoints"], "another": "0123456789ab"}
+    outcomes = {first: [True, False, False], "another": [True] * 3}
+    write(path, {**stored, "outcomes": outcomes, "checkpoints": earlier})
     known = write(tmp_path / "known.json", {"policies": {second: {"k": 1, "n": 2}}})
     found = results_of(replace(config, references=known, coverage=0.5))
     assert found["outcomes"] == {first: [True, False, False], second: [True] * 3, "another": [True] * 3}
     assert [*found["policies"]] == [first, second]
+    assert found["finished"]
+    assert found["checkpoints"].keys() == {first, second, "another"}
     assert found["policies"][second]["real"]["k"] == 1
     with pytest.raises(ValueError, match="was begun with other settings"):
         judge(replace(config, done_threshold=0.9999))
@@ -316,35 +320,35 @@ def test_rollouts_that_the_world_model_has_learnt_from_are_warned_about(
     assert warning in capsys.readouterr().out
     with monkeypatch.context() as held_out:
         held_out.setattr(EpisodeTable, "validation", property(lambda table: np.arange(6) % 3 == 1))
-        assert learnt_from(config.world_model.path, config.dataset, "validation,ind") == []
-        (warning,) = learnt_from(config.world_model.path, config.dataset)
+        assert learnt_from(config.world_model.path, config.dataset, "take others", "validation,ind") == []
+        (warning,) = learnt_from(config.world_model.path, config.dataset, "take others")
         assert "4 of these episodes" in warning
     others = ChosenEpisodes(str(make_synthetic_dataset(tmp_path / "others", episodes=3, length=5).root))
-    assert learnt_from(config.world_model.path, others) == []
+    assert learnt_from(config.world_model.path, others, "take others") == []
     again = ChosenEpisodes(str(tmp_path / "copy"))
     shutil.copytree(small_dataset.root, again.root)
-    (warning,) = learnt_from(config.world_model.path, again)
+    (warning,) = learnt_from(config.world_model.path, again, "take others")
     assert "6 of these episodes" in warning
-    (warning,) = learnt_from(config.world_model.path, again, episodes=[0, 3])
+    (warning,) = learnt_from(config.world_model.path, again, "take others", episodes=[0, 3])
     assert "2 of these episodes" in warning
     copy = tmp_path / "parts"
     shutil.copytree(resolve_checkpoint(config.world_model.path), copy)
     write(copy / "train_config.json", {"dataset": {"root": config.dataset.root, "episodes": [0, 1]}})
-    assert learnt_from(str(copy), config.dataset, episodes=[2, 3]) == []
-    (warning,) = learnt_from(str(copy), config.dataset, episodes=[1, 2])
+    assert learnt_from(str(copy), config.dataset, "take others", episodes=[2, 3]) == []
+    (warning,) = learnt_from(str(copy), config.dataset, "take others", episodes=[1, 2])
     assert "1 of these episodes" in warning
     copy = tmp_path / "model"
     shutil.copytree(resolve_checkpoint(config.world_model.path), copy)
     write(copy / "train_config.json", {"dataset": {"root": "demonstrations", "more": [others.root]}})
-    assert learnt_from(str(copy), others) != []
+    assert learnt_from(str(copy), others, "take others") != []
     (tmp_path / "further").mkdir()
     further = write(tmp_path / "further" / "train_config.json", {
         "dataset": {"root": "rollouts"}, "model": {"pretrained_path": str(copy)},
     })  # fmt: skip
     write(further.parent / "config.json", {})
-    assert learnt_from(str(further.parent), others) != [], "from the first on"
+    assert learnt_from(str(further.parent), others, "take others") != [], "from the first on"
     shutil.rmtree(Path(others.root) / "data")
-    assert learnt_from(str(copy), again) == [], "what is not whole tells nothing"
+    assert learnt_from(str(copy), again, "take others") == [], "what is not whole tells nothing"
 
 
 def test_rollouts_count_within_the_length_of_an_episode_and_must_both_succeed_and_fail(

@@ -304,7 +304,7 @@ def test_rl_that_left_nothing_leaves_the_policy_of_further_bc_to_the_planner(tmp
     write_json(tmp_path / "stages" / "rl.json", {"failed": "stopped: no episode was rewarded"})
     results = {"finished": True, "policies": {"a": {"share": 0.0}, "b": {"share": 0.0}}, "pairs": []}
     write_json(tmp_path / "start" / "comparison.json", results)
-    assert [*improvement.policies] == [SFT, CLONED, DISTILLED]
+    assert [*improvement.policies] == [SFT, CLONED, FITTED]
     (distilled,) = commands_of(improvement, "distilled").values()
     assert f"--policy.path={improvement.policies[CLONED]}" in distilled
     write_json(tmp_path / "stages" / "distilled.json", {"failed": "stopped: no success"})
@@ -319,7 +319,7 @@ def test_rl_that_left_nothing_leaves_a_policy_of_successes_to_the_planner(tmp_pa
     assert rl.optional(STOPPED)
     write_json(tmp_path / "stages" / "rl.json", {"failed": "stopped: no episode was rewarded"})
     assert f"--policy.path={improvement.policy}" in distilled.command()
-    assert [*improvement.policies] == [SFT, DISTILLED]
+    assert [*improvement.policies] == [SFT, FITTED]
     assert not distilled.optional(1)
     (tmp_path / "rl" / "checkpoints" / "last" / "pretrained_model").mkdir(parents=True)
     assert distilled.optional(1)
@@ -353,6 +353,7 @@ def test_only_policies_for_which_it_was_measured_are_fitted_to_a_planner_after_p
 ) -> None:
     improvement = improvement_of(tmp_path, policy=kind(device="cpu", pretrained_path=tmp_path))
     assert [*improvement.policies] == names
+    improvement.rl_checkpoint.mkdir(parents=True)
     optional = [stage.name for stage in commands.stages(improvement) if stage.optional(1)]
     assert optional == (["distilled"] if DISTILLED in names else [])
     assert improvement.chosen() == names[-1]

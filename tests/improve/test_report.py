@@ -20,7 +20,7 @@ from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.tracking import append_metrics
 from lerobot_wmrl.evaluation.comparison import Comparison, Episode
 from lerobot_wmrl.improve import commands
-from lerobot_wmrl.improve.improvement import CLONED, DISTILLED, PPO, SFT, Improvement
+from lerobot_wmrl.improve.improvement import CLONED, DISTILLED, FITTED, PPO, SFT, Improvement
 from lerobot_wmrl.improve.report import figures
 from lerobot_wmrl.improve.report.page import Page
 from lerobot_wmrl.improve.report.results import curve, lerobot_train_curve, training_curves
@@ -151,7 +151,7 @@ def test_rl_that_stopped_early_is_named(finished: Improvement) -> None:
     assert warned in text_of(finished)
     assert warned in verdict(finished, [compared(finished)])
     shutil.rmtree(finished.rl_checkpoint)
-    assert [*finished.policies] == [SFT, CLONED, DISTILLED]
+    assert [*finished.policies] == [SFT, CLONED, FITTED]
     left_none = f"RL stopped ({finished.out}/logs/rl.log). It left no policy. error: too far"
     assert left_none in reservations(finished)
 

@@ -11,6 +11,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
+from lerobot_dataset_maniskill.manifest import imagined_episodes
 from lerobot_dataset_maniskill.recorder import record
 from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
@@ -99,6 +100,23 @@ def test_the_same_command_again_finds_it_complete_and_other_settings_are_refused
     config.env.done_frames = 1
     with pytest.raises(ValueError, match=r"other settings \(done_frames 2 → 1\)"):
         record(config)
+
+
+def test_another_policy_of_the_same_name_is_not_mixed_with_the_first(config):
+    record(config)
+    save_untrained_policy(Path(config.policy.pretrained_path), actions=7, constant=0.01)
+    with pytest.raises(ValueError, match=r"other settings \(policy_content '\w+' → '\w+'\)"):
+        record(config)
+
+
+def test_recordings_with_other_seeds_have_other_noise(config):
+    """They begin in the same starts, in another order."""
+    noises = set()
+    for seed in (0, 2, 6, 12):
+        plans = imagined_episodes(replace(config, seed=seed))
+        assert {plan.start for plan in plans} == {*range(6)}
+        noises |= {(plan.seed, plan.visit) for plan in plans}
+    assert len(noises) == 4 * config.num_episodes
 
 
 def test_frames_have_the_size_of_the_dataset_not_of_the_tokenizer(config, make_synthetic_dataset, tmp_path):

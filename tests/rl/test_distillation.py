@@ -44,6 +44,7 @@ from lerobot_wmrl.rl.labels import (
     action_windows,
     imagined_labels,
     recorded_successes,
+    require_memory,
 )
 from lerobot_wmrl.rl.observations import ObservationBuffer
 from lerobot_wmrl.scripts.train import main
@@ -235,7 +236,7 @@ def test_recorded_frames_that_do_not_fit_into_memory_are_refused(
     monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=1000))
     source, camera = StartFrames(root=str(small_dataset.root)), "observation.images.third_view"
     with pytest.raises(FieldError, match=r"recorded=True: .* 0.0 GB of memory, and 0.0 GB are free"):
-        recorded_successes(source, {camera: (3, 32, 32)}, state_size=8, windows=Windows())
+        require_memory(source, {camera: (3, 32, 32)})
 
 
 def test_windows_of_imagined_observations_end_with_the_step_itself() -> None:

@@ -95,6 +95,18 @@ def test_a_finished_training_is_left_alone(tmp_path: Path, monkeypatch: pytest.M
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
 
 
+def test_another_policy_of_the_same_name_does_not_continue_a_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    policy = save_untrained_policy(tmp_path / "policy")
+    flags = [f"--policy.path={policy}", *SHORT, *POINT, f"--output_dir={tmp_path / 'rl'}"]
+    improve(monkeypatch, *flags)
+    save_untrained_policy(policy, constant=0.01)
+    with pytest.raises(SystemExit):
+        improve(monkeypatch, *flags)
+    assert "was begun with another content of policy, under the same name" in capsys.readouterr().err
+
+
 def test_a_training_that_another_command_continues_is_left_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
