@@ -1,6 +1,6 @@
 """Methods that begin from one policy: what each gains on it, in tables of docs/results.md."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from experiments.cells import Load
 from experiments.value_cells import SCENES, Cell, against, groups, measured, minutes, shares
@@ -17,21 +17,26 @@ def tables(load: Load, study: str, titles: Mapping[str, str], before: str) -> st
         before: the method that made the policy from which the others begin.
     """
     cells = [cell for each in groups(load, study, ()).values() for cell in each]
-    methods = measured(cells, titles)
     rates = [
         [titles[method], *(shares(cells, method, domain) for domain in SCENES), minutes(cells, method)]
-        for method in methods
+        for method in measured(cells, titles)
     ]
-    changes = [
+    return f"""{table(["method", "known scenes", "unseen scenes", "minutes"], rates)}
+
+{changes(cells, titles, before)}"""
+
+
+def changes(cells: Sequence[Cell], titles: Mapping[str, str], before: str) -> str:
+    """Return a table of what methods change on one of them, seed by seed."""
+    methods = measured(cells, titles)
+    rows = [
         [cell["seed"], titles[method], *row]
         for cell in cells
         for method, row in changed(cell, methods, before)
     ]
-    return f"""{table(["method", "known scenes", "unseen scenes", "minutes"], rates)}
+    return f"""Against {titles[before]}, on the same {cells[0]["starts"]} starts:
 
-Against {titles[before]}, on the same {cells[0]["starts"]} starts:
-
-{table(["seed", "method", "known scenes", "unseen scenes"], changes)}"""
+{table(["seed", "method", "known scenes", "unseen scenes"], rows)}"""
 
 
 def changed(cell: Cell, methods: list[str], before: str) -> list[tuple[str, list[str]]]:

@@ -3,11 +3,16 @@
 from typing import Final
 
 from experiments.cells import Load
-from experiments.from_one_policy import tables
+from experiments.from_one_policy import changes, tables
+from experiments.value_cells import groups
 
 STUDY: Final = "value_rewards"
 BEFORE: Final = "filtered"
 """What all others begin from."""
+
+RIVAL: Final = "longer_filtered"
+BEST: Final = ("success", "general", "grpo", "distilled")
+"""The best use of the same recordings without a world model, and what is compared with it."""
 
 TITLES: Final = {
     BEFORE: "filtered BC",
@@ -37,4 +42,6 @@ imagined success falls from 77 to 20 % under the one of the hidden state, while 
 
 def section(load: Load) -> str:
     """Return the section: success with every reward, and what each gains on the policy before it."""
-    return f"{tables(load, STUDY, TITLES, BEFORE)}\n\n{LIMITS}"
+    cells = [cell for each in groups(load, STUDY, ()).values() for cell in each if RIVAL in cell["methods"]]
+    over_rival = [changes(cells, {name: TITLES[name] for name in (RIVAL, *BEST)}, RIVAL)] if cells else []
+    return "\n\n".join([tables(load, STUDY, TITLES, BEFORE), *over_rival, LIMITS])
