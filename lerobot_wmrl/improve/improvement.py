@@ -154,6 +154,12 @@ class Improvement:
         return not read_record(self.out, "rl").get(FAILED) or self.rl_checkpoint.exists()
 
     @property
+    def kept_start(self) -> bool:
+        """Whether RL's best checkpoint in the real environment is from before its first iteration."""
+        step = self.rl_checkpoint.resolve().parent.name
+        return self.config.selects and step.isdigit() and int(step) == 0
+
+    @property
     def has_distilled(self) -> bool:
         """Whether the policy is fitted to a planner after PPO, and that has not failed."""
         return self.config.distils and not read_record(self.out, "distilled").get(FAILED)
@@ -164,11 +170,12 @@ class Improvement:
         trained = {SFT: self.policy}
         if self.clones:
             trained[CLONED] = str(last_checkpoint(self.out / "cloned"))
-        if self.has_trained:
+        others = self.clones or self.has_distilled
+        if changed := self.has_trained and not (self.kept_start and others):  # else it is one of the others
             fitted = self.config.algorithm["algorithm.type"] == "distillation"
             trained[FITTED if fitted else PPO] = str(self.rl_checkpoint)
         if self.has_distilled:
-            trained[DISTILLED if self.has_trained else FITTED] = str(last_checkpoint(self.out / "distilled"))
+            trained[DISTILLED if changed else FITTED] = str(last_checkpoint(self.out / "distilled"))
         return trained
 
     @property

@@ -27,6 +27,7 @@ from lerobot_wmrl.improve import commands
 from lerobot_wmrl.improve import improvement as decisions
 from lerobot_wmrl.improve.findings import few_decisions, usual_length
 from lerobot_wmrl.improve.improvement import CLONED, DISTILLED, FITTED, PPO, SFT
+from lerobot_wmrl.improve.report.words import reservations
 from lerobot_wmrl.scripts.improve import settings
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 from lerobot_wmrl.world_models.configuration_world_model import AnchoredConfig
@@ -293,6 +294,23 @@ def test_rl_may_stop_by_its_own_rules_if_it_leaves_a_checkpoint(
     (tmp_path / "rl" / "checkpoints" / link / "pretrained_model").mkdir(parents=True)
     assert rl.optional(STOPPED)
     assert not rl.optional(1)
+
+
+def test_rl_that_gained_nothing_in_reality_is_not_compared_as_something_else(tmp_path: Path) -> None:
+    """Its best checkpoint is the policy that it began with."""
+    improvement = improvement_of(tmp_path, failures=10)
+    improvement.config.real_env = PushtEnv()
+    for step in ("000000", "000010"):
+        (tmp_path / "rl" / "checkpoints" / step / "pretrained_model").mkdir(parents=True)
+    link_checkpoint(tmp_path / "rl" / "checkpoints" / "000010", "best")
+    assert [*improvement.policies] == [SFT, CLONED, PPO, DISTILLED]
+    assert not improvement.kept_start
+    link_checkpoint(tmp_path / "rl" / "checkpoints" / "000000", "best")
+    assert [*improvement.policies] == [SFT, CLONED, FITTED]
+    assert any(said.startswith("RL gained nothing") for said in reservations(improvement))
+    alone = improvement_of(tmp_path, policy=VQBeTConfig(device="cpu", pretrained_path=tmp_path))
+    alone.config.real_env = PushtEnv()
+    assert [*alone.policies] == [SFT, FITTED], "there is no other to compare with"
 
 
 def test_rl_that_left_nothing_leaves_the_policy_of_further_bc_to_the_planner(tmp_path: Path) -> None:

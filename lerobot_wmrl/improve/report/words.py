@@ -139,6 +139,11 @@ def reservations(improvement: Improvement) -> list[str]:
     if reason := read_record(improvement.out, "rl").get(FAILED):
         left = "A checkpoint from before that is compared" if improvement.has_trained else "It left no policy"
         found.append(f"RL stopped ({improvement.out / 'logs' / 'rl.log'}). {left}. {reason}")
+    if improvement.kept_start:
+        found.append(
+            "RL gained nothing: no checkpoint succeeded more often in the real environment than the policy "
+            "that it began with, whatever imagination says of them. That one is compared as what it is."
+        )
     if improvement.config.distils and not improvement.has_distilled:
         log = improvement.out / "logs" / "distilled.log"
         found.append(
