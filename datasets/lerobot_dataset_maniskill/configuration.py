@@ -14,7 +14,7 @@ from lerobot.configs.rewards import RewardModelConfig
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_dataset_maniskill.planners import MOTIONS
-from lerobot_wmrl.common.checkpoints import checkpoint_digest, resolved_name
+from lerobot_wmrl.common.checkpoints import PARTS, checkpoint_digest, resolved_name
 from lerobot_wmrl.common.command_line import RunConfig, settings_beside
 from lerobot_wmrl.common.constants import EVALUATION_SEED, KINDS, POLICY
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
@@ -318,7 +318,11 @@ class RecordConfig(RunConfig):
             }  # fmt: skip
         own = {each.name for each in fields(self.policy)} - {each.name for each in fields(PreTrainedConfig)}
         settings = draccus.encode(self.policy)
-        return {"policy": self.policy.type, **{f"policy.{name}": settings[name] for name in sorted(own)}}
+        parts = {name: checkpoint_digest(settings[name]) for name in PARTS if settings.get(name)}
+        return {
+            "policy": self.policy.type, **{f"policy.{name}": settings[name] for name in sorted(own)},
+            "policy_content": parts,
+        }  # fmt: skip
 
     def _simulated_content(self) -> dict[str, Any]:
         env = self.maniskill

@@ -15,6 +15,9 @@ from lerobot_wmrl.common.output_folders import different_settings, require_same
 from lerobot_wmrl.maniskill.embodiment import FPS
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
+DIGESTS: Final = ("policy_content", "content")
+"""Settings that say what other settings name, which earlier versions did not keep."""
+
 BY_DEFAULT: Final = {"video": True, "like_columns": True}
 """Settings that earlier versions left out where they were so."""
 
@@ -81,6 +84,7 @@ def already_recorded(
 def require_same_recording(stored: Mapping[str, Any], content: Mapping[str, Any], folder: Path) -> None:
     """Raise FieldError unless both settings describe the same episodes."""
     left_out = {name: value for name, value in BY_DEFAULT.items() if name in content}
+    left_out |= {name: content[name] for name in DIGESTS if name in content}  # earlier versions wrote none
     require_same(folder, {**left_out, **stored}, content)
 
 

@@ -23,8 +23,10 @@ ADAPTERS_FILE = "adapter_model.safetensors"
 SETTINGS: Final = ("config.json", "adapter_config.json")
 """A checkpoint's files of settings."""
 
-PARTS: Final = ("base_model_name_or_path", "world_model_path", "proposal_path")
-"""Settings in them that name further checkpoints."""
+PARTS: Final = (
+    "base_model_name_or_path", "world_model_path", "text_world_model_path", "proposal_path",
+)  # fmt: skip
+"""Settings of policies that name further checkpoints."""
 
 MODEL_FILES: Final = (*SETTINGS, "*processor.json", "*.safetensors")
 """A checkpoint's files that say how its model acts: settings, processors with their numbers, weights."""
@@ -138,16 +140,20 @@ def weights_digest(state: Mapping[str, Tensor]) -> str:
     return found.hexdigest()[:16]
 
 
-def checkpoint_digest(path: str | Path) -> str:
+def checkpoint_digest(path: str | Path, parts: bool = True) -> str:
     """Return a short digest of the files that a checkpoint's model is loaded from.
 
-    Unlike the name it changes where another model was trained in the same folder. Models on this machine that
-    it is made of count too: what an adapter was trained on, the world model of a planner.
+    Unlike the name it changes where another model was trained in the same folder.
+
+    Args:
+        path: the checkpoint.
+        parts: whether models on this machine that it is made of count too: what an adapter was trained on,
+            the world model of a planner.
     """
     folder, found = local_checkpoint(path, MODEL_FILES), hashlib.sha256()
     for file in sorted(each for pattern in MODEL_FILES for each in folder.glob(pattern)):
         found.update(f"{file.name} {file_digest(file)}".encode())
-    for part in parts_of(folder):
+    for part in parts_of(folder) if parts else ():
         found.update(checkpoint_digest(part).encode())
     return found.hexdigest()[:12]
 

@@ -3,10 +3,12 @@
 import shutil
 from pathlib import Path
 
+import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import PushtEnv
 
 from lerobot_wmrl.common.checkpoints import resolve_checkpoint
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.content import content_of
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
@@ -37,3 +39,12 @@ def test_models_datasets_and_files_are_known_by_their_content(
         "world_model_path", "dataset", "dataset.frames",
     }  # fmt: skip
     assert content_of(PushtEnv()) == content_of(None) == {}
+
+
+def test_what_is_not_there_is_named_by_its_setting(trained_models: dict[str, Path], tmp_path: Path) -> None:
+    env = WorldModelEnv(
+        world_model_path=str(trained_models["action_world_model"]),
+        text_world_model_path=str(tmp_path / "nothing"), reward=GeneralConfig(),
+    )  # fmt: skip
+    with pytest.raises(FieldError, match=r"^text_world_model_path=.*nothing: nothing can be read there"):
+        content_of(env)

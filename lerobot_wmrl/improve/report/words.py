@@ -137,12 +137,13 @@ def reservations(improvement: Improvement) -> list[str]:
             "there, label what they did, and run the command again on all episodes."
         )
     if reason := read_record(improvement.out, "rl").get(FAILED):
-        left = "A checkpoint from before that is compared" if improvement.has_trained else "It left no policy"
+        kept = improvement.has_trained and not improvement.kept_start
+        left = "A checkpoint from before that is compared" if kept else "It left no policy"
         found.append(f"RL stopped ({improvement.out / 'logs' / 'rl.log'}). {left}. {reason}")
     if improvement.kept_start:
         found.append(
             "RL gained nothing: no checkpoint succeeded more often in the real environment than the policy "
-            "that it began with, whatever imagination says of them. That one is compared as what it is."
+            "that it began with, whatever imagination says of them."
         )
     if improvement.config.distils and not improvement.has_distilled:
         log = improvement.out / "logs" / "distilled.log"
