@@ -21,7 +21,7 @@ from lerobot_wmrl.data.dataset import ChosenEpisodes, open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.improve import improvement as decisions
 from lerobot_wmrl.improve.configuration_improve import ImproveConfig
-from lerobot_wmrl.improve.improvement import CLONED, DISTILLED, SFT, Improvement
+from lerobot_wmrl.improve.improvement import CLONED, FITTED, SFT, Improvement
 from lerobot_wmrl.scripts import train
 from lerobot_wmrl.scripts.improve import improve
 from tests.pusht import record_pusht
@@ -76,9 +76,11 @@ def test_with_a_real_environment_its_rollouts_are_learnt_from_and_success_is_mea
     assert "observation.image 96x96" in first.stdout
     assert "size tiny: about a minute on two cores, plus the time in pusht" in first.stdout
     report = (folder / "report.html").read_text()
-    assert report.count("<td>0 % (0 of 2; 0–66 %)</td>") == 4, "four policies"
-    assert f"{DISTILLED}, against {CLONED}: 0 starts gained" in report
-    assert f"{DISTILLED}, against {SFT}: 0 starts gained" in first.stdout
+    assert report.count("<td>0 % (0 of 2; 0–66 %)</td>") == 3, "three policies: RL has kept the one before"
+    assert f"{FITTED}, against {CLONED}: 0 starts gained" in report
+    assert f"{FITTED}, against {SFT}: 0 starts gained" in first.stdout
+    assert "RL gained nothing: no checkpoint succeeded more often" in report
+    assert "RL gained nothing" in first.stdout
     assert f"Policy to use: {SFT}, " in first.stdout, "none ever succeeds, and this one costs no training"
     assert "2 rollouts of the SFT policy in pusht, exploration 0.2: 0 succeed" in report
     assert "failures: 2. The world model will hardly tell them" in report
