@@ -19,33 +19,20 @@ from pathlib import Path
 from typing import Any
 from weakref import WeakValueDictionary
 
-import draccus
 import torch
 from lerobot.rewards import make_reward_model
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.precision import compute_in, keep_freed_memory
-from lerobot_wmrl.common.presets import preset_flags, presets_of
-from lerobot_wmrl.scripts.train_world_model import TRAINED, TrainWorldModelConfig
-from workloads import random_clip, random_frames
+from lerobot_wmrl.common.presets import presets_of
+from lerobot_wmrl.scripts.train_world_model import TRAINED
+from workloads import preset_config, random_clip, random_frames, training_step
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
 GB = 1e9
 TRAINED_COPIES = 4
 """Float32 numbers of a trained weight: itself, its gradient, two moments."""
-
-
-def preset_of(preset: str, kind: str) -> TrainWorldModelConfig:
-    """The training command's configuration with `--preset`, with the preset's own tokenizer."""
-    tokenizer, config = (
-        draccus.parse(TrainWorldModelConfig, args=[
-            *preset_flags(preset, "train-world-model", [each]), f"--model.type={each}", "--model.device=cpu",
-        ])
-        for each in ("frame_tokenizer", kind)
-    )  # fmt: skip
-    config.model.tokenizer = tokenizer.model.tokenizer
-    return config
 
 
 def kept_bytes(model: Any, batch: Any) -> int:
@@ -71,7 +58,8 @@ def kept_bytes(model: Any, batch: Any) -> int:
 
 def measured(preset: str, kind: str, steps: int) -> dict[str, Any]:
     """Sizes and memory of one model, and its first steps."""
-    config = preset_of(preset, kind)
+    config, tokenizer = preset_config(preset, kind), preset_config(preset, "frame_tokenizer")
+    config.model.tokenizer = tokenizer.model.tokenizer
     torch.manual_seed(0)
     model: Any = make_reward_model(config.model).train()
     make = random_frames if kind == "frame_tokenizer" else random_clip
@@ -84,15 +72,8 @@ def measured(preset: str, kind: str, steps: int) -> dict[str, Any]:
     trained = [parameter for parameter in model.parameters() if parameter.requires_grad]
     count = sum(parameter.numel() for parameter in trained)
     fixed = 4 * (TRAINED_COPIES * count + sum(p.numel() for p in model.parameters() if not p.requires_grad))
-    optimizer = config.model.get_optimizer_preset().build(trained)
-    losses, began = [], time.perf_counter()
-    for _ in range(steps):
-        with compute_in(torch.bfloat16, device):
-            loss, _ = model(batch)
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        losses.append(loss.item())
+    step, began = training_step(model, batch, torch.bfloat16), time.perf_counter()
+    losses = [step().item() for _ in range(steps)]
     if not all(map(math.isfinite, losses)):
         raise ValueError(f"{preset}, {kind}: losses {losses}")
     return {

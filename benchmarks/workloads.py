@@ -1,16 +1,20 @@
 """What `world_model.py` and `training_memory.py` measure: world models that imagine, and that learn."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import draccus
 import torch
+from lerobot.rewards.pretrained import PreTrainedRewardModel
 from torch import Tensor
 
 from lerobot_wmrl.common.cuda_graphs import cuda_graphs
 from lerobot_wmrl.common.precision import compute_in
+from lerobot_wmrl.common.presets import preset_flags
 from lerobot_wmrl.data.clips import Clip
 from lerobot_wmrl.data.frames import Context, Frames
+from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig
 from lerobot_wmrl.world_models.anchored.imagination import AnchoredImagination
 from lerobot_wmrl.world_models.autoregressive.dynamics import AutoregressiveImagination
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig
@@ -147,16 +151,27 @@ def random_clip(model: WorldModelRewardModel, batch: int, device: torch.device) 
     )  # fmt: skip
 
 
-def training_step(model: ActionWorldModelRewardModel, clip: Clip, dtype: torch.dtype) -> Work:
-    """Loss, gradient and optimiser step on one batch, self-forcing included."""
+def preset_config(preset: str, kind: str, flags: Sequence[str] = ()) -> TrainWorldModelConfig:
+    """The configuration that the training command has with `--preset` and `flags`."""
+    sizes = preset_flags(preset, "train-world-model", [kind])
+    return draccus.parse(
+        TrainWorldModelConfig, args=[*sizes, f"--model.type={kind}", "--model.device=cpu", *flags]
+    )
+
+
+def training_step(
+    model: PreTrainedRewardModel, batch: Clip | dict[str, Tensor], dtype: torch.dtype
+) -> Callable[[], Tensor]:
+    """Loss, gradient and optimiser step on one batch, self-forcing included. Returns the loss."""
     parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
     optimizer: Any = model.config.get_optimizer_preset().build(parameters)
 
-    def descend() -> None:
-        with cuda_graphs(), compute_in(dtype, clip.tokens.device):
-            loss, _ = model(clip)
+    def descend() -> Tensor:
+        with cuda_graphs(), compute_in(dtype, parameters[0].device):
+            loss, _ = model(batch)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
+        return loss.detach()
 
     return descend

@@ -22,20 +22,18 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import draccus
 import torch
 from lerobot.utils.import_utils import register_third_party_plugins
 from torch.utils.flop_counter import FlopCounterMode
 
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.precision import imagination_dtype, keep_freed_memory
-from lerobot_wmrl.common.presets import preset_flags, presets_of
+from lerobot_wmrl.common.presets import presets_of
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
-from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 from machine import matmul_rate, rates, stream_rate
-from workloads import STEPS, Imagination, Work, random_clip, repeated, training_step
+from workloads import STEPS, Imagination, Work, preset_config, random_clip, repeated, training_step
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
 BATCHES = (1, 16, 64, 256)
@@ -136,18 +134,11 @@ def make_model(given: argparse.Namespace, flags: Sequence[str]) -> ActionWorldMo
         model: ActionWorldModelRewardModel = load_model(given.world_model, "action_world_model", device)
         return model
     tokenizer, config = (
-        preset_config(given.sizes, kind, flags if kind == "action_world_model" else ())
+        preset_config(given.sizes, kind, flags if kind == "action_world_model" else ()).model
         for kind in ("frame_tokenizer", "action_world_model")
     )
     config.device, config.tokenizer = device, tokenizer.tokenizer
     return ActionWorldModelRewardModel(config).to(device).eval()
-
-
-def preset_config(preset: str, kind: str, flags: Sequence[str]) -> Any:
-    """The model's configuration that the training command has with `--preset` and `flags`."""
-    sizes = preset_flags(preset, "train-world-model", [kind])
-    given = [*sizes, f"--model.type={kind}", "--model.device=cpu", *flags]
-    return draccus.parse(TrainWorldModelConfig, args=given).model
 
 
 def add_model(parser: argparse.ArgumentParser) -> None:

@@ -68,10 +68,10 @@ def train_policy(cfg: TrainConfig) -> None:
     if isinstance(cfg.algorithm, DistillationConfig):
         require_distillable(config)
     PartialState(cpu=config.device == "cpu", timeout=LONGEST_WAIT)
-    done = finished(cfg)
+    content, done = named_content(cfg, config), finished(cfg)
     wait_for_all()  # no process has written anything before all have looked
     if done:
-        require_free(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER, content=named_content(cfg, config))
+        require_free(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER, content=content)
         if is_first_process():
             link_latest(cfg.output_dir)
         print(f"{cfg.output_dir}: already trained for {cfg.iterations} iterations")
@@ -79,7 +79,6 @@ def train_policy(cfg: TrainConfig) -> None:
         set_seed(cfg.seed)
         policy, processors = load_policy(config), load_processors(config)
         settings = draccus.encode(cfg)  # an environment of the hub tells its configuration of its actions
-        content = named_content(cfg, config)
         require_free(cfg.output_dir, settings, MAY_DIFFER, content=content)
         with within("env"):
             env = make_tensor_env(cfg.env, cfg.num_envs, config.device or "cpu")
