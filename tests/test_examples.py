@@ -1,11 +1,31 @@
+import runpy
 from pathlib import Path
 
 import numpy as np
 import pytest
+from gymnasium.envs.registration import registry
+from lerobot.envs.configs import EnvConfig
 
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from tests.pusht import record_pusht
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+@pytest.mark.parametrize(
+    ("folder", "type_name", "columns"), [("gym_hil", "hil_pick", 4), ("metaworld", "metaworld_small", 2)]
+)
+def test_an_environment_shows_what_its_script_records(folder, type_name, columns, monkeypatch):
+    monkeypatch.syspath_prepend(EXAMPLES / folder)
+    recorded = runpy.run_path(str(EXAMPLES / folder / "record.py"))["FEATURES"]
+    env = EnvConfig.get_choice_class(type_name)()
+    assert env.gym_id in registry
+    shapes = {env.features_map[name]: feature.shape for name, feature in env.features.items()}
+    both = shapes.keys() & recorded.keys()
+    assert {"action", "observation.state"} <= both
+    assert len(both) == columns
+    assert all(shapes[column] == recorded[column]["shape"] for column in both)
 
 
 @pytest.fixture(scope="module")

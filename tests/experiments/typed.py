@@ -139,7 +139,7 @@ def check_module(arguments: list[str]) -> None:
         if not module_name.startswith("experiments"):
             return
     else:
-        sys.path[:0] = [str(ROOT / folder) for folder in ("benchmarks", "examples", "tools")]
+        sys.path.insert(0, str((ROOT / arguments[0]).parent))
         module_name, flags = Path(arguments[0]).stem, arguments[1:]
     try:
         import_module(module_name).make_parser().parse_known_args(flags)

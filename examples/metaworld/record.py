@@ -1,10 +1,11 @@
 """Record a Meta-World task with its scripted expert, made worse by noise, by LeRobot's own API alone.
 
-    pip install 'lerobot[metaworld]' 'mujoco<3.17'
-    MUJOCO_GL=egl python examples/record_metaworld.py --task=push-v3 --root=outputs/metaworld
+    pip install examples/metaworld
+    MUJOCO_GL=egl python examples/metaworld/record.py --task=push-v3 --root=outputs/metaworld
 
 The expert's skill is drawn for each episode: the noise on its actions (`--noise`). LeRobot's environment ends
-an episode at its first success, so that success is recorded in one frame alone. Nothing here imports
+an episode at its first success, so that success is recorded in one frame alone. `--small` records frames of
+96 pixels in place of 480, which is what `--env.type=metaworld_small` shows to a policy. Nothing here imports
 `lerobot_wmrl`: the dataset is what a LeRobot user would bring.
 """
 
@@ -14,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import MetaworldEnv as MetaworldConfig
+from lerobot_env_metaworld_small import make as make_small
 from tqdm import trange
 
 SMOOTHNESS = 0.8
@@ -23,11 +25,6 @@ WRITERS = 4
 """Threads that compress frames."""
 
 FEATURES = {
-    "observation.image": {
-        "dtype": "image",
-        "shape": (480, 480, 3),
-        "names": ["height", "width", "channels"],
-    },
     "observation.state": {"dtype": "float32", "shape": (4,), "names": ["x", "y", "z", "gripper"]},
     "action": {
         "dtype": "float32",
@@ -41,14 +38,19 @@ FEATURES = {
 }
 
 
-def record(task: str, root: Path, num_episodes: int, seed: int, noise: list[float], steps: int) -> None:
+def record(
+    task: str, root: Path, num_episodes: int, seed: int, noise: list[float], steps: int, small: bool
+) -> None:
     """Record the episodes and print how many succeed."""
     from lerobot.envs.metaworld import MetaworldEnv  # imports Meta-World
 
-    env = MetaworldEnv(task, obs_type="pixels_agent_pos")
+    env = (make_small if small else MetaworldEnv)(task, obs_type="pixels_agent_pos")
     fps = MetaworldConfig().fps
+    shape = env.observation_space["pixels"].shape
+    image = {"dtype": "image", "shape": shape, "names": ["height", "width", "channels"]}
+    features = {"observation.image": image, **FEATURES}
     dataset = LeRobotDataset.create(
-        f"local/{task}", fps, FEATURES, root=root, use_videos=False, image_writer_threads=WRITERS
+        f"local/{task}", fps, features, root=root, use_videos=False, image_writer_threads=WRITERS
     )
     successes = 0
     for episode in trange(num_episodes, unit="episode"):
@@ -90,6 +92,7 @@ def make_parser() -> argparse.ArgumentParser:
     noise = {"type": float, "nargs": "+", "default": [0.1, 0.4, 0.8]}
     parser.add_argument("--noise", **noise, help="standard deviation of the noise; actions are from -1 to 1")
     parser.add_argument("--steps", type=int, default=150, help="longest episode")
+    parser.add_argument("--small", action="store_true", help="frames of 96 pixels, without shadows")
     return parser
 
 
