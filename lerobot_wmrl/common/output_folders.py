@@ -3,6 +3,7 @@
 import json
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,7 +16,6 @@ from lerobot_wmrl.common.files import foreign_files, write_json
 CONFIG_FILE: Final = "train_config.json"
 """The settings of a run, in its folder."""
 
-
 CONTENT_FILE: Final = "content.json"
 """Digests of what the settings name."""
 
@@ -23,54 +23,62 @@ LOCK: Final = ".lock"
 """The file that a command locks while it writes the folder."""
 
 
-@contextmanager
-def claimed(
-    output_dir: Path, settings: Mapping[str, Any], free: Collection[str] = (), marker: str = CONFIG_FILE,
-    content: Mapping[str, str] | None = None,
-) -> Iterator[None]:  # fmt: skip
-    """Mark a new folder as this run's, or recognise it, and hold it against other commands.
+@dataclass(frozen=True)
+class Claim:
+    """What marks an output folder as one run's, so that the same command continues there and no other does.
 
     Args:
         output_dir: the folder.
         settings: of the run, as JSON.
-        free: settings that may differ between the first call and its continuation.
-        marker: file of the settings.
+        free: settings that may differ between the first call and its continuation. So may `output_dir`: a run
+            may be moved, but not one of stages, which name its folder.
         content: digests of what settings name, which may be made anew under the same name.
-
-    Raises:
-        FieldError: it holds something else, or another command writes there.
+        marker: file of the settings.
     """
-    require_free(output_dir, settings, free, marker, content)
-    output_dir.mkdir(parents=True, exist_ok=True)
-    with locked(output_dir, output_dir / LOCK):
-        # another command may have begun there meanwhile
-        require_free(output_dir, settings, free, marker, content)
-        if not (output_dir / marker).is_file():
-            if content:
-                write_json(output_dir / CONTENT_FILE, dict(content))
-            write_json(output_dir / marker, dict(settings))
-        yield
 
+    output_dir: Path
+    settings: Mapping[str, Any]
+    free: Collection[str] = ()
+    content: Mapping[str, str] = field(default_factory=dict)
+    marker: str = CONFIG_FILE
 
-def require_free(
-    output_dir: Path, settings: Mapping[str, Any], free: Collection[str] = (), marker: str = CONFIG_FILE,
-    content: Mapping[str, str] | None = None,
-) -> None:  # fmt: skip
-    """Raise FieldError unless the folder is new, empty or this run's; leave it as it is.
+    def check(self) -> None:
+        """Raise FieldError unless the folder is new, empty or this run's; leave it as it is."""
+        if self.output_dir.exists() and not self.output_dir.is_dir():
+            raise FieldError("output_dir", self.output_dir, "is a file", "choose a new folder")
+        if not self._stored.is_file():
+            require_empty(self.output_dir, self.marker, LOCK, CONTENT_FILE)
+            return
+        free = {"output_dir", *self.free} if self.marker == CONFIG_FILE else self.free
+        require_same(self.output_dir, json.loads(self._stored.read_text()), self.settings, free)
+        if self._stored_content.is_file():
+            stored = json.loads(self._stored_content.read_text())
+            require_same_content(self.output_dir, stored, self.content)
 
-    The settings called `free` may differ between the first call and its continuation. So may `output_dir`: a
-    run may be moved, but not one of stages, which name its folder.
-    """
-    stored = output_dir / marker
-    if output_dir.exists() and not output_dir.is_dir():
-        raise FieldError("output_dir", output_dir, "is a file", "choose a new folder")
-    if stored.is_file():
-        free = {"output_dir", *free} if marker == CONFIG_FILE else free
-        require_same(output_dir, json.loads(stored.read_text()), settings, free)
-        if content and (kept := output_dir / CONTENT_FILE).is_file():
-            require_same_content(output_dir, json.loads(kept.read_text()), content)
-    else:
-        require_empty(output_dir, marker, LOCK, CONTENT_FILE)
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Mark a new folder as this run's, or recognise it, and hold it against other commands.
+
+        Raises:
+            FieldError: it holds something else, or another command writes there.
+        """
+        self.check()
+        self.output_dir.mkdir(parents=True, exist_ok=True)
+        with locked(self.output_dir, self.output_dir / LOCK):
+            self.check()  # another command may have begun there meanwhile
+            if not self._stored.is_file():
+                if self.content:
+                    write_json(self._stored_content, dict(self.content))
+                write_json(self._stored, dict(self.settings))
+            yield
+
+    @property
+    def _stored(self) -> Path:
+        return self.output_dir / self.marker
+
+    @property
+    def _stored_content(self) -> Path:
+        return self.output_dir / CONTENT_FILE
 
 
 def require_empty(output_dir: Path, *own: str) -> None:

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from lerobot_wmrl.common.constants import DYNA, START_SCENE
 from lerobot_wmrl.common.errors import FieldError, first_line
 from lerobot_wmrl.common.output_folders import CONFIG_FILE
 from lerobot_wmrl.common.statistics import Proportion
-from lerobot_wmrl.data.dataset import ChosenEpisodes, DatasetSource, open_dataset
+from lerobot_wmrl.data.dataset import DatasetSource, open_dataset
 from lerobot_wmrl.data.episodes import EpisodeTable, choose_episodes, read_episodes
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.evaluation.calibration import Confusion
@@ -24,31 +25,53 @@ from lerobot_wmrl.maniskill.recordings import scene_splits
 from lerobot_wmrl.world_models.checkpoint import load_model
 
 
-def replayed_rollouts(env: WorldModelEnv, rollouts: ChosenEpisodes, split: str) -> Outcomes:
+@dataclass(frozen=True)
+class Rollouts:
+    """Labelled rollouts that a world model is checked on.
+
+    Args:
+        name: of their dataset.
+        table: all of its episodes.
+        chosen: indices of those that are meant. (E,)
+    """
+
+    name: str
+    table: EpisodeTable
+    chosen: np.ndarray
+
+    @classmethod
+    def read(
+        cls, source: DatasetSource, split: str = "all", episodes: Sequence[int] | None = None
+    ) -> "Rollouts":
+        """Open a dataset and choose, of these episodes, those of a split. FieldError if it cannot be read."""
+        table = read_episodes(source.open())
+        scenes, among = scene_splits(table.column(START_SCENE), split), table.among(episodes)
+        return cls(source.name, table, choose_episodes(table, split, len(table.length), scenes, among))
+
+    @property
+    def root(self) -> Path:
+        """Folder of the dataset."""
+        return Path(self.table.dataset.root)
+
+
+def replayed_rollouts(env: WorldModelEnv, rollouts: Rollouts) -> Outcomes:
     """Replay labelled rollouts in a world model, as long as an imagined episode lasts.
 
     Raises:
         FieldError: they do not fit the world model, have no labels, or do not both succeed and fail.
     """
     model = load_model(env.world_model_path, "action_world_model", env.device)
-    recording = labelled_recording(model, rollouts.open())
-    table = recording.table
-    recording = Recording(table.subset(replayed_episodes(table, split, rollouts.episodes)), recording.frames)
+    recording = labelled_recording(model, rollouts.table)
+    recording = Recording(rollouts.table.subset(rollouts.chosen), recording.frames)
     outcomes = predict_outcomes(model, recording).within(env.horizon)
-    for found, kind in ((outcomes.success, "succeeds"), (~outcomes.success, "fails")):
-        if not found.any():
+    for matching, kind in ((outcomes.success, "succeeds"), (~outcomes.success, "fails")):
+        if not matching.any():
             raise FieldError(
                 "dataset.root", rollouts.name,
-                f"none of the {len(found)} rollouts {kind} within {env.horizon} frames, so nobody knows how "
-                "often the world model errs", "give rollouts that both succeed and fail",
+                f"none of the {len(matching)} rollouts {kind} within {env.horizon} frames, so nobody knows "
+                "how often the world model errs", "give rollouts that both succeed and fail",
             )  # fmt: skip
     return outcomes
-
-
-def replayed_episodes(table: EpisodeTable, split: str, episodes: Sequence[int] | None) -> np.ndarray:
-    """Return the chosen episodes of a split. (E,)"""
-    scenes = scene_splits(table.column(START_SCENE), split)
-    return choose_episodes(table, split, len(table.length), scenes, table.among(episodes))
 
 
 def confusion_of(outcomes: Outcomes, env: WorldModelEnv) -> tuple[Confusion, list[str]]:
@@ -71,16 +94,15 @@ def confusion_of(outcomes: Outcomes, env: WorldModelEnv) -> tuple[Confusion, lis
     return Confusion(gate.recall, gate.false_positives), warnings
 
 
-def pooled_instructions(rollouts: ChosenEpisodes, split: str) -> list[str]:
+def pooled_instructions(rollouts: Rollouts) -> list[str]:
     """Return a warning if the rollouts have several instructions, which may be of several tasks."""
-    table = read_episodes(rollouts.open())
-    found = sorted({table.instructions[each] for each in replayed_episodes(table, split, rollouts.episodes)})
-    if len(found) < 2:
+    instructions = sorted({rollouts.table.instructions[episode] for episode in rollouts.chosen})
+    if len(instructions) < 2:
         return []
     return [
-        f"The rollouts have {len(found)} instructions ({found[0]!r}, {found[1]!r} …), over which successes "
-        "and errors are averaged. If they are of different tasks, judge each by itself: choose its rollouts "
-        "with --dataset.episodes."
+        f"The rollouts have {len(instructions)} instructions ({instructions[0]!r}, {instructions[1]!r} …), "
+        "over which successes and errors are averaged. If they are of different tasks, judge each by itself: "
+        "choose its rollouts with --dataset.episodes."
     ]
 
 
@@ -146,39 +168,28 @@ def trained_inside(policy: str, world_model: str) -> str | None:
     return None
 
 
-def learnt_from(
-    world_model: str, rollouts: DatasetSource, remedy: str, split: str = "all",
-    episodes: Sequence[int] | None = None,
-) -> list[str]:  # fmt: skip
-    """Return a warning if the world model has learnt from the rollouts that it is checked on, or from copies.
+def learnt_from(world_model: str, rollouts: Rollouts) -> int:
+    """Return how many of the rollouts the world model has learnt from, themselves or as copies.
 
     Trainings that it was continued from count too, as far as their settings and data lie on this machine.
     """
     sources = [settings.get("dataset") or {} for _, settings in _trainings(world_model, "model")]
     learnt = [
-        (str(root), chosen)
+        (str(root), episodes)
         for source in sources
-        for root, chosen in (
+        for root, episodes in (
             (source.get("root") or source.get("repo_id"), source.get("episodes")),
             *((more, None) for more in source.get("more", ())),
         )
         if root
     ]
-    table = read_episodes(rollouts.open())
-    judged = replayed_episodes(table, split, episodes)
+    table, chosen = rollouts.table, rollouts.chosen
     same = [root == rollouts.name or _same(Path(root), Path(rollouts.name)) for root, _ in learnt]
     if any(same):
-        chosen = [table.among(each) for (_, each), own in zip(learnt, same, strict=True) if own]
-        seen = int((np.any(chosen, axis=0) & ~table.validation)[judged].sum())
-    else:
-        others = (digest for root, chosen in learnt for digest in learnt_digests(Path(root), chosen))
-        seen = len(action_digests(table, judged) & {*others})
-    if not seen:
-        return []
-    return [
-        f"The world model has learnt from {seen} of these episodes ({rollouts.name}) and predicts them "
-        f"better than others: {remedy}"
-    ]
+        parts = [table.among(episodes) for (_, episodes), own in zip(learnt, same, strict=True) if own]
+        return int((np.any(parts, axis=0) & ~table.validation)[chosen].sum())
+    others = (digest for root, episodes in learnt for digest in learnt_digests(Path(root), episodes))
+    return len(action_digests(table, chosen) & {*others})
 
 
 def learnt_digests(root: Path, episodes: Sequence[int] | None) -> set[str]:

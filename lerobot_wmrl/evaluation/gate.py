@@ -12,7 +12,6 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 import torch
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from numpy.lib.stride_tricks import sliding_window_view
 from torch import Tensor
 
@@ -237,21 +236,20 @@ def success_gate(
     Raises:
         FieldError: the model cannot replay the dataset, or its episodes have no labels of success.
     """
-    recording = labelled_recording(model, open_dataset(dataset_root))
+    recording = labelled_recording(model, read_episodes(open_dataset(dataset_root)))
     return gate_at(predict_outcomes(model, recording), threshold, frames)
 
 
-def labelled_recording(model: ActionWorldModelRewardModel, dataset: LeRobotDataset) -> Recording:
-    """Read a dataset of rollouts that the model can replay and whose success is recorded.
+def labelled_recording(model: ActionWorldModelRewardModel, table: EpisodeTable) -> Recording:
+    """Return the recording of rollouts that the model can replay and whose success is recorded.
 
     Raises:
         FieldError: the dataset does not fit the model, or has no labels of success.
     """
-    table = read_episodes(dataset)
     check_dataset(model.config, table.dataset.meta)
     if not table.done_known:
         raise FieldError(
-            "dataset.root", dataset.root,
+            "dataset.root", table.dataset.root,
             "has neither next.success nor next.done, which say whether success holds",
             "use rollouts with labels",
         )  # fmt: skip

@@ -112,7 +112,7 @@ class Judgement:
     def __str__(self) -> str:
         width = max(map(len, self.outcomes))
         rows = [f"{name:<{width}}  {self._row(name)}" for name in self.outcomes]
-        return "\n".join([told(self.confusion), *self.warnings, self._basis(), "", *rows])
+        return "\n".join([confusion_sentence(self.confusion), *self.warnings, self._basis(), "", *rows])
 
     def _row(self, name: str) -> str:
         imagined = self.imagined(name)
@@ -139,7 +139,7 @@ class Judgement:
         )
 
 
-def told(confusion: Confusion) -> str:
+def confusion_sentence(confusion: Confusion) -> str:
     """Say what the world model makes of the rollouts."""
     return (
         f"Of the rollouts' successes the world model predicts {confusion.recall} as successes, of their "

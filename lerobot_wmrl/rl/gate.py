@@ -17,8 +17,9 @@ from termcolor import colored
 from lerobot_wmrl.common.constants import GATE_SEED
 from lerobot_wmrl.common.errors import TrainingStopped
 from lerobot_wmrl.data.dataset import open_dataset
+from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
-from lerobot_wmrl.evaluation.evidence import learnt_from
+from lerobot_wmrl.evaluation.evidence import Rollouts, learnt_from
 from lerobot_wmrl.evaluation.gate import Gate, Outcomes, gate_at, labelled_recording, predict_outcomes
 from lerobot_wmrl.evaluation.pictures import save_strip, side_by_side
 from lerobot_wmrl.evaluation.replay import Recording, replay_episodes
@@ -37,12 +38,6 @@ REMEDIES = (
     "model again, let Dyna rounds do so (`dyna.rounds`), take another checkpoint of it, or judge success "
     "more strictly (`env.done_threshold`, `env.done_frames`)"
 )
-
-
-OTHERS = (
-    "it takes fewer of their failures for successes. Give rollouts that it has not seen (`gate.dataset`)."
-)
-"""What follows where the world model has learnt from the rollouts."""
 
 
 @dataclass
@@ -75,10 +70,7 @@ class SuccessGate:
         """Return a verdict for each source of rollouts, and a warning if one is bad or there is none."""
         recordings: dict[str, Recording] = {}
         if self.config.dataset.given and self._new_model(iteration):
-            recordings[LABELLED] = labelled_recording(self.env.model, self.config.dataset.open())
-            path = str(self.env.model.config.pretrained_path)  # of the newest one after Dyna rounds
-            for warning in learnt_from(path, self.config.dataset, OTHERS):
-                logging.warning(colored(warning, "red", attrs=["bold"]))
+            recordings[LABELLED] = self._labelled()
         if self.recorder is not None:
             recordings[FRESH] = self._fresh(self.recorder, iteration, checkpoint, folder / "rollouts")
         verdicts = {}
@@ -107,11 +99,24 @@ class SuccessGate:
     def _new_model(self, iteration: int) -> bool:
         return iteration == 0 or iteration in self.refreshed
 
+    def _labelled(self) -> Recording:
+        """Read the labelled rollouts, and warn if the world model has learnt from them."""
+        rollouts = Rollouts.read(self.config.dataset)
+        path = str(self.env.model.config.pretrained_path)  # of the newest one after Dyna rounds
+        if learnt := learnt_from(path, rollouts):
+            warning = (
+                f"The world model has learnt from {learnt} of these episodes ({rollouts.name}), so it takes "
+                "fewer of their failures for successes than of others. Give rollouts that it has not seen "
+                "(`gate.dataset`)."
+            )
+            logging.warning(colored(warning, "red", attrs=["bold"]))
+        return labelled_recording(self.env.model, rollouts.table)
+
     def _fresh(self, recorder: Recorder, iteration: int, checkpoint: Path, folder: Path) -> Recording:
         """Record the current policy, from seeds that no earlier rollouts had."""
         episodes = self.config.n_episodes
         recorder.record(checkpoint, episodes, first_rollout_seed(iteration, episodes), folder)
-        return labelled_recording(self.env.model, open_dataset(folder))
+        return labelled_recording(self.env.model, read_episodes(open_dataset(folder)))
 
     def _above(self, verdict: Gate) -> bool:
         return verdict.false_positives.share > self.config.limit

@@ -16,7 +16,7 @@ finished batch. With early stopping `--n_episodes` may then be higher: the test 
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import draccus
 from lerobot.envs.configs import EnvConfig
@@ -25,7 +25,7 @@ from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
 from lerobot_wmrl.common.files import write_json, writing
-from lerobot_wmrl.common.output_folders import claimed, require_free
+from lerobot_wmrl.common.output_folders import Claim
 
 if TYPE_CHECKING:
     from lerobot.configs import PreTrainedConfig
@@ -97,13 +97,13 @@ def compare(cfg: CompareConfig) -> None:
     assert cfg.env is not None
     configs = read_policies(cfg.policies, cfg.env)
     cfg.policies = list(configs)
-    content = named_content(cfg)
-    require_free(cfg.output_dir, draccus.encode(cfg), may_differ(cfg), content=content)
+    claim = Claim(cfg.output_dir, draccus.encode(cfg), may_differ(cfg), named_content(cfg))
+    claim.check()
     comparison = Comparison(
         cfg.policies, cfg.n_episodes, cfg.against, cfg.alpha, cfg.stop_early, stored_episodes(cfg)
     )
     if not comparison.finished:
-        run(cfg, content, comparison, configs)
+        run(cfg, claim, comparison, configs)
     save_picture(comparison, cfg.output_dir / "comparison.png")
     print(f"{comparison}\n{RESULTS} and comparison.png are in {cfg.output_dir}")
 
@@ -131,9 +131,8 @@ def may_differ(cfg: CompareConfig) -> list[str]:
 
 
 def run(
-    cfg: CompareConfig, content: dict[str, str], comparison: "Comparison",
-    configs: "dict[str, PreTrainedConfig]",
-) -> None:  # fmt: skip
+    cfg: CompareConfig, claim: Claim, comparison: "Comparison", configs: "dict[str, PreTrainedConfig]"
+) -> None:
     """Run the episodes that are missing; write the results after every batch."""
     from lerobot_wmrl.evaluation.compare import (
         load_policies,
@@ -144,11 +143,10 @@ def run(
     from lerobot_wmrl.evaluation.comparison import RESULTS
 
     assert cfg.env is not None
-    settings: dict[str, Any] = draccus.encode(cfg)
 
     def save() -> None:
-        content = {"env": settings["env"], "seed": cfg.seed, **comparison.as_json()}
-        write_json(cfg.output_dir / RESULTS, content)
+        results = {"env": claim.settings["env"], "seed": cfg.seed, **comparison.as_json()}
+        write_json(cfg.output_dir / RESULTS, results)
 
     with (
         writing("output_dir", cfg.output_dir),
@@ -156,7 +154,7 @@ def run(
     ):
         require_new_starts(envs[0], cfg.env, cfg.n_episodes)
         policies = load_policies(configs)
-        with claimed(cfg.output_dir, settings, may_differ(cfg), content=content):
+        with claim.held():
             comparison.episodes[:] = stored_episodes(cfg)  # another command may have added some meanwhile
             run_comparison(comparison, envs, cfg.env, policies, cfg.batch_size, cfg.seed, save)
 

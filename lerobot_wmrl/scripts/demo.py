@@ -17,14 +17,15 @@ from lerobot_wmrl.demo.stages import Demo, DemoConfig, conclusion
 
 def run_demo(cfg: DemoConfig) -> None:
     """Run every stage, write the report, and say what came of it."""
-    from lerobot_wmrl.common.output_folders import claimed
+    from lerobot_wmrl.common.output_folders import Claim
     from lerobot_wmrl.common.stages import MARKER, run_stages
     from lerobot_wmrl.maniskill.backend import require_simulator
 
     cfg.validate()
     require_simulator()
     demo = Demo(cfg)
-    with claimed(cfg.output_dir, {**asdict(cfg), "output_dir": str(cfg.output_dir)}, marker=MARKER):
+    settings = {**asdict(cfg), "output_dir": str(cfg.output_dir)}
+    with Claim(cfg.output_dir, settings, marker=MARKER).held():
         run_stages(demo.stages(), cfg.output_dir, ["lerobot_wmrl.maniskill.simulation"], offline=True)
         page = demo.page()
         path = page.write(cfg.output_dir)

@@ -26,7 +26,7 @@ from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least
-from lerobot_wmrl.common.output_folders import claimed
+from lerobot_wmrl.common.output_folders import Claim
 from lerobot_wmrl.common.presets import expand_preset
 from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
@@ -140,7 +140,7 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     scenes = scene_splits(table.column(START_SCENE), cfg.split)
     chosen = table.among(cfg.dataset.episodes)
     episodes = choose_episodes(table, cfg.split, cfg.max_episodes, scenes, chosen)
-    with claimed(cfg.output_dir, draccus.encode(cfg)):
+    with Claim(cfg.output_dir, draccus.encode(cfg)).held():
         measure(cfg, model, text_model, table, episodes, imagination)
 
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 def improve(cfg: ImproveConfig) -> None:
     """Run every stage, write the report, and say what came of it."""
     from lerobot_wmrl.common.checkpoints import checkpoint_digest
-    from lerobot_wmrl.common.output_folders import claimed
+    from lerobot_wmrl.common.output_folders import Claim
     from lerobot_wmrl.common.stages import MARKER, run_stages
     from lerobot_wmrl.data.dataset import fingerprint
     from lerobot_wmrl.improve import commands
@@ -41,11 +41,11 @@ def improve(cfg: ImproveConfig) -> None:
     print(f"{cfg.dataset.name}:\n{improvement.found}\n  {improvement.duration}")
     stages = commands.stages(improvement)
     assert cfg.policy is not None
-    given = {
-        **settings(cfg, stages), "the dataset's content": fingerprint(improvement.found.root),
-        "the policy's content": checkpoint_digest(str(cfg.policy.pretrained_path)),
-    }  # fmt: skip
-    with claimed(cfg.output_dir, given, marker=MARKER):
+    content = {
+        "dataset": fingerprint(improvement.found.root),
+        "policy": checkpoint_digest(str(cfg.policy.pretrained_path)),
+    }
+    with Claim(cfg.output_dir, settings(cfg, stages), content=content, marker=MARKER).held():
         improvement.copy_policy()
         run_stages(stages, cfg.output_dir)
         page = Page.of(improvement)

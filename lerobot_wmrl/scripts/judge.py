@@ -23,7 +23,7 @@ may be given then: what has been imagined is kept.
 
 import json
 from collections.abc import Collection, Mapping
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, field, replace
 from math import ceil
 from pathlib import Path
@@ -36,7 +36,7 @@ from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.errors import FieldError, Stopped, regrouped, renamed, require_at_least
 from lerobot_wmrl.common.files import write_json, writing
-from lerobot_wmrl.common.output_folders import claimed, require_free
+from lerobot_wmrl.common.output_folders import Claim
 from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
@@ -46,6 +46,7 @@ if TYPE_CHECKING:
 
     from lerobot_wmrl.common.statistics import Proportion
     from lerobot_wmrl.evaluation.compare import Envs
+    from lerobot_wmrl.evaluation.evidence import Rollouts
     from lerobot_wmrl.evaluation.judgement import Judgement
 
 
@@ -145,12 +146,6 @@ class JudgeConfig(RunConfig):
             )  # fmt: skip
 
 
-HELD_OUT = (
-    "estimates and intervals are wrong. Take those that were held out (--split=validation of the dataset "
-    "that it was trained on), or others."
-)
-"""What follows where the world model has learnt from the rollouts."""
-
 MAY_DIFFER = ("policies", "references", "coverage")
 """Settings that change no imagined episode of a policy. Device and batch size do: by its number format."""
 
@@ -159,44 +154,53 @@ def judge(cfg: JudgeConfig) -> None:
     """Replay the rollouts and imagine what is missing of the episodes; write the results."""
     from lerobot_wmrl.common.checkpoints import checkpoint_digest, resolved_name
     from lerobot_wmrl.evaluation.evidence import (
+        Rollouts,
         confusion_of,
-        learnt_from,
         pooled_instructions,
         replayed_rollouts,
         trained_inside,
     )
-    from lerobot_wmrl.evaluation.judgement import LEAST_YOUDEN, Judgement, save_picture, told
+    from lerobot_wmrl.evaluation.judgement import LEAST_YOUDEN, Judgement, confusion_sentence, save_picture
 
     cfg.validate()
     cfg.world_model.path = resolved_name(cfg.world_model.path)
     env = cfg.imagination()
     configs, references = read_both(cfg, env)
-    content = named_content(cfg, env)
-    require_free(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER, content=content)
-    confusion, warnings = confusion_of(replayed_rollouts(env, cfg.dataset, cfg.split), env)
+    rollouts = Rollouts.read(cfg.dataset, cfg.split, cfg.dataset.episodes)
+    claim = Claim(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER, named_content(cfg, env, rollouts.root))
+    claim.check()
+    confusion, warnings = confusion_of(replayed_rollouts(env, rollouts), env)
     if not confusion.youden >= LEAST_YOUDEN:
         raise Stopped(
-            f"{told(confusion)} That is too little to judge by. Choose another --done_threshold or "
-            "--done_frames (lerobot-wmrl-eval-world-model shows what they do), or train the world model on "
-            "more failures"
+            f"{confusion_sentence(confusion)} That is too little to judge by. Choose another "
+            "--done_threshold or --done_frames (lerobot-wmrl-eval-world-model shows what they do), or train "
+            "the world model on more failures"
         )
-    reasons = {name: trained_inside(name, cfg.world_model.path) for name in configs}
-    judgement = Judgement(
-        confusion, references, {name: why for name, why in reasons.items() if why}, cfg.coverage,
-        [
-            *learnt_from(cfg.world_model.path, cfg.dataset, HELD_OUT, cfg.split, cfg.dataset.episodes),
-            *pooled_instructions(cfg.dataset, cfg.split), *warnings,
-        ],
-        checkpoints={name: checkpoint_digest(name) for name in configs},
-    )  # fmt: skip
+    warnings = [*unfit(rollouts, cfg.world_model.path), *pooled_instructions(rollouts), *warnings]
+    refused = {name: why for name in configs if (why := trained_inside(name, cfg.world_model.path))}
+    checkpoints = {name: checkpoint_digest(name) for name in configs}
+    judgement = Judgement(confusion, references, refused, cfg.coverage, warnings, checkpoints=checkpoints)
     remember(judgement, cfg, configs)
     with writing("output_dir", cfg.output_dir):
-        imagine(cfg, env, judgement, configs, content)
+        imagine(cfg, env, judgement, configs, len(rollouts.chosen), claim)
         save_picture(judgement, cfg.output_dir / "judgement.png")
     print(
         f"{judgement}\n\njudgement.json and judgement.png are in {cfg.output_dir}. Next: try the best in "
         "reality, and give the success that you count as --references"
     )
+
+
+def unfit(rollouts: "Rollouts", world_model: str) -> list[str]:
+    """Return a warning if the world model has learnt from the rollouts."""
+    from lerobot_wmrl.evaluation.evidence import learnt_from
+
+    if not (learnt := learnt_from(world_model, rollouts)):
+        return []
+    return [
+        f"The world model has learnt from {learnt} of these episodes ({rollouts.name}) and predicts them "
+        "better than others: estimates and intervals are wrong. Take those that were held out "
+        "(--split=validation of the dataset that it was trained on), or others."
+    ]
 
 
 def read_both(
@@ -221,14 +225,20 @@ def read_both(
     return others | judged, dict(zip(others, known.values(), strict=True))
 
 
-def named_content(cfg: JudgeConfig, env: WorldModelEnv) -> dict[str, str]:
+def named_content(cfg: JudgeConfig, env: WorldModelEnv, rollouts: Path) -> dict[str, str]:
     """Return digests of the rollouts, and of what imagined episodes follow from beside the policy."""
     from lerobot_wmrl.data.dataset import fingerprint
     from lerobot_wmrl.envs.content import content_of
 
-    rollouts = {"rollouts": fingerprint(Path(cfg.dataset.open().root))}
-    with regrouped("dataset", "starts") if cfg.starts_given else nullcontext():
-        return rollouts | content_of(env)
+    with starts_as_typed(cfg):
+        content = content_of(env)
+    return content | {"rollouts": fingerprint(rollouts) if cfg.starts_given else content["dataset"]}
+
+
+def starts_as_typed(cfg: JudgeConfig) -> AbstractContextManager[None]:
+    """Name the starts' settings in an error that leaves the block as they were given: `starts`, or, where
+    they are the rollouts, `dataset`."""
+    return regrouped("dataset", "starts") if cfg.starts_given else nullcontext()
 
 
 def remember(judgement: "Judgement", cfg: JudgeConfig, configs: Collection[str]) -> None:
@@ -262,9 +272,12 @@ def remember(judgement: "Judgement", cfg: JudgeConfig, configs: Collection[str])
 
 def imagine(
     cfg: JudgeConfig, env: WorldModelEnv, judgement: "Judgement", configs: "Mapping[str, PreTrainedConfig]",
-    content: dict[str, str],
+    rollouts: int, claim: Claim,
 ) -> None:  # fmt: skip
-    """Imagine the episodes of the policies that have none yet; write the results after every policy."""
+    """Imagine the episodes of the policies that have none yet; write the results after every policy.
+
+    rollouts: how many there are, and so how many starts, unless others are given.
+    """
     from lerobot_wmrl.evaluation.compare import about_policy, load_policies, opened, run_block
     from lerobot_wmrl.evaluation.judgement import RESULTS
 
@@ -272,26 +285,27 @@ def imagine(
         finished = configs.keys() == judgement.outcomes.keys()
         write_json(cfg.output_dir / RESULTS, judgement.as_json(finished))
 
-    if not configs.keys() - judgement.outcomes.keys():
-        with claimed(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER, content=content):
+    most_starts = env.dataset.max_starts if cfg.starts_given else min(env.dataset.max_starts, rollouts)
+    size = even_batch(most_starts, cfg.batch_size)
+    with ExitStack() as held:
+        if missing := [name for name in configs if name not in judgement.outcomes]:
+            with starts_as_typed(cfg):
+                (envs,) = held.enter_context(opened(env, size, False, 1))
+            starts = starts_of_one_task(envs, cfg)
+        held.enter_context(claim.held())
+        remember(judgement, cfg, configs)  # what another has added
+        write()
+        for name in tqdm(missing, desc="Imagining", unit="policy"):
+            if name in judgement.outcomes:
+                continue
+            with about_policy(name):
+                policies = load_policies({name: configs[name]})
+                blocks = [  # the seed of an episode is the number of its start
+                    run_block([envs], env, policies, min(size, starts - begin), begin)
+                    for begin in range(0, starts, size)
+                ]
+            judgement.outcomes[name] = [episode.successes[0] for block in blocks for episode in block]
             write()
-        return
-    size = even_batch(env.dataset.max_starts, cfg.batch_size)
-    group = regrouped("dataset", "starts") if cfg.starts_given else nullcontext()
-    with group, opened(env, size, False, 1) as (envs,):
-        starts = starts_of_one_task(envs, cfg)
-        with claimed(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER, content=content):
-            remember(judgement, cfg, configs)  # what another has added
-            missing = {name: config for name, config in configs.items() if name not in judgement.outcomes}
-            for name, config in tqdm(missing.items(), desc="Imagining", unit="policy"):
-                with about_policy(name):
-                    policies = load_policies({name: config})
-                    blocks = [  # the seed of an episode is the number of its start
-                        run_block([envs], env, policies, min(size, starts - begin), begin)
-                        for begin in range(0, starts, size)
-                    ]
-                judgement.outcomes[name] = [episode.successes[0] for block in blocks for episode in block]
-                write()
 
 
 def even_batch(episodes: int, most: int) -> int:

@@ -31,7 +31,7 @@ from lerobot_wmrl.common.command_line import run_command
 from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.distributed import LONGEST_WAIT, is_first_process, rank_and_size, wait_for_all
 from lerobot_wmrl.common.errors import FieldError, within
-from lerobot_wmrl.common.output_folders import claimed, require_free
+from lerobot_wmrl.common.output_folders import Claim
 from lerobot_wmrl.common.precision import keep_freed_memory
 from lerobot_wmrl.common.presets import expand_preset
 from lerobot_wmrl.common.tracking import make_wandb
@@ -71,19 +71,20 @@ def train_policy(cfg: TrainConfig) -> None:
     content, done = named_content(cfg, config), finished(cfg)
     wait_for_all()  # no process has written anything before all have looked
     if done:
-        require_free(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER, content=content)
+        Claim(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER, content).check()
         if is_first_process():
             link_latest(cfg.output_dir)
         print(f"{cfg.output_dir}: already trained for {cfg.iterations} iterations")
     else:
         set_seed(cfg.seed)
         policy, processors = load_policy(config), load_processors(config)
-        settings = draccus.encode(cfg)  # an environment of the hub tells its configuration of its actions
-        require_free(cfg.output_dir, settings, MAY_DIFFER, content=content)
+        # now, because an environment of the hub tells its configuration of its actions
+        claim = Claim(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER, content)
+        claim.check()
         with within("env"):
             env = make_tensor_env(cfg.env, cfg.num_envs, config.device or "cpu")
         try:
-            train_in(env, cfg, settings, content, policy, processors)
+            train_in(env, cfg, claim, policy, processors)
         finally:
             env.close()
     if is_first_process():
@@ -120,15 +121,9 @@ def finished(cfg: TrainConfig) -> bool:
 
 
 def train_in(
-    env: TensorEnv,
-    cfg: TrainConfig,
-    settings: dict[str, Any],
-    content: dict[str, str],
-    policy: Any,
-    processors: tuple[Any, Any],
+    env: TensorEnv, cfg: TrainConfig, claim: Claim, policy: Any, processors: tuple[Any, Any]
 ) -> None:
-    """Check that policy and environment fit, then train. `settings` are the configuration's, as JSON, and
-    `content` says what they name."""
+    """Check that policy and environment fit, then train in the output folder of the claim."""
     from lerobot_wmrl.common.pipeline import make_pipeline
     from lerobot_wmrl.common.policies import adopt_features, check_fit, learnt_range, with_new_adapters
     from lerobot_wmrl.envs.lerobot_env import LeRobotTensorEnv, check_frame_rate, check_real_env, shapes_of
@@ -171,7 +166,7 @@ def train_in(
 
     schedule = Schedule(cfg.iterations, cfg.save_freq, cfg.seed, cfg.log_freq)
     first = is_first_process()
-    with claimed(cfg.output_dir, settings, MAY_DIFFER, content=content) if first else nullcontext():
+    with claim.held() if first else nullcontext():
         if first and cfg.budget is not None and not isinstance(cfg.env, WorldModelEnv):
             steps = cfg.iterations * cfg.num_envs * rank_and_size()[1] * buffer.steps
             charge_steps(cfg.budget, cfg.output_dir, steps, env.max_episode_steps)

@@ -29,7 +29,7 @@ from lerobot_wmrl.common.command_line import RunConfig, run_command, settings_be
 from lerobot_wmrl.common.distributed import LONGEST_WAIT, is_first_process
 from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least, require_choice, within
 from lerobot_wmrl.common.files import write_json
-from lerobot_wmrl.common.output_folders import CONFIG_FILE, claimed, require_free
+from lerobot_wmrl.common.output_folders import CONFIG_FILE, Claim
 from lerobot_wmrl.common.precision import PRECISIONS, keep_freed_memory, training_dtype
 from lerobot_wmrl.common.presets import expand_preset, format_flags
 from lerobot_wmrl.common.tracking import make_wandb
@@ -43,9 +43,6 @@ MAY_DIFFER = ("resume", "job_name", "log_freq", "wandb")
 """Settings that a continued run may have otherwise than when it began."""
 
 HELD_OUT_FILE = "held_out.json"
-
-DATA_FILE = "datasets.json"
-"""What the datasets were like when a training began: their fingerprints."""
 
 
 @dataclass
@@ -168,18 +165,17 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
     check_data(cfg, table)
     cfg.precision = precision_of(cfg)
     begun = deepcopy(cfg)  # the model fills in what it takes from the data
-    given = draccus.encode(begun)
+    claim = Claim(cfg.output_dir, draccus.encode(begun), MAY_DIFFER, fingerprints(cfg, table))
     checkpoint = latest_checkpoint(cfg.output_dir)
     set_seed(cfg.seed)
-    require_free(cfg.output_dir, given, MAY_DIFFER)
+    claim.check()
     if is_first_process():
         link_latest(cfg.output_dir)
     model: Any = build_model(cfg.model, table, cfg.output_dir)
-    require_same_data(cfg, table)
     if checkpoint is not None and int(checkpoint.name) >= cfg.steps:
         print(f"{cfg.output_dir}: already trained for {cfg.steps} steps")
     else:
-        run_training(begun, model, table, processes)
+        run_training(begun, claim, model, table, processes)
     if is_first_process():
         print(f"\n{conclusion(cfg, model, table)}")
         if cfg.model.push_to_hub:
@@ -197,23 +193,14 @@ def precision_of(cfg: TrainWorldModelConfig) -> str:
     return str(training_dtype(cfg.precision, cfg.model.device)).removeprefix("torch.")
 
 
-def require_same_data(cfg: TrainWorldModelConfig, table: EpisodeTable) -> None:
-    """Raise FieldError if a dataset has changed since the training in the output folder began."""
-    stored = cfg.output_dir / DATA_FILE
-    if stored.is_file() and json.loads(stored.read_text()) != fingerprints(cfg, table):
-        raise FieldError(
-            "dataset.root", table.dataset.root, f"has changed since the training in {cfg.output_dir} began",
-            "choose another `output_dir`, or restore the dataset to continue",
-        )  # fmt: skip
-
-
-def fingerprints(cfg: TrainWorldModelConfig, table: EpisodeTable) -> list[str]:
-    """Return what tells the content of each dataset."""
-    return [fingerprint(Path(root)) for root in (table.dataset.root, *cfg.dataset.more)]
+def fingerprints(cfg: TrainWorldModelConfig, table: EpisodeTable) -> dict[str, str]:
+    """Return a digest of each dataset, by the setting that names it."""
+    more = {f"dataset.more {root}": root for root in cfg.dataset.more}
+    return {name: fingerprint(Path(root)) for name, root in {"dataset": table.dataset.root, **more}.items()}
 
 
 def run_training(
-    cfg: TrainWorldModelConfig, model: Any, table: EpisodeTable, processes: PartialState
+    cfg: TrainWorldModelConfig, claim: Claim, model: Any, table: EpisodeTable, processes: PartialState
 ) -> None:
     """Cache the data, in the first process before the others, and train."""
     from lerobot_wmrl.world_models.training import make_joint_sampler, train
@@ -223,9 +210,7 @@ def run_training(
             seed = cfg.seed + processes.process_index
             sampler = make_joint_sampler(model, table, cfg.dataset, cfg.batch_size, seed)
             if is_first_process():
-                held.enter_context(claimed(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER))
-                if not (cfg.output_dir / DATA_FILE).is_file():
-                    write_json(cfg.output_dir / DATA_FILE, fingerprints(cfg, table))
+                held.enter_context(claim.held())
         train(model, sampler, cfg, cfg.save_pretrained, make_wandb(cfg))
 
 

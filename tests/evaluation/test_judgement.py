@@ -16,9 +16,10 @@ from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.data.episodes import EpisodeTable
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
-from lerobot_wmrl.evaluation import evidence
+from lerobot_wmrl.evaluation import compare, evidence
 from lerobot_wmrl.evaluation.calibration import Confusion
 from lerobot_wmrl.evaluation.evidence import (
+    Rollouts,
     confusion_of,
     learnt_from,
     pooled_instructions,
@@ -176,6 +177,19 @@ def config(small_dataset, trained_models, tmp_path) -> JudgeConfig:
 
 
 @pytest.fixture
+def sizes(monkeypatch) -> list[int]:
+    """Record how many imagined episodes run at once."""
+    sizes, opened = [], compare.opened
+
+    def noted(env, n_envs, *others):
+        sizes.append(n_envs)
+        return opened(env, n_envs, *others)
+
+    monkeypatch.setattr(compare, "opened", noted)
+    return sizes
+
+
+@pytest.fixture
 def seeing(monkeypatch) -> None:
     """Let the untrained world model tell successes from failures."""
     monkeypatch.setattr(evidence, "confusion_of", lambda *_: (GOOD, []))
@@ -201,6 +215,12 @@ def test_every_policy_has_one_episode_from_each_start(config, seeing, capsys):
     assert (config.output_dir / "judgement.png").is_file()
     never = replace(config, done_threshold=0.9999, output_dir=config.output_dir.with_name("never"))
     assert results_of(never)["outcomes"] == {name: [False] * 3 for name in config.policies}
+
+
+def test_no_more_episodes_are_imagined_at_once_than_there_are_rollouts_to_start_in(config, seeing, sizes):
+    found = results_of(replace(config, starts=StartFrames(), batch_size=50))
+    assert [len(outcomes) for outcomes in found["outcomes"].values()] == [6, 6]
+    assert sizes == [6]
 
 
 def test_policies_references_and_coverage_may_be_added_and_what_was_imagined_is_kept(
@@ -254,9 +274,9 @@ def test_another_policy_of_the_same_name_is_not_judged_by_the_first_one_s_episod
 
 def test_instructions_of_several_tasks_are_not_averaged_silently(make_synthetic_dataset, tmp_path):
     two = make_synthetic_dataset(tmp_path / "two", episodes=3, length=5, instructions=["push", "pull"])
-    (warning,) = pooled_instructions(ChosenEpisodes(str(two.root)), "all")
+    (warning,) = pooled_instructions(Rollouts.read(ChosenEpisodes(str(two.root))))
     assert "2 instructions ('pull', 'push' …)" in warning
-    assert pooled_instructions(ChosenEpisodes(str(two.root), episodes=[0, 2]), "all") == []
+    assert pooled_instructions(Rollouts.read(ChosenEpisodes(str(two.root)), episodes=[0, 2])) == []
 
 
 def test_a_policy_is_not_also_a_reference(config, seeing, tmp_path):
@@ -318,53 +338,49 @@ def test_rollouts_that_the_world_model_has_learnt_from_are_warned_about(
     (warning,) = results_of(config)["warnings"]
     assert "has learnt from" in warning
     assert warning in capsys.readouterr().out
+    model = config.world_model.path
     with monkeypatch.context() as held_out:
         held_out.setattr(EpisodeTable, "validation", property(lambda table: np.arange(6) % 3 == 1))
-        assert learnt_from(config.world_model.path, config.dataset, "take others", "validation,ind") == []
-        (warning,) = learnt_from(config.world_model.path, config.dataset, "take others")
-        assert "4 of these episodes" in warning
+        assert learnt_from(model, Rollouts.read(config.dataset, "validation,ind")) == 0
+        assert learnt_from(model, Rollouts.read(config.dataset)) == 4
     others = ChosenEpisodes(str(make_synthetic_dataset(tmp_path / "others", episodes=3, length=5).root))
-    assert learnt_from(config.world_model.path, others, "take others") == []
+    assert learnt_from(model, Rollouts.read(others)) == 0
     again = ChosenEpisodes(str(tmp_path / "copy"))
     shutil.copytree(small_dataset.root, again.root)
-    (warning,) = learnt_from(config.world_model.path, again, "take others")
-    assert "6 of these episodes" in warning
-    (warning,) = learnt_from(config.world_model.path, again, "take others", episodes=[0, 3])
-    assert "2 of these episodes" in warning
+    assert learnt_from(model, Rollouts.read(again)) == 6
+    assert learnt_from(model, Rollouts.read(again, episodes=[0, 3])) == 2
     copy = tmp_path / "parts"
     shutil.copytree(resolve_checkpoint(config.world_model.path), copy)
     write(copy / "train_config.json", {"dataset": {"root": config.dataset.root, "episodes": [0, 1]}})
-    assert learnt_from(str(copy), config.dataset, "take others", episodes=[2, 3]) == []
-    (warning,) = learnt_from(str(copy), config.dataset, "take others", episodes=[1, 2])
-    assert "1 of these episodes" in warning
+    assert learnt_from(str(copy), Rollouts.read(config.dataset, episodes=[2, 3])) == 0
+    assert learnt_from(str(copy), Rollouts.read(config.dataset, episodes=[1, 2])) == 1
     copy = tmp_path / "model"
     shutil.copytree(resolve_checkpoint(config.world_model.path), copy)
     write(copy / "train_config.json", {"dataset": {"root": "demonstrations", "more": [others.root]}})
-    assert learnt_from(str(copy), others, "take others") != []
+    assert learnt_from(str(copy), Rollouts.read(others)) == 3
     (tmp_path / "further").mkdir()
     further = write(tmp_path / "further" / "train_config.json", {
         "dataset": {"root": "rollouts"}, "model": {"pretrained_path": str(copy)},
     })  # fmt: skip
     write(further.parent / "config.json", {})
-    assert learnt_from(str(further.parent), others, "take others") != [], "from the first on"
+    assert learnt_from(str(further.parent), Rollouts.read(others)) == 3, "from the first on"
     shutil.rmtree(Path(others.root) / "data")
-    assert learnt_from(str(copy), again, "take others") == [], "what is not whole tells nothing"
+    assert learnt_from(str(copy), Rollouts.read(again)) == 0, "what is not whole tells nothing"
 
 
 def test_rollouts_count_within_the_length_of_an_episode_and_must_both_succeed_and_fail(
     config, small_dataset, tmp_path
 ):
     env = config.imagination()
-    every = replayed_rollouts(env, config.dataset, "all")
+    every = replayed_rollouts(env, Rollouts.read(config.dataset))
     assert len(every.episodes) == small_dataset.num_episodes
     assert every.probability.shape[1] <= env.horizon
-    chosen = ChosenEpisodes(config.dataset.root, episodes=[0, 1, 2, 3])
-    assert len(replayed_rollouts(env, chosen, "train").episodes) == 4
+    assert len(replayed_rollouts(env, Rollouts.read(config.dataset, "train", [0, 1, 2, 3])).episodes) == 4
     config.episode_length = int(every.done[every.success].argmax(1).min())
     with pytest.raises(
         ValueError, match=rf"none of the \d+ rollouts succeeds within {config.episode_length} frames"
     ):
-        replayed_rollouts(config.imagination(), config.dataset, "all")
+        replayed_rollouts(config.imagination(), Rollouts.read(config.dataset))
     labels = [False] * small_dataset.num_frames
     failing = ChosenEpisodes(
         str(relabelled(Path(small_dataset.root), tmp_path / "f", {"next.success": labels}))
@@ -372,7 +388,7 @@ def test_rollouts_count_within_the_length_of_an_episode_and_must_both_succeed_an
     with pytest.raises(
         ValueError, match=r"dataset\.root=.*none of the \d+ rollouts succeeds within 20 frames"
     ):
-        replayed_rollouts(env, failing, "all")
+        replayed_rollouts(env, Rollouts.read(failing))
 
 
 @pytest.mark.parametrize(

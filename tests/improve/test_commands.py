@@ -17,7 +17,7 @@ from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_wmrl.common.checkpoints import link_checkpoint
 from lerobot_wmrl.common.errors import STOPPED
 from lerobot_wmrl.common.files import write_json
-from lerobot_wmrl.common.output_folders import claimed
+from lerobot_wmrl.common.output_folders import Claim
 from lerobot_wmrl.common.presets import preset_settings
 from lerobot_wmrl.common.stages import MARKER
 from lerobot_wmrl.data.dataset import ChosenEpisodes, open_dataset
@@ -399,7 +399,7 @@ def test_a_run_that_selects_nothing_goes_on_where_there_was_no_selection(tmp_pat
     given = settings(improvement.config, commands.stages(improvement))
     older = {name: value for name, value in given.items() if name != "selection_episodes"}
     write_json(tmp_path / MARKER, older)
-    with claimed(tmp_path, given, marker=MARKER):
+    with Claim(tmp_path, given, marker=MARKER).held():
         pass
 
 
@@ -408,7 +408,7 @@ def test_a_folder_that_was_begun_with_other_stages_is_refused(tmp_path: Path) ->
     improvement = improvement_of(tmp_path, failures=2)
     given = settings(improvement.config, commands.stages(improvement))
     write_json(tmp_path / MARKER, {**given, "stages": ["tokenizer", "world_model", "check", "rl"]})
-    with pytest.raises(ValueError, match="stages"), claimed(tmp_path, given, marker=MARKER):
+    with pytest.raises(ValueError, match="stages"), Claim(tmp_path, given, marker=MARKER).held():
         pass
 
 

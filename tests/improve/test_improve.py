@@ -214,7 +214,7 @@ def test_a_dataset_that_has_changed_is_not_taken_for_the_one_before(
             improve(config)
     stats = root / "meta" / "stats.json"
     stats.write_text(json.dumps(json.loads(stats.read_text()), indent=1))
-    with pytest.raises(ValueError, match=r"was begun with other settings \(the dataset's content"):
+    with pytest.raises(ValueError, match=r"was begun with another content of dataset"):
         improve(config)
 
 

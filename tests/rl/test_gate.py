@@ -16,6 +16,7 @@ from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.lerobot_commands import env_flags
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.data.dataset import DatasetSource
+from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.evaluation.gate import Gate, gate_at, labelled_recording, predict_outcomes
@@ -55,7 +56,7 @@ def test_a_verdict_is_the_evaluations_own(
 ) -> None:
     gate = make_gate(BELIEVES_ALL)
     found = gate.run(0, tmp_path, tmp_path / "gate")
-    outcomes = predict_outcomes(env.model, labelled_recording(env.model, small_dataset))
+    outcomes = predict_outcomes(env.model, labelled_recording(env.model, read_episodes(small_dataset)))
     assert found["labelled"] == gate_at(outcomes, BELIEVES_ALL, 2).as_json()
     assert found["labelled"]["false_positive_rate"]["share"] == 1.0
     assert found["failed"]
