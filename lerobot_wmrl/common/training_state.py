@@ -3,6 +3,7 @@
 The file is ours, so that LeRobot 0.6.1 and 0.6.2 read and write the same.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,7 +14,8 @@ from torch import distributed as dist
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
-from lerobot_wmrl.common.distributed import rank_and_size
+from lerobot_wmrl.common.checkpoints import checkpoint_dir, write_checkpoint
+from lerobot_wmrl.common.distributed import is_first_process, rank_and_size, wait_for_all
 from lerobot_wmrl.common.errors import FieldError
 
 TRAINING_STATE_FILE: Final = "training_state.pt"
@@ -27,6 +29,32 @@ def gather_random_states() -> list[dict[str, Any]]:
     if size > 1:
         dist.all_gather_object(states, states[rank])
     return states
+
+
+def save_checkpoint(
+    output_dir: Path, total: int, step: int, write_models: Callable[[Path], None], optimizer: Optimizer,
+    scheduler: LRScheduler | None = None,
+) -> Path:  # fmt: skip
+    """Write a whole checkpoint or none, from the first process, and return its folder. All must call it.
+
+    Args:
+        output_dir: the training's folder.
+        total: steps or iterations of the whole training.
+        step: those that are done.
+        write_models: writes everything but the training's state into the folder that it is given.
+        optimizer: its state is saved.
+        scheduler: its state is saved, if there is one.
+    """
+    random_states = gather_random_states()
+
+    def write(folder: Path) -> None:
+        write_models(folder)
+        save_training_state(folder, step, random_states, optimizer, scheduler)
+
+    if is_first_process():
+        write_checkpoint(output_dir, total, step, write)
+    wait_for_all()
+    return checkpoint_dir(output_dir, total, step)
 
 
 def save_training_state(

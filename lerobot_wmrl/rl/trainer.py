@@ -12,16 +12,14 @@ from lerobot.utils.logging_utils import MetricsTracker
 from tqdm import tqdm
 
 from lerobot_wmrl.common.checkpoints import (
-    checkpoint_dir,
     latest_checkpoint,
     read_weights,
     should_save_checkpoint,
-    write_checkpoint,
 )
 from lerobot_wmrl.common.distributed import is_first_process, rank_and_size, wait_for_all
 from lerobot_wmrl.common.pipeline import Pipeline
 from lerobot_wmrl.common.tracking import Tracker
-from lerobot_wmrl.common.training_state import gather_random_states, load_training_state, save_training_state
+from lerobot_wmrl.common.training_state import load_training_state, save_checkpoint
 from lerobot_wmrl.envs.tensor_env import TensorEnv
 from lerobot_wmrl.rl.callbacks import Callback, Callbacks
 from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
@@ -146,18 +144,13 @@ def make_tracker(
 def save(
     algorithm: TrainableAlgorithm, output_dir: Path, total: int, save_pretrained: Callable[[Path], None]
 ) -> Path:
-    """Write a whole checkpoint or none: policy, algorithm, optimiser, random states, iteration."""
-    random_states = gather_random_states()
+    """Write a checkpoint of policy and algorithm, and return its folder."""
 
-    def write(folder: Path) -> None:
+    def write_models(folder: Path) -> None:
         save_pretrained(folder / PRETRAINED_MODEL_DIR)
         algorithm.save_pretrained(folder / ALGORITHM_DIR)
-        save_training_state(folder, algorithm.iteration, random_states, algorithm.optimizer)
 
-    if is_first_process():
-        write_checkpoint(output_dir, total, algorithm.iteration, write)
-    wait_for_all()
-    return checkpoint_dir(output_dir, total, algorithm.iteration)
+    return save_checkpoint(output_dir, total, algorithm.iteration, write_models, algorithm.optimizer)
 
 
 def resume(algorithm: TrainableAlgorithm, output_dir: Path) -> Path | None:

@@ -8,7 +8,6 @@ import logging
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -25,14 +24,14 @@ from torch.nn.parallel import DistributedDataParallel
 from torch.optim import Optimizer
 from tqdm import tqdm
 
-from lerobot_wmrl.common.checkpoints import latest_checkpoint, should_save_checkpoint, write_checkpoint
+from lerobot_wmrl.common.checkpoints import latest_checkpoint, should_save_checkpoint
 from lerobot_wmrl.common.constants import HUMAN_LIKE, KINDS, START_KIND
 from lerobot_wmrl.common.cuda_graphs import cuda_graphs
 from lerobot_wmrl.common.distributed import is_first_process, mean_over_processes
 from lerobot_wmrl.common.errors import FieldError, renamed
 from lerobot_wmrl.common.precision import compute_in, training_dtype
 from lerobot_wmrl.common.tracking import log_metrics
-from lerobot_wmrl.common.training_state import gather_random_states, load_training_state, save_training_state
+from lerobot_wmrl.common.training_state import load_training_state, save_checkpoint
 from lerobot_wmrl.data.checks import require_shown
 from lerobot_wmrl.data.clips import ClipSampler, FrameSampler, InTurn
 from lerobot_wmrl.data.dataset import TrainingData
@@ -239,10 +238,9 @@ def train(
     first = 0 if checkpoint is None else load_training_state(checkpoint, optimizer, scheduler)
     network = DistributedDataParallel(model) if processes.num_processes > 1 else model
 
-    def save(folder: Path, step: int, random_states: list[dict[str, Any]]) -> None:
+    def write_models(folder: Path) -> None:
         model.save_pretrained(folder / PRETRAINED_MODEL_DIR)
         save_config(folder / PRETRAINED_MODEL_DIR)
-        save_training_state(folder, step, random_states, optimizer, scheduler)
 
     model.train()
     began, dtype = time.monotonic(), training_dtype(settings.precision, device)
@@ -258,10 +256,7 @@ def train(
             progress.set_postfix(loss=f"{metrics['loss']:.3f}")
             log_metrics(settings.output_dir, step, metrics, wandb)
         if should_save_checkpoint(step, settings.save_freq, settings.steps):
-            states = gather_random_states()
-            if is_first_process():
-                write = partial(save, step=step, random_states=states)
-                write_checkpoint(settings.output_dir, settings.steps, step, write)
+            save_checkpoint(settings.output_dir, settings.steps, step, write_models, optimizer, scheduler)
         progress.update()
     progress.close()
 
