@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_wmrl.common.constants import POLICY
-from lerobot_wmrl.common.errors import regrouped
+from lerobot_wmrl.common.errors import renamed
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.data.budget import spending
 from lerobot_wmrl.data.dataset import open_dataset
@@ -50,7 +50,7 @@ class Rollouts:
     def record(self, work: Path, missing: Sequence[str]) -> None:
         """Record the missing parts one after the other."""
         config, total = self.config, self.config.num_episodes
-        with regrouped("dataset", "like"):
+        with renamed("dataset", "like"):
             like = config.like.open().meta if config.like.given else None
         assert config.policy is not None
         recorder = RolloutRecorder(
@@ -76,7 +76,7 @@ class Rollouts:
     def describe(self, merged: Path) -> str:
         """Describe the columns as `like` does, keep the settings, and say what was recorded."""
         if self.config.like.given and self.config.like_columns:
-            with regrouped("dataset", "like"):
+            with renamed("dataset", "like"):
                 describe_alike(merged, self.config.like.open().features)
         write_json(merged / SETTINGS_FILE, self.content)
         root, table = self.config.root, read_episodes(open_dataset(merged))

@@ -1,5 +1,6 @@
 """Errors that know the field they are about; the command that was called knows its flag."""
 
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
@@ -85,32 +86,21 @@ def within(group: str) -> Iterator[None]:
 
 @contextmanager
 def renamed(field: str, name: str) -> Iterator[None]:
-    """Let a FieldError about `field` that leaves the block be about the field `name`."""
-    try:
-        yield
-    except FieldError as error:
-        if error.field != field:
-            raise
-        raise FieldError(name, error.value, error.problem, error.remedy) from error
+    """Let a FieldError about `field`, or about a field of the group `field`, be about `name` instead.
 
-
-@contextmanager
-def regrouped(group: str, name: str) -> Iterator[None]:
-    """Let a FieldError about a field of `group` that leaves the block be about the same field of `name`.
-
-    Fields that its text names in backquotes are renamed too.
+    What its text names in backquotes is renamed too.
     """
 
     def moved(text: str) -> str:
-        return text.replace(f"`{group}.", f"`{name}.")
+        return re.sub(rf"`{re.escape(field)}(?=[`.=])", f"`{name}", text)
 
     try:
         yield
     except FieldError as error:
-        if not error.field.startswith(f"{group}."):
+        if error.field != field and not error.field.startswith(f"{field}."):
             raise
-        field = f"{name}{error.field.removeprefix(group)}"
-        raise FieldError(field, error.value, moved(error.problem), moved(error.remedy)) from error
+        new = f"{name}{error.field.removeprefix(field)}"
+        raise FieldError(new, error.value, moved(error.problem), moved(error.remedy)) from error
 
 
 def suggestion(name: str, known: Sequence[str], prefix: str = "") -> str:

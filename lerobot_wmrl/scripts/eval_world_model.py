@@ -265,15 +265,12 @@ def policies_imagination(cfg: EvalWorldModelConfig, table: "EpisodeTable") -> "W
         )  # fmt: skip
     starts = StartFrames(**vars(cfg.dataset), split=cfg.split, tasks=tasks, max_starts=cfg.policy_episodes)
     longest = getattr(cfg.real_env, "horizon", None) or getattr(cfg.real_env, "episode_length", None)
-    try:
+    with renamed("world_model_path", "model.path"):
         imagination = WorldModelEnv(
             world_model_path=cfg.model.path, reward=GeneralConfig(alpha=1.0), device=cfg.device,
             episode_length=longest, dataset=starts,
             done_threshold=cfg.done_threshold, done_frames=cfg.done_frames,
         )  # fmt: skip
-    except FieldError as error:
-        field = "model.path" if error.field == "world_model_path" else error.field
-        raise FieldError(field, error.value, error.problem, error.remedy) from error
     with renamed("dataset.split", "split"):
         found = len(chosen_episodes(table, starts))
     if found < cfg.policy_episodes:

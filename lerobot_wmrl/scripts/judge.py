@@ -34,7 +34,7 @@ from tqdm import tqdm
 
 from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.command_line import RunConfig, run_command
-from lerobot_wmrl.common.errors import FieldError, Stopped, regrouped, renamed, require_at_least
+from lerobot_wmrl.common.errors import FieldError, Stopped, renamed, require_at_least
 from lerobot_wmrl.common.files import write_json, writing
 from lerobot_wmrl.common.output_folders import Claim
 from lerobot_wmrl.data.dataset import ChosenEpisodes
@@ -125,7 +125,7 @@ class JudgeConfig(RunConfig):
                 "leave it out",
             )  # fmt: skip
         if self.starts_given:
-            with regrouped("dataset", "starts"):
+            with renamed("dataset", "starts"):
                 starts.validate()
         elif starts != StartFrames(max_starts=starts.max_starts):
             raise FieldError(
@@ -138,7 +138,7 @@ class JudgeConfig(RunConfig):
         starts, group = replace(self.starts, **vars(self.dataset), split=self.split), "dataset"
         if self.starts_given:
             starts, group = self.starts, "starts"
-        with renamed("world_model_path", "world_model.path"), regrouped("dataset", group):
+        with renamed("world_model_path", "world_model.path"), renamed("dataset", group):
             return WorldModelEnv(
                 world_model_path=self.world_model.path, dataset=starts,
                 reward=GeneralConfig(alpha=1.0), episode_length=self.episode_length,
@@ -238,7 +238,7 @@ def named_content(cfg: JudgeConfig, env: WorldModelEnv, rollouts: Path) -> dict[
 def starts_as_typed(cfg: JudgeConfig) -> AbstractContextManager[None]:
     """Name the starts' settings in an error that leaves the block as they were given: `starts`, or, where
     they are the rollouts, `dataset`."""
-    return regrouped("dataset", "starts") if cfg.starts_given else nullcontext()
+    return renamed("dataset", "starts") if cfg.starts_given else nullcontext()
 
 
 def remember(judgement: "Judgement", cfg: JudgeConfig, configs: Collection[str]) -> None:
