@@ -33,7 +33,7 @@ def publishing(name: str, remedy: str) -> Iterator[None]:
     try:
         yield
     except (httpx.HTTPError, OSError, RuntimeError, HFValidationError) as error:
-        raise FieldError(PUSH, "true", f"{name} is not published: {reason(error)}", remedy) from error
+        raise FieldError(PUSH, "true", f"{name} is not published: {failure_reason(error)}", remedy) from error
 
 
 def create_repo(api: HfApi, name: str, private: bool | None, kind: str | None = None) -> str:
@@ -58,7 +58,7 @@ def create_repo(api: HfApi, name: str, private: bool | None, kind: str | None = 
     return name
 
 
-def reason(error: Exception) -> str:
+def failure_reason(error: Exception) -> str:
     """Return why publishing failed, and what helps."""
     if isinstance(error, (httpx.TransportError, ConnectionError)):
         return f"the hub cannot be reached ({error})"

@@ -20,11 +20,11 @@ def content_of(env: EnvConfig | None) -> dict[str, str]:
         "world_model_path": env.world_model_path, "text_world_model_path": env.text_world_model_path,
         "reward.pretrained_path": getattr(env.reward, "pretrained_path", None),
     }  # fmt: skip
-    content = {name: named(name, path, model_digest) for name, path in models.items() if path}
+    content = {name: digest_of_setting(name, path, model_digest) for name, path in models.items() if path}
     if env.dataset.given:
         content["dataset"] = fingerprint(Path(env.dataset.open().root))
     if env.dataset.frames:
-        content["dataset.frames"] = named("dataset.frames", env.dataset.frames, file_digest)
+        content["dataset.frames"] = digest_of_setting("dataset.frames", env.dataset.frames, file_digest)
     return content
 
 
@@ -33,7 +33,7 @@ def model_digest(path: Path) -> str:
     return checkpoint_digest(path, parts=False)
 
 
-def named(name: str, path: str | Path, digest: Callable[[Path], str]) -> str:
+def digest_of_setting(name: str, path: str | Path, digest: Callable[[Path], str]) -> str:
     """Return the digest of what a setting names. FieldError if it cannot be read."""
     try:
         return digest(Path(path))

@@ -26,7 +26,7 @@ from lerobot_wmrl.world_models.checkpoint import load_model
 
 
 @dataclass(frozen=True)
-class Rollouts:
+class LabelledRollouts:
     """Labelled rollouts that a world model is checked on.
 
     Args:
@@ -42,7 +42,7 @@ class Rollouts:
     @classmethod
     def read(
         cls, source: DatasetSource, split: str = "all", episodes: Sequence[int] | None = None
-    ) -> "Rollouts":
+    ) -> "LabelledRollouts":
         """Open a dataset and choose, of these episodes, those of a split. FieldError if it cannot be read."""
         table = read_episodes(source.open())
         scenes, among = scene_splits(table.column(START_SCENE), split), table.among(episodes)
@@ -54,7 +54,7 @@ class Rollouts:
         return Path(self.table.dataset.root)
 
 
-def replayed_rollouts(env: WorldModelEnv, rollouts: Rollouts) -> Outcomes:
+def replayed_rollouts(env: WorldModelEnv, rollouts: LabelledRollouts) -> Outcomes:
     """Replay labelled rollouts in a world model, as long as an imagined episode lasts.
 
     Raises:
@@ -94,7 +94,7 @@ def confusion_of(outcomes: Outcomes, env: WorldModelEnv) -> tuple[Confusion, lis
     return Confusion(gate.recall, gate.false_positives), warnings
 
 
-def pooled_instructions(rollouts: Rollouts) -> list[str]:
+def pooled_instructions(rollouts: LabelledRollouts) -> list[str]:
     """Return a warning if the rollouts have several instructions, which may be of several tasks."""
     instructions = sorted({rollouts.table.instructions[episode] for episode in rollouts.chosen})
     if len(instructions) < 2:
@@ -168,7 +168,7 @@ def trained_inside(policy: str, world_model: str) -> str | None:
     return None
 
 
-def learnt_from(world_model: str, rollouts: Rollouts) -> int:
+def learnt_from(world_model: str, rollouts: LabelledRollouts) -> int:
     """Return how many of the rollouts the world model has learnt from, themselves or as copies.
 
     Trainings that it was continued from count too, as far as their settings and data lie on this machine.

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.frames import Context
 from lerobot_wmrl.world_models.anchored.dynamics import AnchoredDynamics
-from lerobot_wmrl.world_models.anchored.network import Scene, StateRollout
+from lerobot_wmrl.world_models.anchored.network import EncodedScene, StateRollout
 from lerobot_wmrl.world_models.layers import Rotation, attention
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 
@@ -37,7 +37,7 @@ LARGE: Final = 1024
 """Tensors of at least so many weights are stored in 16 bits."""
 
 SCENE: Final = ("anchor", "tokens", "scene_keys_values", "summary", "local")
-"""Names of the parts of a `Scene`; the codes of its frame are the `anchor`."""
+"""Names of the parts of a `EncodedScene`; the codes of its frame are the `anchor`."""
 
 ROLLOUT: Final = ("state", "change", "hidden")
 """Names of the parts of a `StateRollout`."""
@@ -138,7 +138,7 @@ class ImagineStep(Graph):
         network, codebook = self.network, self.network.codebook
         memory = WrittenMemory(given["keys"], given["values"], given["age"])
         mean = self.model.encode_actions(given["action"][:, None]).mean()
-        scene = Scene(*(given[name] for name in SCENE))
+        scene = EncodedScene(*(given[name] for name in SCENE))
         rollout = StateRollout(*(given[name] for name in ROLLOUT))
         prediction, rollout = network.follow(scene, rollout, mean, memory, None)
         codes = codebook.most_likely(prediction.logits)

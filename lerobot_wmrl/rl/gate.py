@@ -19,7 +19,7 @@ from lerobot_wmrl.common.errors import TrainingStopped
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
-from lerobot_wmrl.evaluation.evidence import Rollouts, learnt_from
+from lerobot_wmrl.evaluation.evidence import LabelledRollouts, learnt_from
 from lerobot_wmrl.evaluation.gate import Gate, Outcomes, gate_at, labelled_recording, predict_outcomes
 from lerobot_wmrl.evaluation.pictures import save_strip, side_by_side
 from lerobot_wmrl.evaluation.replay import Recording, replay_episodes
@@ -101,7 +101,7 @@ class SuccessGate:
 
     def _labelled(self) -> Recording:
         """Read the labelled rollouts, and warn if the world model has learnt from them."""
-        rollouts = Rollouts.read(self.config.dataset)
+        rollouts = LabelledRollouts.read(self.config.dataset)
         path = str(self.env.model.config.pretrained_path)  # of the newest one after Dyna rounds
         if learnt := learnt_from(path, rollouts):
             warning = (

@@ -27,7 +27,7 @@ from lerobot_wmrl.envs.start_frames import every_chosen_episode
 from lerobot_wmrl.rl.observations import ObservationBuffer, decoded
 
 ROWS = "rows"
-"""Name of `Part.rows` in a file of labels."""
+"""Name of `LabelBatch.rows` in a file of labels."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Windows:
 
 
 @dataclass(frozen=True)
-class Part:
+class LabelBatch:
     """N labels from one place, whose windows share F observations.
 
     Args:
@@ -90,8 +90,8 @@ class Labels:
 
     def __init__(self, folder: Path, process: int) -> None:
         self.folder, self.process = folder, process
-        self.recorded: list[Part] = []
-        self.imagined: list[Part] = []
+        self.recorded: list[LabelBatch] = []
+        self.imagined: list[LabelBatch] = []
 
     def __len__(self) -> int:
         return sum(map(len, (*self.recorded, *self.imagined)))
@@ -100,7 +100,7 @@ class Labels:
         """Return the file of an iteration."""
         return self.folder / f"{iteration:06d}-{self.process}.safetensors"
 
-    def add(self, iteration: int, part: Part) -> None:
+    def add(self, iteration: int, part: LabelBatch) -> None:
         """Add an iteration's labels, on disk first."""
         self.folder.mkdir(parents=True, exist_ok=True)
         partial = self.path(iteration).with_suffix(".partial")
@@ -145,12 +145,12 @@ class Labels:
         rows = tensors.pop(ROWS)
         actions = {name: tensors.pop(name) for name in (ACTION, ACTION_IS_PAD) if name in tensors}
         if len(rows):
-            self.imagined.append(Part(tensors, actions, rows, instructions))
+            self.imagined.append(LabelBatch(tensors, actions, rows, instructions))
 
 
 def recorded_successes(
     source: StartFrames, frame_shapes: Mapping[str, tuple[int, int, int]], state_size: int, windows: Windows
-) -> list[Part]:
+) -> list[LabelBatch]:
     """Return the actions of a dataset's successful episodes as labels; nothing without a dataset or success.
 
     Args:
@@ -183,7 +183,7 @@ def recorded_successes(
         rows = (start - begin)[episode] + torch.arange(len(episode))
         observations[OBS_STATE] = torch.from_numpy(table.state[rows.numpy()])
     step, labelled = acting.nonzero(as_tuple=True)
-    return [Part(
+    return [LabelBatch(
         observations | {INSTRUCTIONS: episode}, actions,
         observed_rows(begin[labelled], step, windows.observations),
         [table.instructions[each] for each in episodes],
@@ -215,7 +215,7 @@ def require_memory(source: StartFrames, frame_shapes: Mapping[str, tuple[int, in
 
 def imagined_labels(
     observations: ObservationBuffer, actions: Tensor, labelled: Tensor, windows: Windows
-) -> Part:
+) -> LabelBatch:
     """Return the labelled steps of a rollout.
 
     Args:
@@ -227,7 +227,7 @@ def imagined_labels(
     step, env = labelled.nonzero(as_tuple=True)
     wanted = observed_rows(env, step, windows.observations, observations.num_envs)
     kept, rows = wanted.unique(return_inverse=True)
-    return Part(
+    return LabelBatch(
         observations.read_stored(kept.cpu()), action_windows(actions, labelled, windows.actions), rows,
         list(observations.instructions),
     )  # fmt: skip

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
     from lerobot_wmrl.common.statistics import Proportion
     from lerobot_wmrl.evaluation.compare import Envs
-    from lerobot_wmrl.evaluation.evidence import Rollouts
+    from lerobot_wmrl.evaluation.evidence import LabelledRollouts
     from lerobot_wmrl.evaluation.judgement import Judgement
 
 
@@ -154,7 +154,7 @@ def judge(cfg: JudgeConfig) -> None:
     """Replay the rollouts and imagine what is missing of the episodes; write the results."""
     from lerobot_wmrl.common.checkpoints import checkpoint_digest, resolved_name
     from lerobot_wmrl.evaluation.evidence import (
-        Rollouts,
+        LabelledRollouts,
         confusion_of,
         pooled_instructions,
         replayed_rollouts,
@@ -166,7 +166,7 @@ def judge(cfg: JudgeConfig) -> None:
     cfg.world_model.path = resolved_name(cfg.world_model.path)
     env = cfg.imagination()
     configs, references = read_both(cfg, env)
-    rollouts = Rollouts.read(cfg.dataset, cfg.split, cfg.dataset.episodes)
+    rollouts = LabelledRollouts.read(cfg.dataset, cfg.split, cfg.dataset.episodes)
     claim = Claim(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER, named_content(cfg, env, rollouts.root))
     claim.check()
     confusion, warnings = confusion_of(replayed_rollouts(env, rollouts), env)
@@ -190,7 +190,7 @@ def judge(cfg: JudgeConfig) -> None:
     )
 
 
-def unfit(rollouts: "Rollouts", world_model: str) -> list[str]:
+def unfit(rollouts: "LabelledRollouts", world_model: str) -> list[str]:
     """Return a warning if the world model has learnt from the rollouts."""
     from lerobot_wmrl.evaluation.evidence import learnt_from
 

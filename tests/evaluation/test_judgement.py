@@ -19,7 +19,7 @@ from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelE
 from lerobot_wmrl.evaluation import compare, evidence
 from lerobot_wmrl.evaluation.calibration import Confusion
 from lerobot_wmrl.evaluation.evidence import (
-    Rollouts,
+    LabelledRollouts,
     confusion_of,
     learnt_from,
     pooled_instructions,
@@ -274,9 +274,9 @@ def test_another_policy_of_the_same_name_is_not_judged_by_the_first_one_s_episod
 
 def test_instructions_of_several_tasks_are_not_averaged_silently(make_synthetic_dataset, tmp_path):
     two = make_synthetic_dataset(tmp_path / "two", episodes=3, length=5, instructions=["push", "pull"])
-    (warning,) = pooled_instructions(Rollouts.read(ChosenEpisodes(str(two.root))))
+    (warning,) = pooled_instructions(LabelledRollouts.read(ChosenEpisodes(str(two.root))))
     assert "2 instructions ('pull', 'push' …)" in warning
-    assert pooled_instructions(Rollouts.read(ChosenEpisodes(str(two.root)), episodes=[0, 2])) == []
+    assert pooled_instructions(LabelledRollouts.read(ChosenEpisodes(str(two.root)), episodes=[0, 2])) == []
 
 
 def test_a_policy_is_not_also_a_reference(config, seeing, tmp_path):
@@ -341,46 +341,49 @@ def test_rollouts_that_the_world_model_has_learnt_from_are_warned_about(
     model = config.world_model.path
     with monkeypatch.context() as held_out:
         held_out.setattr(EpisodeTable, "validation", property(lambda table: np.arange(6) % 3 == 1))
-        assert learnt_from(model, Rollouts.read(config.dataset, "validation,ind")) == 0
-        assert learnt_from(model, Rollouts.read(config.dataset)) == 4
+        assert learnt_from(model, LabelledRollouts.read(config.dataset, "validation,ind")) == 0
+        assert learnt_from(model, LabelledRollouts.read(config.dataset)) == 4
     others = ChosenEpisodes(str(make_synthetic_dataset(tmp_path / "others", episodes=3, length=5).root))
-    assert learnt_from(model, Rollouts.read(others)) == 0
+    assert learnt_from(model, LabelledRollouts.read(others)) == 0
     again = ChosenEpisodes(str(tmp_path / "copy"))
     shutil.copytree(small_dataset.root, again.root)
-    assert learnt_from(model, Rollouts.read(again)) == 6
-    assert learnt_from(model, Rollouts.read(again, episodes=[0, 3])) == 2
+    assert learnt_from(model, LabelledRollouts.read(again)) == 6
+    assert learnt_from(model, LabelledRollouts.read(again, episodes=[0, 3])) == 2
     copy = tmp_path / "parts"
     shutil.copytree(resolve_checkpoint(config.world_model.path), copy)
     write(copy / "train_config.json", {"dataset": {"root": config.dataset.root, "episodes": [0, 1]}})
-    assert learnt_from(str(copy), Rollouts.read(config.dataset, episodes=[2, 3])) == 0
-    assert learnt_from(str(copy), Rollouts.read(config.dataset, episodes=[1, 2])) == 1
+    assert learnt_from(str(copy), LabelledRollouts.read(config.dataset, episodes=[2, 3])) == 0
+    assert learnt_from(str(copy), LabelledRollouts.read(config.dataset, episodes=[1, 2])) == 1
     copy = tmp_path / "model"
     shutil.copytree(resolve_checkpoint(config.world_model.path), copy)
     write(copy / "train_config.json", {"dataset": {"root": "demonstrations", "more": [others.root]}})
-    assert learnt_from(str(copy), Rollouts.read(others)) == 3
+    assert learnt_from(str(copy), LabelledRollouts.read(others)) == 3
     (tmp_path / "further").mkdir()
     further = write(tmp_path / "further" / "train_config.json", {
         "dataset": {"root": "rollouts"}, "model": {"pretrained_path": str(copy)},
     })  # fmt: skip
     write(further.parent / "config.json", {})
-    assert learnt_from(str(further.parent), Rollouts.read(others)) == 3, "from the first on"
+    assert learnt_from(str(further.parent), LabelledRollouts.read(others)) == 3, "from the first on"
     shutil.rmtree(Path(others.root) / "data")
-    assert learnt_from(str(copy), Rollouts.read(again)) == 0, "what is not whole tells nothing"
+    assert learnt_from(str(copy), LabelledRollouts.read(again)) == 0, "what is not whole tells nothing"
 
 
 def test_rollouts_count_within_the_length_of_an_episode_and_must_both_succeed_and_fail(
     config, small_dataset, tmp_path
 ):
     env = config.imagination()
-    every = replayed_rollouts(env, Rollouts.read(config.dataset))
+    every = replayed_rollouts(env, LabelledRollouts.read(config.dataset))
     assert len(every.episodes) == small_dataset.num_episodes
     assert every.probability.shape[1] <= env.horizon
-    assert len(replayed_rollouts(env, Rollouts.read(config.dataset, "train", [0, 1, 2, 3])).episodes) == 4
+    assert (
+        len(replayed_rollouts(env, LabelledRollouts.read(config.dataset, "train", [0, 1, 2, 3])).episodes)
+        == 4
+    )
     config.episode_length = int(every.done[every.success].argmax(1).min())
     with pytest.raises(
         ValueError, match=rf"none of the \d+ rollouts succeeds within {config.episode_length} frames"
     ):
-        replayed_rollouts(config.imagination(), Rollouts.read(config.dataset))
+        replayed_rollouts(config.imagination(), LabelledRollouts.read(config.dataset))
     labels = [False] * small_dataset.num_frames
     failing = ChosenEpisodes(
         str(relabelled(Path(small_dataset.root), tmp_path / "f", {"next.success": labels}))
@@ -388,7 +391,7 @@ def test_rollouts_count_within_the_length_of_an_episode_and_must_both_succeed_an
     with pytest.raises(
         ValueError, match=r"dataset\.root=.*none of the \d+ rollouts succeeds within 20 frames"
     ):
-        replayed_rollouts(env, Rollouts.read(failing))
+        replayed_rollouts(env, LabelledRollouts.read(failing))
 
 
 @pytest.mark.parametrize(

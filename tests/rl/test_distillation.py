@@ -38,8 +38,8 @@ from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
 from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
 from lerobot_wmrl.rl.labels import (
+    LabelBatch,
     Labels,
-    Part,
     Windows,
     action_windows,
     imagined_labels,
@@ -480,7 +480,7 @@ def test_labels_are_the_same_when_they_are_read_again(tmp_path: Path):
             "task": torch.zeros(count, dtype=torch.long),
         }
         actions = {"action": iteration + torch.arange(float(count))[:, None] / 10}
-        labels.add(iteration, Part(part, actions, torch.arange(count), [f"task {iteration}"]))
+        labels.add(iteration, LabelBatch(part, actions, torch.arange(count), [f"task {iteration}"]))
     again = Labels(tmp_path, 0)
     again.load(3)
     assert len(again) == len(labels) == 6

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 from torch import Tensor
 
-from lerobot_wmrl.world_models.anchored.network import Scene, StateRollout
+from lerobot_wmrl.world_models.anchored.network import EncodedScene, StateRollout
 from lerobot_wmrl.world_models.dynamics import Imagination
 from lerobot_wmrl.world_models.kv_cache import CachedMemory
 
@@ -19,7 +19,7 @@ class AnchoredImagination(Imagination):
     window, at which some environment may have to begin. At all others the host need not wait for the device.
     """
 
-    scene: Scene | None = None
+    scene: EncodedScene | None = None
     rollout: StateRollout | None = None
     frame: int = 0
     phases: set[int] = field(default_factory=lambda: {0})
@@ -41,7 +41,7 @@ class AnchoredImagination(Imagination):
             self.phases.remove(self._phase)
         return rows
 
-    def begin(self, rows: Tensor, scene: Scene, rollout: StateRollout) -> None:
+    def begin(self, rows: Tensor, scene: EncodedScene, rollout: StateRollout) -> None:
         """Begin in the environments `rows` (R,) with scenes and state rollouts of R rows."""
         cache = self.cache
         cache.started.copy_(cache.started.index_copy(0, rows, cache.position.expand(len(rows))))

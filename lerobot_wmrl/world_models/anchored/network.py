@@ -39,7 +39,7 @@ SUMMARY_CHANNELS: Final = 16
 """Channels that each token of the scene contributes to its summary."""
 
 
-class Scene(NamedTuple):
+class EncodedScene(NamedTuple):
     """First frames of B clips, encoded once.
 
     codes (B, 1, S, C); tokens (B, 1, M, D), M = 1 + S' of the transformer; keys_values (B, 1, L, 2, h, M, d)
@@ -248,7 +248,7 @@ class AnchoredNetwork(FrameNetwork):
         begin = StateRollout(*(spread(tensor, len(mean)) for tensor in begin))
         return self.follow(scene, begin, mean, memory, steps)[0]
 
-    def encode(self, codes: Tensor, state: Tensor, context: Context) -> tuple[Scene, StateRollout]:
+    def encode(self, codes: Tensor, state: Tensor, context: Context) -> tuple[EncodedScene, StateRollout]:
         """Encode first frames: codes (B, 1, S, C), states (B, 1, P) and their episodes' context.
 
         ValueError if the network needs a context and has none.
@@ -267,11 +267,16 @@ class AnchoredNetwork(FrameNetwork):
         blocks = cast(Iterable[TrajectoryBlock], self.trajectory)
         keys_values = torch.stack([block.scene.project_kv(tokens) for block in blocks], 2)
         local = local.unflatten(0, (len(codes), -1))  # (B, N, code_width, g, g)
-        scene = Scene(codes, tokens, keys_values, self.summary(tokens), local)
+        scene = EncodedScene(codes, tokens, keys_values, self.summary(tokens), local)
         return scene, self.state_rollout.begin(state)
 
     def follow(
-        self, scene: Scene, begin: StateRollout, mean: Tensor, memory: TemporalMemory, steps: Tensor | None
+        self,
+        scene: EncodedScene,
+        begin: StateRollout,
+        mean: Tensor,
+        memory: TemporalMemory,
+        steps: Tensor | None,
     ) -> tuple[Prediction, StateRollout]:
         """Predict T frames of a scene under the conditions' means (B, T, D), from a state rollout (T = 1) on.
 
@@ -289,13 +294,13 @@ class AnchoredNetwork(FrameNetwork):
             hidden = hidden.float()
             return Prediction(logits, self.done(hidden).squeeze(-1), rollout.state, hidden), rollout
 
-    def _render(self, scene: Scene, hidden: Tensor) -> Tensor:
+    def _render(self, scene: EncodedScene, hidden: Tensor) -> Tensor:
         """Predict the codes of frames from the trajectory's tokens (B, K, D). → logits (B, K, S, V)"""
         count = hidden.shape[1]
         if not count:  # convolutions refuse an empty batch
             sizes = scene.codes.shape[2], len(self.codebook.factor_of_logit)
             return hidden.new_zeros(len(hidden), 0, *sizes)
-        scene = Scene(*(spread(tensor, len(hidden)) for tensor in scene))
+        scene = EncodedScene(*(spread(tensor, len(hidden)) for tensor in scene))
         x = scene.tokens.expand(-1, count, -1, -1)
         for block in self.renderer:
             x = block(x, hidden)
