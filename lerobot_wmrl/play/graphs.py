@@ -37,7 +37,7 @@ LARGE: Final = 1024
 """Tensors of at least so many weights are stored in 16 bits."""
 
 SCENE: Final = ("anchor", "tokens", "scene_keys_values", "summary", "local")
-"""Names of the parts of a `EncodedScene`; the codes of its frame are the `anchor`."""
+"""Names of the parts of an `EncodedScene`; the codes of its frame are the `anchor`."""
 
 ROLLOUT: Final = ("state", "change", "hidden")
 """Names of the parts of a `StateRollout`."""
