@@ -4,7 +4,7 @@ import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from math import ceil
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium as gym
 import torch
@@ -19,9 +19,9 @@ from lerobot.utils.random_utils import set_seed
 from lerobot_wmrl.common.checkpoints import resolved_name
 from lerobot_wmrl.common.errors import FieldError, first_line
 from lerobot_wmrl.common.policies import (
+    LoadedPolicy,
     check_weights,
     fit_to_environment,
-    load_policy,
     load_processors,
     read_policy_config,
 )
@@ -32,14 +32,6 @@ from lerobot_wmrl.world_models.checkpoint import load_model
 
 type Envs = dict[str, dict[int, gym.vector.VectorEnv]]
 """Suite → task → vector environment, as LeRobot's make_env returns them."""
-
-
-class LoadedPolicy(NamedTuple):
-    """A policy with its configuration and its pre- and postprocessor."""
-
-    config: PreTrainedConfig
-    policy: Any
-    processors: tuple[Any, Any]
 
 
 def read_policies(paths: Sequence[str], env: EnvConfig) -> dict[str, PreTrainedConfig]:
@@ -94,7 +86,7 @@ def load_policies(configs: Mapping[str, PreTrainedConfig]) -> list[LoadedPolicy]
     loaded = []
     for name, config in configs.items():
         with about_policy(name):
-            loaded.append(LoadedPolicy(config, load_policy(config), load_processors(config)))
+            loaded.append(LoadedPolicy.load(config))
     return loaded
 
 

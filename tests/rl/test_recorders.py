@@ -91,8 +91,8 @@ def test_a_policy_that_draws_its_actions_draws_the_same_from_a_seed(checkpoint: 
     for name in ("first", "again"):
         config = read_policy_config(str(checkpoint / "pretrained_model"), [])
         recorder = RolloutRecorder(PushtEnv(episode_length=STEPS), config, ROBOT)
-        chosen = recorder.policy.select_action
-        recorder.policy.select_action = lambda seen, chosen=chosen: chosen(seen) + torch.randn(1, 2)
+        chosen = recorder.policy.policy.select_action
+        recorder.policy.policy.select_action = lambda seen, chosen=chosen: chosen(seen) + torch.randn(1, 2)
         torch.manual_seed(len(name))
         expected = torch.rand(1)
         torch.manual_seed(len(name))

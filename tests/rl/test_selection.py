@@ -107,6 +107,9 @@ def test_a_training_whose_imagination_parts_from_reality_is_stopped(tmp_path: Pa
     assert best(tmp_path) == "000005", "the best checkpoint is pointed at nonetheless"
 
 
+UNTRAINED: Any = SimpleNamespace(policy=None, processors=(None, None))
+
+
 class Imagining(PointEnv):
     """In the place of a world model."""
 
@@ -132,6 +135,7 @@ def test_success_is_measured_on_seeds_that_nothing_is_reported_on(
         monkeypatch.setattr(make_callbacks, name, seed_of)
     monkeypatch.setattr(make_callbacks, "WorldModelVectorEnv", Imagining)
     monkeypatch.setattr(make_callbacks, "make_success_env", lambda env, *_: env)
-    trained = make_callbacks.Trained(None, (None, None), env(2), config)
-    measures: dict[str, Any] = make_callbacks.make_measures(CallbackSettings(real_env=real_env), trained)
+    measures: dict[str, Any] = make_callbacks.make_measures(
+        CallbackSettings(real_env=real_env), UNTRAINED, env(2), config
+    )
     assert {place: measure() for place, measure in measures.items()} == dict.fromkeys(places, SELECTION_SEED)
