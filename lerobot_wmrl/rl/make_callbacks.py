@@ -13,7 +13,7 @@ from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.envs.lerobot_env import is_own
 from lerobot_wmrl.envs.tensor_env import TensorEnv
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv, make_success_env
-from lerobot_wmrl.evaluation.agreement import evaluate_policy, evaluate_within
+from lerobot_wmrl.evaluation.policy_rollouts import evaluate_policy, evaluate_within
 from lerobot_wmrl.rl.callbacks import Callback
 from lerobot_wmrl.rl.configuration_callbacks import CallbackSettings
 from lerobot_wmrl.rl.configuration_train import TrainConfig
@@ -57,24 +57,22 @@ def make_recorder(settings: CallbackSettings, env: WorldModelVectorEnv) -> Recor
 
 
 def make_measures(
-    settings: CallbackSettings, loaded: LoadedPolicy, env: TensorEnv, config: EnvConfig
+    settings: CallbackSettings, policy: LoadedPolicy, env: TensorEnv, config: EnvConfig
 ) -> dict[str, Measure]:
     """Return functions that measure success: `real` in `real_env`, and `imagined` in the world model. For a
     training outside a world model, `real` is in `real_env` or else in the training's environment."""
-    policy, processors = loaded.policy, loaded.processors
     episodes, dataset = settings.selection.n_episodes, settings.selection.dataset
     measures: dict[str, Measure] = {}
     if settings.real_env is not None:
         measures[REAL] = partial(
-            evaluate_policy, settings.real_env, policy, processors, episodes, SELECTION_SEED,
-            settings.real_num_envs,
-        )  # fmt: skip
+            evaluate_policy, settings.real_env, policy, episodes, SELECTION_SEED, settings.real_num_envs
+        )
 
     def measure_in_training_env() -> Any:
         if not is_own(config):
-            return evaluate_policy(config, policy, processors, episodes, SELECTION_SEED, num_envs=1)
+            return evaluate_policy(config, policy, episodes, SELECTION_SEED, num_envs=1)
         if not isinstance(env, WorldModelVectorEnv):
-            return evaluate_within(env, config, policy, processors, episodes, SELECTION_SEED)
+            return evaluate_within(env, config, policy, episodes, SELECTION_SEED)
         own, measured_env = env.config.dataset, env
         if dataset.given:
             source = StartFrames(**vars(dataset), max_starts=own.max_starts, branches=own.branches)
@@ -83,7 +81,7 @@ def make_measures(
             measured_env = make_success_env(env, own, episodes)
         count = min(episodes, len(measured_env.starts))
         with measured_env.in_full():
-            return evaluate_within(measured_env, config, policy, processors, count, SELECTION_SEED)
+            return evaluate_within(measured_env, config, policy, count, SELECTION_SEED)
 
     if isinstance(env, WorldModelVectorEnv):
         measures[IMAGINED] = measure_in_training_env

@@ -45,8 +45,8 @@ if TYPE_CHECKING:
     from lerobot.configs import PreTrainedConfig
 
     from lerobot_wmrl.common.statistics import Proportion
-    from lerobot_wmrl.evaluation.compare import Envs
     from lerobot_wmrl.evaluation.judgement import Judgement
+    from lerobot_wmrl.evaluation.policy_rollouts import Envs
 
 
 @dataclass
@@ -207,8 +207,8 @@ def read_both(
     Raises:
         FieldError: one of them cannot be read, or a policy to judge is a reference.
     """
-    from lerobot_wmrl.evaluation.compare import read_policies
     from lerobot_wmrl.evaluation.evidence import read_references
+    from lerobot_wmrl.evaluation.policy_rollouts import read_policies
 
     known, judged = read_references(cfg.references), read_policies(cfg.policies, env)
     with renamed("policies", "references"):
@@ -265,8 +265,8 @@ def imagine(
     content: dict[str, str],
 ) -> None:  # fmt: skip
     """Imagine the episodes of the policies that have none yet; write the results after every policy."""
-    from lerobot_wmrl.evaluation.compare import about_policy, load_policies, opened, run_block
     from lerobot_wmrl.evaluation.judgement import RESULTS
+    from lerobot_wmrl.evaluation.policy_rollouts import about_policy, load_policies, opened, run_block
 
     def write() -> None:
         finished = configs.keys() == judgement.outcomes.keys()

@@ -13,7 +13,7 @@ from lerobot_wmrl.common.constants import SELECTION_SEED
 from lerobot_wmrl.common.errors import TrainingStopped
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
-from lerobot_wmrl.evaluation.agreement import Evaluated
+from lerobot_wmrl.evaluation.policy_rollouts import Evaluated
 from lerobot_wmrl.rl import make_callbacks
 from lerobot_wmrl.rl.callbacks import Record
 from lerobot_wmrl.rl.configuration_callbacks import CallbackSettings
@@ -35,7 +35,7 @@ def record(real: float | None, imagined: float | None, n: int = N) -> Record:
 
 
 def measure(successes: int, n: int = 4, steps: int = 30) -> Measure:
-    return lambda: Evaluated([index < successes for index in range(n)], steps)
+    return lambda: Evaluated({("suite", 0, seed): seed < successes for seed in range(n)}, steps)
 
 
 def make_selection(tmp_path: Path, **measures: Measure) -> Selection:
