@@ -2,7 +2,6 @@
 
 import logging
 from functools import partial
-from typing import Any
 
 from lerobot.envs.configs import EnvConfig
 
@@ -11,11 +10,12 @@ from lerobot_wmrl.common.policies import LoadedPolicy
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.envs.lerobot_env import is_own
+from lerobot_wmrl.envs.start_frames import Starts
 from lerobot_wmrl.envs.tensor_env import TensorEnv
-from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv, make_success_env
-from lerobot_wmrl.evaluation.policy_rollouts import evaluate_policy, evaluate_within
+from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv, load_spread_starts, make_success_env
+from lerobot_wmrl.evaluation.policy_rollouts import Evaluated, evaluate_policy, evaluate_within
 from lerobot_wmrl.rl.callbacks import Callback
-from lerobot_wmrl.rl.configuration_callbacks import CallbackSettings
+from lerobot_wmrl.rl.configuration_callbacks import CallbackSettings, SelectionConfig
 from lerobot_wmrl.rl.configuration_train import TrainConfig
 from lerobot_wmrl.rl.dyna import DynaRounds, round_iterations
 from lerobot_wmrl.rl.gate import SuccessGate
@@ -61,35 +61,41 @@ def make_measures(
 ) -> dict[str, Measure]:
     """Return functions that measure success: `real` in `real_env`, and `imagined` in the world model. For a
     training outside a world model, `real` is in `real_env` or else in the training's environment."""
-    episodes, dataset = settings.selection.n_episodes, settings.selection.dataset
-    measures: dict[str, Measure] = {}
+    episodes, measures = settings.selection.n_episodes, dict[str, Measure]()
     if settings.real_env is not None:
         measures[REAL] = partial(
             evaluate_policy, settings.real_env, policy, episodes, SELECTION_SEED, settings.real_num_envs
         )
-
-    def measure_in_training_env() -> Any:
-        if not is_own(config):
-            return evaluate_policy(config, policy, episodes, SELECTION_SEED, num_envs=1)
-        if not isinstance(env, WorldModelVectorEnv):
-            return evaluate_within(env, config, policy, episodes, SELECTION_SEED)
-        own, measured_env = env.config.dataset, env
-        if dataset.given:
-            source = StartFrames(**vars(dataset), max_starts=own.max_starts, branches=own.branches)
-            measured_env = make_success_env(env, source, episodes)
-        elif not own.resets:
-            measured_env = make_success_env(env, own, episodes)
-        count = min(episodes, len(measured_env.starts))
-        with measured_env.in_full():
-            return evaluate_within(measured_env, config, policy, count, SELECTION_SEED)
-
     if isinstance(env, WorldModelVectorEnv):
-        measures[IMAGINED] = measure_in_training_env
+        starts = selection_starts(settings.selection, env)
+        measures[IMAGINED] = partial(measure_imagined, env, policy, starts, min(episodes, len(starts)))
+    elif REAL not in measures and is_own(config):
+        measures[REAL] = partial(evaluate_within, env, config, policy, episodes, SELECTION_SEED)
     elif REAL not in measures:
-        measures[REAL] = measure_in_training_env
+        measures[REAL] = partial(evaluate_policy, config, policy, episodes, SELECTION_SEED, num_envs=1)
     if REAL not in measures:
         logging.warning(
             "selection: without `real_env` the best checkpoint is the one that succeeds most often in "
             "imagination, which is not checked outside the world model"
         )
     return measures
+
+
+def selection_starts(selection: SelectionConfig, env: WorldModelVectorEnv) -> Starts:
+    """Return the starts of imagined episodes of selection. They hold for refreshed world models too, which
+    keep the tokenizer."""
+    source = env.config.dataset
+    if selection.dataset.given:
+        source = StartFrames(
+            **vars(selection.dataset), max_starts=source.max_starts, branches=source.branches
+        )
+    elif source.resets:
+        return env.starts
+    return load_spread_starts(env.model, source, selection.n_episodes)
+
+
+def measure_imagined(
+    env: WorldModelVectorEnv, policy: LoadedPolicy, starts: Starts, episodes: int
+) -> Evaluated:
+    """Run a policy from these starts in the world model that `env` has by now."""
+    return evaluate_within(make_success_env(env, starts), env.config, policy, episodes, SELECTION_SEED)
