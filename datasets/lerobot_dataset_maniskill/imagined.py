@@ -16,8 +16,7 @@ from lerobot_dataset_maniskill.worker import EpisodeResult, Report, out_of_range
 from lerobot_dataset_maniskill.writer import Outcome, StartColumns, add_step
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.exploration import ExplorationNoise
-from lerobot_wmrl.common.pipeline import make_pipeline
-from lerobot_wmrl.common.policies import fit_to_environment, load_policy, load_processors
+from lerobot_wmrl.common.policies import LoadedPolicy, fit_to_environment
 from lerobot_wmrl.data.dataset import save_episode
 from lerobot_wmrl.envs.evaluation_adapter import images_to_numpy
 from lerobot_wmrl.envs.start_frames import maniskill_side
@@ -49,10 +48,8 @@ class ImaginedPartRecorder:
         self.cameras = self.env.model.config.tokenizer.cameras
         self.side = maniskill_side(self.env.model.config.tokenizer, "env.world_model_path", path, remedy)
         fit_to_environment(config.policy, shown, len(ACTION_NAMES))
-        self.policy: Any = load_policy(config.policy).eval()
-        self.processors = load_processors(config.policy)
-        self.env.model.check_units(config.policy, self.processors[1])
-        self.pipeline = make_pipeline(config.policy, *self.processors)
+        self.policy = LoadedPolicy.load(config.policy)
+        self.env.model.check_units(config.policy, self.policy.postprocessor)
 
     def record(self, part: Part, report: Report) -> None:
         """Record a part. Its folder appears under its final name only when it is whole."""
@@ -73,8 +70,7 @@ class ImaginedPartRecorder:
         largest = self.config.exploration
         noises = [ExplorationNoise(largest, plan.seed, TRANSLATION, plan.visit) for plan in plans]
         torch.manual_seed(plans[0].seed + VISIT_SEEDS * plans[0].visit)
-        for part in (self.policy, *self.processors):
-            part.reset()
+        self.policy.reset()
         spare = [0] * (count - len(plans))
         observation, _ = self.env.reset(seed=[*(plan.start for plan in plans), *spare])
         instructions = list(observation["task"])
@@ -99,8 +95,7 @@ class ImaginedPartRecorder:
         self, observation: dict[str, Any], noises: list[ExplorationNoise]
     ) -> tuple[np.ndarray, list[float]]:
         """Return actions (B, 7) inside the action box, and the shares of the policy's that were not (B,)."""
-        chosen = self.policy.select_action(self.pipeline.prepare(observation))
-        given = self.pipeline.to_action(chosen).cpu()
+        given = self.policy.act(observation).cpu()
         shares, action = out_of_range(given), given.numpy()
         action[: len(noises), :3] += np.stack([noise() for noise in noises])
         return np.clip(action, ACTION_LOW, ACTION_HIGH).astype(np.float32), shares

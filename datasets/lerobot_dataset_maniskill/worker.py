@@ -27,7 +27,7 @@ from lerobot_dataset_maniskill.writer import HOLD_FRAMES, Outcome, StartColumns,
 from lerobot_wmrl.common.actions import clip_actions
 from lerobot_wmrl.common.constants import KINDS, PLAY
 from lerobot_wmrl.common.exploration import ExplorationNoise
-from lerobot_wmrl.common.policies import load_policy, load_processors
+from lerobot_wmrl.common.policies import LoadedPolicy
 from lerobot_wmrl.common.processes import own_progress_lock
 from lerobot_wmrl.data.dataset import save_episode
 from lerobot_wmrl.maniskill.backend import leave_with_command
@@ -74,9 +74,7 @@ class PolicyDriver:
     """Acts by a LeRobot policy with its own pre- and postprocessors, and exploration noise on its actions."""
 
     def __init__(self, config: PreTrainedConfig, exploration: float) -> None:
-        self.policy: Any = load_policy(config).eval()
-        self.preprocess, self.postprocess = load_processors(config)
-        self.exploration = exploration
+        self.policy, self.exploration = LoadedPolicy.load(config), exploration
         self.clipped: list[float] = []
 
     def begin(self, simulation: "Simulation", plan: EpisodePlan) -> None:
@@ -84,13 +82,9 @@ class PolicyDriver:
         self.clipped = []
         self.noise = ExplorationNoise(self.exploration, plan.seed, TRANSLATION)
         self.policy.reset()
-        self.preprocess.reset()
-        self.postprocess.reset()
 
-    @torch.no_grad()
     def act(self, simulation: "Simulation", frame: Frame) -> np.ndarray:
-        batch = self.preprocess(policy_observation(frame, simulation.instruction))
-        chosen = self.postprocess(self.policy.select_action(batch)).cpu()
+        chosen = self.policy.act(policy_observation(frame, simulation.instruction)).cpu()
         self.clipped += out_of_range(chosen)
         action = chosen.squeeze(0).numpy()
         action[:3] += self.noise()

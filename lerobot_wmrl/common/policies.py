@@ -1,7 +1,7 @@
 """Checkpoints of policies, with adapters (PEFT) or without, loaded to act in an environment."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from lerobot_wmrl.common.checkpoints import ADAPTERS_FILE, local_checkpoint, resolve_checkpoint
+from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.errors import FieldError, first_line
 from lerobot_wmrl.common.files import whole_folder
 
@@ -106,6 +107,37 @@ def load_processors(config: PreTrainedConfig) -> tuple[Any, Any]:
         return make_pre_post_processors(config)
     overrides = {"device_processor": {"device": config.device}}
     return make_pre_post_processors(config, str(config.pretrained_path), preprocessor_overrides=overrides)
+
+
+@dataclass
+class LoadedPolicy:
+    """A policy with its configuration and its processors."""
+
+    config: PreTrainedConfig
+    policy: Any
+    preprocessor: Any
+    postprocessor: Any
+
+    @classmethod
+    def load(cls, config: PreTrainedConfig) -> "LoadedPolicy":
+        """Load a policy, in evaluation mode, and its processors. FieldError if the weights do not fit."""
+        return cls(config, load_policy(config), *load_processors(config))
+
+    @property
+    def processors(self) -> tuple[Any, Any]:
+        """Pre- and postprocessor, in the order of LeRobot's functions."""
+        return self.preprocessor, self.postprocessor
+
+    def reset(self) -> None:
+        """Forget the episodes so far."""
+        for part in (self.policy, *self.processors):
+            part.reset()
+
+    @torch.no_grad()
+    def act(self, observation: Observation) -> Tensor:
+        """Return actions, in the dataset's units, for a batch of observations in LeRobot's names. (B, A)"""
+        action: Tensor = self.postprocessor(self.policy.select_action(self.preprocessor(observation)))
+        return action
 
 
 def adopt_features(config: PreTrainedConfig, shown: Mapping[str, tuple[int, ...]]) -> None:

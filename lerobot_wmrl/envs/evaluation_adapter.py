@@ -1,4 +1,4 @@
-"""Adapters for lerobot-eval: a tensor environment in numpy, and a counter of steps."""
+"""A tensor environment in numpy, for lerobot-eval."""
 
 from typing import Any
 
@@ -129,28 +129,3 @@ def numpy_space(space: Any) -> gym.spaces.Dict:
     state = {"agent_pos": space[OBS_STATE]} if OBS_STATE in space.spaces else {}
     pixels = cameras.get(OBS_IMAGE) or gym.spaces.Dict(cameras)
     return gym.spaces.Dict({"pixels": pixels, **state})
-
-
-class StepCounter:
-    """A vector environment that counts the steps of unfinished episodes in `steps`.
-
-    In ManiSkill and on a robot, these are what an evaluation costs.
-    """
-
-    def __init__(self, env: gym.vector.VectorEnv) -> None:
-        self.env, self.steps = env, 0
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.env, name)
-
-    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode in every sub-environment."""
-        self._running = np.ones(self.env.num_envs, bool)
-        return self.env.reset(**kwargs)
-
-    def step(self, actions: Any) -> tuple[Any, ...]:
-        """Step all, and count those whose first episode since the reset goes on."""
-        self.steps += int(self._running.sum())
-        result: tuple[Any, ...] = self.env.step(actions)
-        self._running &= ~(result[2] | result[3])
-        return result

@@ -24,7 +24,7 @@ from lerobot_wmrl.common.errors import FieldError, first_line, renamed
 from lerobot_wmrl.common.exploration import ExplorationNoise
 from lerobot_wmrl.common.files import whole_folder
 from lerobot_wmrl.common.images import to_bytes
-from lerobot_wmrl.common.policies import load_policy, load_processors
+from lerobot_wmrl.common.policies import LoadedPolicy
 from lerobot_wmrl.data.dataset import save_episode
 from lerobot_wmrl.data.embodiment import (
     Embodiment,
@@ -66,7 +66,7 @@ class RolloutRecorder:
         self.columns = like.features if like is not None and like_columns else None
         self.robot_type = like.robot_type if like is not None else None
         self.hold = env.done_frames if isinstance(env, WorldModelEnv) else 1
-        self.policy, self.processors = load_policy(policy).eval(), load_processors(policy)
+        self.policy = LoadedPolicy.load(policy)
         self.env_processors = make_env_pre_post_processors(env, policy)
         made = make_env(env, num_envs, use_async_envs=False)
         self.envs = [each for tasks in made.values() for each in tasks.values()]
@@ -139,10 +139,10 @@ class RolloutRecorder:
         """Return what the policy saw and did from these seeds, and LeRobot's record of the outcome."""
         spare = [seeds[-1]] * (env.num_envs - len(seeds))
         noises = [ExplorationNoise(self.exploration, seed, self._scale()) for seed in [*seeds, *spare]]
-        seen = RecordingProcessors(*self.processors, noises, self.robot)
+        seen = RecordingProcessors(*self.policy.processors, noises, self.robot)
         with seeded_context(seeds[0]):  # of a policy that draws its actions, as flows and diffusion do
             taken = rollout(
-                env, self.policy, *self.env_processors, seen.preprocess, seen.postprocess,
+                env, self.policy.policy, *self.env_processors, seen.preprocess, seen.postprocess,
                 seeds=[*seeds, *spare],
             )  # fmt: skip
         return seen, taken

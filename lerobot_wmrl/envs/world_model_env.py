@@ -1,8 +1,7 @@
 """The world model as a natively batched environment: many imagined episodes, one forward pass a step."""
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -112,15 +111,6 @@ class WorldModelVectorEnv(TensorEnv):
         reward = self.reward.compute_reward({**seen, **parts, "hidden": imagined.hidden})
         parts |= {**entropies(imagined), "done_probability": imagined.done_logit.sigmoid()}
         return Outcome(observation, reward, terminated, truncated, terminated, self._elapsed, parts)
-
-    @contextmanager
-    def in_full(self) -> Iterator[None]:
-        """Show frames of the dataset's size within the block, also if they are compact outside it."""
-        compact, self.compact = self.compact, False
-        try:
-            yield
-        finally:
-            self.compact = compact
 
     def newest_frames(self) -> Frames:
         """Return the newest imagined frames, from which a planner can look ahead."""
@@ -274,14 +264,18 @@ def make_env_at(
     return WorldModelVectorEnv(models.model, starts, goals, models.reward, config, n_envs)
 
 
-def make_success_env(env: WorldModelVectorEnv, source: StartFrames, at_most: int) -> WorldModelVectorEnv:
-    """Return an environment that counts successes: the same world model and as many imaginations, at most so
-    many of other starts, spread evenly, success as the reward and no goals."""
+def load_spread_starts(model: ActionWorldModelRewardModel, source: StartFrames, at_most: int) -> Starts:
+    """Read and tokenise at most so many of the starts that `source` names, spread evenly."""
+    frames = read_start_images(source, model.config)
+    frames = frames.chosen(evenly_spaced(len(frames.images), at_most))
+    return load_starts(frames, model, None, make_similarity("tokenizer", model.state_mean.device))[0]
+
+
+def make_success_env(env: WorldModelVectorEnv, starts: Starts) -> WorldModelVectorEnv:
+    """Return an environment that counts successes from other starts: the world model that `env` has now, as
+    many imaginations, frames of the dataset's size, success as the reward and no goals."""
     reward = make_reward_model(GeneralConfig(alpha=1.0, device=env.device.type))
-    models = WorldModels(env.model, None, make_similarity("tokenizer", env.device), reward)
-    starts = read_start_images(source, env.model.config)
-    starts = starts.chosen(evenly_spaced(len(starts.images), at_most))
-    return make_env_at(starts, models, env.config, env.num_envs)
+    return WorldModelVectorEnv(env.model, starts, None, reward, env.config, env.num_envs)
 
 
 def entropies(imagined: Imagined) -> dict[str, Tensor]:

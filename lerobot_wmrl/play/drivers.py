@@ -4,13 +4,10 @@ import copy
 from typing import Protocol
 
 import torch
-from lerobot.configs import PreTrainedConfig
 from torch import Tensor
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.pipeline import make_pipeline
-from lerobot_wmrl.common.policies import check_units, fit_to_environment, load_policy, load_processors
-from lerobot_wmrl.envs.world_model_env import Observation
+from lerobot_wmrl.common.policies import LoadedPolicy
 from lerobot_wmrl.play.drive import Drive
 from lerobot_wmrl.world_models.configuration_planner import PlannerSettings
 from lerobot_wmrl.world_models.planning import Planner
@@ -28,57 +25,23 @@ class Driver(Protocol):
         """Return the next action. (1, A)"""
 
 
-class DrivingPolicy:
-    """A policy for one visitor. Copies share the weights; each has its own memory of an episode.
-
-    Args:
-        config: configuration of the policy.
-        shown: what the world model shows: LeRobot's names with their shapes.
-        names, low, high: of the components of its actions, and their range. (A,) each
-    """
-
-    def __init__(
-        self, config: PreTrainedConfig, shown: dict[str, tuple[int, ...]], names: list[str], low: Tensor,
-        high: Tensor,
-    ) -> None:  # fmt: skip
-        fit_to_environment(config, shown, len(names))
-        self.config, self.processors = config, load_processors(config)
-        self.policy = load_policy(config).eval()
-        check_units(config, self.processors[1], names, low, high)
-        self.pipeline = make_pipeline(config, *self.processors)
-
-    def copy(self) -> "DrivingPolicy":
-        """Return the policy for another visitor."""
-        shared = {id(each): each for each in (*self.policy.parameters(), *self.policy.buffers())}
-        other = copy.copy(self)
-        other.policy = copy.deepcopy(self.policy, shared)
-        other.processors = copy.deepcopy(self.processors)
-        other.pipeline = make_pipeline(self.config, *other.processors)
-        return other
-
-    def reset(self) -> None:
-        """Forget the episode."""
-        for part in (self.policy, *self.processors):
-            part.reset()
-
-    @torch.no_grad()
-    def action(self, observation: Observation) -> Tensor:
-        """Return the action for an observation, in the dataset's units. (B, A)"""
-        chosen = self.policy.select_action(self.pipeline.prepare(observation))
-        return self.pipeline.to_action(chosen)
+def copied(policy: LoadedPolicy) -> LoadedPolicy:
+    """Return the policy for another visitor: it shares the weights, and has its own memory of an episode."""
+    shared = {id(each): each for each in (*policy.policy.parameters(), *policy.policy.buffers())}
+    return copy.deepcopy(policy, shared)
 
 
 class PolicyDriver:
     """A policy of LeRobot acts."""
 
-    def __init__(self, policy: DrivingPolicy) -> None:
+    def __init__(self, policy: LoadedPolicy) -> None:
         self.policy = policy
 
     def reset(self) -> None:
         self.policy.reset()
 
     def act(self, drive: Drive) -> Tensor:
-        return self.policy.action(drive.observation).cpu()
+        return self.policy.act(drive.observation).cpu()
 
 
 class PlannerDriver:
@@ -90,7 +53,7 @@ class PlannerDriver:
         policy: policy whose actions it changes, if there is one.
     """
 
-    def __init__(self, settings: PlannerSettings, done_frames: int, policy: DrivingPolicy | None) -> None:
+    def __init__(self, settings: PlannerSettings, done_frames: int, policy: LoadedPolicy | None) -> None:
         self.settings, self.done_frames, self.policy = settings, done_frames, policy
         self.reset()
 
@@ -114,7 +77,7 @@ class PlannerDriver:
         if self.policy is not None:
             self.policy.reset()
             row = torch.zeros(1, dtype=torch.long, device=env.device)
-            proposed = env.policy_actions(self.policy.action, row, self.settings.horizon)
+            proposed = env.policy_actions(self.policy.act, row, self.settings.horizon)
         return self.planner.plan(env.newest_frames(), [drive.instruction], proposed)
 
 

@@ -13,6 +13,7 @@ from PIL import Image, ImageOps
 from torchvision.transforms.v2.functional import pil_to_tensor
 
 from lerobot_wmrl.common.errors import FieldError, within
+from lerobot_wmrl.common.policies import LoadedPolicy, fit_to_environment
 from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames
@@ -23,7 +24,7 @@ from lerobot_wmrl.envs.start_frames import StartImages, maniskill_side, observed
 from lerobot_wmrl.envs.world_model_env import WorldModels, load_world_models
 from lerobot_wmrl.play.checks import instruction, is_numbers, whole_number
 from lerobot_wmrl.play.drive import Drive, RealEpisode, Recorded
-from lerobot_wmrl.play.drivers import Driver, DrivingPolicy, PlannerDriver, PolicyDriver, RecordedDriver
+from lerobot_wmrl.play.drivers import Driver, PlannerDriver, PolicyDriver, RecordedDriver, copied
 from lerobot_wmrl.world_models.checkpoint import check_dataset
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 from lerobot_wmrl.world_models.configuration_planner import PlannerSettings
@@ -57,7 +58,7 @@ class World:
     config: WorldModelEnv
     done_frames: int
     table: EpisodeTable | None = None
-    policy: DrivingPolicy | None = None
+    policy: LoadedPolicy | None = None
     real_env: EnvConfig | None = None
     uploads: dict[str, StartImages] = field(default_factory=dict)
 
@@ -127,7 +128,7 @@ class World:
         """Return a visitor's own driver of one of `driver_names`."""
         if name == "recorded":
             return RecordedDriver()
-        policy = self.policy and self.policy.copy()
+        policy = self.policy and copied(self.policy)
         if name == "policy" and policy is not None:
             return PolicyDriver(policy)
         return PlannerDriver(planner_settings(self.model.clip_length), self.done_frames, policy)
@@ -256,9 +257,9 @@ def load_world(
         world.table = read_episodes(dataset.open())
         check_dataset(world.model, world.table.dataset.meta)
     if policy is not None:
-        shown = world.model.observation_shapes
-        names, (low, high) = world.model.embodiment.action_names, models.model.action_range()
-        world.policy = DrivingPolicy(policy, shown, names, low, high)
+        fit_to_environment(policy, world.model.observation_shapes, world.model.action_size)
+        world.policy = LoadedPolicy.load(policy)
+        models.model.check_units(policy, world.policy.postprocessor)
     return world
 
 

@@ -90,8 +90,8 @@ class CompareConfig(RunConfig):
 
 def compare(cfg: CompareConfig) -> None:
     """Run the policies, or what is missing of their episodes; write comparison.json and comparison.png."""
-    from lerobot_wmrl.evaluation.compare import read_policies
     from lerobot_wmrl.evaluation.comparison import RESULTS, Comparison, save_picture
+    from lerobot_wmrl.evaluation.policy_rollouts import read_policies
 
     cfg.validate()
     assert cfg.env is not None
@@ -134,13 +134,9 @@ def run(
     cfg: CompareConfig, claim: Claim, comparison: "Comparison", configs: "dict[str, PreTrainedConfig]"
 ) -> None:
     """Run the episodes that are missing; write the results after every batch."""
-    from lerobot_wmrl.evaluation.compare import (
-        load_policies,
-        opened,
-        require_new_starts,
-        run_comparison,
-    )
+    from lerobot_wmrl.evaluation.compare import require_new_starts, run_comparison
     from lerobot_wmrl.evaluation.comparison import RESULTS
+    from lerobot_wmrl.evaluation.policy_rollouts import load_policies, opened
 
     assert cfg.env is not None
 

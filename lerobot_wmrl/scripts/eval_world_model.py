@@ -33,6 +33,7 @@ from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 
 if TYPE_CHECKING:
     import numpy as np
+    from lerobot.configs import PreTrainedConfig
 
     from lerobot_wmrl.data.episodes import EpisodeTable
     from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
@@ -135,13 +136,12 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     check_dataset(model.config, table.dataset.meta)
     text_model = load_text_model(cfg, model)
     imagination = policies_imagination(cfg, table) if cfg.policies else None
-    if imagination is not None:
-        check_policies(cfg, imagination)
+    policies = {} if imagination is None else checked_policies(cfg, imagination)
     scenes = scene_splits(table.column(START_SCENE), cfg.split)
     chosen = table.among(cfg.dataset.episodes)
     episodes = choose_episodes(table, cfg.split, cfg.max_episodes, scenes, chosen)
     with Claim(cfg.output_dir, draccus.encode(cfg)).held():
-        measure(cfg, model, text_model, table, episodes, imagination)
+        measure(cfg, model, text_model, table, episodes, imagination, policies)
 
 
 def measure(
@@ -151,6 +151,7 @@ def measure(
     table: "EpisodeTable",
     episodes: "np.ndarray",
     imagination: "WorldModelEnv | None",
+    policies: "Mapping[str, PreTrainedConfig]",
 ) -> None:
     """Replay episodes, evaluate policies in imagination, write metrics.json, metrics.md and pictures."""
     from lerobot_wmrl.common.files import write_json, write_text
@@ -167,7 +168,8 @@ def measure(
         longest = cfg.episode_length or model.config.clip_length  # as the environment has it
         reports.append(report_text_model(cfg, text_model, recording, evaluation, longest))
     if imagination is not None:
-        reports.append(report_agreement(policy_agreement(cfg, imagination), cfg.output_dir))
+        agreement = policy_agreement(cfg, imagination, policies)
+        reports.append(report_agreement(agreement, cfg.output_dir))
     metrics = {name: value for report in reports for name, value in report.metrics.items()}
     metrics["tokenizer"] = reconstruction_metrics(model, table, recording.frames, episodes)
     metrics |= {"dataset": cfg.dataset.name, "split": cfg.split}
@@ -282,34 +284,44 @@ def policies_imagination(cfg: EvalWorldModelConfig, table: "EpisodeTable") -> "W
     return imagination
 
 
-def check_policies(cfg: EvalWorldModelConfig, imagination: "WorldModelEnv") -> None:
-    """Raise FieldError unless every policy can act in the world model and in `real_env`, which is looked at.
+def checked_policies(
+    cfg: EvalWorldModelConfig, imagination: "WorldModelEnv"
+) -> "dict[str, PreTrainedConfig]":
+    """Return the configurations of the policies by their checkpoints, checked before the long replay.
 
-    Both are measured after the replay of all episodes, which takes long.
+    Raises:
+        FieldError: a policy cannot act in the world model, or not in `real_env`, of which one is made.
     """
     from lerobot_wmrl.envs.lerobot_env import check_real_env
     from lerobot_wmrl.evaluation.agreement import policy_checkpoints
-    from lerobot_wmrl.evaluation.compare import about_policy, read_policies
+    from lerobot_wmrl.evaluation.policy_rollouts import about_policy, read_policies
 
     assert cfg.real_env is not None
     paths = [str(path) for path in policy_checkpoints(cfg.policies)]
-    for name, config in read_policies(paths, imagination).items():
-        with about_policy(name):
+    policies = dict(zip(paths, read_policies(paths, imagination).values(), strict=True))
+    for path, config in policies.items():
+        with about_policy(path):
             check_real_env(config, cfg.real_env)
+    return policies
 
 
-def policy_agreement(cfg: EvalWorldModelConfig, imagination: "WorldModelEnv") -> "Agreement":
-    """Evaluate every policy in the world model and in `real_env`."""
-    from lerobot_wmrl.evaluation.agreement import Agreement, policy_checkpoints, policy_outcomes
+def policy_agreement(
+    cfg: EvalWorldModelConfig, imagination: "WorldModelEnv", policies: "Mapping[str, PreTrainedConfig]"
+) -> "Agreement":
+    """Run every policy in the world model, which is made once, and in `real_env`."""
+    from lerobot_wmrl.common.policies import LoadedPolicy
+    from lerobot_wmrl.evaluation.agreement import Agreement
+    from lerobot_wmrl.evaluation.policy_rollouts import about_policy, evaluate_policy, opened, run_policy
 
     assert cfg.real_env is not None
-    outcomes = {
-        str(path): (
-            policy_outcomes(imagination, path, cfg.policy_episodes, EVALUATION_SEED, IMAGINED_AT_ONCE),
-            policy_outcomes(cfg.real_env, path, cfg.policy_episodes, EVALUATION_SEED, REAL_AT_ONCE),
-        )
-        for path in policy_checkpoints(cfg.policies)
-    }
+    episodes, outcomes = cfg.policy_episodes, {}
+    with opened(imagination, min(IMAGINED_AT_ONCE, episodes), False, 1) as (envs,):
+        for path, config in policies.items():
+            with about_policy(path):
+                policy = LoadedPolicy.load(config)
+            imagined = run_policy(envs, imagination, policy, episodes, EVALUATION_SEED)
+            real = evaluate_policy(cfg.real_env, policy, episodes, EVALUATION_SEED, REAL_AT_ONCE)
+            outcomes[path] = imagined.successes, real.successes
     return Agreement.of_outcomes(outcomes)
 
 

@@ -45,9 +45,9 @@ if TYPE_CHECKING:
     from lerobot.configs import PreTrainedConfig
 
     from lerobot_wmrl.common.statistics import Proportion
-    from lerobot_wmrl.evaluation.compare import Envs
     from lerobot_wmrl.evaluation.evidence import LabelledRollouts
     from lerobot_wmrl.evaluation.judgement import Judgement
+    from lerobot_wmrl.evaluation.policy_rollouts import Envs
 
 
 @dataclass
@@ -211,8 +211,8 @@ def read_both(
     Raises:
         FieldError: one of them cannot be read, or a policy to judge is a reference.
     """
-    from lerobot_wmrl.evaluation.compare import read_policies
     from lerobot_wmrl.evaluation.evidence import read_references
+    from lerobot_wmrl.evaluation.policy_rollouts import read_policies
 
     known, judged = read_references(cfg.references), read_policies(cfg.policies, env)
     with renamed("policies", "references"):
@@ -278,8 +278,8 @@ def imagine(
 
     rollouts: how many there are, and so how many starts, unless others are given.
     """
-    from lerobot_wmrl.evaluation.compare import about_policy, load_policies, opened, run_block
     from lerobot_wmrl.evaluation.judgement import RESULTS
+    from lerobot_wmrl.evaluation.policy_rollouts import about_policy, load_policies, opened, run_block
 
     def write() -> None:
         finished = configs.keys() == judgement.outcomes.keys()

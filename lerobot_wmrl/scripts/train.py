@@ -22,7 +22,6 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import draccus
 from lerobot.configs.policies import PreTrainedConfig
@@ -32,6 +31,7 @@ from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.distributed import LONGEST_WAIT, is_first_process, rank_and_size, wait_for_all
 from lerobot_wmrl.common.errors import FieldError, within
 from lerobot_wmrl.common.output_folders import Claim
+from lerobot_wmrl.common.policies import LoadedPolicy
 from lerobot_wmrl.common.precision import keep_freed_memory
 from lerobot_wmrl.common.presets import expand_preset
 from lerobot_wmrl.common.tracking import make_wandb
@@ -53,7 +53,7 @@ def train_policy(cfg: TrainConfig) -> None:
     from lerobot.utils.random_utils import set_seed
 
     from lerobot_wmrl.common.checkpoints import link_latest
-    from lerobot_wmrl.common.policies import load_policy, load_processors, require_distillable
+    from lerobot_wmrl.common.policies import require_distillable
     from lerobot_wmrl.envs.lerobot_env import make_tensor_env
     from lerobot_wmrl.rl.budget import check_data
 
@@ -77,14 +77,14 @@ def train_policy(cfg: TrainConfig) -> None:
         print(f"{cfg.output_dir}: already trained for {cfg.iterations} iterations")
     else:
         set_seed(cfg.seed)
-        policy, processors = load_policy(config), load_processors(config)
+        policy = LoadedPolicy.load(config)
         # now, because an environment of the hub tells its configuration of its actions
         claim = Claim(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER, content)
         claim.check()
         with within("env"):
             env = make_tensor_env(cfg.env, cfg.num_envs, config.device or "cpu")
         try:
-            train_in(env, cfg, claim, policy, processors)
+            train_in(env, cfg, claim, policy)
         finally:
             env.close()
     if is_first_process():
@@ -120,9 +120,7 @@ def finished(cfg: TrainConfig) -> bool:
     )
 
 
-def train_in(
-    env: TensorEnv, cfg: TrainConfig, claim: Claim, policy: Any, processors: tuple[Any, Any]
-) -> None:
+def train_in(env: TensorEnv, cfg: TrainConfig, claim: Claim, policy: LoadedPolicy) -> None:
     """Check that policy and environment fit, then train in the output folder of the claim."""
     from lerobot_wmrl.common.pipeline import make_pipeline
     from lerobot_wmrl.common.policies import adopt_features, check_fit, learnt_range, with_new_adapters
@@ -130,7 +128,7 @@ def train_in(
     from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
     from lerobot_wmrl.rl.budget import charge_steps
     from lerobot_wmrl.rl.distillation import Distillation
-    from lerobot_wmrl.rl.make_callbacks import Trained, make_callbacks
+    from lerobot_wmrl.rl.make_callbacks import make_callbacks
     from lerobot_wmrl.rl.rollout import RolloutBuffer
     from lerobot_wmrl.rl.trainer import Schedule, make_algorithm, train
 
@@ -142,26 +140,25 @@ def train_in(
     adopt_features(config, shown)
     check_fit(config, shown, env.single_action_space.shape[-1])
     if isinstance(cfg.env, WorldModelEnv):
-        env.model.check_units(config, processors[1])
-    if isinstance(env, LeRobotTensorEnv) and (learnt := learnt_range(processors[1])):
+        env.model.check_units(config, policy.postprocessor)
+    if isinstance(env, LeRobotTensorEnv) and (learnt := learnt_range(policy.postprocessor)):
         env.widen(*learnt)
     if cfg.real_env is not None:
         check_real_env(config, cfg.real_env)
         if isinstance(env, WorldModelVectorEnv):
             check_frame_rate(cfg.real_env, env.model.config.embodiment.fps, "the world model's dataset")
     if cfg.peft is not None:
-        policy = with_new_adapters(policy, cfg.peft)
-    algorithm = make_algorithm(policy, cfg.algorithm, cfg.output_dir)
-    pipeline = make_pipeline(config, *processors, shown=compacted(env))
+        policy.policy = with_new_adapters(policy.policy, cfg.peft)
+    algorithm = make_algorithm(policy.policy, cfg.algorithm, cfg.output_dir)
+    pipeline = make_pipeline(config, *policy.processors, shown=compacted(env))
     if isinstance(algorithm, Distillation):
         algorithm.check_recorded(env, pipeline)
     longest = env.max_episode_steps
     buffer = RolloutBuffer(rollout_length(cfg, longest), cfg.num_envs, config.device, longest)
-    trained = Trained(policy, processors, env, cfg.env)
-    callbacks = make_callbacks(cfg, trained, cfg.output_dir, cfg.iterations, cfg.seed)
+    callbacks = make_callbacks(cfg, policy, env)
 
     def save_pretrained(folder: Path) -> None:
-        for part in (policy, config, *processors, cfg):
+        for part in (policy.policy, config, *policy.processors, cfg):
             part.save_pretrained(folder)
 
     schedule = Schedule(cfg.iterations, cfg.save_freq, cfg.seed, cfg.log_freq)

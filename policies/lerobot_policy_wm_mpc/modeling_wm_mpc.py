@@ -10,12 +10,7 @@ from torch import Tensor
 from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
 from lerobot_wmrl.common.constants import Observation
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.policies import (
-    check_fit,
-    load_policy,
-    load_processors,
-    read_policy_config,
-)
+from lerobot_wmrl.common.policies import LoadedPolicy, check_fit, read_policy_config
 from lerobot_wmrl.data.frames import Context, Frames
 from lerobot_wmrl.world_models.checkpoint import check_same_tokenizer, load_model
 from lerobot_wmrl.world_models.modeling_frame_tokenizer import stack_cameras
@@ -120,9 +115,8 @@ class Proposal:
         try:
             policy_config = read_policy_config(path, [f"--device={config.device}"])
             check_fit(policy_config, model.config.observation_shapes, len(low))
-            self.preprocess, self.postprocess = load_processors(policy_config)
-            model.check_units(policy_config, self.postprocess)
-            self.policy = load_policy(policy_config)
+            self.policy = LoadedPolicy.load(policy_config)
+            model.check_units(policy_config, self.policy.postprocessor)
         except FieldError as error:
             raise FieldError("proposal_path", path, error.problem, error.remedy) from error
 
@@ -140,7 +134,6 @@ class Proposal:
 
         def act(images: Tensor, state: Tensor) -> Tensor:
             seen = real.pop() if real else self.model.observation(images, state, instructions)
-            action: Tensor = self.postprocess(self.policy.select_action(self.preprocess(seen)))
-            return action.to(self.low.device).clamp(self.low, self.high)
+            return self.policy.act(seen).to(self.low.device).clamp(self.low, self.high)
 
         return self.model.policy_actions(frames, act, steps, images)

@@ -41,7 +41,7 @@ UNDOCUMENTED = {
     },
     "lerobot.rl.algorithms.base": {"RLAlgorithm"},
     "lerobot.rl.algorithms.configs": {"RLAlgorithmConfig", "TrainingStats"},
-    "lerobot.scripts.lerobot_eval": {"eval_policy", "eval_policy_all", "rollout"},
+    "lerobot.scripts.lerobot_eval": {"eval_policy", "rollout"},
     "lerobot.utils.import_utils": {"register_third_party_plugins"},
     "lerobot.utils.keyboard_input": {"apply_recording_control"},
     "lerobot.utils.logging_utils": {"MetricsTracker"},

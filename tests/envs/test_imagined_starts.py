@@ -14,7 +14,7 @@ from lerobot_wmrl.common.constants import TASKS
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.envs.start_frames import branch_frames
-from lerobot_wmrl.envs.world_model_env import make_success_env
+from lerobot_wmrl.envs.world_model_env import load_spread_starts
 from tests.envs.imagination import IMAGE, STATE, B, always_done
 
 
@@ -94,9 +94,9 @@ def test_episodes_begin_in_saved_frames_as_in_those_of_the_dataset(config, env, 
 
 
 def test_success_is_counted_from_starts_all_over_the_dataset(env):
-    counting = make_success_env(env, env.config.dataset, 3)
-    assert torch.equal(counting.starts.images, env.starts.images[[0, 2, 5]])
-    assert len(make_success_env(env, env.config.dataset, 50).starts) == 6, "none twice"
+    starts = load_spread_starts(env.model, env.config.dataset, 3)
+    assert torch.equal(starts.images, env.starts.images[[0, 2, 5]])
+    assert len(load_spread_starts(env.model, env.config.dataset, 50)) == 6, "none twice"
 
 
 def test_instructions_are_those_of_the_starts(env):

@@ -2,11 +2,14 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
+from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_wmrl.common.checkpoints import Checkpoint, resolve_checkpoint
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.statistics import Proportion
@@ -14,16 +17,20 @@ from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
-from lerobot_wmrl.envs.evaluation_adapter import StepCounter
-from lerobot_wmrl.evaluation.agreement import Agreement, policy_checkpoints, policy_outcomes
+from lerobot_wmrl.evaluation.agreement import Agreement, policy_checkpoints
+from lerobot_wmrl.evaluation.policy_rollouts import StepCounter, evaluate_policy
 from lerobot_wmrl.evaluation.report import agreement_table
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.scripts.eval_world_model import (
     EvalWorldModelConfig,
+    checked_policies,
     eval_world_model,
     policies_imagination,
+    policy_agreement,
 )
-from tests.rl.checkpoints import save_untrained_policy
+from tests.rl.checkpoints import loaded, save_untrained_policy
+
+IMAGE = "observation.images.third_view"
 
 
 @pytest.fixture
@@ -46,10 +53,10 @@ def test_every_checkpoint_of_a_training_counts_in_order(tmp_path):
 
 def test_outcomes_are_those_of_the_environment_one_an_episode(imagination, tmp_path):
     """A threshold that the first frame reaches ends every episode in success; one out of reach, none."""
-    policy = save_untrained_policy(tmp_path / "policy", actions=7)
-    assert policy_outcomes(imagination, policy, 5, EVALUATION_SEED, num_envs=3) == [True] * 5
-    imagination.done_threshold = 0.9999
-    assert policy_outcomes(imagination, policy, 5, EVALUATION_SEED, num_envs=3) == [False] * 5
+    policy = loaded(save_untrained_policy(tmp_path / "policy", actions=7))
+    for imagination.done_threshold, success in ((0.0001, True), (0.9999, False)):
+        found = evaluate_policy(imagination, policy, 5, EVALUATION_SEED, num_envs=3)
+        assert found.successes == [success] * 5
 
 
 def test_the_evaluation_reports_policies_beside_reality(imagination, small_dataset, tmp_path):
@@ -71,6 +78,34 @@ def test_the_evaluation_reports_policies_beside_reality(imagination, small_datas
     assert found["pearson"]["value"] is None
     assert "success in `real_env`" in (cfg.output_dir / "metrics.md").read_text()
     assert (cfg.output_dir / "policies.png").is_file()
+
+
+def test_policies_that_sample_have_the_same_rates_each_time_and_the_world_model_is_made_once(
+    imagination, tmp_path, monkeypatch
+):
+    drawn: list[torch.Tensor] = []
+    made: list[WorldModelEnv] = []
+    make = WorldModelEnv.create_envs
+
+    def sample(self: CnnPolicy, batch: dict[str, torch.Tensor]) -> torch.Tensor:
+        drawn.append(torch.rand(len(batch[IMAGE]), 7))
+        return drawn[-1]
+
+    def create_envs(env: WorldModelEnv, *args: object, **kwargs: object) -> object:
+        made.append(env)
+        return make(env, *args, **kwargs)
+
+    monkeypatch.setattr(CnnPolicy, "select_action", sample)
+    monkeypatch.setattr(WorldModelEnv, "create_envs", create_envs)
+    cfg = EvalWorldModelConfig(
+        model=Checkpoint(imagination.world_model_path), policy_episodes=4, real_env=replace(imagination),
+        policies=[str(save_untrained_policy(tmp_path / name, actions=7)) for name in "ab"],
+    )  # fmt: skip
+    for _ in range(2):
+        policy_agreement(cfg, imagination, checked_policies(cfg, imagination))
+    half = len(drawn) // 2
+    assert torch.equal(torch.cat(drawn[:half]), torch.cat(drawn[half:]))
+    assert [env is imagination for env in made] == [True, False, False] * 2
 
 
 @pytest.mark.parametrize(("policy", "said"), [

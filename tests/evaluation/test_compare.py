@@ -31,8 +31,9 @@ from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.lerobot_env import runs_in_processes
 from lerobot_wmrl.evaluation import compare as running
-from lerobot_wmrl.evaluation.compare import opened
+from lerobot_wmrl.evaluation import policy_rollouts
 from lerobot_wmrl.evaluation.comparison import Comparison, Episode
+from lerobot_wmrl.evaluation.policy_rollouts import opened
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.scripts.compare import CompareConfig, compare
 from tests.rl.checkpoints import save_untrained_policy
@@ -127,7 +128,7 @@ class CountingConfig(LiberoEnv):
 def test_policies_meet_the_same_starts_where_resets_choose_them(config, killed, monkeypatch):
     """One policy's episodes end sooner, the comparison is interrupted, and no start comes twice."""
     monkeypatch.setattr(
-        running, "make_env_pre_post_processors", lambda *_: [PolicyProcessorPipeline(steps=[])] * 2
+        policy_rollouts, "make_env_pre_post_processors", lambda *_: [PolicyProcessorPipeline(steps=[])] * 2
     )
     config.policies, config.env, config.n_episodes = config.policies[:2], CountingConfig(), 12
     config.stop_early = False
@@ -144,7 +145,7 @@ def test_policies_meet_the_same_starts_where_resets_choose_them(config, killed, 
 
 def test_no_start_comes_twice_after_a_call_that_ended_within_a_batch(config, monkeypatch):
     monkeypatch.setattr(
-        running, "make_env_pre_post_processors", lambda *_: [PolicyProcessorPipeline(steps=[])] * 2
+        policy_rollouts, "make_env_pre_post_processors", lambda *_: [PolicyProcessorPipeline(steps=[])] * 2
     )
     config.policies, config.env = config.policies[:2], CountingConfig()
     assert len(results_of(replace(config, n_episodes=6))["episodes"]) == 6
@@ -238,13 +239,13 @@ def test_what_another_command_has_run_meanwhile_is_kept(config, monkeypatch):
     results = config.output_dir / "comparison.json"
     finished = results.read_text()
     results.unlink()
-    make = running.opened
+    make = policy_rollouts.opened
 
     def opened(*args: Any) -> Any:
         results.write_text(finished)
         return make(*args)
 
-    monkeypatch.setattr(running, "opened", opened)
+    monkeypatch.setattr(policy_rollouts, "opened", opened)
     monkeypatch.setattr(running, "run_block", None)
     compare(config)
     assert results_of(config) == whole
@@ -444,8 +445,9 @@ def test_no_table_by_scene_is_shown_for_several_policies(monkeypatch: pytest.Mon
     """It would have the outcomes of the first one; tensor environments keep it behind their adapter."""
     kept = SimpleNamespace(results=SimpleNamespace(episodes={"start": True}))
     left = []
-    monkeypatch.setattr(running, "make_env", lambda *_, **__: {"push": {0: SimpleNamespace(env=kept)}})
-    monkeypatch.setattr(running, "close_envs", lambda envs: left.append(dict(kept.results.episodes)))
+    made = {"push": {0: SimpleNamespace(env=kept)}}
+    monkeypatch.setattr(policy_rollouts, "make_env", lambda *_, **__: made)
+    monkeypatch.setattr(policy_rollouts, "close_envs", lambda envs: left.append(dict(kept.results.episodes)))
     with opened(WmrlManiSkillEnv(), 1, False, 2):
         pass
     assert left == [{}]

@@ -16,7 +16,7 @@ from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.data.episodes import EpisodeTable
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
-from lerobot_wmrl.evaluation import compare, evidence
+from lerobot_wmrl.evaluation import evidence, policy_rollouts
 from lerobot_wmrl.evaluation.calibration import Confusion
 from lerobot_wmrl.evaluation.evidence import (
     LabelledRollouts,
@@ -179,13 +179,13 @@ def config(small_dataset, trained_models, tmp_path) -> JudgeConfig:
 @pytest.fixture
 def sizes(monkeypatch) -> list[int]:
     """Record how many imagined episodes run at once."""
-    sizes, opened = [], compare.opened
+    sizes, opened = [], policy_rollouts.opened
 
     def noted(env, n_envs, *others):
         sizes.append(n_envs)
         return opened(env, n_envs, *others)
 
-    monkeypatch.setattr(compare, "opened", noted)
+    monkeypatch.setattr(policy_rollouts, "opened", noted)
     return sizes
 
 

@@ -14,6 +14,7 @@ from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.play.drive import Drive
+from lerobot_wmrl.play.drivers import copied
 from lerobot_wmrl.play.visit import Visit
 from lerobot_wmrl.play.world import load_world
 
@@ -125,7 +126,7 @@ def test_every_driver_acts_and_the_recorded_one_as_recorded(world, saved, small_
     view = visit.answer({"do": "step", "driver": "recorded"})["view"]
     np.testing.assert_allclose(view["action"], world.table.action[row])
     seen = visit.drive.observation
-    expected = world.policy.copy().action(seen)
+    expected = copied(world.policy).act(seen)
     view = visit.answer({"do": "step", "driver": "policy"})["view"]
     np.testing.assert_allclose(view["action"], expected[0], rtol=1e-5)
     assert visit.answer({"do": "step", "driver": "planner"})["view"]["driver"] == "planner"
@@ -151,11 +152,12 @@ def test_the_recorded_episode_ends(world, saved):
 
 def test_copies_of_a_policy_share_their_weights_and_nothing_else(world):
     policy = world.policy
-    other = policy.copy()
+    other = copied(policy)
     pairs = zip(policy.policy.parameters(), other.policy.parameters(), strict=True)
     assert all(a is b for a, b in pairs)
     assert other.policy is not policy.policy
-    assert other.pipeline.prepare is not policy.pipeline.prepare
+    assert other.preprocessor is not policy.preprocessor
+    assert other.postprocessor is not policy.postprocessor
 
 
 def test_saved_episodes_are_a_dataset_that_grows(world, saved, small_dataset):

@@ -10,6 +10,7 @@ from lerobot.policies.factory import make_pre_post_processors
 from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_wmrl.common.images import camera_key
+from lerobot_wmrl.common.policies import LoadedPolicy, read_policy_config
 
 
 def save_untrained_policy(
@@ -39,3 +40,8 @@ def save_untrained_policy(
     for processor in make_pre_post_processors(config, dataset_stats=stats):
         processor.save_pretrained(folder)
     return folder
+
+
+def loaded(checkpoint: Path) -> LoadedPolicy:
+    """The policy of a checkpoint with its processors."""
+    return LoadedPolicy.load(read_policy_config(str(checkpoint), []))

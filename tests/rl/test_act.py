@@ -16,7 +16,7 @@ from lerobot_wmrl.common.pipeline import Pipeline
 from lerobot_wmrl.common.policies import with_new_adapters
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
-from lerobot_wmrl.evaluation.agreement import policy_outcomes
+from lerobot_wmrl.evaluation.policy_rollouts import evaluate_policy
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.minibatches import read_batch
 from lerobot_wmrl.rl.policy_adapters import INITIAL_STD, ActAdapter
@@ -25,6 +25,7 @@ from lerobot_wmrl.rl.rollout import RolloutBuffer, collect
 from lerobot_wmrl.rl.trainer import Schedule, train
 from lerobot_wmrl.scripts.train import main
 from tests.rl.act_checkpoint import ACTED, IMAGE, SCENE, STATE, save_small_act, small_act
+from tests.rl.checkpoints import loaded
 from tests.rl.conformance import check_samples_and_log_probs_agree
 from tests.rl.point_env import PointEnv
 
@@ -150,7 +151,7 @@ def test_the_command_improves_act_in_a_world_model_and_lerobot_evaluates_it(
     last = tmp_path / "rl" / "checkpoints" / "last" / "pretrained_model"
     assert ACTPolicy.from_pretrained(last).config.n_action_steps == 2
     env = WorldModelEnv(**models, dataset=StartFrames(root=str(small_dataset.root)), episode_length=4)
-    assert len(policy_outcomes(env, last, episodes=2, seed=0, num_envs=2)) == 2
+    assert len(evaluate_policy(env, loaded(last), episodes=2, seed=0, num_envs=2).successes) == 2
 
 
 def test_adapters_of_act_are_trained_too() -> None:

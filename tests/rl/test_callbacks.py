@@ -15,9 +15,10 @@ from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_wmrl.common.constants import EVALUATION_SEED, GATE_SEED, SELECTION_SEED
 from lerobot_wmrl.common.errors import TrainingStopped
 from lerobot_wmrl.common.pipeline import Pipeline
+from lerobot_wmrl.common.policies import LoadedPolicy
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
-from lerobot_wmrl.evaluation.agreement import evaluate_within
+from lerobot_wmrl.evaluation.policy_rollouts import evaluate_within
 from lerobot_wmrl.rl import gate
 from lerobot_wmrl.rl.callbacks import Callback, Record
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
@@ -108,9 +109,9 @@ def select(output_dir: Path, policy: CnnPolicy, env: PointEnv) -> list[Callback]
     def scaled(action: torch.Tensor) -> torch.Tensor:
         return action * ACTION_SCALE
 
-    processors = PolicyProcessorPipeline([]), scaled
+    loaded = LoadedPolicy(policy.config, policy, PolicyProcessorPipeline([]), scaled)
     config: EnvConfig = WmrlManiSkillEnv()
-    measure = partial(evaluate_within, env, config, policy, processors, 5, SELECTION_SEED)
+    measure = partial(evaluate_within, env, config, loaded, 5, SELECTION_SEED)
     return [Selection(2, ITERATIONS, {"real": measure}, output_dir)]
 
 

@@ -25,9 +25,9 @@ from lerobot_wmrl.data.embodiment import Embodiment, check_same_robot
 from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
 from lerobot_wmrl.envs import rollout_recorder
 from lerobot_wmrl.envs.rollout_recorder import RolloutRecorder, robot_of
-from lerobot_wmrl.evaluation.agreement import policy_outcomes
+from lerobot_wmrl.evaluation.policy_rollouts import evaluate_policy
 from lerobot_wmrl.rl.recorders import EnvRecorder
-from tests.rl.checkpoints import save_untrained_policy
+from tests.rl.checkpoints import loaded, save_untrained_policy
 
 STEPS, AIM = 5, 250.0
 ROBOT = Embodiment(
@@ -91,8 +91,8 @@ def test_a_policy_that_draws_its_actions_draws_the_same_from_a_seed(checkpoint: 
     for name in ("first", "again"):
         config = read_policy_config(str(checkpoint / "pretrained_model"), [])
         recorder = RolloutRecorder(PushtEnv(episode_length=STEPS), config, ROBOT)
-        chosen = recorder.policy.select_action
-        recorder.policy.select_action = lambda seen, chosen=chosen: chosen(seen) + torch.randn(1, 2)
+        chosen = recorder.policy.policy.select_action
+        recorder.policy.policy.select_action = lambda seen, chosen=chosen: chosen(seen) + torch.randn(1, 2)
         torch.manual_seed(len(name))
         expected = torch.rand(1)
         torch.manual_seed(len(name))
@@ -209,7 +209,6 @@ def test_what_is_recorded_is_not_recorded_again_and_is_entered_in_the_ledger(
 
 
 def test_success_is_measured_there(checkpoint: Path) -> None:
-    env = PushtEnv(episode_length=STEPS)
-    assert (
-        policy_outcomes(env, checkpoint / "pretrained_model", episodes=3, seed=7, num_envs=2) == [False] * 3
-    )
+    policy = loaded(checkpoint / "pretrained_model")
+    found = evaluate_policy(PushtEnv(episode_length=STEPS), policy, episodes=3, seed=7, num_envs=2)
+    assert (found.successes, found.steps) == ([False] * 3, 4 * STEPS)

@@ -1,23 +1,31 @@
 """The checkpoint that is kept as the best, and when imagined and real success part."""
 
 import inspect
-from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import EnvConfig, PushtEnv
 
+from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_wmrl.common.constants import SELECTION_SEED
 from lerobot_wmrl.common.errors import TrainingStopped
+from lerobot_wmrl.common.policies import LoadedPolicy
 from lerobot_wmrl.common.statistics import Proportion
-from lerobot_wmrl.envs.configuration_world_model import StartFrames
-from lerobot_wmrl.evaluation.agreement import Evaluated
+from lerobot_wmrl.envs import start_frames, world_model_env
+from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
+from lerobot_wmrl.envs.start_frames import StartImages
+from lerobot_wmrl.evaluation.policy_rollouts import Evaluated
+from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.rl import make_callbacks
 from lerobot_wmrl.rl.callbacks import Record
-from lerobot_wmrl.rl.configuration_callbacks import CallbackSettings
+from lerobot_wmrl.rl.configuration_callbacks import CallbackSettings, SelectionConfig
 from lerobot_wmrl.rl.selection import Measure, Selection, best_iteration, diverged
+from lerobot_wmrl.world_models.checkpoint import load_model
+from tests.rl.checkpoints import loaded, save_untrained_policy
 from tests.rl.point_env import PointEnv
 from tests.scripts.point_config import PointConfig
 
@@ -35,7 +43,7 @@ def record(real: float | None, imagined: float | None, n: int = N) -> Record:
 
 
 def measure(successes: int, n: int = 4, steps: int = 30) -> Measure:
-    return lambda: Evaluated([index < successes for index in range(n)], steps)
+    return lambda: Evaluated({("suite", 0, seed): seed < successes for seed in range(n)}, steps)
 
 
 def make_selection(tmp_path: Path, **measures: Measure) -> Selection:
@@ -111,8 +119,7 @@ class Imagining(PointEnv):
     """In the place of a world model."""
 
     config = SimpleNamespace(dataset=StartFrames(root="episodes"))
-    starts = range(9)
-    in_full = nullcontext
+    model = None
 
 
 @pytest.mark.parametrize(("real_env", "config", "env", "places"), [
@@ -131,7 +138,41 @@ def test_success_is_measured_on_seeds_that_nothing_is_reported_on(
 
         monkeypatch.setattr(make_callbacks, name, seed_of)
     monkeypatch.setattr(make_callbacks, "WorldModelVectorEnv", Imagining)
-    monkeypatch.setattr(make_callbacks, "make_success_env", lambda env, *_: env)
-    trained = make_callbacks.Trained(None, (None, None), env(2), config)
-    measures: dict[str, Any] = make_callbacks.make_measures(CallbackSettings(real_env=real_env), trained)
+    monkeypatch.setattr(make_callbacks, "load_spread_starts", lambda *_: range(9))
+    monkeypatch.setattr(make_callbacks, "make_success_env", lambda env, _: env)
+    settings, policy = CallbackSettings(real_env=real_env), LoadedPolicy(CnnConfig(), None, None, None)
+    measures: dict[str, Any] = make_callbacks.make_measures(settings, policy, env(2), config)
     assert {place: measure() for place, measure in measures.items()} == dict.fromkeys(places, SELECTION_SEED)
+
+
+def test_starts_are_tokenised_once_and_a_refreshed_world_model_is_measured(
+    small_dataset: LeRobotDataset, trained_models: dict[str, Path], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """Nothing ever succeeds in the first one, everything in the other."""
+    path, read = trained_models["action_world_model"], []
+    config = WorldModelEnv(
+        world_model_path=str(path), dataset=StartFrames(root=str(small_dataset.root)),
+        reward=GeneralConfig(alpha=1.0), done_frames=1, episode_length=2, device="cpu",
+    )  # fmt: skip
+    env: Any = config.create_tensor_env(2)
+
+    def read_start_images(*args: Any) -> StartImages:
+        read.append(args)
+        return start_frames.read_start_images(*args)
+
+    def always(model: Any, logit: float) -> Any:
+        step = model.step
+        model.step = lambda *args: step(*args)._replace(done_logit=torch.full((2,), logit))
+        return model
+
+    monkeypatch.setattr(world_model_env, "read_start_images", read_start_images)
+    policy = loaded(save_untrained_policy(tmp_path / "policy", actions=7))
+    settings, dice = CallbackSettings(selection=SelectionConfig(1, 3)), torch.get_rng_state()
+    imagined = make_callbacks.make_measures(settings, policy, env, config)["imagined"]
+    assert torch.equal(torch.get_rng_state(), dice), "the training's are left alone"
+    always(env.model, -20.0)
+    assert imagined().successes == [False] * 3
+    env.adopt(always(load_model(path, "action_world_model", "cpu"), 20.0))
+    assert imagined().successes == [True] * 3
+    assert len(read) == 1
