@@ -17,7 +17,6 @@ Running the same command again continues from the last checkpoint. `--preset=dem
 `lerobot-eval --policy.path=outputs/rl/checkpoints/best/pretrained_model …` evaluates the result.
 """
 
-import logging
 from collections.abc import Callable
 from contextlib import nullcontext
 from functools import partial
@@ -35,14 +34,9 @@ from lerobot_wmrl.common.policies import LoadedPolicy
 from lerobot_wmrl.common.precision import keep_freed_memory
 from lerobot_wmrl.common.presets import expand_preset
 from lerobot_wmrl.common.tracking import make_wandb
-from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.envs.tensor_env import TensorEnv
-from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
-from lerobot_wmrl.rewards.general import RuleBasedReward, potential_discount
-from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.configuration_distillation import DistillationConfig
-from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 from lerobot_wmrl.rl.configuration_train import MAY_DIFFER, TrainConfig, load_config
 from lerobot_wmrl.rl.trained_policy import publish, summary
 
@@ -123,30 +117,16 @@ def finished(cfg: TrainConfig) -> bool:
 def train_in(env: TensorEnv, cfg: TrainConfig, claim: Claim, policy: LoadedPolicy) -> None:
     """Check that policy and environment fit, then train in the output folder of the claim."""
     from lerobot_wmrl.common.pipeline import make_pipeline
-    from lerobot_wmrl.common.policies import adopt_features, check_fit, learnt_range, with_new_adapters
-    from lerobot_wmrl.envs.lerobot_env import LeRobotTensorEnv, check_frame_rate, check_real_env, shapes_of
-    from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
+    from lerobot_wmrl.common.policies import with_new_adapters
     from lerobot_wmrl.rl.budget import charge_steps
     from lerobot_wmrl.rl.distillation import Distillation
+    from lerobot_wmrl.rl.fit import fit, rollout_length
     from lerobot_wmrl.rl.make_callbacks import make_callbacks
     from lerobot_wmrl.rl.rollout import RolloutBuffer
     from lerobot_wmrl.rl.trainer import Schedule, make_algorithm, train
 
-    check_tasks(cfg, env)
-    check_discount(cfg, env.max_episode_steps)
     config = policy.config
-    observation = env.reset(seed=cfg.seed)[0]
-    shown = shapes_of(observation)
-    adopt_features(config, shown)
-    check_fit(config, shown, env.single_action_space.shape[-1])
-    if isinstance(cfg.env, WorldModelEnv):
-        env.model.check_units(config, policy.postprocessor)
-    if isinstance(env, LeRobotTensorEnv) and (learnt := learnt_range(policy.postprocessor)):
-        env.widen(*learnt)
-    if cfg.real_env is not None:
-        check_real_env(config, cfg.real_env)
-        if isinstance(env, WorldModelVectorEnv):
-            check_frame_rate(cfg.real_env, env.model.config.embodiment.fps, "the world model's dataset")
+    fit(cfg, policy, env)
     if cfg.peft is not None:
         policy.policy = with_new_adapters(policy.policy, cfg.peft)
     algorithm = make_algorithm(policy.policy, cfg.algorithm, cfg.output_dir)
@@ -182,53 +162,6 @@ def compacted(env: TensorEnv) -> Callable[[Observation], Observation]:
         return unchanged
     env.compact = True
     return lambda observation: env.model.shown(observation)  # of the model that Dyna may have refreshed
-
-
-def check_tasks(cfg: TrainConfig, env: TensorEnv) -> None:
-    """Raise FieldError if a task has no environment, or if GRPO finds no two episodes from the same start."""
-    tasks, grpo = env.tasks, isinstance(cfg.algorithm, GRPOConfig)
-    if grpo and tasks > 1:
-        raise FieldError(
-            "algorithm.type", cfg.algorithm.type,
-            f"compares episodes from the same start, and the environment has {tasks} tasks",
-            "choose one task, or ppo",
-        )  # fmt: skip
-    if grpo and not env.repeats_starts():
-        raise FieldError(
-            "algorithm.type", cfg.algorithm.type,
-            "compares episodes from the same start, and in this environment a seed does not decide it",
-            "choose ppo",
-        )  # fmt: skip
-    if tasks > env.num_envs:
-        raise FieldError(
-            "num_envs", env.num_envs, f"the environment has {tasks} tasks, and each needs one of its own",
-            f"set it to a multiple of {tasks}, or choose fewer tasks",
-        )  # fmt: skip
-
-
-def check_discount(cfg: TrainConfig, longest: int) -> None:
-    """Warn if progress is rewarded with another discount than PPO's, in episodes of up to `longest` steps."""
-    reward = cfg.env.reward if isinstance(cfg.env, WorldModelEnv | WmrlManiSkillEnv) else None
-    if not (isinstance(cfg.algorithm, PPOConfig) and isinstance(reward, GeneralConfig | RuleBasedReward)):
-        return
-    discount, own = cfg.algorithm.discount(longest), potential_discount(reward, longest)
-    if reward.alpha < 1 and reward.form == "potential" and own != discount:
-        logging.warning(
-            "env.reward.gamma=%s: progress is rewarded with this discount, and PPO has %s, so that the time "
-            "spent near the goal counts too; set --env.reward.gamma=%s", own, discount, discount,
-        )  # fmt: skip
-
-
-def rollout_length(cfg: TrainConfig, longest: int) -> int:
-    """Return the number of steps of a rollout. FieldError if the longest episodes do not fit in it."""
-    steps = cfg.rollout_steps or longest
-    if steps < longest:
-        raise FieldError(
-            "rollout_steps", steps,
-            f"episodes last up to {longest} steps and every rollout starts new ones, so their ends would "
-            "never be trained on", "raise it, or lower `env.episode_length`",
-        )  # fmt: skip
-    return steps
 
 
 def main() -> None:

@@ -25,7 +25,8 @@ from lerobot_wmrl.envs.lerobot_env import (
 )
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 from lerobot_wmrl.rl.configuration_train import TrainConfig
-from lerobot_wmrl.scripts.train import check_tasks, main
+from lerobot_wmrl.rl.fit import check_tasks
+from lerobot_wmrl.scripts.train import main
 from tests.rl.checkpoints import save_untrained_policy
 
 B, STEPS = 2, 3

@@ -22,8 +22,9 @@ from lerobot_wmrl.rewards.general import RuleBasedReward
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 from lerobot_wmrl.rl.configuration_train import TrainConfig
+from lerobot_wmrl.rl.fit import check_discount, rollout_length
 from lerobot_wmrl.rl.trained_policy import evaluation
-from lerobot_wmrl.scripts.train import check_discount, main, rollout_length
+from lerobot_wmrl.scripts.train import main
 from tests.commands import run_here
 from tests.hub_server import Hub
 from tests.rl.checkpoints import save_untrained_policy

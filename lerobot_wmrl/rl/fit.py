@@ -1,0 +1,85 @@
+"""What policy, environment and settings must agree on before a training begins."""
+
+import logging
+
+from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.policies import LoadedPolicy, adopt_features, check_fit, learnt_range
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
+from lerobot_wmrl.envs.lerobot_env import LeRobotTensorEnv, check_frame_rate, check_real_env, shapes_of
+from lerobot_wmrl.envs.tensor_env import TensorEnv
+from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv
+from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
+from lerobot_wmrl.rewards.general import RuleBasedReward, potential_discount
+from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
+from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
+from lerobot_wmrl.rl.configuration_train import TrainConfig
+
+
+def fit(cfg: TrainConfig, policy: LoadedPolicy, env: TensorEnv) -> None:
+    """Let a policy see what its environment shows and act as far as it has learnt to.
+
+    Raises:
+        FieldError: they do not fit each other, the algorithm or `real_env`.
+    """
+    check_tasks(cfg, env)
+    check_discount(cfg, env.max_episode_steps)
+    observation, _ = env.reset(seed=cfg.seed)
+    shown = shapes_of(observation)
+    adopt_features(policy.config, shown)
+    check_fit(policy.config, shown, env.single_action_space.shape[-1])
+    if isinstance(env, WorldModelVectorEnv):
+        env.model.check_units(policy.config, policy.postprocessor)
+    if isinstance(env, LeRobotTensorEnv) and (learnt := learnt_range(policy.postprocessor)):
+        env.widen(*learnt)
+    if cfg.real_env is not None:
+        check_real_env(policy.config, cfg.real_env)
+        if isinstance(env, WorldModelVectorEnv):
+            check_frame_rate(cfg.real_env, env.model.config.embodiment.fps, "the world model's dataset")
+
+
+def check_tasks(cfg: TrainConfig, env: TensorEnv) -> None:
+    """Raise FieldError if a task has no environment, or if GRPO finds no two episodes from the same start."""
+    tasks, grpo = env.tasks, isinstance(cfg.algorithm, GRPOConfig)
+    if grpo and tasks > 1:
+        raise FieldError(
+            "algorithm.type", cfg.algorithm.type,
+            f"compares episodes from the same start, and the environment has {tasks} tasks",
+            "choose one task, or ppo",
+        )  # fmt: skip
+    if grpo and not env.repeats_starts():
+        raise FieldError(
+            "algorithm.type", cfg.algorithm.type,
+            "compares episodes from the same start, and in this environment a seed does not decide it",
+            "choose ppo",
+        )  # fmt: skip
+    if tasks > env.num_envs:
+        raise FieldError(
+            "num_envs", env.num_envs, f"the environment has {tasks} tasks, and each needs one of its own",
+            f"set it to a multiple of {tasks}, or choose fewer tasks",
+        )  # fmt: skip
+
+
+def check_discount(cfg: TrainConfig, longest: int) -> None:
+    """Warn if progress is rewarded with another discount than PPO's, in episodes of up to `longest` steps."""
+    reward = cfg.env.reward if isinstance(cfg.env, WorldModelEnv | WmrlManiSkillEnv) else None
+    if not (isinstance(cfg.algorithm, PPOConfig) and isinstance(reward, GeneralConfig | RuleBasedReward)):
+        return
+    discount, own = cfg.algorithm.discount(longest), potential_discount(reward, longest)
+    if reward.alpha < 1 and reward.form == "potential" and own != discount:
+        logging.warning(
+            "env.reward.gamma=%s: progress is rewarded with this discount, and PPO has %s, so that the time "
+            "spent near the goal counts too; set --env.reward.gamma=%s", own, discount, discount,
+        )  # fmt: skip
+
+
+def rollout_length(cfg: TrainConfig, longest: int) -> int:
+    """Return the number of steps of a rollout. FieldError if the longest episodes do not fit in it."""
+    steps = cfg.rollout_steps or longest
+    if steps < longest:
+        raise FieldError(
+            "rollout_steps", steps,
+            f"episodes last up to {longest} steps and every rollout starts new ones, so their ends would "
+            "never be trained on", "raise it, or lower `env.episode_length`",
+        )  # fmt: skip
+    return steps
