@@ -38,6 +38,7 @@ from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelE
 from lerobot_wmrl.envs.start_frames import chosen_episodes
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv, make_world_model_env
 from lerobot_wmrl.evaluation.gate import Outcomes
+from lerobot_wmrl.evaluation.replay import Recording
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.world_models.checkpoint import load_model
@@ -198,8 +199,7 @@ def curves_of(given: argparse.Namespace, root: str, rewards: Mapping[str, Any]) 
     probe = RewardProbe(rewards)
     env.reward = probe
     steps = int(table.length[episodes].max())
-    offset = np.minimum(np.arange(steps), table.length[episodes][:, None] - 1)
-    actions = torch.from_numpy(table.action[table.start[episodes][:, None] + offset])
+    actions = Recording.read(table, env.model).actions(episodes, steps, torch.device("cpu"))
     column = np.asarray(table.dataset.hf_dataset.with_format("numpy")["next.reward"][:]).reshape(-1)
     curves = {
         "rule_based": recorded(table, episodes, column, steps), **judged(env, probe, actions, config),

@@ -25,7 +25,7 @@ import numpy as np
 
 from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.files import whole_folder, writing
+from lerobot_wmrl.common.files import require_new, whole_folder, writing
 from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.data.episodes import SUCCESS
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
@@ -81,8 +81,7 @@ def require_unlabelled(cfg: LabelConfig, dataset: "LeRobotDataset") -> None:
             "train with it, or remove it first: lerobot-edit-dataset --operation.type=remove_feature "
             f"--operation.feature_names=[{SUCCESS}]",
         )  # fmt: skip
-    if cfg.output_dir.exists():
-        raise FieldError("output_dir", cfg.output_dir, "there is something already", "choose a new folder")
+    require_new("output_dir", cfg.output_dir)
 
 
 def write_labelled(dataset: "LeRobotDataset", success: np.ndarray, output_dir: Path, repo_id: str) -> None:

@@ -36,7 +36,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.command_line import RunConfig, run_command, settings_beside
 from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least
-from lerobot_wmrl.common.files import writing
+from lerobot_wmrl.common.files import require_new, writing
 from lerobot_wmrl.common.policies import check_weights, read_policy_config, require_trained
 from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.play.checks import LAST_PORT, whole_number
@@ -127,8 +127,7 @@ class PlayConfig(RunConfig):
                 raise FieldError(
                     name, getattr(given, "type", given), "is in no exported page", "leave it out"
                 )
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise FieldError("export", folder, "there is something already", "choose a new folder")
+        require_new("export", folder)
         for package in ("onnx", "onnxscript", "onnxruntime"):
             if find_spec(package) is None:
                 raise FieldError(

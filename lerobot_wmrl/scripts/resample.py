@@ -78,6 +78,7 @@ def summed_components(cfg: ResampleConfig, dataset: "LeRobotDataset") -> np.ndar
     """Mark the components of the action that add up. FieldError for a setting that cannot be. (A,)"""
     from lerobot.utils.constants import ACTION
 
+    from lerobot_wmrl.common.files import require_new
     from lerobot_wmrl.data.embodiment import component_names
 
     require_at_least(cfg, 2, "every")
@@ -103,8 +104,7 @@ def summed_components(cfg: ResampleConfig, dataset: "LeRobotDataset") -> np.ndar
             "dataset.root", dataset.root, f"has annotations ({', '.join(language)}), which are not copied",
             "remove them first: lerobot-edit-dataset --operation.type=remove_feature",
         )  # fmt: skip
-    if cfg.output_dir.exists():
-        raise FieldError("output_dir", cfg.output_dir, "already exists", "choose a new folder")
+    require_new("output_dir", cfg.output_dir)
     return np.isin(names, cfg.displacements)
 
 
