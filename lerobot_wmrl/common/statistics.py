@@ -147,9 +147,6 @@ class PairedChange:
         changed = self.gained + self.lost
         return float(binomtest(self.gained, changed).pvalue) if changed else 1.0
 
-    def __str__(self) -> str:
-        return f"{self.gained} gained, {self.lost} lost (p = {self.p_value:.2g})"
-
     def as_json(self) -> dict[str, float | int]:
         return {"gained": self.gained, "lost": self.lost, "p_value": self.p_value}
 
