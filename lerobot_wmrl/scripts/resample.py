@@ -150,7 +150,7 @@ def episode_rows(
     dataset: "LeRobotDataset", episode: int, features: Mapping[str, Any], every: int, summed: np.ndarray
 ) -> Iterator[dict[str, Any]]:
     """Yield the rows of an episode's copy, as LeRobotDataset's `add_frame` takes them."""
-    from lerobot_wmrl.data.frame_cache import decode, parts_of, rows_of
+    from lerobot_wmrl.data.decoding import decode, parts_of, rows_of
 
     columns = kept_values(dataset, episode, features, every, summed)
     begin = rows_of(dataset, episode).start
@@ -168,7 +168,7 @@ def kept_values(
     """Return an episode's columns but for its pictures, and `task`, at the T rows that are kept. (T, …)"""
     from lerobot.utils.constants import ACTION, DEFAULT_FEATURES, REWARD
 
-    from lerobot_wmrl.data.frame_cache import rows_of
+    from lerobot_wmrl.data.decoding import rows_of
 
     rows = rows_of(dataset, episode)
     length = rows.stop - rows.start

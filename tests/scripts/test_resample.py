@@ -11,7 +11,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_dataset_maniskill.writer import video_encoder
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data import frame_cache
+from lerobot_wmrl.data import decoding
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.scripts.resample import ResampleConfig, main, summed_components
@@ -63,7 +63,7 @@ def test_what_happened_between_two_kept_frames_belongs_to_the_first(
     source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     slow = tmp_path / "slow"
-    monkeypatch.setattr(frame_cache, "DECODED", 3)  # frames that are decoded at a time
+    monkeypatch.setattr(decoding, "DECODED", 3)  # frames that are decoded at a time
     resample(
         monkeypatch, f"--dataset.root={source}", "--every=2", "--displacements=[dx]", f"--output_dir={slow}"
     )
