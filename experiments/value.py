@@ -13,7 +13,6 @@ from lerobot_wmrl.data.budget import Ledger
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.evaluation.comparison import RESULTS
-from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
 CELL: Final = ("task", "kind", "demonstrations", "rollouts", "seed", "starts")
 """Variables of the study that say which cell it is."""
@@ -66,9 +65,14 @@ def spent(study: Study) -> dict[str, Any]:
     dataset = run / "dataset"
     return {
         "real_episodes": Ledger(study.budget).read().spent().total(),
-        "real_successes": int(recorded_episodes(dataset)["success"].sum()) if dataset.exists() else None,
+        "real_successes": successes(dataset) if dataset.exists() else None,
         **begun(run),
     }
+
+
+def successes(root: Path) -> int:
+    """Count the successful episodes of a dataset."""
+    return int(read_episodes(open_dataset(root)).success.sum())
 
 
 def begun(run: Path) -> dict[str, Any]:
