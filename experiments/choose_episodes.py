@@ -64,10 +64,10 @@ def successes(root: Path, count: int | None) -> list[int]:
         raise FieldError(
             "dataset.root", root, f"has no column {SUCCESS}", "record it with lerobot-wmrl-record"
         )
-    found = np.flatnonzero(table.success)
-    if len(found) < (count or 1):
-        raise ValueError(f"{root}: {len(found)} successes, {count or 1} are needed: record more")
-    return [int(episode) for episode in found[:count]]
+    successful = np.flatnonzero(table.success)
+    if len(successful) < (count or 1):
+        raise ValueError(f"{root}: {len(successful)} successes, {count or 1} are needed: record more")
+    return [int(episode) for episode in successful[:count]]
 
 
 def main() -> None:

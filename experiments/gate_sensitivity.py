@@ -47,7 +47,7 @@ def succeeds(simulation: Simulation, actions: np.ndarray) -> bool:
 
 def repeated(simulation: Simulation, table: EpisodeTable, errors_mm: Sequence[float]) -> np.ndarray:
     """Return the success of every episode with each error. → (E, errors)"""
-    found = np.zeros((len(table.start), len(errors_mm)), bool)
+    success = np.zeros((len(table.start), len(errors_mm)), bool)
     for episode in tqdm(range(len(table.start)), desc="Repeating episodes", unit="episode"):
         task, scene, seed, _ = (int(table.columns[name][episode]) for name in START_COLUMNS)
         (rows,) = table.rows([episode])
@@ -57,19 +57,19 @@ def repeated(simulation: Simulation, table: EpisodeTable, errors_mm: Sequence[fl
         for column, error in enumerate(errors_mm):
             simulation.reset(SCENES[scene], seed)
             put_aside(simulation, error / 1000 * direction)
-            found[episode, column] = succeeds(simulation, actions)
-    return found
+            success[episode, column] = succeeds(simulation, actions)
+    return success
 
 
-def measure(found: np.ndarray, success: np.ndarray, errors_mm: Sequence[float]) -> list[dict[str, Any]]:
-    """Return the gate at each error; success (E,) is the recorded one."""
+def measure(repeats: np.ndarray, success: np.ndarray, errors_mm: Sequence[float]) -> list[dict[str, Any]]:
+    """Return the gate at each error; repeats (E, errors) succeed or not, success (E,) is the recorded one."""
     return [
         {
             "error_mm": error,
             "false_positive_rate": Proportion(int(calls[~success].sum()), int((~success).sum())).as_json(),
             "recall": Proportion(int(calls[success].sum()), int(success.sum())).as_json(),
         }
-        for error, calls in zip(errors_mm, found.T, strict=True)
+        for error, calls in zip(errors_mm, repeats.T, strict=True)
     ]
 
 

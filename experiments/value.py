@@ -35,7 +35,7 @@ def four_tasks(study: Study) -> Results:
     `minutes` are those of the steps on the machines that the provenance names.
     """
     methods: dict[str, Sequence[str]] = study.variables["methods"]
-    found = {
+    rates = {
         task: {
             domain: {name: rate(outcomes(study.folder / f"eval_{name}_{task}_{domain}")) for name in methods}
             for domain in ("ind", "ood")
@@ -46,7 +46,7 @@ def four_tasks(study: Study) -> Results:
         **{name: study.variables[name] for name in ("demonstrations", "rollouts", "seed", "starts")},
         **spent(study),
         "minutes": {name: minutes(study, steps) for name, steps in methods.items()},
-        "tasks": found,
+        "tasks": rates,
     }
     if (gate := study.folder / "check" / "metrics.json").exists():
         results["gate"] = json.loads(gate.read_text())["gate_by_task"]
@@ -80,9 +80,9 @@ def begun(run: Path) -> dict[str, Any]:
     results = run / "comparison" / RESULTS
     if not results.exists():
         return {"start": None}
-    found = json.loads(results.read_text())
-    shares = {policy_name(path): rate["share"] for path, rate in found["policies"].items()}
-    return {"start": policy_name(chosen_policy(found)), "imagined": shares}
+    comparison = json.loads(results.read_text())
+    shares = {policy_name(path): rate["share"] for path, rate in comparison["policies"].items()}
+    return {"start": policy_name(chosen_policy(comparison)), "imagined": shares}
 
 
 def policy_name(checkpoint: str) -> str:
@@ -92,11 +92,11 @@ def policy_name(checkpoint: str) -> str:
 
 def control(study: Study) -> Results:
     """Return the success of methods in a world model that learnt from changed data."""
-    found = {name: success(study, name) for name in study.variables["methods"]}
+    rates = {name: success(study, name) for name in study.variables["methods"]}
     settings = {
         name: study.variables[name] for name in ("control", "demonstrations", "rollouts", "seed", "starts")
     }
-    return {study.variables["cell"]: {**settings, "methods": found}}
+    return {study.variables["cell"]: {**settings, "methods": rates}}
 
 
 def driven(study: Study) -> Results:
@@ -108,18 +108,18 @@ def driven(study: Study) -> Results:
     wanted = [len(actions) for actions in driven]
     if (kept := read_episodes(open_dataset(study.folder / "driven")).length.tolist()) != wanted:
         raise ValueError(f"lerobot-record has kept {kept} frames of {wanted}: it did not keep up; repeat it")
-    found = {name: success(study, name) for name in study.variables["methods"]}
-    return {study.variables["cell"]: {**settings, "methods": found}}
+    rates = {name: success(study, name) for name in study.variables["methods"]}
+    return {study.variables["cell"]: {**settings, "methods": rates}}
 
 
 def method(study: Study, name: str, steps: Sequence[str]) -> dict[str, Any]:
     """Return a method's success, the minutes of its steps, and the seconds that it takes for an episode."""
     training = minutes(study, steps)
-    found = success(study, name)
-    evaluated = sum(seconds(study, f"eval_{name}_{domain}") for domain in found)
-    episodes = sum(each["n"] for each in found.values())
+    rates = success(study, name)
+    evaluated = sum(seconds(study, f"eval_{name}_{domain}") for domain in rates)
+    episodes = sum(each["n"] for each in rates.values())
     return {
-        **found,
+        **rates,
         "minutes": training,
         "seconds_an_episode": round(evaluated / episodes, 2),
     }

@@ -17,8 +17,8 @@ def wilson_interval(successes: int, n: int) -> tuple[float, float]:
     """Return Wilson's 95 % score interval of a proportion (Wilson 1927); (0, 1) for n = 0."""
     if n == 0:
         return 0.0, 1.0
-    found = binomtest(successes, n).proportion_ci(0.95, "wilson")
-    return float(found.low), float(found.high)
+    interval = binomtest(successes, n).proportion_ci(0.95, "wilson")
+    return float(interval.low), float(interval.high)
 
 
 @dataclass(frozen=True)

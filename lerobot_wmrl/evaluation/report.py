@@ -265,10 +265,10 @@ def gate_lines(gate: Gate, best: Gate | None) -> str:
 
 def seen_line(auc: float, remedy: str) -> str:
     """Say how well success is seen in recorded frames, `Outcomes.auc` of these, and what helps if hardly."""
-    said = f"In the recorded frames themselves the success classifier has an AUC of {auc:.2f}"
+    sentence = f"In the recorded frames themselves the success classifier has an AUC of {auc:.2f}"
     if auc >= DOUBTFUL_AUC:
-        return f"{said}."
-    return f"{said}: it hardly sees success in them, and the world model has success from it.{remedy}"
+        return f"{sentence}."
+    return f"{sentence}: it hardly sees success in them, and the world model has success from it.{remedy}"
 
 
 def task_table(gates: Mapping[str, Gate], best: Mapping[str, Gate | None]) -> str:

@@ -174,9 +174,9 @@ def export(world: "World", folder: Path, starts: int) -> None:
 
     print("exporting the networks, which takes a minute or two", flush=True)
     with writing("export", folder, resumes=False):
-        found = export_page(world, folder, starts)
+        agreement = export_page(world, folder, starts)
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-    print(f"{folder}: {size / 1e6:.1f} MB; {found}")
+    print(f"{folder}: {size / 1e6:.1f} MB; {agreement}")
     print(f"look at it: python -m http.server --directory {folder} --bind 127.0.0.1")
 
 

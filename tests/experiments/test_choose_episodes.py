@@ -21,10 +21,10 @@ def test_only_successful_optimal_episodes_are_taken(tmp_path: Path) -> None:
 
 
 def test_successes_are_the_first_or_all(small_dataset: LeRobotDataset) -> None:
-    root, found = Path(small_dataset.root), np.flatnonzero(read_episodes(small_dataset).success)
-    assert successes(root, 1) == [found[0]]
-    assert successes(root, None) == found.tolist()
-    with pytest.raises(ValueError, match=f"{len(found)} successes, 9 are needed"):
+    root, successful = Path(small_dataset.root), np.flatnonzero(read_episodes(small_dataset).success)
+    assert successes(root, 1) == [successful[0]]
+    assert successes(root, None) == successful.tolist()
+    with pytest.raises(ValueError, match=f"{len(successful)} successes, 9 are needed"):
         successes(root, 9)
 
 

@@ -223,9 +223,9 @@ def test_a_malformed_request_is_refused_and_nothing_is_lost(served, method, path
     served.run(talk(served, BEGIN, STEP))
     if isinstance(options.get("data"), dict):
         options = {"data": form(**options["data"])}
-    found = served.run(fetch(served, method, path, **options))
-    assert found[0] == status
-    assert said in found[1]
+    answer = served.run(fetch(served, method, path, **options))
+    assert answer[0] == status
+    assert said in answer[1]
     assert served.run(talk(served, STEP))[0]["view"]["frame"] == 2
 
 
