@@ -11,11 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from lerobot_wmrl.common.constants import KINDS
+from lerobot_wmrl.common.constants import KINDS, START_KIND, START_SCENE
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import SUCCESS, read_episodes
-from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
 
 def count(value: str) -> int:
@@ -43,18 +42,19 @@ def optimal_episodes(root: Path, count: int) -> list[int]:
     Raises:
         ValueError: there are not so many.
     """
-    table = recorded_episodes(root)
-    chosen = (table["kind"] == KINDS.index("optimal")) & table["success"]
+    table = read_episodes(open_dataset(root))
+    scenes = table.columns[START_SCENE]
+    chosen = (table.columns[START_KIND] == KINDS.index("optimal")) & table.success
     rank = np.zeros(len(chosen), dtype=np.int64)
-    for scene in np.unique(table["scene"]):
-        members = chosen & (table["scene"] == scene)
+    for scene in np.unique(scenes):
+        members = chosen & (scenes == scene)
         rank[members] = np.arange(members.sum())
-    order = sorted(np.flatnonzero(chosen), key=lambda row: (rank[row], table["scene"][row]))
+    order = sorted(np.flatnonzero(chosen), key=lambda row: (rank[row], scenes[row]))
     if len(order) < count:
         raise ValueError(
             f"{root} holds {len(order)} successful optimal episodes, {count} are needed: record more"
         )
-    return sorted(int(table["episode"][row]) for row in order[:count])
+    return sorted(map(int, order[:count]))
 
 
 def successes(root: Path, count: int | None) -> list[int]:
@@ -64,10 +64,10 @@ def successes(root: Path, count: int | None) -> list[int]:
         raise FieldError(
             "dataset.root", root, f"has no column {SUCCESS}", "record it with lerobot-wmrl-record"
         )
-    found = np.flatnonzero(table.success)
-    if len(found) < (count or 1):
-        raise ValueError(f"{root}: {len(found)} successes, {count or 1} are needed: record more")
-    return [int(episode) for episode in found[:count]]
+    successful = np.flatnonzero(table.success)
+    if len(successful) < (count or 1):
+        raise ValueError(f"{root}: {len(successful)} successes, {count or 1} are needed: record more")
+    return [int(episode) for episode in successful[:count]]
 
 
 def main() -> None:

@@ -19,13 +19,12 @@ import numpy as np
 from lerobot.utils.import_utils import register_third_party_plugins
 from tqdm import tqdm
 
-from lerobot_wmrl.common.constants import TASKS
+from lerobot_wmrl.common.constants import START_COLUMNS, START_SCENE, START_TASK, TASKS
 from lerobot_wmrl.common.files import markdown_table, write_json
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
 from lerobot_wmrl.maniskill.cameras import Rendering
-from lerobot_wmrl.maniskill.recordings import recorded_episodes
 from lerobot_wmrl.maniskill.scenes import SCENES
 from lerobot_wmrl.maniskill.simulation import Simulation
 from lerobot_wmrl.maniskill.tasks import task_of
@@ -46,13 +45,11 @@ def succeeds(simulation: Simulation, actions: np.ndarray) -> bool:
     return any(simulation.step(action).success for action in actions)
 
 
-def repeated(
-    simulation: Simulation, table: EpisodeTable, real: dict[str, np.ndarray], errors_mm: Sequence[float]
-) -> np.ndarray:
+def repeated(simulation: Simulation, table: EpisodeTable, errors_mm: Sequence[float]) -> np.ndarray:
     """Return the success of every episode with each error. → (E, errors)"""
-    found = np.zeros((len(table.start), len(errors_mm)), bool)
+    success = np.zeros((len(table.start), len(errors_mm)), bool)
     for episode in tqdm(range(len(table.start)), desc="Repeating episodes", unit="episode"):
-        task, scene, seed = (int(real[name][episode]) for name in ("task", "scene", "seed"))
+        task, scene, seed, _ = (int(table.columns[name][episode]) for name in START_COLUMNS)
         (rows,) = table.rows([episode])
         actions = table.action[rows]
         direction = np.random.default_rng(seed).normal(size=2)
@@ -60,19 +57,19 @@ def repeated(
         for column, error in enumerate(errors_mm):
             simulation.reset(SCENES[scene], seed)
             put_aside(simulation, error / 1000 * direction)
-            found[episode, column] = succeeds(simulation, actions)
-    return found
+            success[episode, column] = succeeds(simulation, actions)
+    return success
 
 
-def measure(found: np.ndarray, success: np.ndarray, errors_mm: Sequence[float]) -> list[dict[str, Any]]:
-    """Return the gate at each error; success (E,) is the recorded one."""
+def measure(repeats: np.ndarray, success: np.ndarray, errors_mm: Sequence[float]) -> list[dict[str, Any]]:
+    """Return the gate at each error; repeats (E, errors) succeed or not, success (E,) is the recorded one."""
     return [
         {
             "error_mm": error,
             "false_positive_rate": Proportion(int(calls[~success].sum()), int((~success).sum())).as_json(),
             "recall": Proportion(int(calls[success].sum()), int(success.sum())).as_json(),
         }
-        for error, calls in zip(errors_mm, found.T, strict=True)
+        for error, calls in zip(errors_mm, repeats.T, strict=True)
     ]
 
 
@@ -99,10 +96,11 @@ def main() -> None:
     """Entry point."""
     register_third_party_plugins()
     given = make_parser().parse_args()
-    table, real = read_episodes(open_dataset(given.root)), recorded_episodes(Path(given.root))
-    scenes = [SCENES[scene] for scene in np.unique(real["scene"])]
-    simulation = Simulation(task_of(TASKS[int(real["task"][0])]), scenes, Rendering(cameras=()))
-    rows = measure(repeated(simulation, table, real, given.errors), real["success"], given.errors)
+    table = read_episodes(open_dataset(given.root))
+    scenes = [SCENES[scene] for scene in np.unique(table.columns[START_SCENE])]
+    task = task_of(TASKS[int(table.columns[START_TASK][0])])
+    simulation = Simulation(task, scenes, Rendering(cameras=()))
+    rows = measure(repeated(simulation, table, given.errors), table.success, given.errors)
     write_json(given.output, {"episodes": len(table.start), "errors": rows})
     print(results_table(rows))
 

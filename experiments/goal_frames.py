@@ -78,7 +78,7 @@ def measure(
     return {
         **training_minutes(folder),
         "seconds_a_goal": seconds,
-        **goal_quality(goals, probe),
+        **goal_quality(goals, probe).as_json(),
         "auc": auc(similarity_of_ends(model, recording, episodes, 0), success),
         "auc_of_other_starts": auc(similarity_of_ends(model, recording, episodes, 1), success),
     }

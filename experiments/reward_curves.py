@@ -38,6 +38,7 @@ from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelE
 from lerobot_wmrl.envs.start_frames import chosen_episodes
 from lerobot_wmrl.envs.world_model_env import WorldModelVectorEnv, make_world_model_env
 from lerobot_wmrl.evaluation.gate import Outcomes
+from lerobot_wmrl.evaluation.replay import Recording
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.world_models.checkpoint import load_model
@@ -106,12 +107,12 @@ def recorded(table: EpisodeTable, episodes: np.ndarray, column: np.ndarray, step
 
 def within_episodes(reward: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """Return Spearman's correlation over each episode's frames; NaN where one is constant. (E, T) → (E,)"""
-    found = np.full(len(reward), np.nan)
+    correlation = np.full(len(reward), np.nan)
     for row, (own, real) in enumerate(zip(reward, truth, strict=True)):
         known = np.isfinite(real)
         if np.ptp(own[known]) > 0 and np.ptp(real[known]) > 0:
-            found[row] = spearmanr(own[known], real[known]).statistic
-    return found
+            correlation[row] = spearmanr(own[known], real[known]).statistic
+    return correlation
 
 
 def curve(values: np.ndarray) -> dict[str, list[float]]:
@@ -138,20 +139,20 @@ def measure(
     truth, success = curves["rule_based"], done.any(1)
     lasted = {name: np.where(np.isfinite(truth), values, np.nan) for name, values in curves.items()}
     uncertainty = {signal: lasted.pop(signal) for signal in SIGNALS}
-    found = {}
+    by_reward = {}
     for name, cut in lasted.items():
         outcomes = Outcomes(np.arange(len(cut)), cut, done)
         earned = np.nanmean(cut[success], 1)
-        found[name] = {
+        by_reward[name] = {
             "auc": outcomes.auc(FRAMES),
             "spearman": Estimate.mean(within_episodes(cut, truth)).as_json(),
             "curve_of_successes": curve(cut[success]),
             "curve_of_failures": curve(cut[~success]),
             "earned_by_successes": float(earned.mean()),
-            "earned_by": {hand: float(said[name].mean()) for hand, said in alone.items() if name in said},
+            "earned_by": {hand: float(paid[name].mean()) for hand, paid in alone.items() if name in paid},
         }
     return {
-        "successes": int(success.sum()), "failures": int((~success).sum()), "rewards": found,
+        "successes": int(success.sum()), "failures": int((~success).sum()), "rewards": by_reward,
         "uncertainty": warnings(uncertainty, Outcomes(np.arange(len(done)), lasted["success"], done)),
     }  # fmt: skip
 
@@ -198,8 +199,7 @@ def curves_of(given: argparse.Namespace, root: str, rewards: Mapping[str, Any]) 
     probe = RewardProbe(rewards)
     env.reward = probe
     steps = int(table.length[episodes].max())
-    offset = np.minimum(np.arange(steps), table.length[episodes][:, None] - 1)
-    actions = torch.from_numpy(table.action[table.start[episodes][:, None] + offset])
+    actions = Recording.read(table, env.model).actions(episodes, steps, torch.device("cpu"))
     column = np.asarray(table.dataset.hf_dataset.with_format("numpy")["next.reward"][:]).reshape(-1)
     curves = {
         "rule_based": recorded(table, episodes, column, steps), **judged(env, probe, actions, config),
@@ -211,10 +211,10 @@ def curves_of(given: argparse.Namespace, root: str, rewards: Mapping[str, Any]) 
     return measure(curves, done, hands)
 
 
-def results_table(found: Mapping[str, Mapping[str, Any]]) -> str:
+def results_table(measured: Mapping[str, Mapping[str, Any]]) -> str:
     """Return a table with a line for every dataset and reward."""
     lines = []
-    for dataset, numbers in found.items():
+    for dataset, numbers in measured.items():
         for name, row in numbers["rewards"].items():
             earned = [f"{row['earned_by'][hand]:.2f}" if hand in row["earned_by"] else "–" for hand in HANDS]
             lines.append([
@@ -224,12 +224,12 @@ def results_table(found: Mapping[str, Mapping[str, Any]]) -> str:
     return markdown_table(["episodes", "reward", "AUC", "Spearman", "successes earn", *HANDS], lines)
 
 
-def draw(found: Mapping[str, Mapping[str, Any]], path: Path) -> None:
+def draw(measured: Mapping[str, Mapping[str, Any]], path: Path) -> None:
     """Draw the mean curves of successes and failures: a row a dataset, a column a reward."""
-    names = list(next(iter(found.values()))["rewards"])
-    figure = Figure(figsize=(2.2 * len(names), 2.2 * len(found)), layout="constrained")
-    grid = figure.subplots(len(found), len(names), squeeze=False, sharex=True)
-    for row, (dataset, numbers) in zip(grid, found.items(), strict=True):
+    names = list(next(iter(measured.values()))["rewards"])
+    figure = Figure(figsize=(2.2 * len(names), 2.2 * len(measured)), layout="constrained")
+    grid = figure.subplots(len(measured), len(names), squeeze=False, sharex=True)
+    for row, (dataset, numbers) in zip(grid, measured.items(), strict=True):
         for axes, name in zip(row, names, strict=True):
             for colour, kind in zip(COLOURS, ("successes", "failures"), strict=False):
                 shown = numbers["rewards"][name][f"curve_of_{kind}"]
@@ -237,7 +237,7 @@ def draw(found: Mapping[str, Mapping[str, Any]], path: Path) -> None:
                 frames = range(len(shown["mean"]))
                 axes.fill_between(frames, shown["low"], shown["high"], color=colour, alpha=0.25)
             axes.set_title(f"{name}, {dataset}", fontsize=9)
-            axes.set_xlabel("frame" if dataset == list(found)[-1] else "")
+            axes.set_xlabel("frame" if dataset == list(measured)[-1] else "")
     tidy(figure).savefig(path, dpi=130)
 
 
@@ -261,13 +261,13 @@ def main() -> None:
     register_third_party_plugins()
     paths = {kind: getattr(given, kind) for kind in ("proxy", "embedding") if getattr(given, kind)}
     rewards = {kind: load_model(path, kind) for kind, path in paths.items()}
-    found = {
+    measured = {
         name: curves_of(given, root, rewards) for name, _, root in (d.partition("=") for d in given.datasets)
     }
-    write_json(given.output, found)
-    draw(found, given.output.with_suffix(".png"))
-    print(results_table(found))
-    print(*(f"{name}: {numbers['uncertainty']}" for name, numbers in found.items()), sep="\n")
+    write_json(given.output, measured)
+    draw(measured, given.output.with_suffix(".png"))
+    print(results_table(measured))
+    print(*(f"{name}: {numbers['uncertainty']}" for name, numbers in measured.items()), sep="\n")
 
 
 if __name__ == "__main__":

@@ -13,7 +13,6 @@ from lerobot_wmrl.data.budget import Ledger
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.evaluation.comparison import RESULTS
-from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
 CELL: Final = ("task", "kind", "demonstrations", "rollouts", "seed", "starts")
 """Variables of the study that say which cell it is."""
@@ -36,7 +35,7 @@ def four_tasks(study: Study) -> Results:
     `minutes` are those of the steps on the machines that the provenance names.
     """
     methods: dict[str, Sequence[str]] = study.variables["methods"]
-    found = {
+    rates = {
         task: {
             domain: {name: rate(outcomes(study.folder / f"eval_{name}_{task}_{domain}")) for name in methods}
             for domain in ("ind", "ood")
@@ -47,7 +46,7 @@ def four_tasks(study: Study) -> Results:
         **{name: study.variables[name] for name in ("demonstrations", "rollouts", "seed", "starts")},
         **spent(study),
         "minutes": {name: minutes(study, steps) for name, steps in methods.items()},
-        "tasks": found,
+        "tasks": rates,
     }
     if (gate := study.folder / "check" / "metrics.json").exists():
         results["gate"] = json.loads(gate.read_text())["gate_by_task"]
@@ -66,9 +65,14 @@ def spent(study: Study) -> dict[str, Any]:
     dataset = run / "dataset"
     return {
         "real_episodes": Ledger(study.budget).read().spent().total(),
-        "real_successes": int(recorded_episodes(dataset)["success"].sum()) if dataset.exists() else None,
+        "real_successes": successes(dataset) if dataset.exists() else None,
         **begun(run),
     }
+
+
+def successes(root: Path) -> int:
+    """Count the successful episodes of a dataset."""
+    return int(read_episodes(open_dataset(root)).success.sum())
 
 
 def begun(run: Path) -> dict[str, Any]:
@@ -76,9 +80,9 @@ def begun(run: Path) -> dict[str, Any]:
     results = run / "comparison" / RESULTS
     if not results.exists():
         return {"start": None}
-    found = json.loads(results.read_text())
-    shares = {policy_name(path): rate["share"] for path, rate in found["policies"].items()}
-    return {"start": policy_name(chosen_policy(found)), "imagined": shares}
+    comparison = json.loads(results.read_text())
+    shares = {policy_name(path): rate["share"] for path, rate in comparison["policies"].items()}
+    return {"start": policy_name(chosen_policy(comparison)), "imagined": shares}
 
 
 def policy_name(checkpoint: str) -> str:
@@ -88,11 +92,11 @@ def policy_name(checkpoint: str) -> str:
 
 def control(study: Study) -> Results:
     """Return the success of methods in a world model that learnt from changed data."""
-    found = {name: success(study, name) for name in study.variables["methods"]}
+    rates = {name: success(study, name) for name in study.variables["methods"]}
     settings = {
         name: study.variables[name] for name in ("control", "demonstrations", "rollouts", "seed", "starts")
     }
-    return {study.variables["cell"]: {**settings, "methods": found}}
+    return {study.variables["cell"]: {**settings, "methods": rates}}
 
 
 def driven(study: Study) -> Results:
@@ -104,18 +108,18 @@ def driven(study: Study) -> Results:
     wanted = [len(actions) for actions in driven]
     if (kept := read_episodes(open_dataset(study.folder / "driven")).length.tolist()) != wanted:
         raise ValueError(f"lerobot-record has kept {kept} frames of {wanted}: it did not keep up; repeat it")
-    found = {name: success(study, name) for name in study.variables["methods"]}
-    return {study.variables["cell"]: {**settings, "methods": found}}
+    rates = {name: success(study, name) for name in study.variables["methods"]}
+    return {study.variables["cell"]: {**settings, "methods": rates}}
 
 
 def method(study: Study, name: str, steps: Sequence[str]) -> dict[str, Any]:
     """Return a method's success, the minutes of its steps, and the seconds that it takes for an episode."""
     training = minutes(study, steps)
-    found = success(study, name)
-    evaluated = sum(seconds(study, f"eval_{name}_{domain}") for domain in found)
-    episodes = sum(each["n"] for each in found.values())
+    rates = success(study, name)
+    evaluated = sum(seconds(study, f"eval_{name}_{domain}") for domain in rates)
+    episodes = sum(each["n"] for each in rates.values())
     return {
-        **found,
+        **rates,
         "minutes": training,
         "seconds_an_episode": round(evaluated / episodes, 2),
     }

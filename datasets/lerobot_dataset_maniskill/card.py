@@ -13,12 +13,13 @@ import numpy as np
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_dataset_maniskill.writer import VOCABULARY_FILE
-from lerobot_wmrl.common.constants import KINDS, TASKS
+from lerobot_wmrl.common.constants import KINDS, START_KIND, START_SCENE, START_TASK, TASKS
 from lerobot_wmrl.common.files import markdown_table, write_text
 from lerobot_wmrl.common.frame_strips import enlarged, in_a_row
 from lerobot_wmrl.common.statistics import Proportion, evenly_spaced
+from lerobot_wmrl.data.dataset import open_dataset
+from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
 from lerobot_wmrl.maniskill.embodiment import FPS
-from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
 CARD_FILE = Path("README.md")
 
@@ -44,16 +45,16 @@ def name_card(root: Path, repo_id: str) -> None:
     """Write pictures and card, unless the card has this name already: somebody may have edited it."""
     card = root / CARD_FILE
     if not card.is_file() or title(repo_id) not in card.read_text().splitlines():
-        write_card(root, repo_id, recorded_episodes(root))
+        write_card(root, repo_id, read_episodes(open_dataset(root)))
 
 
-def write_card(root: Path, repo_id: str, table: Mapping[str, np.ndarray]) -> None:
+def write_card(root: Path, repo_id: str, table: EpisodeTable) -> None:
     """Write the pictures, then the card, of a dataset.
 
     Args:
         root: root of the dataset.
         repo_id: its name.
-        table: its episodes, as `lerobot_wmrl.maniskill.recordings.recorded_episodes` reads them.
+        table: its episodes.
     """
     write_pictures(root, repo_id, table)
     vocabulary = json.loads((root / VOCABULARY_FILE).read_text())
@@ -62,9 +63,9 @@ def write_card(root: Path, repo_id: str, table: Mapping[str, np.ndarray]) -> Non
         what=IMAGINED if "world_model" in vocabulary["recording"] else "ManiSkill trajectories",
         name=repo_id,
         fps=FPS,
-        episodes=len(table["episode"]),
-        frames=table["length"].sum(),
-        minutes=table["length"].sum() / FPS / 60,
+        episodes=len(table.length),
+        frames=table.length.sum(),
+        minutes=table.length.sum() / FPS / 60,
         success=markdown_table(SUCCESS_HEAD, success_rows(table)),
         meanings="\n".join(f"- `{kind}`: {KIND_MEANINGS[kind]}" for kind in recorded_kinds(table)),
         pictures="\n\n".join(picture_lines(table)),
@@ -86,25 +87,26 @@ def title(repo_id: str) -> str:
     return f"# {repo_id}"
 
 
-def recorded_kinds(table: Mapping[str, np.ndarray]) -> list[str]:
+def recorded_kinds(table: EpisodeTable) -> list[str]:
     """Return the names of the kinds that have episodes."""
-    return [KINDS[kind] for kind in np.unique(table["kind"])]
+    return [KINDS[kind] for kind in np.unique(table.columns[START_KIND])]
 
 
 SUCCESS_HEAD = ("task", "kind", "episodes", "successful", "success rate (95 % interval)")
 
 
-def success_rows(table: Mapping[str, np.ndarray]) -> Iterator[tuple[Any, ...]]:
+def success_rows(table: EpisodeTable) -> Iterator[tuple[Any, ...]]:
     """Yield a row for each task and kind that has episodes."""
-    for task, kind in sorted({*zip(table["task"].tolist(), table["kind"].tolist(), strict=True)}):
-        success = table["success"][(table["task"] == task) & (table["kind"] == kind)]
-        rate = Proportion(int(success.sum()), len(success))
+    tasks, kinds, success = table.columns[START_TASK], table.columns[START_KIND], table.success
+    for task, kind in sorted({*zip(tasks.tolist(), kinds.tolist(), strict=True)}):
+        chosen = success[(tasks == task) & (kinds == kind)]
+        rate = Proportion(int(chosen.sum()), len(chosen))
         low, high = rate.interval
         shown = f"{rate.share:.0%} ({low:.0%}–{high:.0%})"
         yield TASKS[task], KINDS[kind], rate.n, rate.k, shown
 
 
-def picture_lines(table: Mapping[str, np.ndarray]) -> Iterator[str]:
+def picture_lines(table: EpisodeTable) -> Iterator[str]:
     """Yield every example's picture with its caption."""
     for example in chosen_examples(table):
         end = "from its start to success" if example.success else "which fails"
@@ -115,18 +117,16 @@ def picture_lines(table: Mapping[str, np.ndarray]) -> Iterator[str]:
 SCENES_HEAD = ("scene", "object", "container", "table", "split", "episodes")
 
 
-def scene_rows(
-    table: Mapping[str, np.ndarray], scenes: Sequence[Mapping[str, Any]]
-) -> Iterator[tuple[Any, ...]]:
+def scene_rows(table: EpisodeTable, scenes: Sequence[Mapping[str, Any]]) -> Iterator[tuple[Any, ...]]:
     """Yield a row for each recorded scene. `scenes` is the vocabulary's, by index."""
-    for index, episodes in zip(*np.unique(table["scene"], return_counts=True), strict=True):
+    for index, episodes in zip(*np.unique(table.columns[START_SCENE], return_counts=True), strict=True):
         scene = scenes[index]
         yield index, *(scene[part] for part in ("object", "container", "table", "split")), episodes
 
 
-def success_by_kind(table: Mapping[str, np.ndarray]) -> dict[str, tuple[int, int]]:
+def success_by_kind(table: EpisodeTable) -> dict[str, tuple[int, int]]:
     """Count by kind. Returns kind → (successful episodes, episodes)."""
-    kinds, success = table["kind"], table["success"]
+    kinds, success = table.columns[START_KIND], table.success
     return {
         name: (int(success[kinds == index].sum()), int(np.sum(kinds == index)))
         for index, name in enumerate(KINDS)
@@ -149,22 +149,18 @@ class Example:
         return MEDIA / f"{self.task}.png"
 
 
-def chosen_examples(table: Mapping[str, np.ndarray]) -> list[Example]:
+def chosen_examples(table: EpisodeTable) -> list[Example]:
     """Choose an episode of each task: its first success, optimal if possible, else its first failure."""
-    best = np.lexsort((table["episode"], table["kind"], ~table["success"]))
-    rows = [best[table["task"][best] == task][0] for task in np.unique(table["task"])]
+    tasks, kinds, success = table.columns[START_TASK], table.columns[START_KIND], table.success
+    best = np.lexsort((kinds, ~success))
+    chosen = [best[tasks[best] == task][0] for task in np.unique(tasks)]
     return [
-        Example(
-            TASKS[table["task"][row]],
-            int(table["episode"][row]),
-            KINDS[table["kind"][row]],
-            bool(table["success"][row]),
-        )
-        for row in rows
+        Example(TASKS[tasks[episode]], int(episode), KINDS[kinds[episode]], bool(success[episode]))
+        for episode in chosen
     ]
 
 
-def write_pictures(root: Path, repo_id: str, table: Mapping[str, np.ndarray]) -> None:
+def write_pictures(root: Path, repo_id: str, table: EpisodeTable) -> None:
     """Write the picture of every example into the folder `media` of the dataset at `root`."""
     (root / MEDIA).mkdir(exist_ok=True)
     for example in chosen_examples(table):

@@ -4,14 +4,12 @@ resumed."""
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_wmrl.common.constants import KINDS, POLICY, START_COLUMNS, TASKS
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.maniskill.recordings import recorded_episodes
 from lerobot_wmrl.maniskill.scenes import SCENES, Scene, scene_for_seed
 
 MOST_VISITS = 1000
@@ -89,7 +87,7 @@ def imagined_episodes(config: RecordConfig) -> list[EpisodePlan]:
     assert config.imagination is not None
     source = config.imagination.dataset
     table = read_episodes(source.open())
-    missing = [name for name in START_COLUMNS if name not in table.dataset.features]
+    missing = [name for name in START_COLUMNS if name not in table.columns]
     if missing:
         raise FieldError(
             "env.dataset.root",
@@ -97,12 +95,11 @@ def imagined_episodes(config: RecordConfig) -> list[EpisodePlan]:
             f"does not say how its episodes began ({', '.join(missing)})",
             "give a dataset that lerobot-wmrl-record recorded: imagined episodes start like its episodes",
         )
-    starts, real = chosen_episodes(table, source), recorded_episodes(Path(table.dataset.root))
-    plans = []
+    starts, plans = chosen_episodes(table, source), []
     for number in range(config.num_episodes):
         start = (config.seed + number) % len(starts)
         visit = config.seed * MOST_VISITS + number // len(starts)
-        task, scene, seed = (int(real[name][starts[start]]) for name in ("task", "scene", "seed"))
+        task, scene, seed, _ = (int(table.columns[name][starts[start]]) for name in START_COLUMNS)
         plans.append(EpisodePlan(TASKS[task], POLICY, SCENES[scene], seed, start, visit))
     if len(plans) > len(starts) and not config.exploration:
         logging.warning(

@@ -12,8 +12,9 @@ from lerobot_dataset_maniskill.card import CARD_FILE, success_by_kind, write_car
 from lerobot_dataset_maniskill.writer import VOCABULARY_FILE, find_damage, write_vocabulary
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.output_folders import different_settings, require_same
+from lerobot_wmrl.data.dataset import open_dataset
+from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.maniskill.embodiment import FPS
-from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
 DIGESTS: Final = ("policy_content", "content")
 """Settings that say what other settings name, which earlier versions did not keep."""
@@ -46,13 +47,13 @@ def describe(merged: Path, output_dir: Path, repo_id: str, content: Mapping[str,
         What was recorded, how often each kind succeeded, and the next command.
     """
     write_vocabulary(merged, content)
-    table = recorded_episodes(merged)
+    table = read_episodes(open_dataset(merged))
     write_card(merged, repo_id, table)
-    frames = int(table["length"].sum())
+    frames = int(table.length.sum())
     rates = (f"{kind} {wins}/{total}" for kind, (wins, total) in success_by_kind(table).items())
     command = "lerobot-wmrl-train-world-model --model.type=frame_tokenizer"
     return (
-        f"{output_dir}: {len(table['episode'])} episodes, {frames} frames ({frames / FPS / 60:.1f} minutes)\n"
+        f"{output_dir}: {len(table.length)} episodes, {frames} frames ({frames / FPS / 60:.1f} minutes)\n"
         f"successful: {', '.join(rates)}\n"
         f"the card with pictures: {output_dir / CARD_FILE}\n"
         f"next: {command} --dataset.root={output_dir} --output_dir=outputs/frame_tokenizer"

@@ -8,6 +8,8 @@ from errno import EACCES, EDQUOT, EFBIG, ENOSPC, EPERM, EROFS
 from pathlib import Path
 from typing import Any
 
+from lerobot_wmrl.common.errors import FieldError
+
 NOT_WRITABLE = (EACCES, EDQUOT, EFBIG, ENOSPC, EPERM, EROFS)
 """Error numbers of a disk that is full or must not be written."""
 
@@ -31,6 +33,12 @@ def whole_folder(target: Path) -> Iterator[Path]:
     partial.parent.mkdir(parents=True, exist_ok=True)
     yield partial
     partial.replace(target)
+
+
+def require_new(field: str, target: Path) -> None:
+    """Raise FieldError if there is something at `target` already, other than an empty folder."""
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise FieldError(field, target, "there is something already", "choose a new folder")
 
 
 def foreign_files(folder: Path, *own: str) -> bool:

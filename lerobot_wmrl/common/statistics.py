@@ -17,8 +17,8 @@ def wilson_interval(successes: int, n: int) -> tuple[float, float]:
     """Return Wilson's 95 % score interval of a proportion (Wilson 1927); (0, 1) for n = 0."""
     if n == 0:
         return 0.0, 1.0
-    found = binomtest(successes, n).proportion_ci(0.95, "wilson")
-    return float(found.low), float(found.high)
+    interval = binomtest(successes, n).proportion_ci(0.95, "wilson")
+    return float(interval.low), float(interval.high)
 
 
 @dataclass(frozen=True)
@@ -146,9 +146,6 @@ class PairedChange:
         """Two-sided p-value of no change at all: McNemar's test in its exact form."""
         changed = self.gained + self.lost
         return float(binomtest(self.gained, changed).pvalue) if changed else 1.0
-
-    def __str__(self) -> str:
-        return f"{self.gained} gained, {self.lost} lost (p = {self.p_value:.2g})"
 
     def as_json(self) -> dict[str, float | int]:
         return {"gained": self.gained, "lost": self.lost, "p_value": self.p_value}

@@ -9,41 +9,25 @@ measured, one camera's grid after the other.
 import hashlib
 import json
 import os
-import socket
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import numpy as np
-import psutil
 import torch
-from lerobot.configs.video import DEPTH_METER_UNIT, DepthEncoderConfig, infer_depth_unit
-from lerobot.datasets.depth_utils import MM_PER_METRE, dequantize_depth
+from lerobot.datasets.depth_utils import MM_PER_METRE
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.datasets.video_utils import decode_video_frames
 from lerobot.utils.constants import HF_LEROBOT_HOME
 from torch import Tensor
 from torch.nn import functional as F
-from tqdm import trange
 
 from lerobot_wmrl.common.checkpoints import weights_digest
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.files import NOT_WRITABLE
 from lerobot_wmrl.common.images import stretch
 from lerobot_wmrl.data.checks import depth_key
-from lerobot_wmrl.data.dataset import VIDEO_BACKEND
+from lerobot_wmrl.data.decoding import decode, decode_depth, parts_of
 from lerobot_wmrl.data.frames import NO_CONTEXT, Context
-
-ENCODE_BATCH = 128
-
-DECODED = 256
-"""Frames of a camera that are decoded at a time: those of a long episode would not fit into the memory."""
-
-
-PROGRESS_SECONDS: Final = 10
-"""Seconds of work on a cache that are lost at most when a process is killed."""
+from lerobot_wmrl.data.resumable_array import Units, batches, memory_map
 
 
 class FrameEncoder(Protocol):
@@ -180,163 +164,6 @@ def frames_to_tensor(frames: np.ndarray) -> Tensor:
     return torch.from_numpy(np.array(frames)).permute(0, 1, 4, 2, 3).float() / 255
 
 
-def rows_of(dataset: LeRobotDataset, episode: int) -> slice:
-    """Return where an episode has its frames."""
-    rows = dataset.meta.episodes[episode]
-    return slice(rows["dataset_from_index"], rows["dataset_to_index"])
-
-
-def parts_of(dataset: LeRobotDataset, episode: int) -> list[slice]:
-    """Return an episode's rows in parts whose frames are decoded at once."""
-    rows = rows_of(dataset, episode)
-    return [slice(first, min(first + DECODED, rows.stop)) for first in range(rows.start, rows.stop, DECODED)]
-
-
-def decode_episode(dataset: LeRobotDataset, episode: int, key: str) -> Tensor:
-    """Decode one episode and camera, uint8 (T, 3, H, W), from video or from stored images."""
-    return decode(dataset, episode, key, rows_of(dataset, episode))
-
-
-def decode(dataset: LeRobotDataset, episode: int, key: str, rows: slice) -> Tensor:
-    """Decode some rows of an episode, which are the dataset's, in one camera: uint8 (T, 3, H, W)."""
-    if key not in dataset.meta.video_keys:
-        frames = np.stack([np.asarray(image.convert("RGB")) for image in stored_images(dataset, key, rows)])
-        return torch.from_numpy(frames).permute(0, 3, 1, 2)
-    return decode_video(dataset, episode, key, rows)
-
-
-def stored_images(dataset: LeRobotDataset, key: str, rows: slice) -> list[Any]:
-    """Return rows of a camera that the dataset stores as images, as PIL opens them."""
-    images: list[Any] = dataset.hf_dataset.with_format(None, columns=[key])[rows][key]
-    return images
-
-
-def decode_video(dataset: LeRobotDataset, episode: int, key: str, rows: slice) -> Tensor:
-    """Decode rows of an episode from a camera's video: uint8 (T, 3, H, W), or codes of depth (T, 1, H, W).
-
-    Raises:
-        ValueError: the video is corrupted.
-    """
-    begin = rows_of(dataset, episode).start
-    first = dataset.meta.episodes[episode][f"videos/{key}/from_timestamp"]
-    times = [first + index / dataset.fps for index in range(rows.start - begin, rows.stop - begin)]
-    path = Path(dataset.root) / dataset.meta.get_video_file_path(episode, key)
-    try:
-        return decode_video_frames(
-            path, times, dataset.tolerance_s, VIDEO_BACKEND, return_uint8=True,
-            is_depth=key in dataset.meta.depth_keys,
-        )  # fmt: skip
-    except Exception as error:
-        raise ValueError(
-            f"dataset {dataset.root}: episode {episode}: {key}: {path.name} cannot be decoded ({error}). If "
-            "`ffprobe` cannot read it either, copy or download this file again, and only if there is no "
-            "other copy, record it again"
-        ) from error
-
-
-class Units(NamedTuple):
-    """What a cache is written in, one after another: `total` of them, `write(target, number)`, and the
-    progress bar's description."""
-
-    total: int
-    write: Callable[[np.ndarray, int], None]
-    description: str
-
-
-def batches(rows: int, compute: Callable[[slice], np.ndarray], description: str) -> Units:
-    """Return units of `ENCODE_BATCH` rows, each of which is what `compute` returns for it."""
-
-    def write(target: np.ndarray, number: int) -> None:
-        part = slice(number * ENCODE_BATCH, (number + 1) * ENCODE_BATCH)
-        target[part] = compute(part)
-
-    return Units(-(-rows // ENCODE_BATCH), write, description)
-
-
-def memory_map(path: Path, shape: tuple[int, ...], dtype: type, units: Units) -> np.ndarray:
-    """Return the array at `path`, written if it is missing. The file appears only once it is whole.
-
-    A call that was interrupted or killed is continued: the name of its file says how many units are in it.
-    One that failed leaves nothing.
-    """
-    if not path.is_file():
-        with room_in(path.parent):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            partial, begun = begin_or_continue(path, shape, dtype)
-        target = np.lib.format.open_memmap(partial, mode="r+")
-        recorded, done = time.monotonic(), begun
-        try:
-            for number in trange(
-                begun, units.total, desc=units.description, initial=begun, total=units.total
-            ):
-                units.write(target, number)
-                done = number + 1
-                if time.monotonic() - recorded > PROGRESS_SECONDS:
-                    partial, recorded = record_progress(partial, path, target, done), time.monotonic()
-            target.flush()
-            partial.replace(path)
-        except KeyboardInterrupt:
-            record_progress(partial, path, target, done)
-            raise
-        except Exception:  # of a broken file, say, in whose place there will be another one
-            partial.unlink(missing_ok=True)
-            raise
-    return np.load(path, mmap_mode="r")
-
-
-def begin_or_continue(path: Path, shape: tuple[int, ...], dtype: type) -> tuple[Path, int]:
-    """Return the file that becomes the cache at `path`, and how many units are in it already.
-
-    Files of processes that are gone are taken over, or removed where they belong to another cache.
-    """
-    host = socket.gethostname()  # others may share the folder, and their processes are not seen here
-    for torn in path.parent.glob(f"*.{host}+*.partial"):
-        process = int(torn.stem.rpartition("+")[2])
-        if process != os.getpid() and psutil.pid_exists(process):
-            continue
-        count = torn.name.removeprefix(f"{path.stem}.").partition(".")[0]
-        with suppress(FileNotFoundError):  # another process was faster
-            if count.isdecimal() and int(count):
-                return torn.rename(partial_path(path, int(count))), int(count)
-            torn.unlink()
-    partial = partial_path(path, 0)
-    try:
-        np.lib.format.open_memmap(partial, mode="w+", dtype=dtype, shape=shape)
-        with partial.open("r+b") as file:  # a full disk says so now, and not by a bus error later
-            if hasattr(os, "posix_fallocate"):
-                os.posix_fallocate(file.fileno(), 0, partial.stat().st_size)
-    except OSError:
-        partial.unlink(missing_ok=True)
-        raise
-    return partial, 0
-
-
-def record_progress(partial: Path, path: Path, target: np.memmap, done: int) -> Path:
-    """Write what is in memory to the unfinished file, and let its name say how many units are in it."""
-    target.flush()
-    return partial.rename(partial_path(path, done))
-
-
-def partial_path(path: Path, done: int) -> Path:
-    """Return where this process writes the cache at `path` while so many units are done."""
-    return path.with_name(f"{path.stem}.{done}.{socket.gethostname()}+{os.getpid()}.partial")
-
-
-@contextmanager
-def room_in(folder: Path) -> Iterator[None]:
-    """Turn the error of a disk that is full or must not be written into one with a remedy."""
-    try:
-        yield
-    except OSError as error:
-        if error.errno not in NOT_WRITABLE:
-            raise
-        raise FieldError(
-            "dataset.root", folder.with_suffix(""),
-            f"its decoded frames are kept in {folder}, which cannot be written ({error})",
-            "make room, or copy the dataset, or make a symbolic link to it, where you may write",
-        ) from error  # fmt: skip
-
-
 def file_stamps(dataset: LeRobotDataset) -> list[object]:
     """Return names, sizes and times of the dataset's files: a new recording needs caches of its own."""
     root = Path(dataset.root)
@@ -390,23 +217,6 @@ def cached_depth(dataset: LeRobotDataset, camera_keys: Sequence[str], grid: int)
     shape = (dataset.num_frames, len(keys) * grid**2)
     units = Units(dataset.num_episodes, write, "Decoding depth")
     return memory_map(cache_dir(dataset) / f"depth-{key}.npy", shape, np.float32, units)
-
-
-def decode_depth(dataset: LeRobotDataset, episode: int, key: str, rows: slice) -> Tensor:
-    """Decode the depth of some rows of an episode in one camera, (T, 1, H, W) metres."""
-    info = dataset.features[key].get("info") or {}
-    if key in dataset.meta.video_keys:
-        codes = decode_video(dataset, episode, key, rows)
-        encoder = DepthEncoderConfig.from_video_info(info)
-        metres = dequantize_depth(
-            codes, encoder.depth_min, encoder.depth_max, encoder.shift, encoder.use_log,
-            output_unit=DEPTH_METER_UNIT,
-        )  # fmt: skip
-        return torch.where(codes.int() > 0, torch.as_tensor(metres), 0.0)
-    maps = np.stack([np.asarray(image) for image in stored_images(dataset, key, rows)])
-    unit = info.get("depth_unit") or infer_depth_unit(maps.dtype)
-    scale = 1.0 if unit == DEPTH_METER_UNIT else 1 / MM_PER_METRE
-    return torch.from_numpy(maps.astype(np.float32) * np.float32(scale))[:, None]
 
 
 def depth_of_windows(batch: Mapping[str, Any], camera_keys: Sequence[str], grid: int) -> Tensor:

@@ -217,32 +217,54 @@ def extreme_actions(
     return made
 
 
+@dataclass(frozen=True)
+class Robustness:
+    """What extreme actions do, by their name (`extreme_actions`).
+
+    Args:
+        episodes: how many were imagined.
+        frames: how many of each.
+        absolute_control: whether actions are absolute targets; None if that is unknown.
+        predicted_success: episodes predicted as successes.
+        psnr_to_start: PSNR (dB) of the last against the first frame, both decoded.
+    """
+
+    episodes: int
+    frames: int
+    absolute_control: bool | None
+    predicted_success: dict[str, Proportion]
+    psnr_to_start: dict[str, Estimate]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the measures as JSON."""
+        by_name = {
+            name: {"predicted_success": rate.as_json(), "psnr_to_start": self.psnr_to_start[name].as_json()}
+            for name, rate in self.predicted_success.items()
+        }
+        sizes = {"episodes": self.episodes, "frames": self.frames, "absolute_control": self.absolute_control}
+        return sizes | by_name
+
+
 @torch.no_grad()
 def robustness(
     model: ActionWorldModelRewardModel, recording: Recording, episodes: np.ndarray,
     threshold: float, frames: int,
-) -> dict[str, Any]:  # fmt: skip
+) -> Robustness:  # fmt: skip
     """Imagine `HORIZON_SECONDS` under each kind of extreme actions, from at most `BATCH` starts.
 
     Frozen actions cannot succeed and ought to leave the image as it is.
-
-    Returns:
-        For each kind, the share of episodes predicted as successes, and the PSNR (dB) of the last against the
-        first frame, both decoded.
     """
     episodes, device = episodes[evenly_spaced(len(episodes), BATCH)], model.state_mean.device
     table, horizon = recording.table, recording.steps(HORIZON_SECONDS)
     starts, own = recording.starts(model, episodes), recording.actions(episodes, horizon, device)
     absolute = absolute_control(table)
     made = extreme_actions(own, table.action.min(0), table.action.max(0), absolute)
-    result: dict[str, Any] = {"episodes": len(episodes), "frames": horizon, "absolute_control": absolute}
+    result = Robustness(len(episodes), horizon, absolute, {}, {})
     for name, actions in made.items():
         imagined = imagine_frames(model, starts, actions)
         predicted = first_run((imagined.done_probability >= threshold).cpu().numpy(), frames) >= 0
         pair = starts.tokens, imagined.tokens[:, -1]
         first, last = (model.tokenizer.decode(tokens, starts.context) for tokens in pair)
-        result[name] = {
-            "predicted_success": Proportion(int(predicted.sum()), len(predicted)).as_json(),
-            "psnr_to_start": Estimate.mean(psnr(last, first).cpu().numpy()).as_json(),
-        }
+        result.predicted_success[name] = Proportion(int(predicted.sum()), len(predicted))
+        result.psnr_to_start[name] = Estimate.mean(psnr(last, first).cpu().numpy())
     return result

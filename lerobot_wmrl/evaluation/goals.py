@@ -86,23 +86,45 @@ def imagine_goals(model: TextWorldModelRewardModel, recording: Recording, episod
     )  # fmt: skip
 
 
-def goal_quality(goals: Goals, probe: TrainedProbe | None) -> dict[str, Any]:
-    """Return the distances of goals and starts to the nearest finals, and the probe's share of successes."""
-    result = {
-        "goals": len(goals.episodes),
-        "goal_reached": Proportion(int(goals.reached.sum()), len(goals.reached)).as_json(),
-        "nearest_final_tokenizer_lpips": Estimate.mean(goals.distance).as_json(),
-        "start_to_final_tokenizer_lpips": Estimate.mean(goals.start_distance).as_json(),
-        "nearest_final_psnr": Estimate.mean(nearest_psnr(goals)).as_json(),
-    }
-    if probe is not None and goals.finals is not None:
-        unseen = held_out_from_probe(goals.finals.episodes)
-        result["success_holds"] = probe.success(goals.start, goals.goal).as_json()
-        result["success_holds_in_finals"] = probe.success(
-            goals.finals.starts[unseen], goals.finals.images[unseen]
-        ).as_json()
-        result["probe"] = probe.as_json()
-    return result
+class GoalQuality(NamedTuple):
+    """How good goal frames are.
+
+    Attributes:
+        goal_reached: goals that reach the done threshold.
+        nearest_final_tokenizer_lpips, start_to_final_tokenizer_lpips: distance of the goals, and of the
+            starts, to the nearest recorded final frame.
+        nearest_final_psnr: PSNR (dB) of goals and the final frame nearest to them.
+        success_holds, success_holds_in_finals: goals, and finals that `probe` has not seen, in which it says
+            that success holds; None without a probe.
+        probe: the success probe.
+    """
+
+    goal_reached: Proportion
+    nearest_final_tokenizer_lpips: Estimate
+    start_to_final_tokenizer_lpips: Estimate
+    nearest_final_psnr: Estimate
+    success_holds: Proportion | None = None
+    success_holds_in_finals: Proportion | None = None
+    probe: TrainedProbe | None = None
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the measures as JSON, without those of a probe that there is not."""
+        measures = {name: each.as_json() for name, each in self._asdict().items() if each is not None}
+        return {"goals": self.goal_reached.n, **measures}
+
+
+def goal_quality(goals: Goals, probe: TrainedProbe | None) -> GoalQuality:
+    """Measure the distances of goals and starts to the nearest finals, and the probe's share of successes."""
+    quality = GoalQuality(
+        Proportion(int(goals.reached.sum()), len(goals.reached)), Estimate.mean(goals.distance),
+        Estimate.mean(goals.start_distance), Estimate.mean(nearest_psnr(goals)),
+    )  # fmt: skip
+    if probe is None or goals.finals is None:
+        return quality
+    unseen = held_out_from_probe(goals.finals.episodes)
+    in_finals = probe.success(goals.finals.starts[unseen], goals.finals.images[unseen])
+    in_goals = probe.success(goals.start, goals.goal)
+    return quality._replace(success_holds=in_goals, success_holds_in_finals=in_finals, probe=probe)
 
 
 def nearest_psnr(goals: Goals) -> np.ndarray:

@@ -45,24 +45,24 @@ class Reconstruction:
 
 
 def reconstruction_metrics(
-    model: TokenizingModel, table: EpisodeTable, frames: np.ndarray, episodes: np.ndarray,
-    max_frames: int = MAX_FRAMES,
-) -> dict[str, Any]:  # fmt: skip
+    model: TokenizingModel, table: EpisodeTable, frames: np.ndarray, episodes: np.ndarray
+) -> dict[str, Any]:
     """Measure PSNR (dB) per camera, of whole frames and of the pixels that moved, and the use of the codes.
+
+    At most `MAX_FRAMES` frames are measured, evenly spread over the episodes.
 
     Args:
         model: a frame tokenizer, or a world model, which carries one.
         table: the recorded episodes.
         frames: all frames of the table, uint8 (rows, N, H, W, 3).
         episodes: indices of the episodes to reconstruct.
-        max_frames: at most so many frames, evenly spread over the episodes.
 
     Returns:
         frames: their number; by camera psnr, the mean over frames, and moving_psnr, over all pixels that
         moved since the episode's start (None where nothing moved); codes and, one a factor, code_factors:
         size, share used and perplexity.
     """
-    rows, starts = _rows(table, episodes, max_frames)
+    rows, starts = _rows(table, episodes)
     measured = reconstruct(model, frames, rows, starts)
     colors = measured.moving_colors.sum(0)
     whole = psnr_from_mse(measured.error).mean(0)
@@ -127,12 +127,12 @@ def write_reconstruction(model: TokenizingModel, table: EpisodeTable, output_dir
     return measured
 
 
-def _rows(table: EpisodeTable, episodes: np.ndarray, at_most: int) -> tuple[np.ndarray, np.ndarray]:
+def _rows(table: EpisodeTable, episodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the rows of the episodes, evenly thinned, and for each the row where its episode begins."""
     lengths = table.length[episodes]
     starts = np.repeat(table.start[episodes], lengths)
     rows = np.concatenate([np.arange(rows.start, rows.stop) for rows in table.rows(episodes)])
-    kept = evenly_spaced(len(rows), at_most)
+    kept = evenly_spaced(len(rows), MAX_FRAMES)
     return rows[kept], starts[kept]
 
 

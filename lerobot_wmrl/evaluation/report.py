@@ -11,12 +11,13 @@ import numpy as np
 from lerobot_wmrl.common.constants import KINDS, PLAY, START_KIND
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.files import markdown_table
-from lerobot_wmrl.common.statistics import Estimate, evenly_spaced
+from lerobot_wmrl.common.statistics import Estimate, Proportion, evenly_spaced
 from lerobot_wmrl.data.frames import NO_CONTEXT
 from lerobot_wmrl.evaluation import pictures
 from lerobot_wmrl.evaluation.accuracy import (
     HORIZON_SECONDS,
     EpisodeAccuracy,
+    Robustness,
     by_step,
     headline,
     measure,
@@ -37,7 +38,7 @@ from lerobot_wmrl.evaluation.gate import (
     seen_outcomes,
     sweep,
 )
-from lerobot_wmrl.evaluation.goals import goal_quality, imagine_goals
+from lerobot_wmrl.evaluation.goals import GoalQuality, goal_quality, imagine_goals
 from lerobot_wmrl.evaluation.image_metrics import cached_lpips
 from lerobot_wmrl.evaluation.replay import COMPARED_FRAMES, EpisodeReplay, Recording, replay_episodes
 from lerobot_wmrl.evaluation.success_probe import train_probe
@@ -185,7 +186,7 @@ def report_action_model(
             task: point.as_json() if point else None for task, point in best_at_task.items()
         },
         "gate_sweep": [gate.as_json() for gate in gates],
-        "extreme_actions": extremes,
+        "extreme_actions": extremes.as_json(),
     }
     pictures.save_accuracy(steps, folder / "accuracy.png")
     if play:
@@ -215,7 +216,7 @@ def report_goals(
     goals = imagine_goals(text_model, recording, attempts[evenly_spaced(len(attempts), MAX_GOALS)])
     quality = goal_quality(goals, train_probe(text_model.tokenizer, recording))
     pictures.save_goals(goals, folder / "goal_frames.png")
-    return Report({"goal_frames": quality}, goal_table(quality))
+    return Report({"goal_frames": quality.as_json()}, goal_table(quality))
 
 
 def report_agreement(agreement: Agreement, folder: Path) -> Report:
@@ -264,10 +265,10 @@ def gate_lines(gate: Gate, best: Gate | None) -> str:
 
 def seen_line(auc: float, remedy: str) -> str:
     """Say how well success is seen in recorded frames, `Outcomes.auc` of these, and what helps if hardly."""
-    said = f"In the recorded frames themselves the success classifier has an AUC of {auc:.2f}"
+    sentence = f"In the recorded frames themselves the success classifier has an AUC of {auc:.2f}"
     if auc >= DOUBTFUL_AUC:
-        return f"{said}."
-    return f"{said}: it hardly sees success in them, and the world model has success from it.{remedy}"
+        return f"{sentence}."
+    return f"{sentence}: it hardly sees success in them, and the world model has success from it.{remedy}"
 
 
 def task_table(gates: Mapping[str, Gate], best: Mapping[str, Gate | None]) -> str:
@@ -305,33 +306,31 @@ def sweep_table(gates: Sequence[Gate]) -> str:
     return markdown_table(("threshold", *(f"k = {frames}" for frames in SWEEP_FRAMES)), rows)
 
 
-def robustness_table(result: Mapping[str, Any]) -> str:
+def robustness_table(extremes: Robustness) -> str:
     """Tabulate predicted successes and the PSNR to the start under extreme actions."""
     rows = [
-        (name, _share(row["predicted_success"]), _value(row["psnr_to_start"]))
-        for name, row in result.items()
-        if isinstance(row, Mapping)
+        (name, _count(rate), extremes.psnr_to_start[name])
+        for name, rate in extremes.predicted_success.items()
     ]
     return markdown_table(("actions", "predicted success", "PSNR to the start (dB)"), rows)
 
 
-def goal_table(quality: Mapping[str, Any]) -> str:
+def goal_table(quality: GoalQuality) -> str:
     """Tabulate the quality of the text model's goal frames."""
-    rows = [
-        ("goals that reach the done threshold", _share(quality["goal_reached"])),
-        ("distance to the nearest recorded final frame", _value(quality["nearest_final_tokenizer_lpips"])),
-        ("the same distance of the start frame", _value(quality["start_to_final_tokenizer_lpips"])),
-        ("PSNR to the nearest recorded final frame (dB)", _value(quality["nearest_final_psnr"])),
+    rows: list[tuple[str, object]] = [
+        ("goals that reach the done threshold", _count(quality.goal_reached)),
+        ("distance to the nearest recorded final frame", quality.nearest_final_tokenizer_lpips),
+        ("the same distance of the start frame", quality.start_to_final_tokenizer_lpips),
+        ("PSNR to the nearest recorded final frame (dB)", quality.nearest_final_psnr),
     ]
-    if "probe" in quality:
-        accuracy = quality["probe"]["balanced_accuracy"]
-        rows.append(("goals in which success holds, by the success probe", _share(quality["success_holds"])))
-        rows.append(
-            ("the same of recorded final frames it has not seen", _share(quality["success_holds_in_finals"]))
-        )
-        rows.append(
-            ("balanced accuracy of the success probe", "unknown" if accuracy is None else f"{accuracy:.3f}")
-        )
+    if quality.success_holds and quality.success_holds_in_finals and quality.probe:
+        accuracy = quality.probe.balanced_accuracy
+        known = "unknown" if math.isnan(accuracy) else f"{accuracy:.3f}"
+        rows += [
+            ("goals in which success holds, by the success probe", _count(quality.success_holds)),
+            ("the same of recorded final frames it has not seen", _count(quality.success_holds_in_finals)),
+            ("balanced accuracy of the success probe", known),
+        ]
     return markdown_table(("goal frames", "value"), rows)
 
 
@@ -352,14 +351,5 @@ def _percentages(gate: Gate) -> str:
     )
 
 
-def _share(rate: Mapping[str, Any]) -> str:
-    return f"{rate['k']} of {rate['n']}"
-
-
-def _value(estimate: Mapping[str, Any]) -> str:
-    if estimate["value"] is None:
-        return "not measured"
-    if estimate["bootstrap_95"] is None:
-        return f"{estimate['value']:.3g} (1 episode)"
-    low, high = estimate["bootstrap_95"]
-    return f"{estimate['value']:.3g} ({low:.3g} to {high:.3g})"
+def _count(rate: Proportion) -> str:
+    return f"{rate.k} of {rate.n}"

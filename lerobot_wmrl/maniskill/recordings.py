@@ -1,44 +1,16 @@
 """What the columns that our recorder adds say about episodes. Imports no simulator and decodes no video."""
 
-from pathlib import Path
-
 import numpy as np
-import pyarrow.parquet as pq
 
 from lerobot_wmrl.common.constants import (
     EVALUATION_SEED,
     SELECTION_SEED,
-    START_COLUMNS,
     START_SCENE,
     START_SEED,
 )
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.episodes import EpisodeTable, parquet_files
+from lerobot_wmrl.data.episodes import EpisodeTable
 from lerobot_wmrl.maniskill.scenes import scenes_of
-
-
-def recorded_episodes(root: Path) -> dict[str, np.ndarray]:
-    """Read columns (E,): episode, task, scene, seed, kind, length in frames, success at any frame.
-
-    Raises:
-        FieldError: the dataset lacks one of the columns.
-    """
-    columns = ["episode_index", *START_COLUMNS, "next.success"]
-    files = parquet_files(root)
-    missing = [name for name in columns if name not in pq.read_schema(files[0]).names]
-    if missing:
-        raise FieldError(
-            "dataset.root", root, f"has no column {', '.join(missing)}", "record it with lerobot-wmrl-record"
-        )
-    rows = [pq.read_table(path, columns=columns).to_pydict() for path in files]
-    stacked = {
-        name: np.concatenate([np.asarray(part[name]).reshape(-1) for part in rows]) for name in columns
-    }
-    episodes, first, inverse = np.unique(stacked["episode_index"], return_index=True, return_inverse=True)
-    success = np.zeros(len(episodes), dtype=bool)
-    np.logical_or.at(success, inverse, stacked["next.success"].astype(bool))
-    started = {name.removeprefix("start."): stacked[name][first] for name in START_COLUMNS}
-    return {"episode": episodes, **started, "length": np.bincount(inverse), "success": success}
 
 
 def scene_splits(scene: np.ndarray, split: str) -> dict[str, np.ndarray]:

@@ -86,11 +86,11 @@ class PlayServer:
         socket = web.WebSocketResponse(max_msg_size=LARGEST_MESSAGE, heartbeat=30)
         await socket.prepare(request)
         before, self.sockets[name] = self.sockets.get(name), socket
-        if before is not None:
-            await before.close(code=ELSEWHERE)
-        async with self.entering:
-            visit = await self._visit(name)
         try:
+            if before is not None:
+                await before.close(code=ELSEWHERE)
+            async with self.entering:
+                visit = await self._visit(name)
             async for received in socket:
                 if received.type is WSMsgType.TEXT:
                     await socket.send_json(await self._answer(visit, received.data))

@@ -20,8 +20,8 @@ from lerobot_wmrl.common.constants import INSTRUCTIONS, Observation
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.images import stretch
 from lerobot_wmrl.common.pipeline import ACTION_IS_PAD
+from lerobot_wmrl.data.decoding import decode, rows_of
 from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
-from lerobot_wmrl.data.frame_cache import decode_episode
 from lerobot_wmrl.envs.configuration_world_model import StartFrames
 from lerobot_wmrl.envs.start_frames import every_chosen_episode
 from lerobot_wmrl.rl.observations import ObservationBuffer, decoded
@@ -177,7 +177,7 @@ def recorded_successes(
     }
     for first, rows, each in zip(begin.tolist(), length.tolist(), episodes.tolist(), strict=True):
         for camera, (_, height, width) in frame_shapes.items():
-            frames = decode_episode(table.dataset, each, camera)
+            frames = decode(table.dataset, each, camera, rows_of(table.dataset, each))
             observations[camera][first : first + rows] = stretch(frames, height, width)
     if state_size:
         rows = (start - begin)[episode] + torch.arange(len(episode))

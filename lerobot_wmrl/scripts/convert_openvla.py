@@ -16,7 +16,7 @@ from pathlib import Path
 
 from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.errors import FieldError, renamed
-from lerobot_wmrl.common.files import foreign_files, whole_folder, writing
+from lerobot_wmrl.common.files import require_new, whole_folder, writing
 
 DIRECTIONS = ("import", "export")
 
@@ -46,8 +46,9 @@ def convert(cfg: ConvertOpenVLAConfig) -> None:
         raise FieldError("direction", cfg.direction, f"choose one of {', '.join(DIRECTIONS)}")
     if not cfg.source:
         raise FieldError("source", cfg.source, "give the checkpoint to convert")
-    if cfg.target is None or cfg.target.is_file() or foreign_files(cfg.target):
-        raise FieldError("target", cfg.target, "choose a new folder")
+    if cfg.target is None:
+        raise FieldError("target", None, "choose a new folder")
+    require_new("target", cfg.target)
     if cfg.direction == "export" and cfg.unnorm_key is not None:
         raise FieldError("unnorm_key", cfg.unnorm_key, "the export keeps all statistics; leave it out")
     write = importer(cfg.source, cfg.unnorm_key) if cfg.direction == "import" else exporter(cfg.source)

@@ -25,7 +25,7 @@ import numpy as np
 
 from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.common.files import whole_folder, writing
+from lerobot_wmrl.common.files import require_new, whole_folder, writing
 from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.data.episodes import SUCCESS
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
@@ -81,8 +81,7 @@ def require_unlabelled(cfg: LabelConfig, dataset: "LeRobotDataset") -> None:
             "train with it, or remove it first: lerobot-edit-dataset --operation.type=remove_feature "
             f"--operation.feature_names=[{SUCCESS}]",
         )  # fmt: skip
-    if cfg.output_dir.exists():
-        raise FieldError("output_dir", cfg.output_dir, "there is something already", "choose a new folder")
+    require_new("output_dir", cfg.output_dir)
 
 
 def write_labelled(dataset: "LeRobotDataset", success: np.ndarray, output_dir: Path, repo_id: str) -> None:
@@ -114,30 +113,30 @@ def report(runs: Sequence[int], cfg: LabelConfig) -> list[str]:
     """
     held = np.array([count for count in runs if count])
     failures = len(runs) - len(held)
-    said = [f"{cfg.output_dir}: {len(runs)} episodes, of which {len(held)} succeed and {failures} fail."]
+    lines = [f"{cfg.output_dir}: {len(runs)} episodes, of which {len(held)} succeed and {failures} fail."]
     if len(held):
-        said.append(
+        lines.append(
             f"Success holds for {held.min()} to {held.max()} frames in a row (median {np.median(held):.0f})."
         )
     if len(held) > 0 and held.min() < DONE_FRAMES:
         short = int((held < DONE_FRAMES).sum())
-        said.append(
+        lines.append(
             f"{short} of them for fewer than {DONE_FRAMES}: these count with --env.done_frames={held.min()} "
             f"in lerobot-wmrl-train and --done_frames={held.min()} in lerobot-wmrl-eval-world-model."
         )
     if not failures:
-        said.append(
+        lines.append(
             "There is no failure: a world model cannot learn to predict one from this dataset alone, and "
             "nothing measured on it says how many failures are taken for successes. Record rollouts of the "
             "policy, and label them too."
         )
     if not len(held):
-        said.append("There is no success: a world model learns no reward from this dataset alone.")
-    said.append(
+        lines.append("There is no success: a world model learns no reward from this dataset alone.")
+    lines.append(
         f"Next: lerobot-wmrl-train-world-model --preset=cpu --model.type=frame_tokenizer "
         f"--dataset.root={cfg.output_dir} …"
     )
-    return said
+    return lines
 
 
 def main() -> None:

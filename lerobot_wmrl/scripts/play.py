@@ -36,7 +36,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot_wmrl.common.checkpoints import Checkpoint
 from lerobot_wmrl.common.command_line import RunConfig, run_command, settings_beside
 from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least
-from lerobot_wmrl.common.files import writing
+from lerobot_wmrl.common.files import require_new, writing
 from lerobot_wmrl.common.policies import check_weights, read_policy_config, require_trained
 from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.play.checks import LAST_PORT, whole_number
@@ -127,8 +127,7 @@ class PlayConfig(RunConfig):
                 raise FieldError(
                     name, getattr(given, "type", given), "is in no exported page", "leave it out"
                 )
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise FieldError("export", folder, "there is something already", "choose a new folder")
+        require_new("export", folder)
         for package in ("onnx", "onnxscript", "onnxruntime"):
             if find_spec(package) is None:
                 raise FieldError(
@@ -175,9 +174,9 @@ def export(world: "World", folder: Path, starts: int) -> None:
 
     print("exporting the networks, which takes a minute or two", flush=True)
     with writing("export", folder, resumes=False):
-        found = export_page(world, folder, starts)
+        agreement = export_page(world, folder, starts)
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-    print(f"{folder}: {size / 1e6:.1f} MB; {found}")
+    print(f"{folder}: {size / 1e6:.1f} MB; {agreement}")
     print(f"look at it: python -m http.server --directory {folder} --bind 127.0.0.1")
 
 

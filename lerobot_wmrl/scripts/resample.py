@@ -78,6 +78,7 @@ def summed_components(cfg: ResampleConfig, dataset: "LeRobotDataset") -> np.ndar
     """Mark the components of the action that add up. FieldError for a setting that cannot be. (A,)"""
     from lerobot.utils.constants import ACTION
 
+    from lerobot_wmrl.common.files import require_new
     from lerobot_wmrl.data.embodiment import component_names
 
     require_at_least(cfg, 2, "every")
@@ -103,8 +104,7 @@ def summed_components(cfg: ResampleConfig, dataset: "LeRobotDataset") -> np.ndar
             "dataset.root", dataset.root, f"has annotations ({', '.join(language)}), which are not copied",
             "remove them first: lerobot-edit-dataset --operation.type=remove_feature",
         )  # fmt: skip
-    if cfg.output_dir.exists():
-        raise FieldError("output_dir", cfg.output_dir, "already exists", "choose a new folder")
+    require_new("output_dir", cfg.output_dir)
     return np.isin(names, cfg.displacements)
 
 
@@ -150,7 +150,7 @@ def episode_rows(
     dataset: "LeRobotDataset", episode: int, features: Mapping[str, Any], every: int, summed: np.ndarray
 ) -> Iterator[dict[str, Any]]:
     """Yield the rows of an episode's copy, as LeRobotDataset's `add_frame` takes them."""
-    from lerobot_wmrl.data.frame_cache import decode, parts_of, rows_of
+    from lerobot_wmrl.data.decoding import decode, parts_of, rows_of
 
     columns = kept_values(dataset, episode, features, every, summed)
     begin = rows_of(dataset, episode).start
@@ -168,7 +168,7 @@ def kept_values(
     """Return an episode's columns but for its pictures, and `task`, at the T rows that are kept. (T, …)"""
     from lerobot.utils.constants import ACTION, DEFAULT_FEATURES, REWARD
 
-    from lerobot_wmrl.data.frame_cache import rows_of
+    from lerobot_wmrl.data.decoding import rows_of
 
     rows = rows_of(dataset, episode)
     length = rows.stop - rows.start

@@ -172,15 +172,15 @@ class TextEncoder(nn.Module):
 class ByteTextEncoder(TextEncoder):
     """A small T5 encoder over ByT5's bytes (Xue et al. 2022), trained along: nothing to download."""
 
-    def __init__(self, width: int, text_width: int = 64, layers: int = 2) -> None:
+    def __init__(self, width: int) -> None:
         super().__init__()
         self.tokenizer = ByT5Tokenizer()
         config = T5Config(
-            vocab_size=len(self.tokenizer), d_model=text_width, d_kv=text_width // 4, d_ff=4 * text_width,
-            num_layers=layers, num_heads=4, dropout_rate=0.0,
+            vocab_size=len(self.tokenizer), d_model=64, d_kv=16, d_ff=256, num_layers=2, num_heads=4,
+            dropout_rate=0.0,
         )  # fmt: skip
         self.encoder = T5EncoderModel(config)
-        self.project = nn.Linear(text_width, width)
+        self.project = nn.Linear(config.d_model, width)
 
     def encode(self, instructions: Sequence[str]) -> tuple[Tensor, Tensor]:
         batch = tokenize(self.tokenizer, instructions).to(self.project.weight.device)

@@ -12,7 +12,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.images import stretch
-from lerobot_wmrl.data import frame_cache
+from lerobot_wmrl.data import decoding, frame_cache
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.frame_cache import cached_frames, frames_to_tensor
 
@@ -22,8 +22,8 @@ def test_long_episodes_are_decoded_in_parts_to_the_same_frames(
 ) -> None:
     cameras = ["observation.images.third_view"]
     caches = []
-    for part in (frame_cache.DECODED, 7):
-        monkeypatch.setattr(frame_cache, "DECODED", part)
+    for part in (decoding.DECODED, 7):
+        monkeypatch.setattr(decoding, "DECODED", part)
         monkeypatch.setattr(frame_cache, "cache_dir", lambda _, part=part: tmp_path / str(part))
         caches.append(cached_frames(small_dataset, cameras, 32))
     np.testing.assert_array_equal(*caches)

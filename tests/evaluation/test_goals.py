@@ -63,9 +63,9 @@ def test_goals_are_compared_with_real_successes(small_dataset, text_model):
     goals = imagine_goals(text_model, source, np.arange(6))
     assert set(goals.nearest) <= set(range(len(goals.finals.episodes)))
     quality = goal_quality(goals, train_probe(text_model.tokenizer, source))
-    assert quality["nearest_final_tokenizer_lpips"]["episodes"] == 6
-    assert quality["success_holds"]["n"] == 6
-    assert quality["success_holds_in_finals"]["n"] == held_out_from_probe(goals.finals.episodes).sum() == 1
+    assert quality.nearest_final_tokenizer_lpips.n == 6
+    assert quality.success_holds.n == 6
+    assert quality.success_holds_in_finals.n == held_out_from_probe(goals.finals.episodes).sum() == 1
 
 
 def test_without_a_real_success_there_is_no_distance_and_no_probe(small_dataset, text_model, tmp_path):
@@ -74,7 +74,7 @@ def test_without_a_real_success_there_is_no_distance_and_no_probe(small_dataset,
     goals = imagine_goals(text_model, source, np.arange(6))
     probe = train_probe(text_model.tokenizer, source)
     assert probe is None
-    quality = goal_quality(goals, probe)
+    quality = goal_quality(goals, probe).as_json()
     save_goals(goals, tmp_path / "goals.png")
     assert quality["nearest_final_tokenizer_lpips"]["value"] is None
     assert quality["nearest_final_psnr"]["value"] is None

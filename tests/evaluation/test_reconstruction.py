@@ -9,6 +9,7 @@ import torch
 
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames, frames_to_tensor
+from lerobot_wmrl.evaluation import reconstruction
 from lerobot_wmrl.evaluation.image_metrics import psnr_from_mse
 from lerobot_wmrl.evaluation.reconstruction import code_use, reconstruction_metrics
 from lerobot_wmrl.world_models.checkpoint import load_model
@@ -52,10 +53,11 @@ def test_psnr_is_that_of_each_camera_and_of_its_moved_pixels(dataset, output_dir
     assert metrics["frames"] == table.length[4]
 
 
-def test_frames_are_thinned_evenly(dataset, output_dir):
+def test_frames_are_thinned_evenly(dataset, output_dir, monkeypatch):
+    monkeypatch.setattr(reconstruction, "MAX_FRAMES", 10)
     model, table = load_model(output_dir, "frame_tokenizer"), read_episodes(dataset)
     frames = cached_frames(dataset, model.config.tokenizer.camera_keys, 32)
-    assert reconstruction_metrics(model, table, frames, np.arange(21), max_frames=10)["frames"] == 10
+    assert reconstruction_metrics(model, table, frames, np.arange(21))["frames"] == 10
 
 
 def test_the_training_of_a_tokenizer_ends_with_the_held_out_episodes(dataset, output_dir):

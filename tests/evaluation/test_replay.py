@@ -144,7 +144,7 @@ def test_extreme_actions_are_what_they_are_called(source, model):
     torch.testing.assert_close(targets["reversed"] - targets["frozen"], targets["frozen"] - own)
     assert list(extreme_actions(own, low, high, absolute=None)) == ["saturated"]
     result = robustness(model, source, np.arange(6), threshold=1e-9, frames=1)
-    assert result["frozen"]["predicted_success"]["share"] == 1
+    assert result.predicted_success["frozen"].share == 1
 
 
 def test_actions_are_absolute_where_they_follow_the_state(source):

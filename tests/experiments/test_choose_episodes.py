@@ -13,17 +13,18 @@ from tests.relabelled import UNLABELLED, relabelled
 
 
 def test_only_successful_optimal_episodes_are_taken(tmp_path: Path) -> None:
-    write_recording(tmp_path)
-    assert optimal_episodes(tmp_path, 2) == [0, 3]
+    root = tmp_path / "recording"
+    write_recording(root)
+    assert optimal_episodes(root, 2) == [0, 3]
     with pytest.raises(ValueError, match="holds 2 successful optimal episodes, 3 are needed"):
-        optimal_episodes(tmp_path, 3)
+        optimal_episodes(root, 3)
 
 
 def test_successes_are_the_first_or_all(small_dataset: LeRobotDataset) -> None:
-    root, found = Path(small_dataset.root), np.flatnonzero(read_episodes(small_dataset).success)
-    assert successes(root, 1) == [found[0]]
-    assert successes(root, None) == found.tolist()
-    with pytest.raises(ValueError, match=f"{len(found)} successes, 9 are needed"):
+    root, successful = Path(small_dataset.root), np.flatnonzero(read_episodes(small_dataset).success)
+    assert successes(root, 1) == [successful[0]]
+    assert successes(root, None) == successful.tolist()
+    with pytest.raises(ValueError, match=f"{len(successful)} successes, 9 are needed"):
         successes(root, 9)
 
 

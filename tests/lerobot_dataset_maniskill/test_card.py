@@ -1,6 +1,7 @@
 """The card says what the files hold, and its pictures show an episode from start to success."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from lerobot_dataset_maniskill.card import (
     scene_rows,
 )
 from lerobot_dataset_maniskill.configuration import RecordConfig
-from lerobot_wmrl.common.constants import KINDS
+from lerobot_wmrl.common.constants import KINDS, START_KIND, START_SCENE, START_TASK
 from lerobot_wmrl.common.frame_strips import GAP
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.maniskill.scenes import SCENES
@@ -73,7 +74,7 @@ def test_only_recorded_scenes_are_listed(root: Path) -> None:
 
 
 def test_scenes_are_counted_by_episode() -> None:
-    table = {"scene": np.array([3, 0, 3])}
+    table = SimpleNamespace(columns={START_SCENE: np.array([3, 0, 3])})
     assert [row[0::5] for row in scene_rows(table, [vars(scene) for scene in SCENES])] == [(0, 1), (3, 2)]
 
 
@@ -97,12 +98,11 @@ def test_a_picture_runs_from_the_start_to_success(root: Path, task: str) -> None
 
 def test_an_example_is_a_success_if_there_is_one_and_optimal_if_possible() -> None:
     near_miss, policy = KINDS.index("near_miss"), KINDS.index("policy")
-    table = {
-        "episode": np.arange(6),
-        "task": np.array([0, 0, 0, 0, 3, 3]),
-        "kind": np.array([0, policy, 0, 0, near_miss, policy]),
-        "success": np.array([False, True, True, True, False, False]),
+    columns = {
+        START_TASK: np.array([0, 0, 0, 0, 3, 3]),
+        START_KIND: np.array([0, policy, 0, 0, near_miss, policy]),
     }
+    table = SimpleNamespace(columns=columns, success=np.array([False, True, True, True, False, False]))
     shown = {example.task: (example.episode, example.success) for example in chosen_examples(table)}
     assert shown == {"push": (2, True), "move_to_aim": (4, False)}
 

@@ -17,12 +17,12 @@ from lerobot_dataset_maniskill.recorder import record
 from lerobot_policy_cnn.configuration_cnn import CnnConfig
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
-from lerobot_wmrl.common.constants import KINDS
+from lerobot_wmrl.common.constants import KINDS, START_KIND, START_SCENE, START_SEED, START_TASK
 from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.data.dataset import open_dataset
+from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH
-from lerobot_wmrl.maniskill.recordings import recorded_episodes
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 from tests.rl.checkpoints import save_untrained_policy
@@ -51,11 +51,11 @@ def test_every_row_is_what_the_world_model_imagined(config, small_dataset):
     """The first frames are those of the dataset's episodes, as the tokenizer draws them; the next states
     are those that the same actions lead to in the environment."""
     record(config)
-    found, real = recorded_episodes(config.root), recorded_episodes(Path(small_dataset.root))
-    assert found["length"].tolist() == [LENGTH] * 7
-    assert set(found["kind"]) == {KINDS.index("policy")}
-    for name in ("seed", "scene", "task"):
-        assert found[name].tolist() == [real[name][index % 6] for index in range(7)]
+    table, real = read_episodes(open_dataset(config.root)), read_episodes(small_dataset)
+    assert table.length.tolist() == [LENGTH] * 7
+    assert set(table.columns[START_KIND]) == {KINDS.index("policy")}
+    for name in (START_SEED, START_SCENE, START_TASK):
+        assert table.columns[name].tolist() == [real.columns[name][index % 6] for index in range(7)]
     dataset = LeRobotDataset("local/imagined", root=config.root)
     rows = dataset.hf_dataset.with_format("torch")[: 3 * LENGTH]
     env = config.env.create_tensor_env(3)
@@ -75,9 +75,9 @@ def test_every_row_is_what_the_world_model_imagined(config, small_dataset):
 def test_an_episode_ends_with_the_k_frame_done(config):
     config.env.done_threshold = 0.0001
     record(config)
-    found = recorded_episodes(config.root)
-    assert found["length"].tolist() == [2] * 7
-    assert found["success"].all()
+    table = read_episodes(open_dataset(config.root))
+    assert table.length.tolist() == [2] * 7
+    assert table.success.all()
 
 
 def test_a_single_done_frame_is_no_success(config, monkeypatch):
@@ -89,9 +89,9 @@ def test_a_single_done_frame_is_no_success(config, monkeypatch):
 
     monkeypatch.setattr(ActionWorldModelRewardModel, "step", every_second)
     record(config)
-    found = recorded_episodes(config.root)
-    assert found["length"].tolist() == [LENGTH] * 7
-    assert not found["success"].any()
+    table = read_episodes(open_dataset(config.root))
+    assert table.length.tolist() == [LENGTH] * 7
+    assert not table.success.any()
 
 
 def test_the_same_command_again_finds_it_complete_and_other_settings_are_refused(config, capsys):

@@ -14,9 +14,10 @@ from lerobot_dataset_maniskill.planners import MOTIONS, PLANNERS, Follower, Moti
 from lerobot_dataset_maniskill.planners.follower import OPTIMAL_SPEED, Waypoint
 from lerobot_dataset_maniskill.recorder import record
 from lerobot_wmrl.common.constants import KINDS, PLAY
+from lerobot_wmrl.data.dataset import open_dataset
+from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.maniskill.cameras import Rendering
 from lerobot_wmrl.maniskill.objects import CONTAINERS, OBJECTS
-from lerobot_wmrl.maniskill.recordings import recorded_episodes
 from lerobot_wmrl.maniskill.scenes import SCENES
 from lerobot_wmrl.maniskill.simulation import Simulation
 from lerobot_wmrl.maniskill.tasks import TASKS
@@ -160,6 +161,6 @@ def test_a_recording_with_it_is_complete_and_another_planner_is_refused(tmp_path
         return RecordConfig(output_dir=tmp_path / "dataset", **settings)
 
     record(config("mplib"))
-    assert recorded_episodes(tmp_path / "dataset")["success"].tolist() == [True, True]
+    assert read_episodes(open_dataset(tmp_path / "dataset")).success.tolist() == [True, True]
     with pytest.raises(ValueError, match=r"other settings.*planner 'mplib' → 'cartesian'"):
         record(config("cartesian"))

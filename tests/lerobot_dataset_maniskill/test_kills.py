@@ -15,7 +15,9 @@ import pytest
 from lerobot_dataset_maniskill.manifest import planned_parts
 from lerobot_dataset_maniskill.recorder import merge
 from lerobot_dataset_maniskill.writer import find_damage
-from lerobot_wmrl.maniskill.recordings import recorded_episodes
+from lerobot_wmrl.common.constants import START_SEED
+from lerobot_wmrl.data.dataset import open_dataset
+from lerobot_wmrl.data.episodes import read_episodes
 from tests.lerobot_dataset_maniskill.killed_writers import ADVISED, Order, Writers, running_writers
 from tests.lerobot_dataset_maniskill.made_up import ROWS, source_of, write_missing
 
@@ -66,6 +68,6 @@ def test_twenty_kills_cost_nothing_that_was_finished(tmp_path: Path, writers: Wr
     write_missing(order.config, work)
     merge(source_of(order.config), work, order.config.root, order.config.dataset_id)
     assert find_damage(tmp_path / "dataset", 90) is None
-    table = recorded_episodes(tmp_path / "dataset")
-    assert sorted(table["seed"]) == list(range(90))
-    assert set(table["length"]) == {ROWS}
+    table = read_episodes(open_dataset(tmp_path / "dataset"))
+    assert sorted(table.columns[START_SEED]) == list(range(90))
+    assert set(table.length) == {ROWS}

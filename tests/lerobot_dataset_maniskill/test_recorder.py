@@ -21,12 +21,12 @@ from lerobot_dataset_maniskill.maniskill import follow_workers
 from lerobot_dataset_maniskill.merging import require_same_recording
 from lerobot_dataset_maniskill.recorder import missing_parts, record
 from lerobot_dataset_maniskill.writer import HOLD_FRAMES, find_damage
-from lerobot_wmrl.common.constants import KINDS
+from lerobot_wmrl.common.constants import KINDS, START_KIND
 from lerobot_wmrl.data.dataset import open_dataset
+from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.frame_cache import cached_frames
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.maniskill.embodiment import STATE_NAMES
-from lerobot_wmrl.maniskill.recordings import recorded_episodes
 from tests.lerobot_dataset_maniskill.made_up import source_of
 
 EPISODES, PART = 6, 2
@@ -119,8 +119,8 @@ def test_an_optimal_episode_holds_success_a_failure_is_truncated(dataset: LeRobo
     episode, done = column(dataset, "episode_index"), column(dataset, "next.done").ravel()
     truncated, success = column(dataset, "next.truncated").ravel(), column(dataset, "next.success").ravel()
     assert np.array_equal(done, success)
-    table = recorded_episodes(Path(dataset.root))
-    kinds, wins = table["kind"], table["success"]
+    table = read_episodes(dataset)
+    kinds, wins = table.columns[START_KIND], table.success
     assert wins[kinds == KINDS.index("optimal")].all()
     for index, won in enumerate(wins):
         rows = np.flatnonzero(episode == index)

@@ -8,8 +8,9 @@ import pytest
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.manifest import planned_parts
 from lerobot_dataset_maniskill.merging import check_set, merge_shards
+from lerobot_wmrl.common.constants import START_SEED
 from lerobot_wmrl.data.dataset import open_dataset
-from lerobot_wmrl.maniskill.recordings import recorded_episodes
+from lerobot_wmrl.data.episodes import read_episodes
 from tests.lerobot_dataset_maniskill.made_up import ROWS, record_made_up
 
 NAMES = [Path("a"), Path("b"), Path("c")]
@@ -66,7 +67,7 @@ def test_merged_shards_are_the_whole_and_merged_again_say_so(
             RecordConfig(output_dir=shard, num_episodes=5, part_episodes=2, shard=f"{index}/2", seed=7)
         )
     merge_shards(shards, tmp_path / "whole", "local/whole")
-    assert sorted(recorded_episodes(tmp_path / "whole")["seed"]) == list(range(7, 12))
+    assert sorted(read_episodes(open_dataset(tmp_path / "whole")).columns[START_SEED]) == list(range(7, 12))
     rewards = open_dataset(tmp_path / "whole").hf_dataset.with_format("numpy")["next.reward"]
     np.testing.assert_allclose(np.ravel(rewards)[:ROWS], np.arange(1, ROWS + 1) / ROWS, rtol=1e-6)
     capsys.readouterr()

@@ -128,6 +128,24 @@ def test_no_more_visitors_come_than_there_is_room_for(served):
     assert served.run(crowd()) == 503
 
 
+def test_a_visit_that_cannot_begin_takes_no_room(served, world, monkeypatch):
+    def broken(name: str) -> None:
+        raise RuntimeError(f"{name} cannot be loaded")
+
+    async def visit(name: str) -> aiohttp.WSMsgType:
+        async with (
+            aiohttp.ClientSession() as session,
+            session.ws_connect(f"{served.address}drive?visit={name}") as opened,
+        ):
+            return (await opened.receive(timeout=60)).type
+
+    monkeypatch.setattr(world, "driver", broken)
+    for index in range(MOST_VISITORS):
+        assert served.run(visit(f"visitor{index:02d}")) in (aiohttp.WSMsgType.CLOSE, aiohttp.WSMsgType.CLOSED)
+    monkeypatch.undo()
+    assert served.run(talk(served, BEGIN, visit="onemorevisitor"))[0]["begun"]
+
+
 def test_a_drive_goes_on_in_the_tab_that_opened_it_last(served):
     async def tabs() -> tuple[int, dict[str, Any]]:
         async with aiohttp.ClientSession() as session:
@@ -205,9 +223,9 @@ def test_a_malformed_request_is_refused_and_nothing_is_lost(served, method, path
     served.run(talk(served, BEGIN, STEP))
     if isinstance(options.get("data"), dict):
         options = {"data": form(**options["data"])}
-    found = served.run(fetch(served, method, path, **options))
-    assert found[0] == status
-    assert said in found[1]
+    answer = served.run(fetch(served, method, path, **options))
+    assert answer[0] == status
+    assert said in answer[1]
     assert served.run(talk(served, STEP))[0]["view"]["frame"] == 2
 
 

@@ -83,7 +83,7 @@ ROLL_OUT = ["--policy.path={policy}", *SIMULATOR, "--num_episodes=1"]
     (compare, [*FITTING, "--output_dir={foreign}"], "foreign: holds something else"),
     (convert_openvla, ["--direction=sideways", NEW], "--direction=sideways: choose one of import"),
     (convert_openvla, ["--direction=import", NEW], "--source: give the checkpoint to convert"),
-    (convert_openvla, [*IMPORT, "--target={foreign}"], "foreign: choose a new folder"),
+    (convert_openvla, [*IMPORT, "--target={foreign}"], "foreign: there is something already; choose a new"),
     (convert_openvla, [*IMPORT, NEW], "policy: tokenizer.json is missing beside"),
     (convert_openvla, ["--direction=export", "--source={policy}", NEW], "of type cnn"),
     (demo, ["--preset=huge"], "--preset=huge: unknown preset"),

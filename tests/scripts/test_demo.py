@@ -12,12 +12,13 @@ from pathlib import Path
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.constants import EVALUATION_SEED, START_SEED
 from lerobot_wmrl.common.presets import preset_settings
 from lerobot_wmrl.common.tracking import read_metrics
+from lerobot_wmrl.data.dataset import open_dataset
+from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.demo.stages import Demo, DemoConfig
 from lerobot_wmrl.improve.improvement import CLONED, DISTILLED, PPO, SFT
-from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
 ROOT = Path(__file__).parents[2]
 KILLED_STAGE = "improve/rollouts"
@@ -106,14 +107,15 @@ def test_the_dataset_reopens_and_holds_successes_and_failures(outputs: tuple[Pat
     assert frame["observation.state"].shape == (8,)
     assert frame["action"].shape == (7,)
     given = preset_settings("tiny", "demo")
-    success = recorded_episodes(root)["success"]
+    success = read_episodes(open_dataset(root)).success
     assert len(success) == dataset.num_episodes == given["demonstrations"] + given["rollouts"]
     assert 0 < success.sum() < len(success)
 
 
 def test_no_held_out_seed_is_trained_on(outputs: tuple[Path, str]) -> None:
     demo, _ = outputs
-    assert recorded_episodes(demo / "improve" / "merged")["seed"].max() < EVALUATION_SEED
+    table = read_episodes(open_dataset(demo / "improve" / "merged"))
+    assert table.columns[START_SEED].max() < EVALUATION_SEED
     for stage in ("improve/comparison", "unseen", "imagined"):
         assert f"--seed={EVALUATION_SEED} " in str(stage_record(demo, stage)["command"])
 

@@ -11,7 +11,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_dataset_maniskill.writer import video_encoder
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data import frame_cache
+from lerobot_wmrl.data import decoding
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.scripts.resample import ResampleConfig, main, summed_components
@@ -63,7 +63,7 @@ def test_what_happened_between_two_kept_frames_belongs_to_the_first(
     source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     slow = tmp_path / "slow"
-    monkeypatch.setattr(frame_cache, "DECODED", 3)  # frames that are decoded at a time
+    monkeypatch.setattr(decoding, "DECODED", 3)  # frames that are decoded at a time
     resample(
         monkeypatch, f"--dataset.root={source}", "--every=2", "--displacements=[dx]", f"--output_dir={slow}"
     )
@@ -137,7 +137,7 @@ def test_videos_are_encoded_as_they_were(tmp_path: Path, monkeypatch) -> None:
     (["--every=1"], "--every=1: must be at least 2"),
     (["--every=3"], "--every=3: does not divide the dataset's 50 frames a second"),
     (["--displacements=[dy]"], "--displacements=dy: the action has no such component; choose from"),
-    (["--output_dir={source}"], "already exists"),
+    (["--output_dir={source}"], "there is something already"),
 ])  # fmt: skip
 def test_what_cannot_be_is_refused(
     flags: list[str], message: str, source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,

@@ -15,10 +15,11 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import EnvConfig
 from safetensors.torch import load_file
 
-from lerobot_wmrl.common.constants import GATE_SEED
+from lerobot_wmrl.common.constants import GATE_SEED, START_SEED
 from lerobot_wmrl.common.errors import STOPPED
 from lerobot_wmrl.common.tracking import read_metrics
-from lerobot_wmrl.maniskill.recordings import recorded_episodes
+from lerobot_wmrl.data.dataset import open_dataset
+from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.scripts.train import main
 from tests.rl.checkpoints import save_untrained_policy
 from tests.rl.point_env import PointEnv
@@ -185,7 +186,8 @@ def test_gate_and_selection_in_the_simulator(improve: Any) -> None:
     assert last["selection/real/n"] == last["selection/imagined/n"] == 1
     assert first["gate/fresh/false_positive_rate/n"] == 1
     assert (out / "gate" / "000000" / "fresh_failure.png").is_file()
-    assert recorded_episodes(out / "gate" / "000000" / "rollouts")["seed"].tolist() == [GATE_SEED]
+    rollouts = read_episodes(open_dataset(out / "gate" / "000000" / "rollouts"))
+    assert rollouts.columns[START_SEED].tolist() == [GATE_SEED]
 
 
 @pytest.mark.parametrize(("flags", "message"), [

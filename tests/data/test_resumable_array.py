@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lerobot_wmrl.data.frame_cache import Units, memory_map
+from lerobot_wmrl.data.resumable_array import Units, memory_map
 
 
 def counted(written: list[int], stop_at: int | None = None, by: type = KeyboardInterrupt) -> Units:
