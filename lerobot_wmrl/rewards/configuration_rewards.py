@@ -27,7 +27,8 @@ class GeneralConfig(RewardModelConfig):
         alpha: weight α of the sparse part (success); the dense part (similarity) has 1 − α.
         form: `potential` pays for getting closer to the goal frame, `absolute` (as published) for being
             close.
-        gamma: discount of the potential form, which should be PPO's; by default PPO's default.
+        gamma: discount of the potential form, which should be PPO's; by default PPO's default, and 1 for
+            GRPO, which adds rewards up without one.
         similarity: measure of similarity to the goal frame: `tokenizer`, 1 − LPIPS's formula on the
             tokenizer's features; `lpips_alex` or `lpips_vgg`, 1 − LPIPS, whose backbone must be in torch's
             cache; `mse`, 1 − the mean squared error.

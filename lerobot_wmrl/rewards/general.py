@@ -85,7 +85,8 @@ class RuleBasedReward:
         alpha: weight of success; progress has 1 − alpha.
         form: `potential` pays for progress made. `absolute` pays for being far on in every step; since
             success ends an episode, that can be worth more than success.
-        gamma: discount of the potential form, which should be PPO's; by default PPO's default.
+        gamma: discount of the potential form, which should be PPO's; by default PPO's default, and 1 for
+            GRPO, which adds rewards up without one.
     """
 
     alpha: float = 0.9

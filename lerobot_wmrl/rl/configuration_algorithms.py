@@ -27,8 +27,8 @@ class PolicyGradientConfig(RLAlgorithmConfig):
             Above it, the updates of this iteration end early. A step of the optimiser that moves the policy
             ten times as far is undone, and the learning rate falls.
         max_reference_kl: KL to the SFT policy, in the same unit. Above it, the training stops.
-        patience: iterations in a row without any reward, after which the training stops: there is nothing to
-            learn from.
+        patience: iterations in a row without any reward (GRPO: without a group whose returns differ), after
+            which the training stops: there is nothing to learn from.
         initial_std: standard deviation of exploration in normalised actions; by default the policy's own.
         train_encoder: train the policy's encoder of observations too. `false` keeps it as it was cloned, so
             that every frame is encoded once, and an update takes a small part of the time. For the policy

@@ -177,7 +177,8 @@ class Distillation(RLAlgorithm):
                         tasks = [observation[INSTRUCTIONS][row] for row in planned.tolist()]
                         policy.reset()
                         proposed = env.policy_actions(act, planned, horizon)
-                        chunk = planner.plan(env.newest_frames()[planned], tasks, proposed)
+                        left = env.max_episode_steps - step
+                        chunk = planner.plan(env.newest_frames()[planned], tasks, proposed, left)
                     actions[step, planned] = chunk[:, ahead]
                     acting[step] = alive
                 observation, _, terminated, truncated, _ = env.step(actions[step])

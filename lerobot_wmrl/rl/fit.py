@@ -60,16 +60,34 @@ def check_tasks(cfg: TrainConfig, env: TensorEnv) -> None:
         )  # fmt: skip
 
 
-def check_discount(cfg: TrainConfig, longest: int) -> None:
-    """Warn if progress is rewarded with another discount than PPO's, in episodes of up to `longest` steps."""
+def settle_discount(cfg: TrainConfig) -> None:
+    """Let GRPO, which adds rewards up without a discount, be rewarded for progress without one: discounted,
+    an early approach to the goal would cost more than it earns. Leave a discount that is given."""
+    reward = progress_reward(cfg)
+    if isinstance(cfg.algorithm, GRPOConfig) and reward is not None and reward.gamma is None:
+        reward.gamma = 1.0
+
+
+def progress_reward(cfg: TrainConfig) -> GeneralConfig | RuleBasedReward | None:
+    """Return the settings of a reward that pays for progress made, None for others."""
     reward = cfg.env.reward if isinstance(cfg.env, WorldModelEnv | WmrlManiSkillEnv) else None
-    if not (isinstance(cfg.algorithm, PPOConfig) and isinstance(reward, GeneralConfig | RuleBasedReward)):
+    if not isinstance(reward, GeneralConfig | RuleBasedReward):
+        return None
+    return reward if reward.alpha < 1 and reward.form == "potential" else None
+
+
+def check_discount(cfg: TrainConfig, longest: int) -> None:
+    """Warn if progress is rewarded with another discount than the algorithm's, in episodes of up to `longest`
+    steps."""
+    reward, algorithm = progress_reward(cfg), cfg.algorithm
+    if reward is None or not isinstance(algorithm, PPOConfig | GRPOConfig):
         return
-    discount, own = cfg.algorithm.discount(longest), potential_discount(reward, longest)
-    if reward.alpha < 1 and reward.form == "potential" and own != discount:
+    discount = algorithm.discount(longest) if isinstance(algorithm, PPOConfig) else 1.0
+    if (own := potential_discount(reward, longest)) != discount:
         logging.warning(
-            "env.reward.gamma=%s: progress is rewarded with this discount, and PPO has %s, so that the time "
-            "spent near the goal counts too; set --env.reward.gamma=%s", own, discount, discount,
+            "env.reward.gamma=%s: progress is rewarded with this discount, and %s has %s, so that the time "
+            "spent near the goal counts too; set --env.reward.gamma=%s",
+            own, algorithm.type.upper(), discount, discount,
         )  # fmt: skip
 
 

@@ -1,5 +1,7 @@
 """Group relative policy optimisation of any StochasticPolicy. T time, B environments, G of a group."""
 
+from typing import ClassVar
+
 import torch
 from torch import Tensor, nn
 
@@ -34,6 +36,7 @@ class GRPO(PolicyGradient):
     config_class = GRPOConfig
     name = "grpo"
     config: GRPOConfig
+    without_signal: ClassVar[str] = "in no group did returns differ by `algorithm.least_group_std`"
 
     @property
     def group_size(self) -> int:
@@ -44,13 +47,21 @@ class GRPO(PolicyGradient):
         """Return the policy alone: a value function that it has is not trained."""
         return {POLICY: (self.policy_parameters, self.config.policy_lr)}
 
+    def compare(self, rollout: RolloutBuffer) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the episodes' returns (B,), their advantages within groups (B / G, G), and which groups have
+        a signal (B / G,)."""
+        returns = (rollout.reward * rollout.first_episode).sum(dim=0)
+        groups = returns.view(-1, self.config.group_size)
+        return returns, *group_advantages(groups, self.config.least_group_std)
+
+    def signal(self, rollout: RolloutBuffer) -> Tensor:
+        """Return 1 if there is a group with a signal, else 0. ()"""
+        return self.compare(rollout)[2].any().float()
+
     @torch.no_grad()
     def add_targets(self, rollout: RolloutBuffer) -> tuple[Tensor, dict[str, float]]:
         """Add advantages within groups. Only decisions of groups with a signal are trained on."""
-        returns = (rollout.reward * rollout.first_episode).sum(dim=0)  # (B,)
-        advantages, signal = group_advantages(
-            returns.view(-1, self.config.group_size), self.config.least_group_std
-        )
+        returns, advantages, signal = self.compare(rollout)
         rollout.columns = {"advantage": advantages.flatten().expand(rollout.steps, -1)}  # (T, B)
         with_signal = signal.repeat_interleave(self.config.group_size)  # (B,)
         chosen = rollout.decided & rollout.first_episode & with_signal

@@ -69,10 +69,11 @@ def make_measures(
     if isinstance(env, WorldModelVectorEnv):
         starts = selection_starts(settings.selection, env)
         measures[IMAGINED] = partial(measure_imagined, env, policy, starts, min(episodes, len(starts)))
-    elif REAL not in measures and is_own(config):
+    elif REAL not in measures and is_own(config) and env.tasks == 1:
         measures[REAL] = partial(evaluate_within, env, config, policy, episodes, SELECTION_SEED)
-    elif REAL not in measures:
-        measures[REAL] = partial(evaluate_policy, config, policy, episodes, SELECTION_SEED, num_envs=1)
+    elif REAL not in measures:  # task by task: each in all of its scenes, and on as many episodes
+        at_once = max(1, env.num_envs // env.tasks) if is_own(config) else 1
+        measures[REAL] = partial(evaluate_policy, config, policy, episodes, SELECTION_SEED, at_once)
     if REAL not in measures:
         logging.warning(
             "selection: without `real_env` the best checkpoint is the one that succeeds most often in "

@@ -11,7 +11,7 @@ import time
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import torch
@@ -86,7 +86,10 @@ class PolicyGradient(RLAlgorithm):
     """Rollouts that were trained on."""
 
     unrewarded: Tensor
-    """Rollouts in a row, up to the latest, without any reward. () int64"""
+    """Rollouts in a row, up to the latest, without a signal. () int64"""
+
+    without_signal: ClassVar[str] = "no episode was rewarded"
+    """What a rollout without a signal is like."""
 
     def __init__(self, policy: Any, config: PolicyGradientConfig) -> None:
         self.lerobot_policy, self.policy = policy, as_stochastic(policy)
@@ -186,15 +189,18 @@ class PolicyGradient(RLAlgorithm):
                 "`algorithm.reference_coefficient` or lower `algorithm.policy_lr`"
             )
 
-    def check_rewarded(self, rollout: RolloutBuffer) -> None:
-        """Raise TrainingStopped after `patience` rollouts in a row without any reward."""
-        rewarded = largest_over_processes(rollout.reward.abs().max()).item() > 0
+    def signal(self, rollout: RolloutBuffer) -> Tensor:
+        """Return a number above 0 if there is something to learn from. ()"""
+        return rollout.reward.abs().max()
+
+    def check_signal(self, rollout: RolloutBuffer) -> None:
+        """Raise TrainingStopped after `patience` rollouts in a row without a signal."""
         self.unrewarded += 1
-        if rewarded:
+        if largest_over_processes(self.signal(rollout)).item() > 0:
             self.unrewarded.zero_()
         if self.unrewarded >= self.config.patience:
             raise TrainingStopped(
-                f"iteration {self.iteration + 1}: no episode was rewarded in {self.unrewarded} iterations, "
+                f"iteration {self.iteration + 1}: {self.without_signal} in {self.unrewarded} iterations, "
                 "so there is nothing to learn from. If imagination sees no success, lower "
                 "`env.done_threshold`, or train the world model longer or on more successes; if the policy "
                 "has none, take one that has, or raise `algorithm.initial_std`"
@@ -221,7 +227,7 @@ class PolicyGradient(RLAlgorithm):
         pipeline = self.encoding(pipeline)
         collected = collect(env, self.policy, pipeline, rollout, seed, self.group_size)
         rollout_end = time.perf_counter()
-        self.check_rewarded(rollout)
+        self.check_signal(rollout)
         minibatches, targets = self.prepare(rollout, pipeline)
         progress = tqdm(minibatches, "update", leave=False, unit="minibatch", disable=hidden_progress())
         stats = self.update(iter(progress))

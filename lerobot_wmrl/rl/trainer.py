@@ -32,8 +32,8 @@ from lerobot_wmrl.rl.rollout import RolloutBuffer
 from lerobot_wmrl.rl.seeds import first_seed
 
 SHOWN = (
-    "success_rate", "reward", "policy_loss", "value_loss", "explained_variance", "kl", "reference_kl",
-    "clip_fraction", "entropy", "rollout_s", "update_s",
+    "success_rate", "reward", "groups_with_signal", "policy_loss", "value_loss", "explained_variance", "kl",
+    "reference_kl", "clip_fraction", "entropy", "rollout_s", "update_s",
 )  # fmt: skip
 """Metrics that a line in the terminal shows; metrics.jsonl has all."""
 

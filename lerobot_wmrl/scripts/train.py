@@ -50,8 +50,10 @@ def train_policy(cfg: TrainConfig) -> None:
     from lerobot_wmrl.common.policies import require_distillable
     from lerobot_wmrl.envs.lerobot_env import make_tensor_env
     from lerobot_wmrl.rl.budget import check_data
+    from lerobot_wmrl.rl.fit import settle_discount
 
     cfg.validate()
+    settle_discount(cfg)
     check_data(cfg, cfg.env)
     config = load_config(cfg)
     if isinstance(cfg.env, WorldModelEnv) and cfg.env.device not in (None, config.device):

@@ -101,7 +101,10 @@ class Planner:
         self.generator = torch.Generator(self.low.device).manual_seed(self.seed)
 
     @torch.no_grad()
-    def plan(self, frames: Frames, instructions: Sequence[str], proposed: Tensor | None = None) -> Tensor:
+    def plan(
+        self, frames: Frames, instructions: Sequence[str], proposed: Tensor | None = None,
+        steps_left: int | None = None,
+    ) -> Tensor:  # fmt: skip
         """Plan from these frames on.
 
         Args:
@@ -109,12 +112,13 @@ class Planner:
             instructions: one a frame.
             proposed: actions (B, T, A) to change. The search samples changes at the knots; its first sample
                 changes nothing. By default the search begins at what is left of the last plans.
+            steps_left: steps until the episodes end, after which success does not count.
 
         Returns:
             (B, T, A)
         """
         model, settings = self.model, self.settings
-        value = self._objective(frames, instructions)
+        value = self._objective(frames, instructions, steps_left)
 
         def search(objective: Objective, mean: Tensor, low: Tensor, high: Tensor) -> Tensor:
             best, average = plan_knots(
@@ -145,12 +149,13 @@ class Planner:
         steps = torch.linspace(settings.execute, settings.execute + settings.horizon - 1, settings.knots)
         return plans[:, steps.round().long().clamp(max=settings.horizon - 1)]
 
-    def _objective(self, frames: Frames, instructions: Sequence[str]) -> Objective:
+    def _objective(self, frames: Frames, instructions: Sequence[str], steps_left: int | None) -> Objective:
         """Return the objective of action sequences that begin at these frames."""
         model, done_frames = self.model, self.done_frames
         if self.text_model is None:
+            counted = None if steps_left is None else max(steps_left, done_frames)
             return lambda actions: success_logit(
-                model.open_loop(frames, actions, with_tokens=False).done_logit, done_frames
+                model.open_loop(frames, actions, with_tokens=False).done_logit[:, :counted], done_frames
             )
         goal = imagine_goal(self.text_model, frames, instructions).decoded
 

@@ -3,6 +3,7 @@
 import json
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -97,6 +98,25 @@ def test_a_search_changes_the_proposed_actions_by_a_few_deviations(trained_model
 def test_done_counts_as_long_as_it_holds():
     logits = torch.tensor([[9.0, -9, 9, -9, 9], [-9, 1, 2, 3, -9]])
     assert success_logit(logits, 3).tolist() == [-9, 1]
+
+
+@pytest.mark.parametrize(("left", "best"), [(None, 1.0), (8, 1.0), (4, -1.0), (1, -1.0)])
+def test_success_after_the_end_of_the_episode_does_not_count(left, best):
+    """Positive actions succeed surely at the eighth step, negative ones less surely at the third."""
+
+    class Model(SimpleNamespace):
+        def open_loop(self, frames, actions, with_tokens):
+            logit, first = torch.full(actions.shape[:2], -9.0), actions[:, 0, 0]
+            logit[first > 0, 6:] = 5.0
+            logit[first < 0, 1:4] = 2.0
+            return SimpleNamespace(done_logit=logit)
+
+    model = Model(action_mean=torch.zeros(1), action_spread=lambda: torch.ones(1))
+    settings = PlannerSettings(horizon=8, execute=2, samples=32, elites=1, iterations=1, knots=1)
+    bound = torch.ones(1)
+    planner = Planner(model, None, settings, 2, averaged=False, low=-bound, high=bound, seed=0)
+    plan = planner.plan([None], [""], torch.zeros(1, 8, 1), left)
+    assert plan[0, 0, 0].sign() == best
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ import torch
 
 from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_wmrl.common.constants import EVALUATION_SEED
+from lerobot_wmrl.common.errors import TrainingStopped
 from lerobot_wmrl.common.pipeline import Pipeline
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
@@ -92,6 +93,19 @@ def test_an_iteration_without_a_signal_is_logged_as_any(
     buffer, schedule = RolloutBuffer(3, ENVS, "cpu"), Schedule(2, 2, 0)
     train(PointEnv(ENVS), algorithm, pipeline, buffer, schedule, tmp_path, policy.save_pretrained)
     assert [line["updates"] for line in read_metrics(tmp_path)] == [0, 0]
+
+
+def test_a_training_without_a_signal_stops(make_policy: MakePolicy, pipeline: Pipeline) -> None:
+    """Rewards that differ by less than `least_group_std` are none to it."""
+    algorithm = GRPO(make_policy(), GRPOConfig(group_size=GROUP, least_group_std=1e3, patience=2))
+    buffer = RolloutBuffer(STEPS, ENVS, "cpu")
+    algorithm.iterate(PointEnv(ENVS), pipeline, buffer, seed=0, last=False)
+    assert buffer.reward.any()
+    with pytest.raises(
+        TrainingStopped,
+        match=r"in no group did returns differ by .*in 2 iterations",
+    ):
+        algorithm.iterate(PointEnv(ENVS), pipeline, buffer, seed=0, last=False)
 
 
 def test_the_value_is_not_touched(make_policy: MakePolicy, pipeline: Pipeline) -> None:

@@ -16,6 +16,7 @@ from lerobot_wmrl.common.errors import TrainingStopped
 from lerobot_wmrl.common.policies import LoadedPolicy
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.envs import start_frames, world_model_env
+from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.envs.start_frames import StartImages
 from lerobot_wmrl.evaluation.policy_rollouts import Evaluated
@@ -143,6 +144,16 @@ def test_success_is_measured_on_seeds_that_nothing_is_reported_on(
     settings, policy = CallbackSettings(real_env=real_env), LoadedPolicy(CnnConfig(), None, None, None)
     measures: dict[str, Any] = make_callbacks.make_measures(settings, policy, env(2), config)
     assert {place: measure() for place, measure in measures.items()} == dict.fromkeys(places, SELECTION_SEED)
+
+
+def test_tasks_of_maniskill_are_measured_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Together they would share the episodes, and each see scenes that no other one sees."""
+    monkeypatch.setattr(make_callbacks, "evaluate_policy", lambda *given: given)
+    config = WmrlManiSkillEnv(task="push,pull")
+    env: Any = SimpleNamespace(tasks=2, num_envs=6)
+    policy, settings = LoadedPolicy(CnnConfig(), None, None, None), CallbackSettings()
+    found: Any = make_callbacks.make_measures(settings, policy, env, config)["real"]()
+    assert found == (config, policy, settings.selection.n_episodes, SELECTION_SEED, 3)
 
 
 def test_starts_are_tokenised_once_and_a_refreshed_world_model_is_measured(

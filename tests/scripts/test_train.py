@@ -3,6 +3,7 @@
 import json
 import shutil
 import sys
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -22,7 +23,7 @@ from lerobot_wmrl.rewards.general import RuleBasedReward
 from lerobot_wmrl.rl.configuration_algorithms import PPOConfig
 from lerobot_wmrl.rl.configuration_grpo import GRPOConfig
 from lerobot_wmrl.rl.configuration_train import TrainConfig
-from lerobot_wmrl.rl.fit import check_discount, rollout_length
+from lerobot_wmrl.rl.fit import check_discount, rollout_length, settle_discount
 from lerobot_wmrl.rl.trained_policy import evaluation
 from lerobot_wmrl.scripts.train import main
 from tests.commands import run_here
@@ -252,6 +253,23 @@ def test_another_discount_of_progress_than_ppos_is_warned_of(
     check_discount(cfg, longest=60)
     assert ("env.reward.gamma=0.98: progress" in caplog.text) == warned
     assert ("set --env.reward.gamma=0.9" in caplog.text) == warned
+
+
+def test_grpo_pays_for_progress_without_a_discount(caplog: pytest.LogCaptureFixture) -> None:
+    """It adds rewards up: of two failures the one that came nearer then has the larger return."""
+    env = WmrlManiSkillEnv()
+    cfg = TrainConfig(env=env, algorithm=GRPOConfig())
+    settle_discount(cfg)
+    check_discount(cfg, longest=40)
+    assert not caplog.text
+    for level in (0.2, 0.8):
+        path = [0.0, *[level] * 40]
+        rewards = [env.reward.step_reward(0.0, now, before, 40) for before, now in pairwise(path)]
+        assert sum(rewards) == pytest.approx(0.1 * level)
+    given = TrainConfig(env=WmrlManiSkillEnv(reward=RuleBasedReward(gamma=0.9)), algorithm=GRPOConfig())
+    settle_discount(given)
+    check_discount(given, longest=40)
+    assert "env.reward.gamma=0.9: progress is rewarded with this discount, and GRPO has 1.0" in caplog.text
 
 
 def test_a_rollout_reaches_the_end_of_an_episode() -> None:
