@@ -36,8 +36,8 @@ def train_command(folder: Path, flags: Sequence[str]) -> list[str]:
 def merge_command(folder: Path, datasets: Mapping[str, Path]) -> list[str]:
     """Return lerobot-edit-dataset that merges datasets, name → folder, into a new one."""
     return edit_command(folder, "merge", {
-        "operation.repo_ids": str([f"local/{name}" for name in datasets]),
-        "operation.roots": str([str(root) for root in datasets.values()]),
+        "operation.repo_ids": [f"local/{name}" for name in datasets],
+        "operation.roots": [str(root) for root in datasets.values()],
         "operation.concatenate_data": False,
     })  # fmt: skip
 

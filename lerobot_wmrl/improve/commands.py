@@ -65,7 +65,7 @@ def stages(improvement: Improvement) -> list[Stage]:
 
 def columns(improvement: Improvement) -> list[str]:
     root = improvement.found.root
-    names: Flags = {"operation.feature_names": str(improvement.extra_columns)}
+    names: Flags = {"operation.feature_names": improvement.extra_columns}
     command = edit_command(improvement.out / "columns", "remove_feature", names)
     return [*command, f"--repo_id=local/{root.name}", f"--root={root}"]
 
@@ -107,7 +107,7 @@ def cloned(improvement: Improvement) -> list[str]:
 
 def tokenizer(improvement: Improvement) -> list[str]:
     return learn(improvement, "frame_tokenizer", "tokenizer", {
-        "model.tokenizer.cameras": f"[{','.join(improvement.found.cameras)}]",
+        "model.tokenizer.cameras": improvement.found.cameras,
         "model.tokenizer.image_size": improvement.sizes.side, "model.tokenizer.context": True,
         "model.tokenizer.success": True,
     })  # fmt: skip
@@ -202,7 +202,7 @@ def compare(
         env = {**env, "env.dataset.max_starts": improvement.spread(starts)}
     at_once = 16 if imagined else MANISKILL_PROCESSES if improvement.in_maniskill else 1
     return ["lerobot-wmrl-compare", *format_flags({
-        "policies": f"[{','.join(policies or improvement.policies.values())}]", "against": "all", **env,
+        "policies": [*(policies or improvement.policies.values())], "against": "all", **env,
         "n_episodes": starts, "batch_size": min(at_once, starts), "stop_early": False, "seed": seed,
         "output_dir": str(folder),
     })]  # fmt: skip

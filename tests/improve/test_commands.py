@@ -6,6 +6,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import draccus
 import numpy as np
 import pytest
 from lerobot.configs import PreTrainedConfig
@@ -28,6 +29,7 @@ from lerobot_wmrl.improve import improvement as decisions
 from lerobot_wmrl.improve.findings import few_decisions, usual_length
 from lerobot_wmrl.improve.improvement import CLONED, DISTILLED, FITTED, PPO, SFT
 from lerobot_wmrl.improve.report.words import reservations
+from lerobot_wmrl.scripts.compare import CompareConfig
 from lerobot_wmrl.scripts.improve import settings
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 from lerobot_wmrl.world_models.configuration_world_model import AnchoredConfig
@@ -210,13 +212,13 @@ def test_rollouts_are_merged_and_successes_cloned_before_rl(
     made = {stage.name: stage.command() for stage in islice(stages, 3)}
     success = read_episodes(make_synthetic_dataset(folder / "merged", episodes=6)).success
     made |= {stage.name: stage.command() for stage in stages}
-    assert {"--root=data", f"--new_root={folder / 'columns'}", "--operation.feature_names=['effort']"} <= {
+    assert {"--root=data", f"--new_root={folder / 'columns'}", "--operation.feature_names=[effort]"} <= {
         *made["columns"]
     }
     assert {f"--like.root={folder / 'columns'}", "--max_frames=80", "--video=true", "--seed=50000"} <= {
         *made["rollouts"]
     }
-    assert f"--operation.roots=['{folder / 'columns'}', '{folder / 'rollouts'}']" in made["merged"]
+    assert f"--operation.roots=[{folder / 'columns'},{folder / 'rollouts'}]" in made["merged"]
     episodes = [episode for episode in (0, 3, 4, 5) if success[episode]]
     assert 0 < len(episodes) < 4
     assert {f"--policy.path={before}", f"--dataset.episodes={episodes}".replace(" ", "")} <= {*made["cloned"]}
@@ -268,6 +270,13 @@ def test_commands_name_the_checkpoint_that_is_there_now_as_lerobots_take_it(
         assert improvement.policy == "cloned/checkpoints/000002/pretrained_model"
     link_checkpoint(tmp_path / "cloned" / "checkpoints" / "000004", "last")
     assert improvement.policy == "cloned/checkpoints/000004/pretrained_model"
+
+
+def test_policies_in_a_folder_with_a_comma_are_compared(tmp_path: Path) -> None:
+    improvement = improvement_of(tmp_path / "push, a")
+    improvement.config.real_env = PushtEnv()
+    (command,) = commands_of(improvement, "comparison").values()
+    assert draccus.parse(CompareConfig, args=command[1:]).policies == [*improvement.policies.values()]
 
 
 def test_without_starts_to_select_on_the_last_checkpoint_and_policy_are_taken(tmp_path: Path) -> None:
