@@ -97,7 +97,7 @@ class Demo:
         """List every stage in order."""
         return [
             Stage("demonstrations", "Record demonstrations in ManiSkill", self._demonstrations),
-            Stage("cloned", "Clone a policy from them", self._cloned),
+            Stage("cloned", "Clone a policy from them", self._cloned, fresh=self.out / "cloned"),
             Stage("improve", "Improve it", self._improve),
             Stage("text_world_model", "Train the text world model", self._text_world_model),
             Stage("replay", "Replay held-out episodes in both world models", self._replay),

@@ -33,9 +33,10 @@ def stages(improvement: Improvement) -> list[Stage]:
 
     def stage(
         name: str, title: str, command: Callable[[Improvement], list[str]], needed: bool = True,
-        optional: Callable[[int], bool] = never,
+        optional: Callable[[int], bool] = never, fresh: bool = False,
     ) -> list[Stage]:  # fmt: skip
-        return [Stage(name, title, partial(command, improvement), optional)] if needed else []
+        folder = improvement.out / name if fresh else None
+        return [Stage(name, title, partial(command, improvement), optional, folder)] if needed else []
 
     def leaves_policies(status: int) -> bool:
         """Return whether RL stopped by a rule of its own, and there are policies to compare."""
@@ -47,10 +48,11 @@ def stages(improvement: Improvement) -> list[Stage]:
 
     records, clones = config.rollouts > 0, improvement.clones
     return [
-        *stage("columns", "Leave out columns that rollouts lack", columns, bool(improvement.extra_columns)),
+        *stage("columns", "Leave out columns that rollouts lack", columns, bool(improvement.extra_columns),
+               fresh=True),
         *stage("rollouts", "Record rollouts of the policy", rollouts, records),
-        *stage("merged", "Merge the dataset with them", merged, records),
-        *stage("cloned", "Train the policy further on the successes", cloned, clones),
+        *stage("merged", "Merge the dataset with them", merged, records, fresh=True),
+        *stage("cloned", "Train the policy further on the successes", cloned, clones, fresh=True),
         *stage("tokenizer", "Train the frame tokenizer", tokenizer),
         *stage("world_model", "Train the world model", world_model),
         *stage("check", "Check the world model on recorded episodes", check),
