@@ -16,7 +16,7 @@ from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.presets import preset_settings
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.demo.stages import Demo, DemoConfig
-from lerobot_wmrl.improve.improvement import CLONED, DISTILLED, PPO, SFT
+from lerobot_wmrl.improve.progress import CLONED, DISTILLED, PPO, SFT
 from lerobot_wmrl.maniskill.recordings import recorded_episodes
 
 ROOT = Path(__file__).parents[2]
