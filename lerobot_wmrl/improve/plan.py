@@ -1,6 +1,7 @@
 """What is decided for an improvement before its first stage, from its configuration and the data."""
 
-from dataclasses import dataclass, replace
+from copy import copy
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -87,7 +88,9 @@ class Plan:
             # not in this process: stages are forks of it that render too
             in_fork(check_real_env, own, config.real_env, starts)
             check_frame_rate(config.real_env, table.dataset.fps, "the dataset")
-        return cls(replace(config, policy=own), found, adapted)
+        planned = copy(config)
+        planned.policy = own
+        return cls(planned, found, adapted)
 
     @property
     def duration(self) -> str:
