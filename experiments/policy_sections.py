@@ -8,7 +8,7 @@ from experiments.study import ROOT, read_cells
 from experiments.success import STEPS_AN_ITERATION
 from experiments.value_cells import SCENES, against, published
 from lerobot_wmrl.common.files import markdown_table as table
-from lerobot_wmrl.improve.improvement import CLONED, DISTILLED
+from lerobot_wmrl.improve.progress import CLONED, DISTILLED
 
 
 def demo(load: Load) -> str:

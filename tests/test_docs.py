@@ -23,7 +23,7 @@ from experiments.value_cells import (
 )
 from lerobot_wmrl.common.statistics import RunsMean
 from lerobot_wmrl.common.stored_help import FOLDER
-from lerobot_wmrl.improve.improvement import CLONED, DISTILLED, PPO, SFT
+from lerobot_wmrl.improve.progress import CLONED, DISTILLED, PPO, SFT
 from tests.experiments.typed import ROOT, check
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -8,14 +8,13 @@ from typing import Any, ClassVar
 import draccus
 from huggingface_hub.errors import HFValidationError
 from huggingface_hub.utils import validate_repo_id
-from lerobot.configs import parser
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.rewards import RewardModelConfig
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_dataset_maniskill.planners import MOTIONS
 from lerobot_wmrl.common.checkpoints import PARTS, checkpoint_digest, resolved_name
-from lerobot_wmrl.common.command_line import RunConfig, settings_beside
+from lerobot_wmrl.common.command_line import RunConfig
 from lerobot_wmrl.common.constants import EVALUATION_SEED, KINDS, POLICY
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice
 from lerobot_wmrl.common.hub import check_login
@@ -131,13 +130,11 @@ class RecordConfig(RunConfig):
     list_scenes: bool = False
     """Print the table of scenes and stop."""
 
-    def __post_init__(self) -> None:
-        path = parser.get_path_arg("policy")
-        if path:
-            self.policy = read_policy_config(path, settings_beside("policy"))
-
     def validate(self) -> None:
-        """Raise FieldError for the first setting that cannot be."""
+        """Read the policy's configuration. FieldError for the first setting that cannot be."""
+        path, settings = self.given["policy"]
+        if path:
+            self.policy = read_policy_config(path, settings)
         if self.output_dir is None:
             raise FieldError("output_dir", None, "missing", "give the folder for the dataset")
         require_at_least(self, 1, "num_episodes", "num_workers", "part_episodes")
@@ -313,7 +310,7 @@ class RecordConfig(RunConfig):
         if self.policy.pretrained_path:
             path = resolved_name(str(self.policy.pretrained_path))
             return {
-                "policy": path, "policy_settings": settings_beside("policy"),
+                "policy": path, "policy_settings": self.given["policy"].settings,
                 "policy_content": checkpoint_digest(path),
             }  # fmt: skip
         own = {each.name for each in fields(self.policy)} - {each.name for each in fields(PreTrainedConfig)}

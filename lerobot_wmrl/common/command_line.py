@@ -9,11 +9,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr
 from dataclasses import dataclass
 from difflib import get_close_matches
-from functools import cache
+from functools import cache, cached_property
 from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import draccus
 from draccus.utils import ParsingError
@@ -42,6 +42,18 @@ FIELD = re.compile(r"`([\w.]+)((?:=[^`]*)?)`")
 """A field in a message, alone or with a value: `dynamics.type=anchored`."""
 
 
+class GivenPath(NamedTuple):
+    """What the command line says of a field that is loaded from a checkpoint.
+
+    Args:
+        path: `--<field>.path`; None if that is not there.
+        settings: settings beside it, as flags of the checkpoint's own configuration: `--n_action_steps=8`.
+    """
+
+    path: str | None
+    settings: list[str]
+
+
 @dataclass
 class RunConfig:
     """Base of the commands' configurations: parsed by draccus, saved beside what the run makes."""
@@ -56,26 +68,30 @@ class RunConfig:
         """Return the fields that are loaded from a checkpoint given as `--<field>.path`."""
         return cls.path_fields
 
+    @cached_property
+    def given(self) -> dict[str, GivenPath]:
+        """What the command line says of each of `path_fields`: nothing, unless `parse_flags` noted it."""
+        return {name: GivenPath(None, []) for name in self.path_fields}
+
     def save_pretrained(self, folder: Path) -> None:
         """Write the configuration as LeRobot does, `train_config.json`."""
         write_json(folder / CONFIG_FILE, draccus.encode(self))
 
 
-def settings_beside(path_field: str) -> list[str]:
-    """Return the settings that stand beside `--<field>.path`, in a `--config_path` file and then in flags, as
-    flags of the checkpoint's own configuration: `--n_action_steps=8`.
-
-    LeRobot's own reading of the file leaves out lists and nulls.
-    """
+def given_path(path_field: str) -> GivenPath:
+    """Read from the command line `--<field>.path` and the settings beside it, those in a `--config_path` file
+    first. LeRobot's own reading of the file leaves out lists and nulls."""
     file, inside = parser.parse_arg("config_path"), f"{path_field}."
-    stored = read_settings(Path(file), [inside + name for name in MAPPINGS]) if is_file(file) else {}
-    own = {name.removeprefix(inside): value for name, value in stored.items() if name.startswith(inside)}
+    read = read_settings(Path(file), [inside + name for name in MAPPINGS]) if is_file(file) else {}
+    own = {name.removeprefix(inside): value for name, value in read.items() if name.startswith(inside)}
     beside = {  # draccus reads a list of texts or null only as JSON
         name: json.dumps(value) if isinstance(value, list) else value
         for name, value in own.items()
         if name not in ("path", "type")
     }
-    return [*(format_flags(beside) if "path" in own else []), *(parser.get_cli_overrides(path_field) or [])]
+    stored = format_flags(beside) if "path" in own else []
+    typed = parser.get_cli_overrides(path_field) or []
+    return GivenPath(parser.get_path_arg(path_field), [*stored, *typed])
 
 
 def is_file(path: str | None) -> bool:
@@ -135,7 +151,7 @@ def help_of(function: Callable[..., None], config_class: type) -> str:
 
 
 def parse_flags[Config: RunConfig](config_class: type[Config]) -> Config:
-    """Parse the command line as LeRobot does.
+    """Parse the command line as LeRobot does, and note what it says of checkpoints.
 
     Raises:
         ValueError: it cannot be parsed; in one line, without argparse's page of usage, and with the reason
@@ -149,12 +165,14 @@ def parse_flags[Config: RunConfig](config_class: type[Config]) -> Config:
     said = StringIO()
     try:
         with redirect_stderr(said), parsed_quickly():
-            return parsed()
+            config = parsed()
     except SystemExit as stopped:
         reason = stopped.__context__ and cause(stopped.__context__)
         if isinstance(reason, FieldError):
             raise reason from None
         raise ValueError(parsing_error(said.getvalue().strip(), config_class)) from None
+    config.given.update({name: given_path(name) for name in config.path_fields})
+    return config
 
 
 @contextmanager

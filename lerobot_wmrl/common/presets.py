@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import yaml
 
-type Flags = Mapping[str, str | int | float | bool]
+type Flags = Mapping[str, str | int | float | bool | list[int] | list[str]]
 
 PRESETS: Final = ("tiny", "demo", "cpu", "gpu", "paper")
 """From seconds to the published sizes."""
@@ -136,5 +136,17 @@ def format_flags(settings: Mapping[str, Any]) -> list[str]:
 def format_value(value: Any) -> str:
     """Write a setting as YAML in one line."""
     if isinstance(value, list | tuple):
-        return f"[{','.join(map(format_value, value))}]"
+        return f"[{','.join(map(_format_element, value))}]"
     return json.dumps(value) if isinstance(value, bool | dict | None) else str(value)
+
+
+def _format_element(value: Any) -> str:
+    """Write an element of a list; a text that YAML would not read as the same one has quotation marks."""
+    text = format_value(value)
+    if not isinstance(value, str | Path):
+        return text
+    try:
+        plain = yaml.safe_load(f"[{text}]") == [text]
+    except yaml.YAMLError:
+        plain = False
+    return text if plain else json.dumps(text, ensure_ascii=False)

@@ -30,6 +30,7 @@ from lerobot.configs import parser
 
 from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.files import write_json
+from lerobot_wmrl.common.lerobot_commands import whole_checkpoint
 from lerobot_wmrl.common.precision import keep_freed_memory
 from lerobot_wmrl.common.processes import die_with, find_program, not_installed, own_progress_lock
 
@@ -57,17 +58,20 @@ def never(status: int) -> bool:
 class Stage:
     """One console command.
 
-    The command is made when the stage starts: some of its flags depend on what earlier stages left, and what
-    an interrupted call left may have to be removed first.
+    The command is made when the stage starts: some of its flags depend on what earlier stages left.
 
     `optional` is called with the exit status of a command that failed. If it returns True, the later stages
     run, and this one is tried again only as long as none of them has begun.
+
+    `fresh` is a folder in which the command refuses what an interrupted call left. It is removed first,
+    unless it has a checkpoint from which lerobot-train continues.
     """
 
     name: str
     title: str
     command: Callable[[], list[str]]
     optional: Callable[[int], bool] = never
+    fresh: Path | None = None
 
 
 class StageError(RuntimeError):
@@ -123,6 +127,8 @@ def run_stages(
 def run_stage(stage: Stage, heading: str, output_dir: Path, record: dict[str, Any]) -> None:
     """Run one stage. Its record is written about once a second, so an interruption loses no time measured."""
     command = stage.command()
+    if stage.fresh is not None and whole_checkpoint(stage.fresh) is None:
+        shutil.rmtree(stage.fresh, ignore_errors=True)
     seconds, peak = record.get("seconds", 0.0), record.get("peak_memory_bytes", 0)
     # The first command is the one to copy: a resumed stage may run another one.
     record = {"name": stage.name, "title": stage.title, "command": record.get("command", shlex.join(command))}

@@ -19,10 +19,12 @@ from lerobot_wmrl.data.episodes import VALIDATION_EVERY
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.improve import commands
 from lerobot_wmrl.improve.configuration_improve import ROLLOUT_SEED_OFFSET, ImproveConfig
-from lerobot_wmrl.improve.improvement import Improvement
+from lerobot_wmrl.improve.plan import Plan
+from lerobot_wmrl.improve.progress import Progress
+from lerobot_wmrl.improve.report.curves import curve, lerobot_train_curve
 from lerobot_wmrl.improve.report.page import Page, stage_records
-from lerobot_wmrl.improve.report.results import curve, lerobot_train_curve, read_place
 from lerobot_wmrl.improve.report.words import verdict
+from lerobot_wmrl.improve.results import read_place
 
 SEED_STRIDE: Final = 100_000
 """Demo seed s records and trains with seeds from s·SEED_STRIDE on, below EVALUATION_SEED."""
@@ -97,7 +99,7 @@ class Demo:
         """List every stage in order."""
         return [
             Stage("demonstrations", "Record demonstrations in ManiSkill", self._demonstrations),
-            Stage("cloned", "Clone a policy from them", self._cloned),
+            Stage("cloned", "Clone a policy from them", self._cloned, fresh=self.out / "cloned"),
             Stage("improve", "Improve it", self._improve),
             Stage("text_world_model", "Train the text world model", self._text_world_model),
             Stage("replay", "Replay held-out episodes in both world models", self._replay),
@@ -138,12 +140,12 @@ class Demo:
     def first_seed(self) -> int:
         return self.config.seed * SEED_STRIDE
 
-    def improvement(self) -> Improvement:
+    def improvement(self) -> Progress:
         """Return what the stage `improve` does, once there is a policy to improve."""
-        return Improvement.of(ImproveConfig(
+        return Progress(Plan.of(ImproveConfig(
             policy=read_policy_config(self._policy, []), dataset=ChosenEpisodes(root=self._recorded),
             real_env=WmrlManiSkillEnv(**KNOWN), **self._given,
-        ))  # fmt: skip
+        )))  # fmt: skip
 
     @property
     def _given(self) -> dict[str, Any]:
@@ -216,7 +218,7 @@ class Demo:
 def conclusion(page: Page, path: Path) -> str:
     """Say in a few lines what the demo made, how good it is, and what comes next."""
     return "\n".join([
-        verdict(page.improvement, page.places), "", f"The report: {path}",
+        verdict(page.progress, page.places), "", f"The report: {path}",
         "Next: open it; it ends with every command, to change and run by hand. Drive the world model:",
-        shlex.join(commands.drive(page.improvement)),
+        shlex.join(commands.drive(page.progress)),
     ])  # fmt: skip

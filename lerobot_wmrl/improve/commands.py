@@ -15,7 +15,9 @@ from lerobot_wmrl.common.presets import Flags, format_flags
 from lerobot_wmrl.common.stages import Stage, never
 from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.improve.configuration_improve import ROLLOUT_SEED_OFFSET
-from lerobot_wmrl.improve.improvement import CLONED, MAX_STARTS, Improvement
+from lerobot_wmrl.improve.learnt import MAX_STARTS
+from lerobot_wmrl.improve.plan import Plan
+from lerobot_wmrl.improve.progress import CLONED, Progress
 
 SELECTIONS: Final = 4
 """Measurements of success in the real environment during RL at most, beside one before it."""
@@ -27,15 +29,16 @@ MANISKILL_PROCESSES: Final = 2
 """Processes that simulate ManiSkill while policies are compared."""
 
 
-def stages(improvement: Improvement) -> list[Stage]:
+def stages(progress: Progress) -> list[Stage]:
     """List every stage that this improvement needs, in order."""
-    config = improvement.config
+    plan, config = progress.plan, progress.plan.config
 
-    def stage(
-        name: str, title: str, command: Callable[[Improvement], list[str]], needed: bool = True,
-        optional: Callable[[int], bool] = never,
+    def stage[T](
+        name: str, title: str, command: Callable[[T], list[str]], of: T, needed: bool = True,
+        optional: Callable[[int], bool] = never, fresh: bool = False,
     ) -> list[Stage]:  # fmt: skip
-        return [Stage(name, title, partial(command, improvement), optional)] if needed else []
+        folder = plan.out / name if fresh else None
+        return [Stage(name, title, partial(command, of), optional, folder)] if needed else []
 
     def leaves_policies(status: int) -> bool:
         """Return whether RL stopped by a rule of its own, and there are policies to compare."""
@@ -43,214 +46,223 @@ def stages(improvement: Improvement) -> list[Stage]:
 
     def others() -> bool:
         """Return whether there is a policy to compare with the one before."""
-        return improvement.clones or improvement.rl_checkpoint.exists()
+        return plan.clones or plan.rl_checkpoint.exists()
 
-    records, clones = config.rollouts > 0, improvement.clones
+    records, clones = config.rollouts > 0, plan.clones
     return [
-        *stage("columns", "Leave out columns that rollouts lack", columns, bool(improvement.extra_columns)),
-        *stage("rollouts", "Record rollouts of the policy", rollouts, records),
-        *stage("merged", "Merge the dataset with them", merged, records),
-        *stage("cloned", "Train the policy further on the successes", cloned, clones),
-        *stage("tokenizer", "Train the frame tokenizer", tokenizer),
-        *stage("world_model", "Train the world model", world_model),
-        *stage("check", "Check the world model on recorded episodes", check),
-        *stage("start", "Choose in imagination which policy to improve", start, clones),
-        *stage("rl", "Train the policy in imagination", rl, optional=leaves_policies),
-        *stage("distilled", "Fit the policy to a planner in imagination", distilled, config.distils,
+        *stage("columns", "Leave out columns that rollouts lack", columns, plan, bool(plan.extra_columns),
+               fresh=True),
+        *stage("rollouts", "Record rollouts of the policy", rollouts, plan, records),
+        *stage("merged", "Merge the dataset with them", merged, plan, records, fresh=True),
+        *stage("cloned", "Train the policy further on the successes", cloned, progress, clones, fresh=True),
+        *stage("tokenizer", "Train the frame tokenizer", tokenizer, plan),
+        *stage("world_model", "Train the world model", world_model, plan),
+        *stage("check", "Check the world model on recorded episodes", check, progress),
+        *stage("start", "Choose in imagination which policy to improve", start, progress, clones),
+        *stage("rl", "Train the policy in imagination", rl, progress, optional=leaves_policies),
+        *stage("distilled", "Fit the policy to a planner in imagination", distilled, progress, config.distils,
                optional=lambda status: others()),
-        *stage("choice", "Choose the policy to use", choice, config.selects),
-        *stage("comparison", "Compare the policies", comparison),
+        *stage("choice", "Choose the policy to use", choice, progress, config.selects),
+        *stage("comparison", "Compare the policies", comparison, progress),
     ]  # fmt: skip
 
 
-def columns(improvement: Improvement) -> list[str]:
-    root = improvement.found.root
-    names: Flags = {"operation.feature_names": str(improvement.extra_columns)}
-    command = edit_command(improvement.out / "columns", "remove_feature", names)
+def columns(plan: Plan) -> list[str]:
+    root = plan.found.root
+    names: Flags = {"operation.feature_names": plan.extra_columns}
+    command = edit_command(plan.out / "columns", "remove_feature", names)
     return [*command, f"--repo_id=local/{root.name}", f"--root={root}"]
 
 
-def rollouts(improvement: Improvement) -> list[str]:
-    config = improvement.config
-    like: Flags = {"like.root": str(improvement.mergeable), "max_frames": improvement.frame_limit}
-    env = {name: value for name, value in real_env(improvement, "env").items() if name != "env.batched"}
+def rollouts(plan: Plan) -> list[str]:
+    config = plan.config
+    like: Flags = {"like.root": str(plan.mergeable), "max_frames": plan.frame_limit}
+    env = {name: value for name, value in real_env(plan, "env").items() if name != "env.batched"}
     return ["lerobot-wmrl-record", *format_flags({
-        "policy.path": improvement.policy, **env,
-        **({} if improvement.in_maniskill else like),
-        "video": "video" in improvement.found.columns.values(), "num_episodes": config.rollouts,
+        "policy.path": plan.policy, **env,
+        **({} if plan.in_maniskill else like),
+        "video": "video" in plan.found.columns.values(), "num_episodes": config.rollouts,
         "exploration": config.exploration, "seed": config.seed + ROLLOUT_SEED_OFFSET,
-        "output_dir": str(improvement.out / "rollouts"),
+        "output_dir": str(plan.out / "rollouts"),
     })]  # fmt: skip
 
 
-def merged(improvement: Improvement) -> list[str]:
-    parts = {"dataset": improvement.mergeable, "rollouts": improvement.out / "rollouts"}
-    return merge_command(improvement.out / "merged", parts)
+def merged(plan: Plan) -> list[str]:
+    parts = {"dataset": plan.mergeable, "rollouts": plan.out / "rollouts"}
+    return merge_command(plan.out / "merged", parts)
 
 
-def cloned(improvement: Improvement) -> list[str]:
-    policy, table = improvement.config.policy, improvement.table
+def cloned(progress: Progress) -> list[str]:
+    plan = progress.plan
+    policy, table = plan.config.policy, progress.learnt.table
     assert policy is not None
-    successes = np.flatnonzero(table.success & table.among(improvement.data.episodes)).tolist()
+    successes = np.flatnonzero(table.success & table.among(plan.data.episodes)).tolist()
     # LeRobot keeps loaded adapters, but writes no policy's configuration beside them without the flag
     adapters: Flags = {"peft.method_type": "LORA"} if policy.use_peft else {}
-    return train_command(improvement.out / "cloned", [
-        *format_flags(improvement.sizes.cloning_settings()),
+    return train_command(plan.out / "cloned", [
+        *format_flags(plan.sizes.cloning_settings()),
         *format_flags({
-            "policy.path": improvement.policy, "policy.push_to_hub": False, **adapters,
+            "policy.path": plan.policy, "policy.push_to_hub": False, **adapters,
             "dataset.repo_id": f"local/{table.dataset.root.name}",
             "dataset.root": str(table.dataset.root), "dataset.episodes": successes,
-            "seed": improvement.config.seed,
+            "seed": plan.config.seed,
         }),
     ])  # fmt: skip
 
 
-def tokenizer(improvement: Improvement) -> list[str]:
-    return learn(improvement, "frame_tokenizer", "tokenizer", {
-        "model.tokenizer.cameras": f"[{','.join(improvement.found.cameras)}]",
-        "model.tokenizer.image_size": improvement.sizes.side, "model.tokenizer.context": True,
+def tokenizer(plan: Plan) -> list[str]:
+    return learn(plan, "frame_tokenizer", "tokenizer", {
+        "model.tokenizer.cameras": plan.found.cameras,
+        "model.tokenizer.image_size": plan.sizes.side, "model.tokenizer.context": True,
         "model.tokenizer.success": True,
     })  # fmt: skip
 
 
-def world_model(improvement: Improvement) -> list[str]:
-    return learn(improvement, "action_world_model", "world_model", {
-        "model.tokenizer_path": str(improvement.out / "tokenizer"),
-        "model.clip_length": improvement.length + 2,
+def world_model(plan: Plan) -> list[str]:
+    return learn(plan, "action_world_model", "world_model", {
+        "model.tokenizer_path": str(plan.out / "tokenizer"),
+        "model.clip_length": plan.length + 2,
     })  # fmt: skip
 
 
-def learn(improvement: Improvement, model: str, folder: str, flags: Flags) -> list[str]:
+def learn(plan: Plan, model: str, folder: str, flags: Flags) -> list[str]:
     """Return the command that trains a tokenizer or a world model."""
-    return sized_command(improvement, "lerobot-wmrl-train-world-model", {
-        "model.type": model, **flags, **improvement.data.flags(), "seed": improvement.config.seed,
-        "output_dir": str(improvement.out / folder),
+    return sized_command(plan, "lerobot-wmrl-train-world-model", {
+        "model.type": model, **flags, **plan.data.flags(), "seed": plan.config.seed,
+        "output_dir": str(plan.out / folder),
     })  # fmt: skip
 
 
-def check(improvement: Improvement) -> list[str]:
-    data, split = improvement.checked()
+def check(progress: Progress) -> list[str]:
+    plan = progress.plan
+    data, split = progress.learnt.checked()
     # imagination that also begins in the middle of episodes reaches their ends
-    length: Flags = {} if improvement.branches() else {"episode_length": improvement.length}
+    length: Flags = {} if progress.learnt.branches() else {"episode_length": plan.length}
     return ["lerobot-wmrl-eval-world-model", *format_flags({
-        "model.path": str(improvement.out / "world_model"), **data, "split": split, **length,
-        **improvement.strict_criterion(), "max_episodes": 200, "output_dir": str(improvement.out / "check"),
+        "model.path": str(plan.out / "world_model"), **data, "split": split, **length,
+        **plan.strict_criterion(), "max_episodes": 200, "output_dir": str(plan.out / "check"),
     })]  # fmt: skip
 
 
-def start(improvement: Improvement) -> list[str]:
-    both = [improvement.policies[CLONED], improvement.policy]
-    folder, seed = improvement.out / "start", improvement.config.seed
-    return compare(improvement, folder, imagination(improvement), IMAGINED_STARTS, both, seed)
+def start(progress: Progress) -> list[str]:
+    plan = progress.plan
+    both = [progress.policies[CLONED], plan.policy]
+    folder, seed = plan.out / "start", plan.config.seed
+    return compare(progress, folder, imagination(progress), IMAGINED_STARTS, both, seed)
 
 
-def rl(improvement: Improvement) -> list[str]:
-    config = improvement.config
-    real: Flags = {} if config.real_env is None else real_env(improvement, "real_env")
+def rl(progress: Progress) -> list[str]:
+    plan, config = progress.plan, progress.plan.config
+    real: Flags = {} if config.real_env is None else real_env(plan, "real_env")
     given: Flags = {} if config.iterations is None else {"iterations": config.iterations}
     algorithm = {**config.algorithm, **given}
     if algorithm["algorithm.type"] == "ppo":
-        algorithm = {**algorithm, "algorithm.gamma": improvement.discount}
+        algorithm = {**algorithm, "algorithm.gamma": plan.discount}
         if config.policy is not None and config.policy.use_peft:  # the standard deviation is in no adapter
             algorithm = {**algorithm, "algorithm.initial_std": "null"}
     selection: Flags = {
-        "selection.freq": ceil(improvement.sizes.iterations(algorithm) / SELECTIONS),
-        "selection.n_episodes": improvement.rl_selection_episodes,
+        "selection.freq": ceil(plan.sizes.iterations(algorithm) / SELECTIONS),
+        "selection.n_episodes": plan.rl_selection_episodes,
     }
-    return train(improvement, "rl", improvement.policies[improvement.start()], {
+    return train(progress, "rl", progress.policies[progress.start()], {
         **real, "gate.action": "warn" if real else "off", "gate.freq": 0,
         "gate.n_episodes": min(50, config.eval_episodes),
         **(selection if config.selects else {}), **algorithm,
     })  # fmt: skip
 
 
-def distilled(improvement: Improvement) -> list[str]:
-    return train(improvement, "distilled", improvement.fitted(), {
+def distilled(progress: Progress) -> list[str]:
+    return train(progress, "distilled", progress.fitted(), {
         "gate.action": "off", "algorithm.type": "distillation", "algorithm.recorded": False,
     })  # fmt: skip
 
 
-def train(improvement: Improvement, folder: str, policy: str, flags: Flags) -> list[str]:
+def train(progress: Progress, folder: str, policy: str, flags: Flags) -> list[str]:
     """Return the command that trains a policy in imagination."""
-    fitting = improvement.sizes.rl_flags(flags, improvement.success_frames)
-    return sized_command(improvement, "lerobot-wmrl-train", {
-        "policy.path": policy, **imagination(improvement), **fitting, **flags,
-        "seed": improvement.config.seed, "output_dir": str(improvement.out / folder),
+    plan = progress.plan
+    fitting = plan.sizes.rl_flags(flags, progress.learnt.success_frames)
+    return sized_command(plan, "lerobot-wmrl-train", {
+        "policy.path": policy, **imagination(progress), **fitting, **flags,
+        "seed": plan.config.seed, "output_dir": str(plan.out / folder),
     })  # fmt: skip
 
 
-def choice(improvement: Improvement) -> list[str]:
-    folder, starts = improvement.out / "choice", improvement.config.selection_episodes
-    seed = SELECTION_SEED + improvement.rl_selection_episodes
-    return compare(improvement, folder, real_env(improvement, "env"), starts, seed=seed)
+def choice(progress: Progress) -> list[str]:
+    plan = progress.plan
+    folder, starts = plan.out / "choice", plan.config.selection_episodes
+    seed = SELECTION_SEED + plan.rl_selection_episodes
+    return compare(progress, folder, real_env(plan, "env"), starts, seed=seed)
 
 
-def comparison(improvement: Improvement) -> list[str]:
-    imagined = improvement.config.real_env is None
-    env = imagination(improvement) if imagined else real_env(improvement, "env")
-    return compare(improvement, improvement.out / "comparison", env, improvement.config.eval_episodes)
+def comparison(progress: Progress) -> list[str]:
+    plan = progress.plan
+    imagined = plan.config.real_env is None
+    env = imagination(progress) if imagined else real_env(plan, "env")
+    return compare(progress, plan.out / "comparison", env, plan.config.eval_episodes)
 
 
 def compare(
-    improvement: Improvement, folder: Path, env: Flags, starts: int, policies: Sequence[str] = (),
+    progress: Progress, folder: Path, env: Flags, starts: int, policies: Sequence[str] = (),
     seed: int = EVALUATION_SEED,
 ) -> list[str]:  # fmt: skip
     """Return the command that compares policies, by default all, each pair on the same starts."""
     imagined = env["env.type"] == "world_model"
     if imagined:  # none twice: there are at least as many as episodes
-        starts = min(starts, improvement.fewest_starts())
-        env = {**env, "env.dataset.max_starts": improvement.spread(starts)}
-    at_once = 16 if imagined else MANISKILL_PROCESSES if improvement.in_maniskill else 1
+        starts = min(starts, progress.learnt.fewest_starts())
+        env = {**env, "env.dataset.max_starts": progress.learnt.spread(starts)}
+    at_once = 16 if imagined else MANISKILL_PROCESSES if progress.plan.in_maniskill else 1
     return ["lerobot-wmrl-compare", *format_flags({
-        "policies": f"[{','.join(policies or improvement.policies.values())}]", "against": "all", **env,
+        "policies": [*(policies or progress.policies.values())], "against": "all", **env,
         "n_episodes": starts, "batch_size": min(at_once, starts), "stop_early": False, "seed": seed,
         "output_dir": str(folder),
     })]  # fmt: skip
 
 
-def imagination(improvement: Improvement) -> Flags:
+def imagination(progress: Progress) -> Flags:
     """Return the environment that the world model makes."""
+    plan = progress.plan
     return {
-        "env.type": "world_model", "env.world_model_path": str(improvement.out / "world_model"),
-        **{f"env.{name}": value for name, value in improvement.data.flags().items()},
-        "env.dataset.max_starts": MAX_STARTS, "env.dataset.branches": improvement.branches(),
-        "env.reward.type": "general", "env.reward.alpha": 1, "env.episode_length": improvement.length,
-        **{f"env.{name}": value for name, value in improvement.criterion().items()},
+        "env.type": "world_model", "env.world_model_path": str(plan.out / "world_model"),
+        **{f"env.{name}": value for name, value in plan.data.flags().items()},
+        "env.dataset.max_starts": MAX_STARTS, "env.dataset.branches": progress.learnt.branches(),
+        "env.reward.type": "general", "env.reward.alpha": 1, "env.episode_length": plan.length,
+        **{f"env.{name}": value for name, value in progress.criterion().items()},
     }  # fmt: skip
 
 
-def real_env(improvement: Improvement, prefix: str) -> Flags:
+def real_env(plan: Plan, prefix: str) -> Flags:
     """Return the real environment's settings behind a prefix."""
-    assert improvement.config.real_env is not None
-    return env_flags(improvement.config.real_env, prefix)
+    assert plan.config.real_env is not None
+    return env_flags(plan.config.real_env, prefix)
 
 
-def sized_command(improvement: Improvement, program: str, flags: Flags) -> list[str]:
+def sized_command(plan: Plan, program: str, flags: Flags) -> list[str]:
     """Return a command that has the preset of the improvement's size."""
-    return [program, f"--preset={improvement.config.preset}", *format_flags(flags)]
+    return [program, f"--preset={plan.config.preset}", *format_flags(flags)]
 
 
-def drive(improvement: Improvement) -> list[str]:
+def drive(progress: Progress) -> list[str]:
     """Return the command that shows the world model in the browser."""
-    real = {} if improvement.config.real_env is None else real_env(improvement, "real_env")
+    plan = progress.plan
+    real = {} if plan.config.real_env is None else real_env(plan, "real_env")
     return ["lerobot-wmrl-play", *format_flags({
-        "world_model.path": str(improvement.out / "world_model"), **DatasetSource.flags(improvement.data),
-        "policy.path": improvement.policies[improvement.chosen()], **real, **improvement.criterion(),
+        "world_model.path": str(plan.out / "world_model"), **DatasetSource.flags(plan.data),
+        "policy.path": progress.policies[progress.chosen()], **real, **progress.criterion(),
     })]  # fmt: skip
 
 
-def another_round(improvement: Improvement) -> list[str] | None:
+def another_round(progress: Progress) -> list[str] | None:
     """Return the command that records rollouts of the policy to use and improves it on all episodes; None if
     nothing was recorded."""
-    config = improvement.config
+    plan, config = progress.plan, progress.plan.config
     if not config.rollouts:
         return None
     given: Flags = {} if config.iterations is None else {"iterations": config.iterations}
-    limit: Flags = {} if improvement.in_maniskill else {"max_frames": improvement.frame_limit}
+    limit: Flags = {} if plan.in_maniskill else {"max_frames": plan.frame_limit}
     return ["lerobot-wmrl-improve", *format_flags({
-        "policy.path": improvement.policies[improvement.chosen()], **improvement.data.flags(),
-        **real_env(improvement, "real_env"), "rollouts": config.rollouts, "exploration": config.exploration,
+        "policy.path": progress.policies[progress.chosen()], **plan.data.flags(),
+        **real_env(plan, "real_env"), "rollouts": config.rollouts, "exploration": config.exploration,
         "size": config.preset, **given, **limit, "selection_episodes": config.selection_episodes,
         "eval_episodes": config.eval_episodes, "seed": config.seed + config.rollouts,
-        "output_dir": f"{improvement.out}_again",
+        "output_dir": f"{plan.out}_again",
     })]  # fmt: skip

@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import ClassVar, Final
 
 import torch
-from lerobot.configs import PreTrainedConfig, parser
+from lerobot.configs import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_wmrl.common.command_line import RunConfig, settings_beside
+from lerobot_wmrl.common.command_line import RunConfig
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import FieldError, require_at_least, require_choice, require_share
 from lerobot_wmrl.common.policies import (
@@ -97,12 +97,11 @@ class ImproveConfig(RunConfig):
     @property
     def policy_flags(self) -> list[str]:
         """The settings of the policy that the command line changes: `--n_action_steps=8`."""
-        return settings_beside("policy")
+        return self.given["policy"].settings
 
     def validate(self) -> None:
         """Read the policy's configuration. FieldError for a setting that cannot be."""
-        path = parser.get_path_arg("policy")
-        if path:
+        if path := self.given["policy"].path:
             self.policy = read_policy_config(path, self.policy_flags)
         if self.policy is None:
             raise FieldError("policy.path", None, "is missing", "give the policy to improve")

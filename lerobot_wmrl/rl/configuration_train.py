@@ -11,7 +11,7 @@ from lerobot.configs.default import PeftConfig, WandBConfig
 from lerobot.envs.configs import EnvConfig
 from lerobot.rl.algorithms.configs import RLAlgorithmConfig
 
-from lerobot_wmrl.common.command_line import RunConfig, settings_beside
+from lerobot_wmrl.common.command_line import RunConfig
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import FieldError, require_at_least, within
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
@@ -144,11 +144,10 @@ def load_config(cfg: TrainConfig) -> PreTrainedConfig:
     from lerobot_wmrl.common.output_folders import CONFIG_FILE
     from lerobot_wmrl.common.policies import read_policy_config
 
-    typed, stored = parser.get_path_arg("policy"), cfg.policy
+    (typed, overrides), stored = cfg.given["policy"], cfg.policy
     path = typed or (stored and stored.pretrained_path)
     if not path:
         raise ValueError("--policy.path: give the checkpoint of the policy to train")
-    overrides = settings_beside("policy")
     cfg.policy = read_policy_config(str(path), [*UNPUBLISHED, *overrides])
     if stored is not None:
         given = {each.removeprefix("--").partition("=")[0] for each in overrides}

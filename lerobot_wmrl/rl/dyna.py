@@ -127,8 +127,7 @@ class DynaRounds:
             initial = str(self._world_model(self.iterations[number - 1]))
         flags: Flags = {
             "model.path": initial, "model.device": self.env.device.type, **self.learnt.flags(),
-            "dataset.more": str(more),
-            "model.learning_rate": LEARNING_RATE,
+            "dataset.more": more, "model.learning_rate": LEARNING_RATE,
             "steps": self.config.steps, "batch_size": self.config.batch_size,
             "save_freq": max(1, self.config.steps // 4), "seed": self.seed + number,
             "output_dir": str(output_dir), **budget_flags(self.budget),

@@ -63,7 +63,7 @@ class ManiSkillRecorder:
         flags: Flags = {
             "policy.path": str(checkpoint / PRETRAINED_MODEL_DIR), "num_workers": self.num_workers,
             **env_flags(replace(self.env, batched=False)),  # each worker has a simulation of its own
-            "env.cameras": str(list(self.cameras)), "depth": self.depth,
+            "env.cameras": list(self.cameras), "depth": self.depth,
             "num_episodes": episodes, "seed": seed, "exploration": exploration, "output_dir": str(folder),
             **budget_flags(self.budget),
         }  # fmt: skip

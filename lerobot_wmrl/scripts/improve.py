@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import draccus
 
 from lerobot_wmrl.improve.configuration_improve import ImproveConfig
-from lerobot_wmrl.improve.improvement import Improvement
+from lerobot_wmrl.improve.plan import Plan
 
 if TYPE_CHECKING:
     from lerobot_wmrl.common.stages import Stage
@@ -33,25 +33,27 @@ def improve(cfg: ImproveConfig) -> None:
     from lerobot_wmrl.common.stages import MARKER, run_stages
     from lerobot_wmrl.data.dataset import fingerprint
     from lerobot_wmrl.improve import commands
+    from lerobot_wmrl.improve.progress import Progress
     from lerobot_wmrl.improve.report.page import Page
     from lerobot_wmrl.improve.report.words import verdict
 
     cfg.validate()
-    improvement = Improvement.of(cfg)
-    print(f"{cfg.dataset.name}:\n{improvement.found}\n  {improvement.duration}")
-    stages = commands.stages(improvement)
+    plan = Plan.of(cfg)
+    print(f"{cfg.dataset.name}:\n{plan.found}\n  {plan.duration}")
+    progress = Progress(plan)
+    stages = commands.stages(progress)
     assert cfg.policy is not None
     content = {
-        "dataset": fingerprint(improvement.found.root),
+        "dataset": fingerprint(plan.found.root),
         "policy": checkpoint_digest(str(cfg.policy.pretrained_path)),
     }
     with Claim(cfg.output_dir, settings(cfg, stages), content=content, marker=MARKER).held():
-        improvement.copy_policy()
+        plan.copy_policy()
         run_stages(stages, cfg.output_dir)
-        page = Page.of(improvement)
+        page = Page.of(progress)
         path = page.write(cfg.output_dir)
-    print(f"\n{verdict(improvement, page.places)}\n\nThe report: {path}")
-    if again := commands.another_round(improvement):
+    print(f"\n{verdict(progress, page.places)}\n\nThe report: {path}")
+    if again := commands.another_round(progress):
         print(f"Another round, with as many rollouts of this policy:\n{shlex.join(again)}")
 
 

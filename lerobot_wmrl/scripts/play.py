@@ -30,11 +30,11 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from lerobot.configs import PreTrainedConfig, parser
+from lerobot.configs import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_wmrl.common.checkpoints import Checkpoint
-from lerobot_wmrl.common.command_line import RunConfig, run_command, settings_beside
+from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least
 from lerobot_wmrl.common.files import require_new, writing
 from lerobot_wmrl.common.policies import check_weights, read_policy_config, require_trained
@@ -95,9 +95,9 @@ class PlayConfig(RunConfig):
 
     def validate(self) -> None:
         """Read the policy's configuration. FieldError for a setting that cannot be."""
-        path = parser.get_path_arg("policy")
+        path, settings = self.given["policy"]
         if path:
-            self.policy = read_policy_config(path, settings_beside("policy"))
+            self.policy = read_policy_config(path, settings)
             check_weights(self.policy)
         if self.policy is not None:
             require_trained(self.policy)

@@ -21,11 +21,10 @@ from typing import Any, ClassVar
 
 import draccus
 from accelerate import PartialState
-from lerobot.configs import parser
 from lerobot.configs.default import WandBConfig
 from lerobot.configs.rewards import RewardModelConfig
 
-from lerobot_wmrl.common.command_line import RunConfig, run_command, settings_beside
+from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.distributed import LONGEST_WAIT, is_first_process
 from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least, require_choice, within
 from lerobot_wmrl.common.files import write_json
@@ -154,8 +153,9 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
     from lerobot_wmrl.world_models.checkpoint import config_to_continue
     from lerobot_wmrl.world_models.training import build_model
 
-    if path := parser.get_path_arg("model"):
-        cfg.model = config_to_continue(path, settings_beside("model"))
+    path, settings = cfg.given["model"]
+    if path:
+        cfg.model = config_to_continue(path, settings)
     cfg.validate()
     if cfg.resume:
         require_resumable(cfg.output_dir)

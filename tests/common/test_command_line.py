@@ -1,10 +1,13 @@
 """Fields become the flags that were typed, and flags that do not exist lead to those that do."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import pytest
+from lerobot.configs import parser
 
 from lerobot_wmrl.common.command_line import (
+    GivenPath,
     RunConfig,
     near_flag,
     parse_flags,
@@ -112,6 +115,23 @@ def test_what_cannot_be_parsed_is_said_in_one_line(
         parse_flags(TrainConfig)
     assert message in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_what_is_said_of_a_checkpoint_is_noted_where_flags_are_parsed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A configuration that is made in Python knows nothing of the process's flags."""
+    monkeypatch.setattr(parser, "_config_path_args", {})
+    monkeypatch.setattr(parser, "_config_yaml_overrides", {})
+    file = tmp_path / "settings.yaml"
+    file.write_text("policy: {path: stored, n_obs_steps: 1, names: [a, b]}")
+    flags = [f"--config_path={file}", "--policy.path=outputs/a", "--policy.device=cpu", "--seed=3"]
+    monkeypatch.setattr("sys.argv", ["lerobot-wmrl-train", *flags])
+    config = parse_flags(TrainConfig)
+    assert TrainConfig().given == {"policy": GivenPath(None, [])}
+    monkeypatch.setattr("sys.argv", ["another"])
+    settings = ["--n_obs_steps=1", '--names=["a", "b"]', "--device=cpu"]
+    assert config.given == {"policy": GivenPath("outputs/a", settings)}
 
 
 def test_flags_may_be_written_with_a_space() -> None:

@@ -1,5 +1,6 @@
 """Presets: files that stand for flags, that every command can parse and that LeRobot reads by itself."""
 
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import draccus
@@ -99,6 +100,25 @@ def test_every_file_is_a_configuration_of_its_command(path: Path, as_flags: bool
 
 def read_settings_of(config: object) -> dict[str, object]:
     return dict(presets._flat(draccus.encode(config), ()))
+
+
+@dataclass
+class Lists:
+    texts: list[str] = field(default_factory=list)
+    numbers: list[int] | None = None
+
+
+@pytest.mark.parametrize("text", [
+    "outputs/push, a/policy", "it's", 'a "b"', "'a'", '"a"', "a [b]", "]", "{a: b}", "a: b", "a:", "b=c",
+    " a ", "", "#a", "a #b", "- a", "*a", "!include a", "=", "null", "true", "12", "1e-4", "2026-01-01",
+    "ä😀, b", "a\nb", "\\",
+])  # fmt: skip
+def test_lists_are_parsed_as_they_were_written(text: str) -> None:
+    texts = [text, "outputs/b", text]
+    flags = format_flags({"texts": texts, "numbers": [3, -1]})
+    assert draccus.parse(Lists, args=flags) == Lists(texts, [3, -1])
+    assert "outputs/b" in flags[0].split(",")
+    assert flags[1] == "--numbers=[3,-1]"
 
 
 def test_the_demos_defaults_are_those_of_its_preset() -> None:

@@ -16,6 +16,7 @@ from lerobot.configs import parser
 from lerobot_wmrl.common import stages as runner
 from lerobot_wmrl.common.constants import EVALUATION_SEED
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.lerobot_commands import edit_command, train_command
 from lerobot_wmrl.common.stages import (
     Stage,
     StageError,
@@ -103,6 +104,24 @@ def test_an_optional_stage_that_was_killed_has_not_failed(tmp_path: Path) -> Non
     with pytest.raises(StageError, match="exit status -9"):
         run_stages([replace(python("b", kill), optional=lambda status: True)], tmp_path)
     assert "failed" not in read_record(tmp_path, "b")
+
+
+@pytest.mark.parametrize(("left", "kept"), [
+    ([], False), (["000100"], False), (["000100", "000200"], True), (["000100", "last"], True),
+])  # fmt: skip
+def test_what_an_interrupted_command_left_is_removed_unless_it_goes_on_from_there(
+    left: list[str], kept: bool, tmp_path: Path
+) -> None:
+    """When the stage runs, not when its command is asked for. Only `last` is whole for certain, and what is
+    older than the newest checkpoint."""
+    folder = tmp_path / "trained"
+    for name in ("", *left):
+        (folder / "checkpoints" / name).mkdir(parents=True, exist_ok=True)
+    assert ("--resume=true" in train_command(folder, [])) == kept
+    assert edit_command(folder, "merge", {})
+    assert folder.exists()
+    seen = f"import pathlib; assert pathlib.Path({str(folder)!r}).exists() == {kept}"
+    run_stages([replace(python("a", seen), fresh=folder)], tmp_path)
 
 
 def test_time_of_interrupted_attempts_counts(tmp_path: Path) -> None:

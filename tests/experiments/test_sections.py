@@ -4,7 +4,7 @@ from typing import Any
 
 from experiments.policy_sections import demo
 from lerobot_wmrl.common.statistics import PairedChange, Proportion
-from lerobot_wmrl.improve.improvement import CLONED, DISTILLED, SFT
+from lerobot_wmrl.improve.progress import CLONED, DISTILLED, SFT
 
 
 def test_the_demo_s_section_says_what_ppo_added_to_the_rival() -> None:

@@ -10,23 +10,25 @@ from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.improve import commands
 from lerobot_wmrl.improve.configuration_improve import ImproveConfig
 from lerobot_wmrl.improve.findings import Findings
-from lerobot_wmrl.improve.improvement import Improvement
+from lerobot_wmrl.improve.plan import Plan
+from lerobot_wmrl.improve.progress import Progress
 
 
 def improvement_of(
     folder: Path, size: str = "demo", policy: PreTrainedConfig | None = None, **found: Any
-) -> Improvement:
-    """Return the stages for data of which this was found: 40 short episodes unless something else is said."""
+) -> Progress:
+    """Return one with data of which this was found: 40 short episodes unless something else is said."""
     policy = policy or CnnConfig(device="cpu", pretrained_path=folder)
     data = {
         "cameras": ["top"], "frame_side": 96, "pixels": 96**2, "held_out": 2, "tasks": 1, "fewest": 40,
         "longest": 40, "usual": 40, "success_frames": 1000, "failures": 0, "total": 40, "held": 2,
     }  # fmt: skip
     config = ImproveConfig(policy=policy, dataset=ChosenEpisodes("data"), size=size, output_dir=folder)
-    return Improvement(config, Findings([], [], **{**data, "root": Path("data"), "columns": {}, **found}))
+    found = {**data, "root": Path("data"), "columns": {}, **found}
+    return Progress(Plan(config, Findings([], [], **found)))
 
 
-def commands_of(improvement: Improvement, *names: str) -> dict[str, list[str]]:
+def commands_of(improvement: Progress, *names: str) -> dict[str, list[str]]:
     """Return the commands of an improvement's stages by name, by default of all."""
     return {
         stage.name: stage.command()

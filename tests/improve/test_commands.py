@@ -6,6 +6,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import draccus
 import numpy as np
 import pytest
 from lerobot.configs import PreTrainedConfig
@@ -23,11 +24,11 @@ from lerobot_wmrl.common.stages import MARKER
 from lerobot_wmrl.data.dataset import ChosenEpisodes, open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
-from lerobot_wmrl.improve import commands
-from lerobot_wmrl.improve import improvement as decisions
+from lerobot_wmrl.improve import commands, learnt
 from lerobot_wmrl.improve.findings import few_decisions, usual_length
-from lerobot_wmrl.improve.improvement import CLONED, DISTILLED, FITTED, PPO, SFT
+from lerobot_wmrl.improve.progress import CLONED, DISTILLED, FITTED, PPO, SFT
 from lerobot_wmrl.improve.report.words import reservations
+from lerobot_wmrl.scripts.compare import CompareConfig
 from lerobot_wmrl.scripts.improve import settings
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 from lerobot_wmrl.world_models.configuration_world_model import AnchoredConfig
@@ -61,10 +62,10 @@ def test_imagination_begins_all_over_the_rollouts_too(
 ) -> None:
     """Here they have 20 frames. A frame more than the dataset has is no reason to begin in the middle."""
     improvement = improvement_of(tmp_path, longest=longest, usual=longest, total=3)
-    assert improvement.branches() == 0
+    assert improvement.learnt.branches() == 0
     make_synthetic_dataset(tmp_path / "merged", episodes=6)
-    improvement.config.rollouts = 3
-    assert improvement.branches() == branches
+    improvement.plan.config.rollouts = 3
+    assert improvement.learnt.branches() == branches
 
 
 def test_no_start_is_imagined_twice_where_one_task_has_few(
@@ -74,23 +75,23 @@ def test_no_start_is_imagined_twice_where_one_task_has_few(
     root = make_synthetic_dataset(tmp_path / "merged", episodes=6).root
     tasks = read_episodes(open_dataset(root)).column("start.task")
     assert len(np.unique(tasks)) == 1
-    monkeypatch.setattr(decisions, "MAX_STARTS", 4)
+    monkeypatch.setattr(learnt, "MAX_STARTS", 4)
     improvement = improvement_of(tmp_path, total=6, fewest=6)
-    improvement.config.dataset = ChosenEpisodes(str(root))
+    improvement.plan.config.dataset = ChosenEpisodes(str(root))
     assert "--n_episodes=4" in commands.compare(improvement, tmp_path, commands.imagination(improvement), 256)
     table = read_episodes(open_dataset(root))
     two = replace(table, columns={**table.columns, "start.task": np.array([0, 0, 0, 0, 1, 1])})
-    monkeypatch.setattr(type(improvement), "learnt", lambda self: two)
+    monkeypatch.setattr(type(improvement.learnt), "chosen", lambda self: two)
     assert "--n_episodes=1" in commands.compare(improvement, tmp_path, commands.imagination(improvement), 256)
 
 
 def test_another_round_does_not_double_the_frames_of_a_rollout(tmp_path: Path) -> None:
     improvement = improvement_of(tmp_path, longest=80)
-    improvement.config.rollouts, improvement.config.real_env = 3, PushtEnv()
-    improvement.config.selection_episodes = 0
-    assert improvement.frame_limit == 160
-    improvement.config.max_frames = 80
-    assert improvement.frame_limit == 80
+    improvement.plan.config.rollouts, improvement.plan.config.real_env = 3, PushtEnv()
+    improvement.plan.config.selection_episodes = 0
+    assert improvement.plan.frame_limit == 160
+    improvement.plan.config.max_frames = 80
+    assert improvement.plan.frame_limit == 80
     assert "--max_frames=80" in (commands.another_round(improvement) or [])
 
 
@@ -178,13 +179,13 @@ def test_rollouts_are_checked_on_if_they_tell_more_than_the_dataset(
         success=np.append(np.ones(40, bool), success),
         validation=np.append(np.ones(40, bool), number % 20 == 19),
     )
-    monkeypatch.setattr(decisions, "read_episodes", lambda dataset: table)
+    monkeypatch.setattr(learnt, "read_episodes", lambda dataset: table)
     monkeypatch.setattr(ChosenEpisodes, "open", lambda self: self.root)
     improvement = improvement_of(tmp_path, held_out=held_out)
-    improvement.config.rollouts, improvement.config.real_env = rollouts, PushtEnv()
+    improvement.plan.config.rollouts, improvement.plan.config.real_env = rollouts, PushtEnv()
     merged = {"dataset.root": str(tmp_path / "merged"), "dataset.episodes": [*range(40, 40 + rollouts)]}
     wanted = {"data": {"dataset.root": "data"}, "rollouts": merged}[root]
-    assert improvement.checked() == (wanted, split)
+    assert improvement.learnt.checked() == (wanted, split)
 
 
 @pytest.mark.parametrize("better", [None, "before"])
@@ -198,7 +199,7 @@ def test_rollouts_are_merged_and_successes_cloned_before_rl(
     improvement = improvement_of(
         folder, total=4, failures=2, columns={"observation.image": "video", **numbers}
     )
-    config = improvement.config
+    config = improvement.plan.config
     config.rollouts, config.real_env, config.dataset.episodes = 2, PushtEnv(), [0, 3]
     before, cloned, ppo, distilled = improvement.policies.values()
     results = {
@@ -210,13 +211,13 @@ def test_rollouts_are_merged_and_successes_cloned_before_rl(
     made = {stage.name: stage.command() for stage in islice(stages, 3)}
     success = read_episodes(make_synthetic_dataset(folder / "merged", episodes=6)).success
     made |= {stage.name: stage.command() for stage in stages}
-    assert {"--root=data", f"--new_root={folder / 'columns'}", "--operation.feature_names=['effort']"} <= {
+    assert {"--root=data", f"--new_root={folder / 'columns'}", "--operation.feature_names=[effort]"} <= {
         *made["columns"]
     }
     assert {f"--like.root={folder / 'columns'}", "--max_frames=80", "--video=true", "--seed=50000"} <= {
         *made["rollouts"]
     }
-    assert f"--operation.roots=['{folder / 'columns'}', '{folder / 'rollouts'}']" in made["merged"]
+    assert f"--operation.roots=[{folder / 'columns'},{folder / 'rollouts'}]" in made["merged"]
     episodes = [episode for episode in (0, 3, 4, 5) if success[episode]]
     assert 0 < len(episodes) < 4
     assert {f"--policy.path={before}", f"--dataset.episodes={episodes}".replace(" ", "")} <= {*made["cloned"]}
@@ -248,8 +249,8 @@ def test_the_discount_leaves_a_late_success_its_worth(
     real: EnvConfig | None, rollouts: int, longest: int, discount: float, tmp_path: Path
 ) -> None:
     improvement = improvement_of(tmp_path, longest=longest)
-    improvement.config.real_env, improvement.config.rollouts = real, rollouts
-    assert improvement.discount == discount
+    improvement.plan.config.real_env, improvement.plan.config.rollouts = real, rollouts
+    assert improvement.plan.discount == discount
     if not rollouts:
         rl = commands_of(improvement, "rl")["rl"]
         assert f"--algorithm.gamma={discount}" in rl
@@ -265,14 +266,21 @@ def test_commands_name_the_checkpoint_that_is_there_now_as_lerobots_take_it(
     for given in ("cloned", "cloned/checkpoints/last", "cloned/checkpoints/last/pretrained_model"):
         policy = CnnConfig(device="cpu", pretrained_path=Path(given))
         improvement = improvement_of(tmp_path, policy=policy)
-        assert improvement.policy == "cloned/checkpoints/000002/pretrained_model"
+        assert improvement.plan.policy == "cloned/checkpoints/000002/pretrained_model"
     link_checkpoint(tmp_path / "cloned" / "checkpoints" / "000004", "last")
-    assert improvement.policy == "cloned/checkpoints/000004/pretrained_model"
+    assert improvement.plan.policy == "cloned/checkpoints/000004/pretrained_model"
+
+
+def test_policies_in_a_folder_with_a_comma_are_compared(tmp_path: Path) -> None:
+    improvement = improvement_of(tmp_path / "push, a")
+    improvement.plan.config.real_env = PushtEnv()
+    (command,) = commands_of(improvement, "comparison").values()
+    assert draccus.parse(CompareConfig, args=command[1:]).policies == [*improvement.policies.values()]
 
 
 def test_without_starts_to_select_on_the_last_checkpoint_and_policy_are_taken(tmp_path: Path) -> None:
     improvement = improvement_of(tmp_path)
-    improvement.config.real_env, improvement.config.selection_episodes = PushtEnv(), 0
+    improvement.plan.config.real_env, improvement.plan.config.selection_episodes = PushtEnv(), 0
     made = commands_of(improvement, "rl", "choice")
     assert [*made] == ["rl"]
     assert not [flag for flag in made["rl"] if "selection" in flag]
@@ -286,7 +294,7 @@ def test_rl_may_stop_by_its_own_rules_if_it_leaves_a_checkpoint(
 ) -> None:
     """After any other error it is tried again. No planner is fitted to this policy, which could go on."""
     improvement = improvement_of(tmp_path, policy=VQBeTConfig(device="cpu", pretrained_path=tmp_path))
-    improvement.config.real_env = real
+    improvement.plan.config.real_env = real
     (rl,) = (stage for stage in commands.stages(improvement) if stage.name == "rl")
     for other in {"last", "best"} - {link}:
         (tmp_path / "rl" / "checkpoints" / other / "pretrained_model").mkdir(parents=True)
@@ -299,7 +307,7 @@ def test_rl_may_stop_by_its_own_rules_if_it_leaves_a_checkpoint(
 def test_rl_that_gained_nothing_in_reality_is_not_compared_as_something_else(tmp_path: Path) -> None:
     """Its best checkpoint is the policy that it began with."""
     improvement = improvement_of(tmp_path, failures=10)
-    improvement.config.real_env = PushtEnv()
+    improvement.plan.config.real_env = PushtEnv()
     for step in ("000000", "000010"):
         (tmp_path / "rl" / "checkpoints" / step / "pretrained_model").mkdir(parents=True)
     link_checkpoint(tmp_path / "rl" / "checkpoints" / "000010", "best")
@@ -309,7 +317,7 @@ def test_rl_that_gained_nothing_in_reality_is_not_compared_as_something_else(tmp
     assert [*improvement.policies] == [SFT, CLONED, FITTED]
     assert any(said.startswith("RL gained nothing") for said in reservations(improvement))
     alone = improvement_of(tmp_path, policy=VQBeTConfig(device="cpu", pretrained_path=tmp_path))
-    alone.config.real_env = PushtEnv()
+    alone.plan.config.real_env = PushtEnv()
     assert [*alone.policies] == [SFT, FITTED], "there is no other to compare with"
 
 
@@ -336,7 +344,7 @@ def test_rl_that_left_nothing_leaves_a_policy_of_successes_to_the_planner(tmp_pa
     rl, distilled = (stage for stage in commands.stages(improvement) if stage.name in ("rl", "distilled"))
     assert rl.optional(STOPPED)
     write_json(tmp_path / "stages" / "rl.json", {"failed": "stopped: no episode was rewarded"})
-    assert f"--policy.path={improvement.policy}" in distilled.command()
+    assert f"--policy.path={improvement.plan.policy}" in distilled.command()
     assert [*improvement.policies] == [SFT, FITTED]
     assert not distilled.optional(1)
     (tmp_path / "rl" / "checkpoints" / "last" / "pretrained_model").mkdir(parents=True)
@@ -351,7 +359,7 @@ def test_rl_is_measured_four_times_at_most(
     kind: type[PreTrainedConfig], iterations: int | None, freq: int, tmp_path: Path
 ) -> None:
     improvement = improvement_of(tmp_path, policy=kind(device="cpu", pretrained_path=tmp_path))
-    config = improvement.config
+    config = improvement.plan.config
     config.real_env, config.iterations, config.selection_episodes = PushtEnv(), iterations, 1
     made = commands_of(improvement, "rl", "choice")
     assert {f"--selection.freq={freq}", "--selection.n_episodes=1"} <= {*made["rl"]}
@@ -371,7 +379,7 @@ def test_only_policies_for_which_it_was_measured_are_fitted_to_a_planner_after_p
 ) -> None:
     improvement = improvement_of(tmp_path, policy=kind(device="cpu", pretrained_path=tmp_path))
     assert [*improvement.policies] == names
-    improvement.rl_checkpoint.mkdir(parents=True)
+    improvement.plan.rl_checkpoint.mkdir(parents=True)
     optional = [stage.name for stage in commands.stages(improvement) if stage.optional(1)]
     assert optional == (["distilled"] if DISTILLED in names else [])
     assert improvement.chosen() == names[-1]
@@ -387,7 +395,7 @@ def test_cloning_suits_the_policy_and_its_frames(
     """Without the flag LeRobot writes adapters without the policy's configuration."""
     policy = CnnConfig(device="cpu", pretrained_path=tmp_path, use_peft=adapters)
     improvement = improvement_of(tmp_path, policy=policy, pixels=pixels, failures=2)
-    improvement.config.dataset.root = str(small_dataset.root)
+    improvement.plan.config.dataset.root = str(small_dataset.root)
     command = commands_of(improvement, "cloned")["cloned"]
     given = [flag for flag in command if flag.startswith(("--batch_size=", "--peft"))]
     assert given == flags
@@ -396,7 +404,7 @@ def test_cloning_suits_the_policy_and_its_frames(
 
 def test_a_run_that_selects_nothing_goes_on_where_there_was_no_selection(tmp_path: Path) -> None:
     improvement = improvement_of(tmp_path, failures=2)
-    given = settings(improvement.config, commands.stages(improvement))
+    given = settings(improvement.plan.config, commands.stages(improvement))
     older = {name: value for name, value in given.items() if name != "selection_episodes"}
     write_json(tmp_path / MARKER, older)
     with Claim(tmp_path, given, marker=MARKER).held():
@@ -406,7 +414,7 @@ def test_a_run_that_selects_nothing_goes_on_where_there_was_no_selection(tmp_pat
 def test_a_folder_that_was_begun_with_other_stages_is_refused(tmp_path: Path) -> None:
     """As by a version that did not clone."""
     improvement = improvement_of(tmp_path, failures=2)
-    given = settings(improvement.config, commands.stages(improvement))
+    given = settings(improvement.plan.config, commands.stages(improvement))
     write_json(tmp_path / MARKER, {**given, "stages": ["tokenizer", "world_model", "check", "rl"]})
     with pytest.raises(ValueError, match="stages"), Claim(tmp_path, given, marker=MARKER).held():
         pass
@@ -437,7 +445,7 @@ def test_a_policy_that_seldom_decides_is_named(make_synthetic_dataset: Any, tmp_
 def test_success_is_asked_for_no_longer_than_recorded_ones_hold(
     held: int, frames: int, tmp_path: Path
 ) -> None:
-    assert improvement_of(tmp_path, held=held).strict_criterion()["done_frames"] == frames
+    assert improvement_of(tmp_path, held=held).plan.strict_criterion()["done_frames"] == frames
 
 
 def test_one_long_recording_does_not_decide_how_long_episodes_usually_are() -> None:

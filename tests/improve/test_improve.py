@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +20,10 @@ from lerobot_wmrl.common.policies import read_policy_config
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data.dataset import ChosenEpisodes, open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
-from lerobot_wmrl.improve import improvement as decisions
+from lerobot_wmrl.improve import plan as decisions
 from lerobot_wmrl.improve.configuration_improve import ImproveConfig
-from lerobot_wmrl.improve.improvement import CLONED, FITTED, SFT, Improvement
+from lerobot_wmrl.improve.plan import Plan
+from lerobot_wmrl.improve.progress import CLONED, FITTED, SFT
 from lerobot_wmrl.scripts import train
 from lerobot_wmrl.scripts.improve import improve
 from tests.pusht import record_pusht
@@ -229,7 +231,7 @@ def test_nothing_is_rendered_in_the_process_that_stages_are_forked_from(
     monkeypatch.setattr(decisions, "check_real_env", note_process)
     monkeypatch.chdir(tmp_path)
     policy = save_untrained_policy(tmp_path / "policy", OBS_IMAGE, size=96, actions=2)
-    Improvement.of(
+    Plan.of(
         ImproveConfig(
             policy=read_policy_config(str(policy), []),
             dataset=ChosenEpisodes(str(demonstrations)),
@@ -238,3 +240,17 @@ def test_nothing_is_rendered_in_the_process_that_stages_are_forked_from(
         )
     )
     assert int(Path("process").read_text()) != os.getpid()
+
+
+def test_looking_at_the_data_leaves_the_settings_as_they_were(
+    demonstrations: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where the policy gets the dataset's cameras."""
+    monkeypatch.setattr(decisions, "with_own_cameras", lambda policy, *_: deepcopy(policy))
+    path = save_untrained_policy(tmp_path / "policy", OBS_IMAGE, size=96, actions=2, constant=250.0)
+    policy = read_policy_config(str(path), [])
+    config = ImproveConfig(policy=policy, dataset=ChosenEpisodes(str(demonstrations)), output_dir=tmp_path)
+    plan = Plan.of(config)
+    assert config.policy is policy
+    assert plan.config.policy is not policy
+    assert plan.copies

@@ -20,10 +20,11 @@ from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.tracking import append_metrics
 from lerobot_wmrl.evaluation.comparison import Comparison, Episode
 from lerobot_wmrl.improve import commands
-from lerobot_wmrl.improve.improvement import CLONED, DISTILLED, FITTED, PPO, SFT, Improvement
+from lerobot_wmrl.improve.learnt import LearntEpisodes
+from lerobot_wmrl.improve.progress import CLONED, DISTILLED, FITTED, PPO, SFT, Progress
 from lerobot_wmrl.improve.report import figures
+from lerobot_wmrl.improve.report.curves import curve, lerobot_train_curve, training_curves
 from lerobot_wmrl.improve.report.page import Page
-from lerobot_wmrl.improve.report.results import curve, lerobot_train_curve, training_curves
 from lerobot_wmrl.improve.report.words import compared, reservations, trust, verdict
 from tests.experiments.typed import check
 from tests.improve.made_up import improvement_of
@@ -33,10 +34,10 @@ SUCCESSES = {SFT: 16, CLONED: 24, PPO: 20, DISTILLED: 36}
 
 
 @pytest.fixture
-def finished(tmp_path: Path) -> Improvement:
+def finished(tmp_path: Path) -> Progress:
     """An output folder as 40 starts of each policy and nine replayed episodes would leave it."""
     improvement, out = improvement_of(tmp_path, failures=20), tmp_path
-    improvement.config.real_env = PushtEnv()
+    improvement.plan.config.real_env = PushtEnv()
     write_records(improvement)
     write_json(out / "comparison" / "comparison.json", comparison([*SUCCESSES.values()]))
     write_json(out / "start" / "comparison.json", comparison([7, 9], 10))
@@ -57,10 +58,10 @@ def finished(tmp_path: Path) -> Improvement:
     return improvement
 
 
-def write_records(improvement: Improvement) -> None:
+def write_records(improvement: Progress) -> None:
     """Write those of finished stages."""
     for stage in commands.stages(improvement):
-        write_json(improvement.out / "stages" / f"{stage.name}.json", {
+        write_json(improvement.plan.out / "stages" / f"{stage.name}.json", {
             "name": stage.name, "title": stage.title, "command": f"run-{stage.name}", "seconds": 3.0,
             "peak_memory_bytes": 2e9,
         })  # fmt: skip
@@ -73,9 +74,9 @@ def comparison(successes: Sequence[int], starts: int = 40) -> dict[str, Any]:
     return Comparison(names, starts, "all", 0.06, stop_early=False, episodes=episodes).as_json()
 
 
-def text_of(improvement: Improvement) -> str:
+def text_of(improvement: Progress) -> str:
     """Return the page."""
-    return Page.of(improvement).write(improvement.out).read_text()
+    return Page.of(improvement).write(improvement.plan.out).read_text()
 
 
 @pytest.fixture
@@ -84,7 +85,7 @@ def without_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(figures, "drawn", lambda figure: "data:image/png;base64,")
 
 
-def test_the_page_is_self_contained_and_says_the_numbers(finished: Improvement) -> None:
+def test_the_page_is_self_contained_and_says_the_numbers(finished: Progress) -> None:
     page = text_of(finished)
     assert not re.findall(r"""(?:src|href)=["'](?!data:)""", page), "the page needs other files"
     assert "<h3>Changes in pusht, on the same starts</h3>" in page
@@ -105,14 +106,14 @@ def test_the_page_is_self_contained_and_says_the_numbers(finished: Improvement) 
 
 
 @pytest.mark.usefixtures("without_drawing")
-def test_failures_among_the_rollouts_count(finished: Improvement, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failures_among_the_rollouts_count(finished: Progress, monkeypatch: pytest.MonkeyPatch) -> None:
     """Demonstrations alone lack them, and that was said before there were rollouts."""
-    finished.config.rollouts = 20
+    finished.plan.config.rollouts = 20
     write_records(finished)
     for failures, lacking in ((3, True), (20, False)):
         table = SimpleNamespace(success=np.arange(60) < 60 - failures, among=lambda episodes: None)
         monkeypatch.setattr(table, "subset", lambda among, table=table: table, raising=False)
-        monkeypatch.setattr(Improvement, "table", property(lambda improvement, table=table: table))
+        monkeypatch.setattr(LearntEpisodes, "table", property(lambda learnt, table=table: table))
         page = text_of(finished)
         assert f"20 rollouts of the {SFT} in pusht, exploration 0.2: {20 - failures} succeed" in page
         said = verdict(finished, [compared(finished)])
@@ -122,14 +123,14 @@ def test_failures_among_the_rollouts_count(finished: Improvement, monkeypatch: p
 
 
 @pytest.mark.usefixtures("without_drawing")
-def test_a_planner_that_could_not_be_distilled_is_left_out(finished: Improvement) -> None:
-    write_json(finished.out / "stages" / "distilled.json", {
+def test_a_planner_that_could_not_be_distilled_is_left_out(finished: Progress) -> None:
+    write_json(finished.plan.out / "stages" / "distilled.json", {
         "name": "distilled", "title": "Fit", "command": "run", "seconds": 1.0, "peak_memory_bytes": 1e9,
         "failed": True,
     })  # fmt: skip
-    write_json(finished.out / "comparison" / "comparison.json", comparison([16, 24, 20]))
-    write_json(finished.out / "choice" / "comparison.json", comparison([10, 12, 13], 20))
-    said = f"Fitting the policy to a planner failed ({finished.out}/logs/distilled.log)"
+    write_json(finished.plan.out / "comparison" / "comparison.json", comparison([16, 24, 20]))
+    write_json(finished.plan.out / "choice" / "comparison.json", comparison([10, 12, 13], 20))
+    said = f"Fitting the policy to a planner failed ({finished.plan.out}/logs/distilled.log)"
     page = text_of(finished)
     assert said in page
     assert "<td>Fit, failed</td>" in page
@@ -140,75 +141,75 @@ def test_a_planner_that_could_not_be_distilled_is_left_out(finished: Improvement
 
 
 @pytest.mark.usefixtures("without_drawing")
-def test_rl_that_stopped_early_is_named(finished: Improvement) -> None:
-    warned = (
-        f"RL stopped ({finished.out}/logs/rl.log). A checkpoint from before that is compared. error: too far"
-    )
+def test_rl_that_stopped_early_is_named(finished: Progress) -> None:
+    stopped = f"RL stopped ({finished.plan.out}/logs/rl.log)"
+    warned = f"{stopped}. A checkpoint from before that is compared. error: too far"
     assert warned not in text_of(finished)
-    record = json.loads((finished.out / "stages" / "rl.json").read_text())
-    write_json(finished.out / "stages" / "rl.json", {**record, "failed": "error: too far"})
-    finished.rl_checkpoint.mkdir(parents=True)
+    record = json.loads((finished.plan.out / "stages" / "rl.json").read_text())
+    write_json(finished.plan.out / "stages" / "rl.json", {**record, "failed": "error: too far"})
+    finished.plan.rl_checkpoint.mkdir(parents=True)
     assert warned in text_of(finished)
     assert warned in verdict(finished, [compared(finished)])
-    shutil.rmtree(finished.rl_checkpoint)
+    shutil.rmtree(finished.plan.rl_checkpoint)
     assert [*finished.policies] == [SFT, CLONED, FITTED]
-    left_none = f"RL stopped ({finished.out}/logs/rl.log). It left no policy. error: too far"
-    assert left_none in reservations(finished)
+    assert f"{stopped}. It left no policy. error: too far" in reservations(finished)
 
 
 @pytest.mark.usefixtures("without_drawing")
-def test_a_success_in_imagination_is_said_to_be_a_belief(finished: Improvement) -> None:
+def test_a_success_in_imagination_is_said_to_be_a_belief(finished: Progress) -> None:
     warned = "shows nothing about the real world"
     assert warned not in text_of(finished)
-    finished.config.real_env = None
+    finished.plan.config.real_env = None
     page = text_of(finished)
     assert warned in page
     assert "<h3>Changes in imagination, from frames of the dataset, on the same starts</h3>" in page
     assert f"The last policy: {DISTILLED}, {finished.policies[DISTILLED]}. RL can make a policy worse" in page
     assert 'class="chosen"' not in page
-    assert json.loads((finished.out / "summary.json").read_text())["chosen"] is None
+    assert json.loads((finished.plan.out / "summary.json").read_text())["chosen"] is None
     assert warned in verdict(finished, [compared(finished)])
 
 
 @pytest.mark.usefixtures("without_drawing")
-def test_the_command_that_drives_the_world_model_takes_its_flags(finished: Improvement) -> None:
-    finished.config.dataset.episodes = [0, 2]
+def test_the_command_that_drives_the_world_model_takes_its_flags(finished: Progress) -> None:
+    finished.plan.config.dataset.episodes = [0, 2]
     command = shlex.join(commands.drive(finished))
     check(command)
     assert "--dataset.root=data " in command
     assert "--done_threshold=0.95" in command
     assert "--real_env.type=pusht" in command
-    assert f"--policy.path={finished.out}/distilled/" in command
+    assert f"--policy.path={finished.plan.out}/distilled/" in command
     assert html.escape(command).replace("&#x27;", "&#39;") in text_of(finished)
 
 
 @pytest.mark.usefixtures("without_drawing")
 def test_another_round_begins_from_the_policy_to_use_on_all_episodes(
-    finished: Improvement, monkeypatch: pytest.MonkeyPatch
+    finished: Progress, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """From starts of its own."""
     assert commands.another_round(finished) is None
     assert "Another round" not in text_of(finished)
-    finished.config.rollouts, finished.config.seed = 20, 7
+    finished.plan.config.rollouts, finished.plan.config.seed = 20, 7
     command = shlex.join(commands.another_round(finished) or [])
     check(command)
-    merged = f"--dataset.root={finished.out}/merged --real_env.type=pusht --rollouts=20"
-    assert f"--policy.path={finished.out}/distilled/checkpoints/last/pretrained_model {merged}" in command
-    assert f"--seed=27 --output_dir={finished.out}_again" in command
-    assert f"--max_frames={2 * finished.found.longest} " in command, "as many as in this round"
+    merged = f"--dataset.root={finished.plan.out}/merged --real_env.type=pusht --rollouts=20"
+    assert (
+        f"--policy.path={finished.plan.out}/distilled/checkpoints/last/pretrained_model {merged}" in command
+    )
+    assert f"--seed=27 --output_dir={finished.plan.out}_again" in command
+    assert f"--max_frames={2 * finished.plan.found.longest} " in command, "as many as in this round"
     write_records(finished)
     table = SimpleNamespace(success=np.arange(60) < 40, among=lambda episodes: None)
     monkeypatch.setattr(table, "subset", lambda among: table, raising=False)
-    monkeypatch.setattr(Improvement, "table", property(lambda improvement: table))
+    monkeypatch.setattr(LearntEpisodes, "table", property(lambda learnt: table))
     page = text_of(finished)
     assert "<p>This records as many rollouts of the policy to use" in page
     assert html.escape(command).replace("&#x27;", "&#39;") in page
 
 
 @pytest.mark.usefixtures("without_drawing")
-def test_what_the_gate_found_is_shown_and_its_last_warning_in_red(finished: Improvement) -> None:
+def test_what_the_gate_found_is_shown_and_its_last_warning_in_red(finished: Progress) -> None:
     fresh = {"false_positive_rate": {"k": 1, "n": 10}, "recall": {"k": 3, "n": 4}}
-    gate, shown = finished.out / "rl" / "gate", '<p class="warning">'
+    gate, shown = finished.plan.out / "rl" / "gate", '<p class="warning">'
     assert shown not in text_of(finished)
     record = {"warning": "many false positives", "failed": True, "fresh": fresh}
     write_json(gate / "000000" / "record.json", record)
@@ -222,9 +223,9 @@ def test_what_the_gate_found_is_shown_and_its_last_warning_in_red(finished: Impr
 
 
 @pytest.mark.usefixtures("without_drawing")
-def test_the_summary_holds_every_headline_number(finished: Improvement) -> None:
+def test_the_summary_holds_every_headline_number(finished: Progress) -> None:
     text_of(finished)
-    summary = json.loads((finished.out / "summary.json").read_text())
+    summary = json.loads((finished.plan.out / "summary.json").read_text())
     place = summary["places"]["in pusht"]
     assert {title: rate["k"] for title, rate in place["policies"].items()} == SUCCESSES
     assert sum(episode["successes"][2] for episode in place["episodes"]) == SUCCESSES[PPO]
@@ -248,28 +249,28 @@ def test_the_summary_holds_every_headline_number(finished: Improvement) -> None:
     ([13, 12, 6, 13], SFT),
 ])  # fmt: skip
 def test_the_policy_to_use_is_the_best_one_on_other_starts(
-    successes: list[int], chosen: str, finished: Improvement
+    successes: list[int], chosen: str, finished: Progress
 ) -> None:
     """Of equally good ones the earliest, whatever the reported starts say."""
-    write_json(finished.out / "choice" / "comparison.json", comparison(successes, 20))
+    write_json(finished.plan.out / "choice" / "comparison.json", comparison(successes, 20))
     said, path = verdict(finished, [compared(finished)]), finished.policies[chosen]
     assert f"Policy to use: {chosen}, {path}. None succeeded more often in pusht, on starts set aside" in said
     assert said.count(": better") + said.count(": worse") + said.count(": not decided") == 3
     assert said.count(f"{chosen}, against ") + said.count(f", against {chosen}:") == 3
     assert f"--policy.path={path}" in commands.drive(finished)
     assert f'<tr class="chosen"><td>{chosen}</td>' in text_of(finished)
-    assert json.loads((finished.out / "summary.json").read_text())["chosen"] == chosen
+    assert json.loads((finished.plan.out / "summary.json").read_text())["chosen"] == chosen
 
 
 @pytest.mark.usefixtures("without_drawing")
-def test_an_rl_that_never_helped_is_said_to_be_where_it_began(finished: Improvement) -> None:
+def test_an_rl_that_never_helped_is_said_to_be_where_it_began(finished: Progress) -> None:
     for iteration in (10, 20):
         record = {"real": {"k": 5, "n": 10}, "imagined": {"k": 9, "n": 10}}
-        write_json(finished.out / "rl" / "selection" / f"{iteration:06d}" / "record.json", record)
+        write_json(finished.plan.out / "rl" / "selection" / f"{iteration:06d}" / "record.json", record)
     assert "RL&#39;s checkpoint is iteration 0, the policy that RL began with: none" in text_of(finished)
 
 
-def test_the_command_says_what_the_chosen_policy_gained_over_each_other_one(finished: Improvement) -> None:
+def test_the_command_says_what_the_chosen_policy_gained_over_each_other_one(finished: Progress) -> None:
     said = verdict(finished, [compared(finished)])
     path = finished.policies[CLONED]
     assert f"- {CLONED}: 60 % (24 of 40; 45–74 %), `{path}`" in said
@@ -278,12 +279,12 @@ def test_the_command_says_what_the_chosen_policy_gained_over_each_other_one(fini
     assert said.count("starts gained") == said.count(": better") == 3
 
 
-def test_a_policy_that_loses_is_said_to_be_worse(finished: Improvement) -> None:
-    write_json(finished.out / "comparison" / "comparison.json", comparison([36, 36, 36, 16]))
+def test_a_policy_that_loses_is_said_to_be_worse(finished: Progress) -> None:
+    write_json(finished.plan.out / "comparison" / "comparison.json", comparison([36, 36, 36, 16]))
     assert verdict(finished, [compared(finished)]).count(": worse") == 3
 
 
-def test_the_curves_are_those_of_the_algorithms(finished: Improvement) -> None:
+def test_the_curves_are_those_of_the_algorithms(finished: Progress) -> None:
     """PPO and distillation log different things; columns that are missing have no curve."""
     assert training_curves(finished) == {
         "Frame tokenizer": ([1.0], [1.0], "step"),
@@ -294,7 +295,7 @@ def test_the_curves_are_those_of_the_algorithms(finished: Improvement) -> None:
         "Fitting to the planner: loss": ([1.0], [2.0], "iteration"),
     }
     fitted = improvement_of(
-        finished.out, policy=VQBeTConfig(device="cpu", pretrained_path=finished.out), failures=20
+        finished.plan.out, policy=VQBeTConfig(device="cpu", pretrained_path=finished.plan.out), failures=20
     )
     assert [*training_curves(fitted)] == [
         "Frame tokenizer",

@@ -20,6 +20,7 @@ from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.elsewhere import Rollouts
 from lerobot_dataset_maniskill.merging import merge_folders
 from lerobot_dataset_maniskill.recorder import record
+from lerobot_wmrl.common.command_line import GivenPath
 from lerobot_wmrl.common.constants import EVALUATION_SEED, GATE_SEED, START_SEED
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.images import to_pixels
@@ -223,15 +224,15 @@ def test_where_resets_choose_the_start_none_comes_twice(
 
 
 def test_a_recording_goes_on_with_the_policy_that_it_was_begun_with_alone(
-    config: RecordConfig, monkeypatch: pytest.MonkeyPatch
+    config: RecordConfig,
 ) -> None:
     """Neither with other settings of it, nor with what a longer training has made of it."""
     record(config)
-    with monkeypatch.context() as typed:
-        typed.setattr("sys.argv", ["record", "--policy.path=policy", "--policy.optimizer_lr=1"])
-        with pytest.raises(ValueError, match=r"\(policy_settings \[\] → \['--optimizer_lr=1'\]\)"):
-            record(config)
     assert config.policy is not None
+    config.given["policy"] = GivenPath(str(config.policy.pretrained_path), ["--optimizer_lr=1"])
+    with pytest.raises(ValueError, match=r"\(policy_settings \[\] → \['--optimizer_lr=1'\]\)"):
+        record(config)
+    del config.given
     config.policy.pretrained_path = save_untrained_policy(
         config.root.with_name("longer"), OBS_IMAGE, size=96, actions=2, constant=250.0
     )

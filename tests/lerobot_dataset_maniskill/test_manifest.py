@@ -51,6 +51,15 @@ def test_every_task_meets_every_scene_and_a_short_recording_has_every_task(scene
     assert {plan.task for plan in plans[:2]} == set(tasks)
 
 
+def test_flags_of_the_process_are_not_those_of_a_configuration_made_in_python(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("sys.argv", ["lerobot-wmrl-train", "--policy.path=outputs/policy"])
+    made = config()
+    made.validate()
+    assert made.policy is None
+
+
 @pytest.mark.parametrize(
     ("fields", "message"),
     [

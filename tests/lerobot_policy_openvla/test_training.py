@@ -31,7 +31,8 @@ from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.improve.configuration_improve import ImproveConfig
 from lerobot_wmrl.improve.findings import look
-from lerobot_wmrl.improve.improvement import Improvement
+from lerobot_wmrl.improve.plan import Plan
+from lerobot_wmrl.improve.progress import Progress
 from lerobot_wmrl.rl.policy_gradient import frozen_copy
 from lerobot_wmrl.scripts.convert_openvla import ConvertOpenVLAConfig, convert
 from lerobot_wmrl.scripts.train import main
@@ -133,7 +134,7 @@ def test_adapters_are_trained_further_as_the_command_improve_does_it(
         size="tiny", output_dir=tmp_path,
     )  # fmt: skip
     found = look(read_episodes(small_dataset), config.policy, None)
-    command = commands_of(Improvement(config, found), "cloned")["cloned"]
+    command = commands_of(Progress(Plan(config, found)), "cloned")["cloned"]
     run_here(*command, "--policy.device=cpu", "--steps=2", "--save_freq=2")
     before, after = (load_file(folder / LAST / ADAPTERS) for folder in (tuned, tmp_path / "cloned"))
     assert after.keys() == before.keys()

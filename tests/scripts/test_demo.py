@@ -18,7 +18,7 @@ from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data.dataset import open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.demo.stages import Demo, DemoConfig
-from lerobot_wmrl.improve.improvement import CLONED, DISTILLED, PPO, SFT
+from lerobot_wmrl.improve.progress import CLONED, DISTILLED, PPO, SFT
 
 ROOT = Path(__file__).parents[2]
 KILLED_STAGE = "improve/rollouts"

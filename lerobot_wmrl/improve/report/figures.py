@@ -8,7 +8,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from lerobot_wmrl.common.statistics import Proportion
-from lerobot_wmrl.improve.report.results import Curve
+from lerobot_wmrl.improve.report.curves import Curve
 
 COLOURS = ("#2b6cb0", "#dd6b20", "#2f855a", "#805ad5")
 

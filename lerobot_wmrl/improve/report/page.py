@@ -11,17 +11,9 @@ import jinja2
 from lerobot_wmrl.common.files import write_json, write_text
 from lerobot_wmrl.common.stages import Stage, read_record
 from lerobot_wmrl.improve import commands
-from lerobot_wmrl.improve.improvement import Improvement
+from lerobot_wmrl.improve.progress import Progress
 from lerobot_wmrl.improve.report import figures
-from lerobot_wmrl.improve.report.results import (
-    Curve,
-    Place,
-    read_check,
-    read_choice,
-    read_gate,
-    read_selection,
-    training_curves,
-)
+from lerobot_wmrl.improve.report.curves import Curve, training_curves
 from lerobot_wmrl.improve.report.words import (
     choice_line,
     compared,
@@ -30,12 +22,14 @@ from lerobot_wmrl.improve.report.words import (
     gate_warnings,
     lacks,
     pair_lines,
+    read_choice,
     reservations,
     rl_line,
     rollouts_line,
     start_line,
     trust,
 )
+from lerobot_wmrl.improve.results import Place, read_check, read_gate, read_selection
 
 PAGE = "report.html"
 
@@ -73,7 +67,7 @@ class Page:
     """A page about an improvement.
 
     Args:
-        improvement: what was done.
+        progress: the improvement, as far as it has come.
         title: the page's heading.
         seed: that the command was given.
         records: records of the command's stages, in order.
@@ -82,7 +76,7 @@ class Page:
         curves: curves of trainings beside those of the improvement, by title.
     """
 
-    improvement: Improvement
+    progress: Progress
     title: str
     seed: int
     records: Sequence[dict[str, Any]]
@@ -91,12 +85,13 @@ class Page:
     curves: Mapping[str, Curve] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, improvement: Improvement) -> "Page":
+    def of(cls, progress: Progress) -> "Page":
         """Return the page of an improvement by itself."""
+        plan = progress.plan
         return cls(
-            improvement, f"{improvement.policy}, improved in imagination", improvement.config.seed,
-            stage_records(improvement.out, commands.stages(improvement)), [compared(improvement)],
-            {"recorded": improvement.out / "check"},
+            progress, f"{plan.policy}, improved in imagination", plan.config.seed,
+            stage_records(plan.out, commands.stages(progress)), [compared(progress)],
+            {"recorded": plan.out / "check"},
         )  # fmt: skip
 
     def write(self, folder: Path) -> Path:
@@ -108,17 +103,18 @@ class Page:
 
     def summary(self) -> dict[str, Any]:
         """Return every headline number as JSON."""
-        check, gate = read_check(self.improvement), read_gate(self.improvement)
-        choice = read_choice(self.improvement)
+        plan = self.progress.plan
+        check, gate = read_check(plan.out), read_gate(plan.out)
+        choice = read_choice(self.progress)
         return {
-            "size": self.improvement.config.preset,
+            "size": plan.config.preset,
             "seed": self.seed,
             "places": {place.name: place.comparison.as_json() for place in self.places},
             "check": {name: check[name] for name in CHECKED},
             "gate": gate and gate["fresh"],
-            "chosen": self.improvement.chosen() if choice else None,
+            "chosen": self.progress.chosen() if choice else None,
             "choice": choice and choice.comparison.as_json(),
-            "rl_checkpoints": read_selection(self.improvement),
+            "rl_checkpoints": read_selection(plan.out),
             "seconds": sum(record["seconds"] for record in self.records),
             "peak_memory_bytes": max(record["peak_memory_bytes"] for record in self.records),
         }
@@ -129,7 +125,7 @@ class Page:
         for record in self.records:
             found.append(record)
             if shlex.split(record["command"])[0] == "lerobot-wmrl-improve":
-                own = stage_records(self.improvement.out, commands.stages(self.improvement))
+                own = stage_records(self.progress.plan.out, commands.stages(self.progress))
                 found += [{**each, "title": f"– {each['title']}"} for each in own]
         return found
 
@@ -140,31 +136,31 @@ class Page:
             autoescape=True,
             undefined=jinja2.StrictUndefined,
         )
-        improvement = self.improvement
-        curves = {**self.curves, **training_curves(improvement)}
+        progress = self.progress
+        curves = {**self.curves, **training_curves(progress)}
         return environment.get_template("template.html").render(
             title=self.title,
             size=summary["size"],
             seed=self.seed,
             minutes=round(summary["seconds"] / 60, 1),
             peak_memory=f"{summary['peak_memory_bytes'] / 1e9:.1f}",
-            paths=improvement.policies,
+            paths=progress.policies,
             places=self.places,
             changes={place.name: pair_lines(place) for place in self.places},
             decided_at=decided_at(self.places),
-            reservations=reservations(improvement),
-            start=[*start_line(improvement), *rl_line(improvement)],
-            choice=choice_line(improvement),
+            reservations=reservations(progress),
+            start=[*start_line(progress), *rl_line(progress)],
+            choice=choice_line(progress),
             chosen=summary["chosen"],
             bars=figures.success_bars({place.name: place.rates for place in self.places}),
-            data=[*improvement.found.lines, *rollouts_line(improvement)],
-            missing=lacks(improvement),
-            trust=[trust(improvement), *gate_line(improvement)],
-            warnings=gate_warnings(improvement),
+            data=[*progress.plan.found.lines, *rollouts_line(progress)],
+            missing=lacks(progress),
+            trust=[trust(progress), *gate_line(progress)],
+            warnings=gate_warnings(progress),
             pictures=picture_sections(self.replays),
             curves=[figures.line(curve, title) for title, curve in curves.items()],
-            drive=shlex.join(commands.drive(improvement)),
-            another_round=shlex.join(commands.another_round(improvement) or []),
+            drive=shlex.join(commands.drive(progress)),
+            another_round=shlex.join(commands.another_round(progress) or []),
             stages=self._all_records(),
         )
 

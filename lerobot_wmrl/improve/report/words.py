@@ -11,11 +11,11 @@ from lerobot_wmrl.evaluation.comparison import Pair
 from lerobot_wmrl.evaluation.gate import DOUBTFUL_AUC
 from lerobot_wmrl.evaluation.report import seen_line
 from lerobot_wmrl.improve.findings import few_failures
-from lerobot_wmrl.improve.improvement import CLONED, DONE_THRESHOLD, SFT, Improvement
-from lerobot_wmrl.improve.report.results import (
+from lerobot_wmrl.improve.plan import DONE_THRESHOLD
+from lerobot_wmrl.improve.progress import CLONED, SFT, Progress
+from lerobot_wmrl.improve.results import (
     Place,
     read_check,
-    read_choice,
     read_gate,
     read_place,
     read_selection,
@@ -23,50 +23,58 @@ from lerobot_wmrl.improve.report.results import (
 from lerobot_wmrl.rl.selection import REAL, best_iteration, success
 
 
-def compared(improvement: Improvement) -> Place:
+def compared(progress: Progress) -> Place:
     """Read the comparison that ends an improvement."""
-    real = improvement.config.real_env
+    real = progress.plan.config.real_env
     where = "in imagination, from frames of the dataset" if real is None else f"in {real.type}"
-    return read_place(where, improvement.out / "comparison", [*improvement.policies])
+    return read_place(where, progress.plan.out / "comparison", [*progress.policies])
 
 
-def rollouts_line(improvement: Improvement) -> list[str]:
+def read_choice(progress: Progress) -> Place | None:
+    """Read the comparison that chooses the policy to use; None without selection."""
+    real = progress.plan.config.real_env
+    if real is None or not progress.plan.config.selects:
+        return None
+    return read_place(f"in {real.type}", progress.plan.out / "choice", [*progress.policies])
+
+
+def rollouts_line(progress: Progress) -> list[str]:
     """Say how many of the recorded rollouts succeed; nothing without rollouts."""
-    real = improvement.config.real_env
-    if real is None or not improvement.config.rollouts:
+    config = progress.plan.config
+    if config.real_env is None or not config.rollouts:
         return []
-    success = improvement.table.success[[*improvement.rollout_numbers()]]
-    noise = improvement.config.exploration
+    success = progress.learnt.table.success[[*progress.plan.rollout_numbers()]]
     return [
-        f"{len(success)} rollouts of the {SFT} in {real.type}, exploration {noise}: {success.sum()} succeed"
+        f"{len(success)} rollouts of the {SFT} in {config.real_env.type}, exploration {config.exploration}: "
+        f"{success.sum()} succeed"
     ]
 
 
-def lacks(improvement: Improvement) -> list[str]:
+def lacks(progress: Progress) -> list[str]:
     """Say what the data lacks, rollouts included."""
-    found = improvement.found.missing
-    if not improvement.config.rollouts:
+    found = progress.plan.found.missing
+    if not progress.plan.config.rollouts:
         return found
-    return [*found, *few_failures(improvement.learnt(), "Record more rollouts, with more exploration")]
+    return [*found, *few_failures(progress.learnt.chosen(), "Record more rollouts, with more exploration")]
 
 
-def verdict(improvement: Improvement, places: Sequence[Place]) -> str:
+def verdict(progress: Progress, places: Sequence[Place]) -> str:
     """Say in a few lines which policy to use, and how it compares with each other one, and where."""
-    paths, chosen = improvement.policies, improvement.chosen()
+    paths, chosen = progress.policies, progress.chosen()
     said = []
     for place in places:
         rates = [f"- {title}: {rate}, `{paths[title]}`" for title, rate in place.rates.items()]
         changes = [f"- {line}" for line in pair_lines(place, chosen)]
         said.append("\n".join([f"Success {place.name}, on the same starts:", *rates, *changes]))
     return "\n\n".join([
-        *said, decided_at(places), *lacks(improvement), *reservations(improvement), choice_line(improvement),
+        *said, decided_at(places), *lacks(progress), *reservations(progress), choice_line(progress),
     ])  # fmt: skip
 
 
-def choice_line(improvement: Improvement) -> str:
+def choice_line(progress: Progress) -> str:
     """Say which policy to use, and why."""
-    chosen, found = improvement.chosen(), read_choice(improvement)
-    path = improvement.policies[chosen]
+    chosen, found = progress.chosen(), read_choice(progress)
+    path = progress.policies[chosen]
     if found is None:
         return (
             f"The last policy: {chosen}, {path}. RL can make a policy worse: the comparison says "
@@ -74,22 +82,22 @@ def choice_line(improvement: Improvement) -> str:
         )
     shown = ", ".join(f"{title} {rate}" for title, rate in found.rates.items())
     return (
-        f"Policy to use: {chosen}, {path}. None succeeded more often {found.name}, {set_aside(improvement)}: "
+        f"Policy to use: {chosen}, {path}. None succeeded more often {found.name}, {set_aside(progress)}: "
         f"{shown}. Of equally good ones it is the earliest."
     )
 
 
-def set_aside(improvement: Improvement) -> str:
+def set_aside(progress: Progress) -> str:
     """Say on which starts a choice was made."""
-    real = improvement.config.real_env
+    real = progress.plan.config.real_env
     if real is not None and counts_resets(real):
         return f"on the first starts of {real.type}, on which the policies are compared too"
     return "on starts set aside for this"
 
 
-def rl_line(improvement: Improvement) -> list[str]:
+def rl_line(progress: Progress) -> list[str]:
     """Say which checkpoint of RL is compared, and how others did; nothing if none was chosen."""
-    records = read_selection(improvement)
+    records = read_selection(progress.plan.out)
     if not records:
         return []
     best = best_iteration(records, REAL)
@@ -97,7 +105,7 @@ def rl_line(improvement: Improvement) -> list[str]:
     which = f"that of iteration {best}" if best else "iteration 0, the policy that RL began with"
     return [
         f"RL's checkpoint is {which}: none succeeded more often in the real environment. Success by "
-        f"iteration, {set_aside(improvement)}: {shown}."
+        f"iteration, {set_aside(progress)}: {shown}."
     ]
 
 
@@ -128,25 +136,25 @@ def decided_at(places: Sequence[Place]) -> str:
     )
 
 
-def reservations(improvement: Improvement) -> list[str]:
+def reservations(progress: Progress) -> list[str]:
     """Say what a reader must know beside the success rates."""
-    found = []
-    if improvement.config.real_env is None:
+    plan, found = progress.plan, []
+    if plan.config.real_env is None:
         found.append(
             "This is what the world model predicts, and shows nothing about the real world. Run the policies "
             "there, label what they did, and run the command again on all episodes."
         )
-    if reason := read_record(improvement.out, "rl").get(FAILED):
-        kept = improvement.has_trained and not improvement.kept_start
+    if reason := read_record(plan.out, "rl").get(FAILED):
+        kept = progress.has_trained and not progress.kept_start
         left = "A checkpoint from before that is compared" if kept else "It left no policy"
-        found.append(f"RL stopped ({improvement.out / 'logs' / 'rl.log'}). {left}. {reason}")
-    if improvement.kept_start:
+        found.append(f"RL stopped ({plan.out / 'logs' / 'rl.log'}). {left}. {reason}")
+    if progress.kept_start:
         found.append(
             "RL gained nothing: no checkpoint succeeded more often in the real environment than the policy "
             "that it began with, whatever imagination says of them."
         )
-    if improvement.config.distils and not improvement.has_distilled:
-        log = improvement.out / "logs" / "distilled.log"
+    if plan.config.distils and not progress.has_distilled:
+        log = plan.out / "logs" / "distilled.log"
         found.append(
             f"Fitting the policy to a planner failed ({log}), and left no policy. To try again, choose "
             "another output_dir."
@@ -154,29 +162,29 @@ def reservations(improvement: Improvement) -> list[str]:
     return found
 
 
-def start_line(improvement: Improvement) -> list[str]:
+def start_line(progress: Progress) -> list[str]:
     """Say which policy RL began with, and why; nothing if there was no choice."""
-    if not improvement.clones:
+    if not progress.plan.clones:
         return []
-    rates = read_place("in imagination", improvement.out / "start", [CLONED, SFT]).rates
+    rates = read_place("in imagination", progress.plan.out / "start", [CLONED, SFT]).rates
     shown = ", ".join(f"{title} {rate}" for title, rate in rates.items())
     return [
-        f"RL began with: {improvement.start()}. Success in imagination, from frames of the dataset: {shown}. "
+        f"RL began with: {progress.start()}. Success in imagination, from frames of the dataset: {shown}. "
         f"The {SFT} is taken only if it is better by the same test."
     ]
 
 
-def trust(improvement: Improvement) -> str:
+def trust(progress: Progress) -> str:
     """Say how well the world model tells recorded successes from failures."""
-    found = read_check(improvement)
+    found = read_check(progress.plan.out)
     wins, losses = found["successes"], found["failures"]
-    whose = "rollouts" if Path(found["dataset"]) == improvement.out / "merged" else "episodes"
+    whose = "rollouts" if Path(found["dataset"]) == progress.plan.out / "merged" else "episodes"
     held_out = found["split"] == "validation"
     kind = f"held-out {whose}" if held_out else f"{whose} (most of which it has learnt from)"
     if not wins or not losses:
         return (
             f"Unknown: of the {kind} {wins} succeed and {losses} fail, and both are needed. Record more."
-            f"{taken_instead(improvement)}"
+            f"{taken_instead(progress)}"
         )
     false, recall = Proportion(found["false_positives"], losses), Proportion(found["true_positives"], wins)
     said = (
@@ -186,14 +194,14 @@ def trust(improvement: Improvement) -> str:
     if found["auc"] < DOUBTFUL_AUC:
         said += " That is not enough to trust its reward: record more episodes, failures above all."
     if (seen := found.get("seen_auc")) is not None:
-        larger = " `--size=cpu` has larger frames." if improvement.sizes.could_be_larger else ""
+        larger = " `--size=cpu` has larger frames." if progress.plan.sizes.could_be_larger else ""
         said += f" {seen_line(seen, larger)}"
-    return said + taken_instead(improvement)
+    return said + taken_instead(progress)
 
 
-def gate_line(improvement: Improvement) -> list[str]:
+def gate_line(progress: Progress) -> list[str]:
     """Say how well it judged fresh rollouts in the real environment before RL; nothing without any."""
-    record = read_gate(improvement)
+    record = read_gate(progress.plan.out)
     if record is None:
         return []
     false, recall = gate_rates(record["fresh"])
@@ -203,9 +211,9 @@ def gate_line(improvement: Improvement) -> list[str]:
     ]
 
 
-def gate_warnings(improvement: Improvement) -> list[str]:
+def gate_warnings(progress: Progress) -> list[str]:
     """Say what the gate warned of."""
-    record = read_gate(improvement)
+    record = read_gate(progress.plan.out)
     if record is None or not record["warning"]:
         return []
     if not record["failed"]:
@@ -221,9 +229,9 @@ def gate_rates(gate: Mapping[str, Any]) -> list[Proportion]:
     return [Proportion.from_json(gate[name]) for name in ("false_positive_rate", "recall")]
 
 
-def taken_instead(improvement: Improvement) -> str:
+def taken_instead(progress: Progress) -> str:
     """Say where imagination saw success, if not at the strict threshold."""
-    point = improvement.relaxed_criterion()
+    point = progress.relaxed_criterion()
     if point is None:
         return ""
     false, recall = gate_rates(point)
