@@ -313,11 +313,11 @@ class RecordConfig(RunConfig):
                 "policy": path, "policy_settings": self.given["policy"].settings,
                 "policy_content": checkpoint_digest(path),
             }  # fmt: skip
-        own = {each.name for each in fields(self.policy)} - {each.name for each in fields(PreTrainedConfig)}
+        names = {each.name for each in fields(self.policy)} - {each.name for each in fields(PreTrainedConfig)}
         settings = draccus.encode(self.policy)
         parts = {name: checkpoint_digest(settings[name]) for name in PARTS if settings.get(name)}
         return {
-            "policy": self.policy.type, **{f"policy.{name}": settings[name] for name in sorted(own)},
+            "policy": self.policy.type, **{f"policy.{name}": settings[name] for name in sorted(names)},
             "policy_content": parts,
         }  # fmt: skip
 

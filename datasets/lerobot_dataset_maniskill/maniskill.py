@@ -77,16 +77,16 @@ def progress_bar(episodes: int, missing: Sequence[Part]) -> Iterator[Report]:
     At the end it says how many components of a policy's actions were out of range.
     """
     done = episodes - sum(len(part.episodes) for part in missing)
-    seen: Counter[str] = Counter()
+    tried: Counter[str] = Counter()
     won: Counter[str] = Counter()
     clipped: list[float] = []
     with tqdm(total=episodes, initial=done, unit="episode", desc="record") as bar:
 
         def report(result: EpisodeResult) -> None:
-            seen[result.kind] += 1
+            tried[result.kind] += 1
             won[result.kind] += result.success
             clipped.extend(result.clipped)
-            bar.set_postfix({kind: f"{won[kind] / seen[kind]:.0%}" for kind in KINDS if seen[kind]}, False)
+            bar.set_postfix({kind: f"{won[kind] / tried[kind]:.0%}" for kind in KINDS if tried[kind]}, False)
             bar.update()
 
         yield report

@@ -133,11 +133,11 @@ def link_checkpoint(checkpoint: Path, name: str) -> None:
 
 def weights_digest(state: Mapping[str, Tensor]) -> str:
     """Return a short digest of a model's weights, by name, equal only for equal weights."""
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for name, tensor in sorted(state.items()):
-        found.update(name.encode())
-        found.update(tensor.detach().cpu().contiguous().numpy().tobytes())
-    return found.hexdigest()[:16]
+        digest.update(name.encode())
+        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()[:16]
 
 
 def checkpoint_digest(path: str | Path, parts: bool = True) -> str:
@@ -150,12 +150,12 @@ def checkpoint_digest(path: str | Path, parts: bool = True) -> str:
         parts: whether models on this machine that it is made of count too: what an adapter was trained on,
             the world model of a planner.
     """
-    folder, found = local_checkpoint(path, MODEL_FILES), hashlib.sha256()
+    folder, digest = local_checkpoint(path, MODEL_FILES), hashlib.sha256()
     for file in sorted(each for pattern in MODEL_FILES for each in folder.glob(pattern)):
-        found.update(f"{file.name} {file_digest(file)}".encode())
+        digest.update(f"{file.name} {file_digest(file)}".encode())
     for part in parts_of(folder) if parts else ():
-        found.update(checkpoint_digest(part).encode())
-    return found.hexdigest()[:12]
+        digest.update(checkpoint_digest(part).encode())
+    return digest.hexdigest()[:12]
 
 
 def file_digest(path: Path) -> str:

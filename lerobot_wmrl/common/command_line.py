@@ -83,13 +83,13 @@ def given_path(path_field: str) -> GivenPath:
     first. LeRobot's own reading of the file leaves out lists and nulls."""
     file, inside = parser.parse_arg("config_path"), f"{path_field}."
     read = read_settings(Path(file), [inside + name for name in MAPPINGS]) if is_file(file) else {}
-    own = {name.removeprefix(inside): value for name, value in read.items() if name.startswith(inside)}
+    settings = {name.removeprefix(inside): value for name, value in read.items() if name.startswith(inside)}
     beside = {  # draccus reads a list of texts or null only as JSON
         name: json.dumps(value) if isinstance(value, list) else value
-        for name, value in own.items()
+        for name, value in settings.items()
         if name not in ("path", "type")
     }
-    stored = format_flags(beside) if "path" in own else []
+    stored = format_flags(beside) if "path" in settings else []
     typed = parser.get_cli_overrides(path_field) or []
     return GivenPath(parser.get_path_arg(path_field), [*stored, *typed])
 
@@ -162,15 +162,15 @@ def parse_flags[Config: RunConfig](config_class: type[Config]) -> Config:
     def parsed(cfg: config_class) -> Config:  # type: ignore[valid-type]
         return cfg
 
-    said = StringIO()
+    stderr = StringIO()
     try:
-        with redirect_stderr(said), parsed_quickly():
+        with redirect_stderr(stderr), parsed_quickly():
             config = parsed()
     except SystemExit as stopped:
         reason = stopped.__context__ and cause(stopped.__context__)
         if isinstance(reason, FieldError):
             raise reason from None
-        raise ValueError(parsing_error(said.getvalue().strip(), config_class)) from None
+        raise ValueError(parsing_error(stderr.getvalue().strip(), config_class)) from None
     config.given.update({name: given_path(name) for name in config.path_fields})
     return config
 
@@ -188,9 +188,9 @@ def parsed_quickly() -> Iterator[None]:
         docstring.get_attribute_docstring, field_wrapper.inspect = look_up, inspected
 
 
-def parsing_error(said: str, config_class: type[RunConfig]) -> str:
-    """Return in one line why the command line was refused, of which argparse or draccus `said` something."""
-    group, reason = "", said.rpartition("error: ")[2]
+def parsing_error(message: str, config_class: type[RunConfig]) -> str:
+    """Return in one line why the command line was refused, from the `message` of argparse or draccus."""
+    group, reason = "", message.rpartition("error: ")[2]
     if undecoded := re.match(r"`(\w+)`: Could not decode the value into any.*?\n\s*\w+: (.*)", reason, re.S):
         group, reason = undecoded[1], refusal(undecoded[1], config_class) or undecoded[2]
     if inner := re.match(r"`([\w.]+)`: (.*)", reason, re.S):
@@ -205,8 +205,8 @@ def parsing_error(said: str, config_class: type[RunConfig]) -> str:
         unknown = [".".join(filter(None, (group, name))) for name in re.findall(r"`(\w+)`", invalid[1])]
     near = [near_flag(name, settings, config_class) for name in unknown]
     hints = [f"did you mean --{name}?" if name else "see --help" for name in near]
-    found = [f"there is no flag --{name}: {hint}" for name, hint in zip(unknown, hints, strict=True)]
-    return "; ".join(found) or " ".join(f"{f'--{group}: ' if group else ''}{reason}".split())
+    problems = [f"there is no flag --{name}: {hint}" for name, hint in zip(unknown, hints, strict=True)]
+    return "; ".join(problems) or " ".join(f"{f'--{group}: ' if group else ''}{reason}".split())
 
 
 def untyped(settings: Sequence[Setting]) -> Iterator[tuple[str, str]]:
@@ -246,13 +246,13 @@ def near_flag(name: str, settings: Sequence[Setting], config_class: type[RunConf
     nearly so, then the same last word in another group.
     """
     group, _, last = name.rpartition(".")
-    others = [config_class.other_names[name]] if name in config_class.other_names else []
+    lerobot_names = [config_class.other_names[name]] if name in config_class.other_names else []
     known = sorted((each.name for each in settings), key=lambda each: each.count("."))
     longer = [each for each in known if group and each.endswith(f".{name}")]
     beside = {each.rpartition(".")[2]: each for each in known if each.rpartition(".")[0] == group}
     spelt = [beside[each] for each in get_close_matches(last, beside, 1)]
     elsewhere = [each for each in known if group and each.rpartition(".")[2] == last]
-    return next(iter([*others, *longer, *spelt, *elsewhere]), None)
+    return next(iter([*lerobot_names, *longer, *spelt, *elsewhere]), None)
 
 
 def cause(error: BaseException) -> BaseException:
@@ -301,23 +301,23 @@ def said_in_flags(error: BaseException, config_class: type, argv: Sequence[str])
 
     def as_flag(match: re.Match[str]) -> str:
         nearest = (".".join([*groups[:count], match[1]]) for count in range(len(groups), -1, -1))
-        found = next((name for name in nearest if name in known or name in typed), None)
-        found = found or flag_of(match[1], None, typed) or flag_of(match[1], None, known)
-        return f"--{found}{match[2]}" if found else match[0]
+        option = next((name for name in nearest if name in known or name in typed), None)
+        option = option or flag_of(match[1], None, typed) or flag_of(match[1], None, known)
+        return f"--{option}{match[2]}" if option else match[0]
 
     if isinstance(error, Stopped):
         return re.sub(FIELD, as_flag, str(error))
     problem, remedy = (re.sub(FIELD, as_flag, text) for text in (error.problem, error.remedy))
-    given = "" if value in (None, "") else f"={format_value(value)}"
-    said = f"{f'--{flag}' if flag else field}{given}: {problem}"
-    return f"{said}; {remedy}" if remedy else said
+    shown = "" if value in (None, "") else f"={format_value(value)}"
+    message = f"{f'--{flag}' if flag else field}{shown}: {problem}"
+    return f"{message}; {remedy}" if remedy else message
 
 
 def flag_of(field: str, value: object, flags: Mapping[str, Any]) -> str | None:
     """Return the flag that ends with a field's name, one with that value first, then the shortest."""
-    found = [name for name in flags if name == field or name.endswith(f".{field}")]
+    matches = [name for name in flags if name == field or name.endswith(f".{field}")]
     return min(
-        found,
+        matches,
         key=lambda name: (format_value(flags[name]) != format_value(value), name.count(".")),
         default=None,
     )

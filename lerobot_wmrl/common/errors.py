@@ -26,8 +26,8 @@ class FieldError(ValueError):
         self.field, self.value, self.problem, self.remedy = field, value, problem, remedy
 
     def __str__(self) -> str:
-        said = f"{self.field}={self.value}: {self.problem}"
-        return f"{said}; {self.remedy}" if self.remedy else said
+        message = f"{self.field}={self.value}: {self.problem}"
+        return f"{message}; {self.remedy}" if self.remedy else message
 
 
 STOPPED: Final = 3

@@ -41,9 +41,9 @@ def require_new(field: str, target: Path) -> None:
         raise FieldError(field, target, "there is something already", "choose a new folder")
 
 
-def foreign_files(folder: Path, *own: str) -> bool:
-    """Return whether a folder holds more than the files called `own` and what a torn `write_text` left."""
-    known = {*own, *(f".{name}.partial" for name in own)}
+def foreign_files(folder: Path, *allowed: str) -> bool:
+    """Return whether a folder holds more than the `allowed` files and what a torn `write_text` left."""
+    known = {*allowed, *(f".{name}.partial" for name in allowed)}
     return folder.is_dir() and any(path.name not in known for path in folder.iterdir())
 
 

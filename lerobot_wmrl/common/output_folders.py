@@ -81,9 +81,9 @@ class Claim:
         return self.output_dir / CONTENT_FILE
 
 
-def require_empty(output_dir: Path, *own: str) -> None:
-    """Raise FieldError for a folder that holds anything but the files called `own`."""
-    if foreign_files(output_dir, *own):
+def require_empty(output_dir: Path, *allowed: str) -> None:
+    """Raise FieldError for a folder that holds any files but those `allowed`."""
+    if foreign_files(output_dir, *allowed):
         raise FieldError("output_dir", output_dir, "holds something else", "choose a new folder")
 
 

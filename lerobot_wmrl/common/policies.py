@@ -285,9 +285,9 @@ def learnt_range(postprocessor: Any) -> tuple[Tensor, Tensor] | None:
 def _action_statistics(postprocessor: Any, *names: str) -> Iterator[list[Any]]:
     """Yield these statistics of actions from every step of a postprocessor that has them all."""
     for step in postprocessor.steps:
-        found = (getattr(step, "stats", None) or {}).get(ACTION, {})
-        if all(found.get(name) is not None for name in names):
-            yield [found[name] for name in names]
+        stats = (getattr(step, "stats", None) or {}).get(ACTION, {})
+        if all(stats.get(name) is not None for name in names):
+            yield [stats[name] for name in names]
 
 
 def with_new_adapters(policy: Any, settings: AdapterSettings) -> Any:
@@ -364,9 +364,9 @@ def load_trained_weights(policy: Any, weights: dict[str, Any]) -> None:
     from peft import set_peft_model_state_dict
 
     if not has_adapters(policy):
-        own = policy.state_dict()
-        held = {own[name].data_ptr() for name in weights if name in own}
-        tied = {name: own[name] for name in own.keys() - weights.keys() if own[name].data_ptr() in held}
+        state = policy.state_dict()
+        held = {state[name].data_ptr() for name in weights if name in state}
+        tied = {name: state[name] for name in state.keys() - weights.keys() if state[name].data_ptr() in held}
         policy.load_state_dict({**tied, **weights})
         return
     unexpected = set_peft_model_state_dict(policy, weights).unexpected_keys

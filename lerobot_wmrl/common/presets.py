@@ -89,10 +89,10 @@ def preset_file(preset: str, command: str, types: Sequence[str] = ()) -> Path:
 
 def presets_of(command: str) -> dict[str, list[str]]:
     """Return the presets of a command, each with the types that have a file of their own."""
-    found = {size: sorted((FOLDER / size).glob(f"{command}.*yaml")) for size in PRESETS}
+    files = {size: sorted((FOLDER / size).glob(f"{command}.*yaml")) for size in PRESETS}
     return {
         size: [kind for _, *kinds, _ in (path.name.split(".") for path in paths) for kind in kinds]
-        for size, paths in found.items()
+        for size, paths in files.items()
         if paths
     }
 

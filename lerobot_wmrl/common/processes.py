@@ -58,10 +58,10 @@ def environment() -> dict[str, str]:
 def find_program(name: str) -> str:
     """Find the console command beside this interpreter, or on the path. ValueError if there is none."""
     beside = Path(sys.executable).with_name(name)
-    found = str(beside) if beside.is_file() else shutil.which(name)
-    if found is None:
+    program = str(beside) if beside.is_file() else shutil.which(name)
+    if program is None:
         raise not_installed(name)
-    return found
+    return program
 
 
 def not_installed(name: str) -> ValueError:

@@ -63,28 +63,28 @@ def settings_of(
             continue
         name, hint = f"{prefix}{field.name}", without_none(hints.get(field.name, field.type))
         # LeRobot's configurations put the device that this machine has in place of a default of None
-        own = isinstance(config, type) or field.name == "device"
-        value = default_of(field) if own else getattr(config, field.name)
-        said = explanations.get(field.name, "")
+        from_class = isinstance(config, type) or field.name == "device"
+        value = default_of(field) if from_class else getattr(config, field.name)
+        explanation = explanations.get(field.name, "")
         known = known_types(hint)
         if known is not None:
             chosen = types.get(name) or registered_name(known, type(value))
-            yield Setting(f"{name}.type", "|".join(known), chosen, said, depth)
+            yield Setting(f"{name}.type", "|".join(known), chosen, explanation, depth)
             if chosen in known:
                 same = type(value) is known[chosen]
                 yield from settings_of(value if same else known[chosen], types, f"{name}.", depth + 1)
         elif is_dataclass(hint):
             inner = hint if value is MISSING or value is None else value
-            yield from introduced(settings_of(inner, types, f"{name}.", depth + 1), said)
+            yield from introduced(settings_of(inner, types, f"{name}.", depth + 1), explanation)
         else:
-            yield Setting(name, kind_of(hint), value, said, depth)
+            yield Setting(name, kind_of(hint), value, explanation, depth)
 
 
-def introduced(settings: Iterator[Setting], said: str) -> Iterator[Setting]:
-    """Yield a group's settings. What is `said` of the group goes before the first one's explanation."""
+def introduced(settings: Iterator[Setting], introduction: str) -> Iterator[Setting]:
+    """Yield a group's settings, with the group's `introduction` before the first one's explanation."""
     for number, setting in enumerate(settings):
-        own = setting.explanation
-        both = " ".join(filter(None, (said, own[:1].upper() + own[1:])))
+        explanation = setting.explanation
+        both = " ".join(filter(None, (introduction, explanation[:1].upper() + explanation[1:])))
         yield setting if number else replace(setting, explanation=both)
 
 
@@ -106,8 +106,8 @@ def without_none(hint: Any) -> Any:
     """Return `X` for `X | None`, anything else as it is."""
     if get_origin(hint) not in (Union, UnionType):
         return hint
-    others = [each for each in get_args(hint) if each is not NoneType]
-    return others[0] if len(others) == 1 else hint
+    members = [each for each in get_args(hint) if each is not NoneType]
+    return members[0] if len(members) == 1 else hint
 
 
 def default_of(field: "Field[Any]") -> Any:
@@ -132,17 +132,17 @@ def kind_of(hint: Any) -> str:
 @cache
 def explanations_of(cls: type) -> dict[str, str]:
     """Return what the source of a class and its bases says of each field: name → one paragraph."""
-    found: dict[str, str] = {}
+    texts: dict[str, str] = {}
     for each in reversed(cls.__mro__):
         if is_dataclass(each):
-            found |= explained_in_source(each) | explained_in_docstring(each.__dict__.get("__doc__") or "")
-    return found
+            texts |= explained_in_source(each) | explained_in_docstring(each.__dict__.get("__doc__") or "")
+    return texts
 
 
 def explained_in_docstring(text: str) -> dict[str, str]:
     """Read the section `Args:` of a Google-style docstring."""
     _, _, section = inspect.cleandoc(text).partition("Args:\n")
-    found: dict[str, list[str]] = {}
+    explanations: dict[str, list[str]] = {}
     names: list[str] = []
     for line in textwrap.dedent(section).splitlines():
         if line and not line.startswith(" "):
@@ -150,11 +150,11 @@ def explained_in_docstring(text: str) -> dict[str, str]:
             if not argument:
                 break  # the next section
             names = re.split(r", *", argument[1])
-            found |= {name: [argument[2]] for name in names}
+            explanations |= {name: [argument[2]] for name in names}
         elif line.strip():
             for name in names:
-                found[name].append(line.strip())
-    return {name: " ".join(lines) for name, lines in found.items()}
+                explanations[name].append(line.strip())
+    return {name: " ".join(lines) for name, lines in explanations.items()}
 
 
 def explained_in_source(cls: type) -> dict[str, str]:
@@ -165,12 +165,12 @@ def explained_in_source(cls: type) -> dict[str, str]:
     except (OSError, TypeError, SyntaxError, ValueError):
         return {}
     assert isinstance(definition, ast.ClassDef)
-    found = {}
+    explanations = {}
     for node, following in zip(definition.body, [*definition.body[1:], None], strict=True):
         if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
-            said = string_of(following) or comment_in(lines[(node.end_lineno or node.lineno) - 1])
-            found[node.target.id] = said or comments_above(lines, node.lineno - 1)
-    return {name: said for name, said in found.items() if said}
+            explanation = string_of(following) or comment_in(lines[(node.end_lineno or node.lineno) - 1])
+            explanations[node.target.id] = explanation or comments_above(lines, node.lineno - 1)
+    return {name: explanation for name, explanation in explanations.items() if explanation}
 
 
 def string_of(node: ast.AST | None) -> str:
@@ -198,9 +198,9 @@ def help_page(config_class: type, introduction: str, command: str, types: Mappin
     settings = list(settings_of(config_class, types))
     paths = getattr(config_class, "path_fields", ())
     lines = [introduction.strip(), "", *preset_lines(command), "Flags, each as --name=value:", ""]
-    own = inspect.get_annotations(config_class)
+    direct = inspect.get_annotations(config_class)
     # the command's own flags first, then those that it inherits, then nested ones
-    for setting in sorted(settings, key=lambda each: (each.depth > 0, each.name.split(".")[0] not in own)):
+    for setting in sorted(settings, key=lambda each: (each.depth > 0, each.name.split(".")[0] not in direct)):
         lines += flag_lines(setting)
         group, _, last = setting.name.rpartition(".")
         if last == "type" and group in paths:
@@ -239,10 +239,10 @@ def flag_lines(setting: Setting) -> list[str]:
     known = "Registered types:" if of_type else "One of"
     choices = f"{known} {', '.join(setting.kind.split('|'))}." if listed else ""
     head = f"  --{setting.name}  {'' if choices else f'{setting.kind}  '}({default})"
-    said = f"{setting.explanation} {choices}".strip()
+    explanation = f"{setting.explanation} {choices}".strip()
     return [
         line
-        for text, indent in ((head, ""), (said, "      "))
+        for text, indent in ((head, ""), (explanation, "      "))
         for line in textwrap.wrap(
             text, WIDTH, initial_indent=indent, subsequent_indent="      ", break_on_hyphens=False
         )

@@ -186,10 +186,10 @@ def preload(modules: Sequence[str], offline: bool) -> None:
 
 def entry_point(program: str) -> Callable[[], int | None]:
     """Return the function that the console command calls. Raises ValueError if no package installs it."""
-    found = importlib.metadata.entry_points(group="console_scripts", name=program)
-    if not found:
+    entry_points = importlib.metadata.entry_points(group="console_scripts", name=program)
+    if not entry_points:
         raise not_installed(program)
-    return next(iter(found)).load()
+    return next(iter(entry_points)).load()
 
 
 def may_fork() -> bool:

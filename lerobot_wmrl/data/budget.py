@@ -101,9 +101,9 @@ class Ledger:
         with ledger._locked():
             if not path.exists():
                 ledger._write(Entries(limits))
-            elif (found := ledger.read().limits) != limits:
+            elif (stored := ledger.read().limits) != limits:
                 raise FieldError(
-                    "budget", path, f"has other limits ({asdict(found)}) than {asdict(limits)}",
+                    "budget", path, f"has other limits ({asdict(stored)}) than {asdict(limits)}",
                     "repeat its limits, or choose another file",
                 )  # fmt: skip
         return ledger
@@ -136,9 +136,9 @@ class Ledger:
         """
         kinds = [KINDS[kind] if kind >= 0 else "" for kind in table.column(START_KIND)]
         source = Path(table.dataset.root).name
-        found = dict(zip(episode_digests(table), [spent or spending(kind) for kind in kinds], strict=True))
+        uses = dict(zip(episode_digests(table), [spent or spending(kind) for kind in kinds], strict=True))
         with self._changing() as entries:
-            new = {digest: name for digest, name in found.items() if digest not in entries.episodes}
+            new = {digest: name for digest, name in uses.items() if digest not in entries.episodes}
             entries.require_left(self.path, Counter(new.values()))
             entries.episodes |= {digest: {"spent": name, "dataset": source} for digest, name in new.items()}
 

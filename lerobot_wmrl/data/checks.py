@@ -81,11 +81,11 @@ def require_shown(table: EpisodeTable, episodes: Iterable[int]) -> None:
 def check_widths(features: Mapping[str, Any], wanted: Mapping[str, int]) -> None:
     """Raise ValueError unless the features have as many components as a model was trained with, 0 for any."""
     for name, width in wanted.items():
-        found = features[name]["shape"][0] if name in features else 0
-        if width and found != width:
+        size = features[name]["shape"][0] if name in features else 0
+        if width and size != width:
             raise ValueError(
                 f"{name}: the world model was trained with {width} components, the dataset has "
-                f"{found or 'none'}; use a dataset like the one it was trained on"
+                f"{size or 'none'}; use a dataset like the one it was trained on"
             )
 
 
@@ -93,11 +93,11 @@ def check_statistics(meta: Any, key: str) -> None:
     """Raise FieldError unless a dataset's statistics of a feature are a finite number for each component."""
     size = int(np.prod(meta.features[key]["shape"]))
     for name in ("mean", "std"):
-        found = np.asarray((meta.stats or {}).get(key, {}).get(name, ()), np.float64).reshape(-1)
-        if len(found) != size or not np.isfinite(found).all():
+        values = np.asarray((meta.stats or {}).get(key, {}).get(name, ()), np.float64).reshape(-1)
+        if len(values) != size or not np.isfinite(values).all():
             raise FieldError(
                 "dataset.root", meta.root,
-                f"its statistics (meta/stats.json) say that the {name} of {key} is {found.tolist()}, where "
+                f"its statistics (meta/stats.json) say that the {name} of {key} is {values.tolist()}, where "
                 f"{size} finite numbers should be",
                 "compute them again with lerobot-edit-dataset --operation.type=recompute_stats",
             )  # fmt: skip

@@ -204,16 +204,16 @@ class FrameSampler:
 
 @dataclass
 class InTurn:
-    """Take every second batch from `first`, the ones in between from the others in turn."""
+    """Take every second batch from `first`, the ones in between from `more` in turn."""
 
     first: ClipSampler | FrameSampler
-    others: Sequence[ClipSampler | FrameSampler]
+    more: Sequence[ClipSampler | FrameSampler]
 
     def __call__(self, step: int) -> Any:
         """Draw the batch of one step from the sampler whose turn it is."""
         if step % 2 == 0:
             return self.first(step)
-        return self.others[step // 2 % len(self.others)](step)
+        return self.more[step // 2 % len(self.more)](step)
 
 
 def clip_from_windows(
@@ -248,8 +248,8 @@ def clip_from_windows(
         action = action[:, 1:]  # where there is none before the window, it begins with its episode
         begins = batch.get(f"{ACTION}_is_pad", begins).to(device)[:, :1]
     if action is None or action.ndim != 3 or action.shape[1] != length:
-        found = "none" if action is None else f"shape {tuple(action.shape)}"
-        raise ValueError(f"action: {found}, but the batch has windows of {length} frames; give one a frame")
+        shape = "none" if action is None else f"shape {tuple(action.shape)}"
+        raise ValueError(f"action: {shape}, but the batch has windows of {length} frames; give one a frame")
     state = action.new_zeros(rows, length, 0)
     if state_size:
         state = batch[OBS_STATE].reshape(rows, length, -1)

@@ -99,12 +99,12 @@ def read_embodiment(meta: Any, given: Embodiment) -> Embodiment:
     if not low:
         (low, high), source = observed_range(meta), "recorded actions"
     check_range(low, high, names)
-    found = replace(
+    embodiment = replace(
         given, fps=meta.fps, action_names=names, action_low=list(low), action_high=list(high),
         state_names=component_names(meta.features[OBS_STATE]) if OBS_STATE in meta.features else [],
     )  # fmt: skip
-    logging.info("range of the actions, from the %s: %s", source, found.range_text())
-    return found
+    logging.info("range of the actions, from the %s: %s", source, embodiment.range_text())
+    return embodiment
 
 
 def recorded_range(feature: Mapping[str, Any]) -> tuple[list[float], list[float]] | None:
@@ -163,21 +163,21 @@ def check_range(low: Sequence[float], high: Sequence[float], names: Sequence[str
             )  # fmt: skip
 
 
-def check_same_robot(own: Embodiment, meta: Any) -> None:
+def check_same_robot(embodiment: Embodiment, meta: Any) -> None:
     """Raise FieldError if a dataset shows another robot, or another frame rate, than a world model learnt.
 
     Names that are numbers say nothing and are not compared.
     """
-    for column, names in ((ACTION, own.action_names), (OBS_STATE, own.state_names)):
-        found = component_names(meta.features[column]) if column in meta.features else []
-        unnamed = any(each and each[0].isdigit() for each in (*found[:1], *names[:1]))
-        if names and found and not unnamed and names != found:
+    for column, names in ((ACTION, embodiment.action_names), (OBS_STATE, embodiment.state_names)):
+        parts = component_names(meta.features[column]) if column in meta.features else []
+        unnamed = any(each and each[0].isdigit() for each in (*parts[:1], *names[:1]))
+        if names and parts and not unnamed and names != parts:
             raise FieldError(
-                "dataset.root", meta.root, f"its {column} has the components {', '.join(found)}, the world "
+                "dataset.root", meta.root, f"its {column} has the components {', '.join(parts)}, the world "
                 f"model has learnt {', '.join(names)}", "use a dataset of the same robot",
             )  # fmt: skip
-    if own.fps and own.fps != meta.fps:
+    if embodiment.fps and embodiment.fps != meta.fps:
         raise FieldError(
             "dataset.root", meta.root, f"has {meta.fps} frames a second, the world model has learnt "
-            f"{own.fps}", "use a dataset of the same frame rate",
+            f"{embodiment.fps}", "use a dataset of the same frame rate",
         )  # fmt: skip

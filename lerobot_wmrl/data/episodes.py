@@ -241,9 +241,9 @@ def truth_of(dataset: LeRobotDataset, column: str, values: ArrayLike) -> np.ndar
 
 
 def bad_row(
-    dataset: LeRobotDataset, column: str, row: int, found: object, remedy: str | None = None
+    dataset: LeRobotDataset, column: str, row: int, value: object, remedy: str | None = None
 ) -> FieldError:
-    """Return the error for a row of a column, N rows in all, at which `found` is no value to learn from.
+    """Return the error for a row of a column, N rows in all, whose `value` cannot be learnt from.
 
     Args:
         remedy: what to do about it; None: remove the episode.
@@ -252,7 +252,7 @@ def bad_row(
     episode = int(episodes[row])
     frame = row - int(np.argmax(np.asarray(episodes) == episode))
     return FieldError(
-        "dataset.root", dataset.root, f"{column} of episode {episode}, frame {frame}, is {found}",
+        "dataset.root", dataset.root, f"{column} of episode {episode}, frame {frame}, is {value}",
         remedy
         or "remove the episode with lerobot-edit-dataset --operation.type=delete_episodes "
         f"--operation.episode_indices=[{episode}]",

@@ -64,18 +64,18 @@ def observation_features(
     return features
 
 
-def matched(own: Mapping[str, Any], columns: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the features with which a recording of `own` can be merged with a dataset of `columns`.
+def matched(recorded: Mapping[str, Any], columns: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the features with which a recording, `recorded`, can be merged with a dataset of `columns`.
 
     Raises:
         FieldError: the dataset has a column that a rollout lacks, or has in another shape or type.
     """
     wanted = {name: dict(feature) for name, feature in columns.items() if name not in DEFAULT_FEATURES}
     for name, feature in wanted.items():
-        found, needed = (_kept_as(each) for each in (own.get(name), feature))
-        if found != needed:
+        actual, needed = (_kept_as(each) for each in (recorded.get(name), feature))
+        if actual != needed:
             raise FieldError(
-                "like.root", name, f"the dataset has it as {needed}, a rollout has {found}",
+                "like.root", name, f"the dataset has it as {needed}, a rollout has {actual}",
                 "give `like_columns=false`, and the recording as `dataset.more` to what learns from it",
             )  # fmt: skip
         if "info" in feature and feature["dtype"] == "video":

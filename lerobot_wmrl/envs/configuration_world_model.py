@@ -48,9 +48,9 @@ class StartFrames(ChosenEpisodes):
 
     def validate(self) -> None:
         """Raise FieldError unless there is exactly one kind of starts, and it can be chosen as asked."""
-        given = [name for name in ("given", "frames", "resets") if getattr(self, name)]
-        if len(given) != 1:
-            named = " and ".join(given).replace("given", "a dataset") or "nothing"
+        chosen = [name for name in ("given", "frames", "resets") if getattr(self, name)]
+        if len(chosen) != 1:
+            named = " and ".join(chosen).replace("given", "a dataset") or "nothing"
             raise FieldError(
                 "dataset.root", self.name, f"starts are given by {named}",
                 "give one of `dataset.root`, `dataset.repo_id`, `dataset.frames` and `dataset.resets`",

@@ -33,8 +33,8 @@ SAME_START: Final = 0.01
 def make_tensor_env(config: EnvConfig, n_envs: int, device: str) -> TensorEnv:
     """Return `n_envs` environments for reinforcement learning, as this project's own or around LeRobot's."""
     if is_own(config):
-        own: TensorEnv = config.create_tensor_env(n_envs, device)
-        return own
+        env: TensorEnv = config.create_tensor_env(n_envs, device)
+        return env
     if isinstance(config, HubEnvConfig):
         raise FieldError(
             "type", config.type, "its code lies on the hub, and this command does not run that of this type",
@@ -229,8 +229,8 @@ class LeRobotTensorEnv(TensorEnv):
         """Return an observation as LeRobot's rollout shows it to a policy's processors, batch of one."""
         observation = preprocess_observation(_batch_of_one(raw))
         observation["task"] = self._instruction(row)
-        seen: Observation = self.before(observation)
-        return seen
+        processed: Observation = self.before(observation)
+        return processed
 
     def _instruction(self, row: int) -> list[str]:
         for name in ("task_description", "task"):
@@ -240,13 +240,13 @@ class LeRobotTensorEnv(TensorEnv):
                 continue
         return [""]
 
-    def _stacked(self, seen: list[Observation]) -> Observation:
+    def _stacked(self, observations: list[Observation]) -> Observation:
         stacked: Observation = {
-            key: torch.cat([each[key] for each in seen]).to(self.device)
-            for key, value in seen[0].items()
+            key: torch.cat([each[key] for each in observations]).to(self.device)
+            for key, value in observations[0].items()
             if isinstance(value, Tensor)
         }
-        return {**stacked, "task": [text for each in seen for text in each["task"]]}
+        return {**stacked, "task": [text for each in observations for text in each["task"]]}
 
     def _vector(self, values: np.ndarray) -> Tensor:
         return torch.from_numpy(values).to(self.device)

@@ -107,12 +107,12 @@ class RolloutRecorder:
         dataset, clipped = None, list[float]()
         with whole_folder(folder) as partial:
             for env, chosen in self._batches(seeds):
-                seen, taken = self._roll_out(env, chosen)
-                dataset = dataset or self._create(partial, seen.observations[0])
+                recording, taken = self._roll_out(env, chosen)
+                dataset = dataset or self._create(partial, recording.observations[0])
                 for row, seed in enumerate(chosen):
                     length = int(taken["done"][row].int().argmax()) + 1
-                    report(self._add_episode(dataset, seen, taken, row, seed, length))
-                    clipped += [float(shares[row]) for shares in seen.clipped[:length]]
+                    report(self._add_episode(dataset, recording, taken, row, seed, length))
+                    clipped += [float(shares[row]) for shares in recording.clipped[:length]]
             assert dataset is not None, "there is no seed"
             dataset.finalize()
         warn_of_clipped(clipped)
@@ -131,21 +131,21 @@ class RolloutRecorder:
     def _batches(self, seeds: Sequence[int]) -> Iterator[tuple[Any, Sequence[int]]]:
         """Yield the environments of a task, and the seeds of the next episodes in them."""
         for task, env in enumerate(self.envs):
-            own = [seed for seed in seeds if seed % len(self.envs) == task]
-            for first in range(0, len(own), env.num_envs):
-                yield env, own[first : first + env.num_envs]
+            task_seeds = [seed for seed in seeds if seed % len(self.envs) == task]
+            for first in range(0, len(task_seeds), env.num_envs):
+                yield env, task_seeds[first : first + env.num_envs]
 
     def _roll_out(self, env: Any, seeds: Sequence[int]) -> tuple["RecordingProcessors", dict[str, Tensor]]:
         """Return what the policy saw and did from these seeds, and LeRobot's record of the outcome."""
         spare = [seeds[-1]] * (env.num_envs - len(seeds))
         noises = [ExplorationNoise(self.exploration, seed, self._scale()) for seed in [*seeds, *spare]]
-        seen = RecordingProcessors(*self.policy.processors, noises, self.robot)
+        recording = RecordingProcessors(*self.policy.processors, noises, self.robot)
         with seeded_context(seeds[0]):  # of a policy that draws its actions, as flows and diffusion do
             taken = rollout(
-                env, self.policy.policy, *self.env_processors, seen.preprocess, seen.postprocess,
+                env, self.policy.policy, *self.env_processors, recording.preprocess, recording.postprocess,
                 seeds=[*seeds, *spare],
             )  # fmt: skip
-        return seen, taken
+        return recording, taken
 
     def _scale(self) -> np.ndarray:
         return (np.array(self.robot.action_high) - np.array(self.robot.action_low)) / 2
@@ -153,11 +153,11 @@ class RolloutRecorder:
     def _create(self, folder: Path, observation: Observation) -> LeRobotDataset:
         """Create an empty dataset for what this observation shows."""
         whole = {"dtype": "int64", "shape": (1,), "names": None}
-        own = {
+        recorded = {
             **episode_features(observation, self.robot, "video" if self.video else "image"),
             START_SEED: whole, START_KIND: whole,
         }  # fmt: skip
-        features = own if self.columns is None else matched(own, self.columns)
+        features = recorded if self.columns is None else matched(recorded, self.columns)
         return LeRobotDataset.create(
             f"local/{folder.name.strip('.')}", self.config.fps, features, root=folder,
             robot_type=self.robot_type, rgb_encoder=self.encoder,
@@ -168,7 +168,7 @@ class RolloutRecorder:
     def _add_episode(
         self,
         dataset: LeRobotDataset,
-        seen: "RecordingProcessors",
+        recording: "RecordingProcessors",
         taken: dict[str, Tensor],
         row: int,
         seed: int,
@@ -178,11 +178,11 @@ class RolloutRecorder:
         success = bool(taken["success"][row, length - 1])
         labelled = "next.success" in dataset.features  # else next.done is taken for it
         for step in range(length):
-            observation = seen.observations[step]
+            observation = recording.observations[step]
             frame: dict[str, Any] = observation_row(observation, row)
             solved = bool(taken["success"][row, step]) or (success and step >= length - self.hold)
             frame |= {
-                ACTION: seen.actions[step][row],
+                ACTION: recording.actions[step][row],
                 "next.reward": np.array([float(taken["reward"][row, step])], np.float32),
                 "next.success": np.array([solved]),
                 "next.done": np.array([step == length - 1 if labelled else solved]),
@@ -220,11 +220,11 @@ def robot_of(config: EnvConfig, env: Any, like: Any | None) -> Embodiment:
                 "like.root", like.root, f"its actions have {count} components, the environment's {len(low)}",
                 "give a dataset of the same robot",
             )  # fmt: skip
-        given = Embodiment()
+        embodiment = Embodiment()
         with renamed("dataset.root", "like.root"):
             if recorded_range(like.features[ACTION]) is None and bounded:
-                given = widened(config, low, high, like)
-            return read_embodiment(like, given)
+                embodiment = widened(config, low, high, like)
+            return read_embodiment(like, embodiment)
     if not bounded:
         raise FieldError(
             "env.type", config.type, "does not say between which values its actions are",
@@ -237,12 +237,12 @@ def widened(config: EnvConfig, low: list[float], high: list[float], like: Any) -
     """Return the range of an environment's actions, widened to that of a dataset's; warns where it was."""
     least, most = observed_range(like)
     beyond = [
-        f"{name} {seen[0]:.4g} to {seen[1]:.4g} (in {config.type} {own[0]:.4g} to {own[1]:.4g})"
-        for name, own, seen in zip(
+        f"{name} {observed[0]:.4g} to {observed[1]:.4g} (in {config.type} {limits[0]:.4g} to {limits[1]:.4g})"
+        for name, limits, observed in zip(
             component_names(like.features[ACTION]), zip(low, high, strict=True),
             zip(least, most, strict=True), strict=True,
         )
-        if seen[0] < own[0] or seen[1] > own[1]
+        if observed[0] < limits[0] or observed[1] > limits[1]
     ]  # fmt: skip
     if beyond:
         logging.warning(

@@ -238,9 +238,9 @@ def observed_frame(observation: Mapping[str, Any], sizes: TokenizerConfig) -> St
     Raises:
         ValueError: it lacks a camera of the tokenizer.
     """
-    seen = {name: value.cpu() for name, value in observation.items() if isinstance(value, Tensor)}
-    images = to_pixels(stack_cameras(seen, sizes.camera_keys, sizes.image_size))
-    state = seen.get(OBS_STATE, torch.zeros(len(images), 0)).float().numpy()
+    tensors = {name: value.cpu() for name, value in observation.items() if isinstance(value, Tensor)}
+    images = to_pixels(stack_cameras(tensors, sizes.camera_keys, sizes.image_size))
+    state = tensors.get(OBS_STATE, torch.zeros(len(images), 0)).float().numpy()
     unknown = np.full(len(images), -1)
     return StartImages(images, images, state, list(observation["task"]), unknown, without_depth)
 
@@ -257,27 +257,27 @@ def read_saved_frames(path: Path, max_starts: int, config: WorldModelConfig) -> 
     Raises:
         FieldError: the file lacks one of these, or has it in another shape.
     """
-    found = read_arrays(path)
+    arrays = read_arrays(path)
     side, shapes = config.trained_tokenizer.image_size, config.trained_tokenizer.frame_shapes
     images = {key: (height, width, 3) for key, (_, height, width) in shapes.items()}
     states = {OBS_STATE: (config.state_size,)} if config.state_size else {}
     wanted = {**images, **states, INSTRUCTIONS: ()}
-    count = max((len(found[name]) for name in wanted if name in found and found[name].ndim), default=0)
+    count = max((len(arrays[name]) for name in wanted if name in arrays and arrays[name].ndim), default=0)
     for name, size in wanted.items():
-        if name not in found or not count or found[name].shape != (count, *size):
-            has = found[name].shape if name in found else "nothing of that name"
+        if name not in arrays or not count or arrays[name].shape != (count, *size):
+            has = arrays[name].shape if name in arrays else "nothing of that name"
             raise FieldError(
                 "dataset.frames", path, f"needs {name} of shape {(count or 'K', *size)}, has {has}"
             )
     for name in shapes:
-        if found[name].dtype != np.uint8:
-            raise FieldError("dataset.frames", path, f"{name} is {found[name].dtype}, it must be uint8")
+        if arrays[name].dtype != np.uint8:
+            raise FieldError("dataset.frames", path, f"{name} is {arrays[name].dtype}, it must be uint8")
     rows = evenly_spaced(count, max_starts)
-    state = found[OBS_STATE][rows].astype(np.float32) if states else np.zeros((len(rows), 0), np.float32)
+    state = arrays[OBS_STATE][rows].astype(np.float32) if states else np.zeros((len(rows), 0), np.float32)
     if not np.isfinite(state).all():
         raise FieldError("dataset.frames", path, f"{OBS_STATE} contains NaN or infinity")
-    instructions = [str(text) for text in found[INSTRUCTIONS][rows]]
-    squares = np.stack([_squares(found[name][rows], side) for name in shapes], 1)
+    instructions = [str(text) for text in arrays[INSTRUCTIONS][rows]]
+    squares = np.stack([_squares(arrays[name][rows], side) for name in shapes], 1)
     return StartImages(squares, squares, state, instructions, np.full(len(rows), -1), without_depth)
 
 
@@ -370,8 +370,8 @@ def load_starts(
         if text_model is not None:
             features.append(measure.features(decoded))
     begin = Frames(torch.cat(tokens), state, Context.joined(contexts))
-    own = replace(begin, state=state[:, : model.config.state_size], depth=frames.depth(model))
-    starts = Starts(own, torch.cat(images), frames.instructions)
+    start_frames = replace(begin, state=state[:, : model.config.state_size], depth=frames.depth(model))
+    starts = Starts(start_frames, torch.cat(images), frames.instructions)
     if text_model is None:
         return starts, None
     begin = replace(begin, depth=frames.depth(text_model))

@@ -107,8 +107,8 @@ class WorldModelVectorEnv(TensorEnv):
         decoded = self.model.decode(imagined.tokens, self._imagination.context)
         observation = self._observe(decoded.images, imagined.state)
         parts = {"success": terminated.float(), **self._progress(decoded)}
-        seen = self.model.shown(observation) if isinstance(self.reward, LeRobotReward) else observation
-        reward = self.reward.compute_reward({**seen, **parts, "hidden": imagined.hidden})
+        shown = self.model.shown(observation) if isinstance(self.reward, LeRobotReward) else observation
+        reward = self.reward.compute_reward({**shown, **parts, "hidden": imagined.hidden})
         parts |= {**entropies(imagined), "done_probability": imagined.done_logit.sigmoid()}
         return Outcome(observation, reward, terminated, truncated, terminated, self._elapsed, parts)
 

@@ -132,8 +132,8 @@ class BatchedSimulation:
         Returns:
             The frame of all B rows.
         """
-        own = [self.env.scenes[scene.index] for scene in scenes]
-        started = [Episode(self.task, scene, seed) for scene, seed in zip(own, seeds, strict=True)]
+        env_scenes = [self.env.scenes[scene.index] for scene in scenes]
+        started = [Episode(self.task, scene, seed) for scene, seed in zip(env_scenes, seeds, strict=True)]
         running = {**dict(enumerate(self.episodes)), **dict(zip(rows, started, strict=True))}
         self.episodes = [running[row] for row in range(self.env.num_envs)]
         self.env.place_rows(rows, started)

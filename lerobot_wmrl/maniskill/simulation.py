@@ -207,10 +207,10 @@ class Simulation:
         Raises:
             ValueError: it contains NaN.
         """
-        given = np.asarray(action, np.float32)
-        if np.isnan(given).any():
-            raise ValueError(f"action: NaN in {given.tolist()}; nothing can be simulated after it")
-        clipped = np.clip(given, self._low, self._high)
+        values = np.asarray(action, np.float32)
+        if np.isnan(values).any():
+            raise ValueError(f"action: NaN in {values.tolist()}; nothing can be simulated after it")
+        clipped = np.clip(values, self._low, self._high)
         clipped[2] = max(clipped[2], WORKSPACE_FLOOR - self.tcp_position[2])
         self.episode.object_before = self.object_position
         self.env.step(torch.from_numpy(clipped)[None])

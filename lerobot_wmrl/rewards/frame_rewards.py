@@ -65,8 +65,8 @@ def frame_rewards(path: str, device: str | None, dataset: LeRobotDataset) -> np.
     model = make_reward_model(config).eval()
     batches = torch.utils.data.DataLoader(shown, BATCH)
     with torch.no_grad():
-        found = [
+        rewards = [
             model.compute_reward(prepare(batch)).float().cpu()
             for batch in tqdm(batches, "label", unit="batch")
         ]
-    return torch.cat(found).numpy().reshape(-1)
+    return torch.cat(rewards).numpy().reshape(-1)

@@ -79,13 +79,13 @@ class FirstFramesRule(SuccessRule):
         require_episodes("first", self.first, dataset)
         solved = np.zeros(len(episode), bool)
         for index, first in self.first.items():
-            own = episode == index
-            if not 0 <= first < length[own][0]:
+            rows = episode == index
+            if not 0 <= first < length[rows][0]:
                 raise FieldError(
                     "first", self.first, f"episode {index} has no frame {first}",
-                    f"its frames are 0 to {length[own][0] - 1}",
+                    f"its frames are 0 to {length[rows][0] - 1}",
                 )  # fmt: skip
-            solved |= own & (frame >= first)
+            solved |= rows & (frame >= first)
         return next_frame_solved(solved, dataset)
 
 

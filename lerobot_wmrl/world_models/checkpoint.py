@@ -70,11 +70,11 @@ def read_config(
     return config
 
 
-def require_type(found: Any, expected: str, field: str, path: str | Path) -> None:
+def require_type(actual: Any, expected: str, field: str, path: str | Path) -> None:
     """Raise FieldError unless the checkpoint at `path` is of the expected type."""
-    if found != expected:
+    if actual != expected:
         raise FieldError(
-            field, path, f"is a checkpoint of type {found!r}, but {expected!r} is needed here",
+            field, path, f"is a checkpoint of type {actual!r}, but {expected!r} is needed here",
             "give the output folder of a training with that type",
         )  # fmt: skip
 
@@ -226,8 +226,8 @@ def check_tokenizer_source(config: WorldModelConfig, untrained: bool) -> None:
 
 def check_same_tokenizer(model: Any, other: Any, field: str, value: object) -> None:
     """Raise FieldError about `field`, which names the other world model, unless both have one tokenizer."""
-    own, others = model.tokenizer.state_dict(), other.tokenizer.state_dict()
-    if own.keys() != others.keys() or not all(torch.equal(own[name], others[name]) for name in own):
+    first, second = model.tokenizer.state_dict(), other.tokenizer.state_dict()
+    if first.keys() != second.keys() or not all(torch.equal(first[name], second[name]) for name in first):
         raise FieldError(
             field, value, "was trained with another tokenizer than the action world model",
             "train both with the same `tokenizer_path`",

@@ -249,11 +249,11 @@ class ActionWorldModelRewardModel(WorldModelRewardModel):
         super()._adopt_dataset(meta)
         check_statistics(meta, ACTION)
         self.config.action_size = meta.features[ACTION]["shape"][0]
-        own = self.config.embodiment
+        embodiment = self.config.embodiment
         if self.config.pretrained_path:  # another range may have been given beside it
-            check_range(own.action_low, own.action_high, own.action_names)
+            check_range(embodiment.action_low, embodiment.action_high, embodiment.action_names)
         else:
-            self.config.embodiment = read_embodiment(meta, own)
+            self.config.embodiment = read_embodiment(meta, embodiment)
 
     def check_units(self, policy: PreTrainedConfig, postprocessor: Any) -> None:
         """Raise FieldError if a policy's actions are in other units than those that the model learnt from."""
@@ -294,10 +294,10 @@ class ActionWorldModelRewardModel(WorldModelRewardModel):
         self, images: Tensor, state: Tensor, instructions: Sequence[str]
     ) -> dict[str, Any]:
         """Return B frames as in `observation`, but as squares: what is worth storing of large frames."""
-        seen = dict(zip(self.config.trained_tokenizer.frame_shapes, images.unbind(1), strict=True))
+        observation = dict(zip(self.config.trained_tokenizer.frame_shapes, images.unbind(1), strict=True))
         if self.config.state_size:
-            seen[OBS_STATE] = state
-        return {**seen, "task": list(instructions)}
+            observation[OBS_STATE] = state
+        return {**observation, "task": list(instructions)}
 
     def shown(self, observation: Mapping[str, Any]) -> dict[str, Any]:
         """Return a compact observation with frames of the dataset's sizes; those that have them stay."""

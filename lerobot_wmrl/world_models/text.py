@@ -70,15 +70,15 @@ def tokenize(tokenizer: Any, instructions: Sequence[str]) -> Any:
 
 def token_limit(tokenizer: Any) -> int:
     """Return the tokenizer's own maximum, `MAX_TOKENS` if it states none."""
-    own = tokenizer.model_max_length
-    return MAX_TOKENS if own >= VERY_LARGE_INTEGER else int(own)
+    limit = tokenizer.model_max_length
+    return MAX_TOKENS if limit >= VERY_LARGE_INTEGER else int(limit)
 
 
 def check_one_each(instructions: Sequence[str], batch: int) -> None:
     """Raise ValueError unless there is one instruction for each of `batch` episodes."""
     if isinstance(instructions, str) or len(instructions) != batch:
-        given = "a single string" if isinstance(instructions, str) else f"{len(instructions)} instructions"
-        raise ValueError(f"task: {given} for {batch} episodes; give a list with one instruction for each")
+        received = "a single string" if isinstance(instructions, str) else f"{len(instructions)} instructions"
+        raise ValueError(f"task: {received} for {batch} episodes; give a list with one instruction for each")
 
 
 class FrozenT5:

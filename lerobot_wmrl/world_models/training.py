@@ -179,8 +179,8 @@ def make_joint_sampler(
         note_outcomes(model.config, [(table, data.episodes), *((each, None) for each in more)])
     first = make_sampler(model, table, data.episodes, batch_size, seed)
     with renamed("dataset.root", "dataset.more"):
-        others = [make_sampler(model, each, None, batch_size, seed) for each in more]
-    return InTurn(first, others) if others else first
+        samplers = [make_sampler(model, each, None, batch_size, seed) for each in more]
+    return InTurn(first, samplers) if samplers else first
 
 
 def note_outcomes(

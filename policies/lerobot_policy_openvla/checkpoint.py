@@ -96,10 +96,10 @@ class OpenVLACheckpoint:
                 pixels do not cover 384.
         """
         sizes = sizes_from_weights(self.shapes(), self.config, self._heads())
-        told = self.config.get("image_sizes") or [sizes.image_size]
-        if set(told) != {sizes.image_size}:
+        sides = self.config.get("image_sizes") or [sizes.image_size]
+        if set(sides) != {sizes.image_size}:
             raise ValueError(
-                f"{self.folder}: image_sizes={told}: the weights are for pictures of {sizes.image_size} "
+                f"{self.folder}: image_sizes={sides}: the weights are for pictures of {sizes.image_size} "
                 f"pixels in patches of {sizes.patch_size}; only pictures that patches cover are supported"
             )
         return sizes
@@ -176,13 +176,13 @@ def _require_names(path: Path, names: list[str]) -> list[str]:
         raise ValueError(f"{path}: this file of weights is missing; download the checkpoint again")
     try:
         with safe_open(path, framework="pt") as file:
-            found = list(file.keys())
+            stored = list(file.keys())
     except SafetensorError as error:
         raise ValueError(f"{path}: cannot be read ({error}); download the checkpoint again") from error
-    missing = sorted(set(names) - set(found))
+    missing = sorted(set(names) - set(stored))
     if missing:
         raise ValueError(f"{path}: lacks {', '.join(missing[:5])}, which {SAFETENSORS_INDEX_FILE} has there")
-    return found
+    return stored
 
 
 def write_openvla(

@@ -71,8 +71,8 @@ def filter_matrix(before: int, after: int) -> Tensor:
     support = BICUBIC_SUPPORT * stretch
     centres = (torch.arange(after, dtype=torch.float64)[:, None] + 0.5) * scale
     old = torch.arange(before)
-    seen = (old >= (centres - support + 0.5).int()) & (old < (centres + support + 0.5).int())
-    weights = bicubic((old - centres + 0.5) * (1.0 / stretch)) * seen
+    covered = (old >= (centres - support + 0.5).int()) & (old < (centres + support + 0.5).int())
+    weights = bicubic((old - centres + 0.5) * (1.0 / stretch)) * covered
     fixed = weights / weights.sum(dim=1, keepdim=True) * (1 << PRECISION_BITS)
     return (fixed + torch.where(fixed < 0, -0.5, 0.5)).trunc()
 

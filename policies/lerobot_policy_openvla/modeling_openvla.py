@@ -175,8 +175,8 @@ class OpenVLAPolicy(PreTrainedPolicy):
         Raises:
             FieldError: if that includes weights in bfloat16.
         """
-        own = {id(parameter) for parameter in self.value_parameters()}
-        trained = [p for p in self.parameters() if p.requires_grad and id(p) not in own]
+        value_ids = {id(parameter) for parameter in self.value_parameters()}
+        trained = [p for p in self.parameters() if p.requires_grad and id(p) not in value_ids]
         require_exact_updates(trained)
         return trained
 

@@ -144,13 +144,13 @@ class VisionTransformer(nn.Module):
 
 def _initialise_vit(module: nn.Module) -> None:
     """Initialise as timm does: normal weights of std 0.02, also in embeddings and prefix tokens."""
-    own = [parameter for _, parameter in module.named_parameters(recurse=False)]
+    parameters = [parameter for _, parameter in module.named_parameters(recurse=False)]
     if isinstance(module, nn.Linear | nn.Conv2d):
         nn.init.trunc_normal_(module.weight, std=INITIAL_STD)
         if module.bias is not None:
             nn.init.zeros_(module.bias)
     elif isinstance(module, VisionTransformer | AttentionPool):
-        for parameter in own:
+        for parameter in parameters:
             nn.init.trunc_normal_(parameter, std=INITIAL_STD)
 
 
@@ -249,8 +249,8 @@ class OpenVLANetwork(nn.Module):
         embeddings = torch.cat([text[:, :1], patches, text[:, 1:]], dim=1)
         if mask is None:
             return Prefix(embeddings)
-        seen = torch.cat([mask[:, :1], mask.new_ones(patches.shape[:2]), mask[:, 1:]], dim=1).bool()
-        return Prefix(embeddings, seen, contiguous_positions(seen))
+        attended = torch.cat([mask[:, :1], mask.new_ones(patches.shape[:2]), mask[:, 1:]], dim=1).bool()
+        return Prefix(embeddings, attended, contiguous_positions(attended))
 
     @property
     def dtype(self) -> torch.dtype:

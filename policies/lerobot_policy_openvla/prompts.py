@@ -146,9 +146,9 @@ def select_inputs(config: OpenVLAConfig, observation: dict[str, Any]) -> tuple[T
     if isinstance(instructions, str):
         instructions = [instructions] * len(images)
     if instructions is None or len(instructions) != len(images):
-        given = "none" if instructions is None else len(instructions)
+        count = "none" if instructions is None else len(instructions)
         raise ValueError(
-            f"observation.task: needs one instruction per image, {len(images)}; there are {given}"
+            f"observation.task: needs one instruction per image, {len(images)}; there are {count}"
         )
     return images, list(instructions)
 

@@ -133,7 +133,7 @@ class Proposal:
         instructions, real = list(observed.get("task", [])), [observed]
 
         def act(images: Tensor, state: Tensor) -> Tensor:
-            seen = real.pop() if real else self.model.observation(images, state, instructions)
-            return self.policy.act(seen).to(self.low.device).clamp(self.low, self.high)
+            observation = real.pop() if real else self.model.observation(images, state, instructions)
+            return self.policy.act(observation).to(self.low.device).clamp(self.low, self.high)
 
         return self.model.policy_actions(frames, act, steps, images)

@@ -126,16 +126,16 @@ class ImaginedRobot(Robot):
         """
         if not self.is_connected:
             raise ConnectionError("the imagined robot is not connected")
-        given = {name.removesuffix(self.config.suffix): float(value) for name, value in action.items()}
-        if "delta_x" in given:
-            given = self._displaced(given)
+        components = {name.removesuffix(self.config.suffix): float(value) for name, value in action.items()}
+        if "delta_x" in components:
+            components = self._displaced(components)
         names = self.model.embodiment.action_names
-        if missing := [name for name in names if name not in given]:
+        if missing := [name for name in names if name not in components]:
             raise FieldError(
                 "teleop.type", ", ".join(action), f"the world model's actions need {', '.join(missing)} too",
                 f"use a teleoperator whose actions are {', '.join(names)}, or keyboard_ee or gamepad",
             )  # fmt: skip
-        wanted = torch.tensor([[given[name] for name in names]], dtype=torch.float32)
+        wanted = torch.tensor([[components[name] for name in names]], dtype=torch.float32)
         self.last = wanted.clamp(self.env.action_low.cpu(), self.env.action_high.cpu())
         if not self.succeeded:
             observation, _, terminated, _, info = self.env.step(self.last)
@@ -171,13 +171,13 @@ class ImaginedRobot(Robot):
         low, high, mean, last = (dict(zip(names, each.tolist(), strict=True)) for each in ends)
         action = {name: 0.0 if low[name] <= 0 <= high[name] else mean[name] for name in names}
         for key, candidates in DISPLACEMENTS.items():
-            found = next((name for name in candidates if name in names), None)
-            if found is None:
+            component = next((name for name in candidates if name in names), None)
+            if component is None:
                 raise FieldError(
                     "teleop.type", key, f"the world model's actions have no {' or '.join(candidates)}",
                     f"use a teleoperator whose actions are {', '.join(names)}",
                 )  # fmt: skip
-            action[found] += sent.get(key, 0.0) * (high[found] - low[found]) / 2
+            action[component] += sent.get(key, 0.0) * (high[component] - low[component]) / 2
         if GRIPPER in names:
             gripper = {0.0: low[GRIPPER], 2.0: high[GRIPPER]}
             action[GRIPPER] = gripper.get(sent.get(GRIPPER, 1.0), last[GRIPPER])

@@ -76,13 +76,13 @@ class PlanningArm:
         Its fingers are at `finger` (m). None if it is out of the joints' limits or touches an obstacle.
         """
         pose = np.array([*(tcp - BASE_POSITION), *POINTING_DOWN])
-        found, solved, _ = self._model.compute_IK_CLIK(self._tcp, pose, near)
-        found[self._joints :] = finger
-        joints = found[: self._joints]
+        qpos, solved, _ = self._model.compute_IK_CLIK(self._tcp, pose, near)
+        qpos[self._joints :] = finger
+        joints = qpos[: self._joints]
         if not solved or (joints < self._low).any() or (joints > self._high).any():
             return None
-        self._planner.robot.set_qpos(found, True)
-        return None if self._world.collide() else found
+        self._planner.robot.set_qpos(qpos, True)
+        return None if self._world.collide() else qpos
 
     def plan_path(self, start: np.ndarray, goal: np.ndarray) -> np.ndarray | None:
         """Plan between two configurations by RRT-Connect (Kuffner and LaValle 2000), and shorten the path.

@@ -134,17 +134,17 @@ class StateRolloutNetwork(nn.Module):
         """Go T steps further under the conditions' means (B, T, D), in a scene of this summary (B, 1, D)."""
         with compute_in(torch.float32, mean.device):
             mean = mean.float()
-            given = self.condition_in(torch.cat([mean, summary.float().expand_as(mean)], -1))
+            joined = self.condition_in(torch.cat([mean, summary.float().expand_as(mean)], -1))
             steps, now = [], StateRollout(*(tensor[:, 0] for tensor in begin))
-            for known, change in zip(given.unbind(1), self.condition_change(mean).unbind(1), strict=True):
+            for known, change in zip(joined.unbind(1), self.condition_change(mean).unbind(1), strict=True):
                 now = self._step(now, known, change)
                 steps.append(now)
             return StateRollout(*(torch.stack(tensors, 1) for tensors in zip(*steps, strict=True)))
 
-    def _step(self, now: StateRollout, given: Tensor, given_change: Tensor) -> StateRollout:
+    def _step(self, now: StateRollout, condition: Tensor, given_change: Tensor) -> StateRollout:
         """Go one action further; no tensor has a time dimension."""
-        seen = F.silu(given + self.state_in(torch.cat([now.state, now.change], -1)))
-        hidden = self.cell(F.silu(self.mix(seen)), now.hidden)
+        inputs = F.silu(condition + self.state_in(torch.cat([now.state, now.change], -1)))
+        hidden = self.cell(F.silu(self.mix(inputs)), now.hidden)
         change = given_change + self.momentum(now.change) + self.hidden_change(hidden)
         return StateRollout(now.state + STATE_STEP * change, change, hidden)
 

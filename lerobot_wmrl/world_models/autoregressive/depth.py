@@ -34,9 +34,9 @@ def metres(depth: Tensor) -> Tensor:
 def require_depth(depth: Tensor | None, shape: Sequence[int]) -> Tensor:
     """Return the depth. ValueError unless it has this shape."""
     if depth is None or depth.shape != shape:
-        found = "none" if depth is None else f"shape {tuple(depth.shape)}"
+        actual = "none" if depth is None else f"shape {tuple(depth.shape)}"
         raise ValueError(
-            f"depth: {found}, but this world model looks at depth (`dynamics.depth`) and needs a number a "
+            f"depth: {actual}, but this world model looks at depth (`dynamics.depth`) and needs a number a "
             f"token, shape {tuple(shape)}; use a dataset recorded with depth"
         )
     return depth

@@ -54,8 +54,8 @@ def replace_by_predictions(
     swap = torch.rand(real.codes.shape[:2], device=real.codes.device)[:, 1:] < share
     frames = torch.where(swap[..., None, None], predicted, real.codes[:, 1:])
     states, depths = (
-        torch.where(swap[..., None], own[:, :-1].to(seen.dtype), seen[:, 1:])
-        for own, seen in ((guess.state, real.state), (next_depth, real.depth))
+        torch.where(swap[..., None], imagined[:, :-1].to(recorded.dtype), recorded[:, 1:])
+        for imagined, recorded in ((guess.state, real.state), (next_depth, real.depth))
     )
     return Inputs(
         torch.cat([real.codes[:, :1], frames], 1),
@@ -100,15 +100,15 @@ class AutoregressiveDynamics(Dynamics):
         """Eqs. 2-4, with part of the inputs replaced by the dynamics' own predictions."""
         network, codebook, config = self.network, self.network.codebook, self.config
         real = Inputs(codebook.codes(clip.tokens), clip.state, self._depth(clip.depth, clip.tokens))
-        seen = self.network_inputs(real, clip, condition, progress)
+        inputs = self.network_inputs(real, clip, condition, progress)
         torch.clear_autocast_cache()  # older torch keeps the casts made without gradients
         memory = network.clip_memory(real.codes.shape[1], real.codes.device)
-        prediction, next_depth = network(seen.codes, seen.state, condition, memory, seen.depth)
+        prediction, next_depth = network(inputs.codes, inputs.state, condition, memory, inputs.depth)
         known = known_transitions(clip.valid)  # (B, T − 1)
         target = weighted_frames(codebook, real.codes[:, 1:], real.codes[:, :-1], known)
         loss, metrics = next_frame_loss(prediction, codebook, target, clip)
         if self.maskgit is not None:
-            first = FirstPass(seen.codes, condition, prediction, next_depth, memory)
+            first = FirstPass(inputs.codes, condition, prediction, next_depth, memory)
             draft_loss, parts = self.maskgit.loss(network, first, target.codes, target.weight)
             loss, metrics = loss + draft_loss, metrics | parts
         if network.depth is not None:
@@ -127,18 +127,18 @@ class AutoregressiveDynamics(Dynamics):
 
         Against drift: noise, one-pass predictions of single frames, and whole rollouts from first frames.
         """
-        seen = real
+        inputs = real
         if self.training:
-            seen = real._replace(codes=corrupt_codes(real.codes, self.network.codebook))
+            inputs = real._replace(codes=corrupt_codes(real.codes, self.network.codebook))
         share = replaced_share(self.config.self_forcing, progress)
         if share > 0:
-            guess, next_depth = self.network(seen.codes, seen.state, condition, depth=seen.depth)
-            seen = replace_by_predictions(guess, next_depth, self.network.codebook, seen, share)
+            guess, next_depth = self.network(inputs.codes, inputs.state, condition, depth=inputs.depth)
+            inputs = replace_by_predictions(guess, next_depth, self.network.codebook, inputs, share)
         rows = self_rollout_rows(self.config.self_rollout, progress, len(real.codes), real.codes.device)
         if len(rows):
             rolled = self._roll_out_rows(rows, clip, condition)
-            seen = Inputs(*(a.index_copy(0, rows, b) for a, b in zip(seen, rolled, strict=True)))
-        return seen
+            inputs = Inputs(*(a.index_copy(0, rows, b) for a, b in zip(inputs, rolled, strict=True)))
+        return inputs
 
     def _roll_out_rows(self, rows: Tensor, clip: Clip, condition: Condition) -> Inputs:
         """Imagine the clips `rows` (R,) from their first frames, in float32 if training computes in it."""
@@ -146,8 +146,8 @@ class AutoregressiveDynamics(Dynamics):
         exact = computing_dtype(clip.tokens.device) == torch.float32
         depth = None if clip.depth is None else clip.depth[rows, 0]
         first = Frames(clip.tokens[rows, 0], clip.state[rows, 0], depth=depth)
-        own, steps = Condition(condition.tokens[rows].float(), mask), clip.tokens.shape[1] - 1
-        return self.roll_out(first, own, steps, torch.float32 if exact else None)
+        selected, steps = Condition(condition.tokens[rows].float(), mask), clip.tokens.shape[1] - 1
+        return self.roll_out(first, selected, steps, torch.float32 if exact else None)
 
     @torch.no_grad()
     def roll_out(

@@ -52,11 +52,11 @@ def track_tokens(codes: Tensor, codebook: CodeBook, around: Tensor) -> Tensor:
     at its start, if they are nearer by `MOTION_LEVELS` than where it is.
     """
     clip = torch.arange(len(codes), device=codes.device)[:, None, None]
-    own = codes[:, 0, :, None]
+    initial = codes[:, 0, :, None]
     places = [torch.arange(codes.shape[2], device=codes.device).expand(len(codes), -1)]
     for frame in codes[:, 1:].unbind(1):
         reachable = around[places[-1]]
-        distance = codebook.distance(frame[clip, reachable], own)
+        distance = codebook.distance(frame[clip, reachable], initial)
         distance[..., 0] -= MOTION_LEVELS - 1
         places.append(reachable.gather(-1, distance.argmin(-1, keepdim=True)).squeeze(-1))
     return torch.stack(places, 1)
@@ -90,7 +90,7 @@ def keypoint_loss(
     places = tracks.places[:, 1:, :, None]
     along = logits.gather(2, places.expand(-1, -1, -1, logits.shape[-1]))
     start = tracks.places[:, 0, :, None].expand(-1, -1, codebook.channels)
-    own = codebook.values(codes[:, 0]).gather(1, start)
+    initial = codebook.values(codes[:, 0]).gather(1, start)
     with compute_in(torch.float32, logits.device):
-        apart = (codebook.expected_values(along.float()) - own[:, None]).square().mean(-1)
+        apart = (codebook.expected_values(along.float()) - initial[:, None]).square().mean(-1)
     return masked_mean(apart, tracks.moving[:, 1:])

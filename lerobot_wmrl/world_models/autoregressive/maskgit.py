@@ -59,8 +59,8 @@ class DraftMemory:
         query, key = self.rotation(query), self.rotation(key)
         keys, values = self.past[layer]
         scores = (query @ keys.transpose(-1, -2)).masked_fill(~self.mask, float("-inf"))
-        own = (query * key).sum(-1, keepdim=True)
-        weights = (torch.cat([scores, own], -1) * query.shape[-1] ** -0.5).softmax(-1)
+        own_score = (query * key).sum(-1, keepdim=True)
+        weights = (torch.cat([scores, own_score], -1) * query.shape[-1] ** -0.5).softmax(-1)
         return weights[..., :-1] @ values + weights[..., -1:] * value
 
 
