@@ -73,8 +73,8 @@ def measure(
         other = psnr(model.tokenizer.decode(replay.shuffled[None], replay.context), target)
         whole["delta_psnr_0_6s"] = float(steps["psnr"][step - 1] - other)
     if len(steps["psnr"]) >= (step := recording.steps(CEILING_SECONDS)):
-        own, best = (float(steps[name][step - 1]) for name in ("psnr", "psnr_ceiling"))
-        whole |= {"psnr_1_2s": own, "psnr_ceiling_1_2s": best, "psnr_below_ceiling_1_2s": best - own}
+        score, best = (float(steps[name][step - 1]) for name in ("psnr", "psnr_ceiling"))
+        whole |= {"psnr_1_2s": score, "psnr_ceiling_1_2s": best, "psnr_below_ceiling_1_2s": best - score}
     return EpisodeAccuracy(
         replay.episode, {name: value.cpu().numpy() for name, value in steps.items()}, whole
     )
@@ -194,12 +194,12 @@ def absolute_control(table: EpisodeTable) -> bool | None:
 
 
 def extreme_actions(
-    own: Tensor, low: np.ndarray, high: np.ndarray, absolute: bool | None
+    actions: Tensor, low: np.ndarray, high: np.ndarray, absolute: bool | None
 ) -> dict[str, Tensor]:
     """Make actions that no demonstration holds, each (E, T, A).
 
     Args:
-        own: the episodes' actions (E, T, A).
+        actions: the episodes' actions (E, T, A).
         low, high: extremes of the dataset's actions (A,).
         absolute: whether actions are absolute targets or displacements, None if that is unknown.
 
@@ -208,12 +208,12 @@ def extreme_actions(
         reversed: the own motion in the opposite direction; frozen: actions under which the robot stays: zero
         displacements, or the first target. Both are left out where `absolute` is None.
     """
-    corner = np.random.default_rng(0).random((len(own), own.shape[-1])) < 0.5
-    saturated = torch.from_numpy(np.where(corner, low, high).astype(np.float32)).to(own)
-    made = {"saturated": saturated[:, None].expand_as(own)}
+    corner = np.random.default_rng(0).random((len(actions), actions.shape[-1])) < 0.5
+    saturated = torch.from_numpy(np.where(corner, low, high).astype(np.float32)).to(actions)
+    made = {"saturated": saturated[:, None].expand_as(actions)}
     if absolute is not None:
-        still = own[:, :1] if absolute else torch.zeros_like(own[:, :1])
-        made |= {"reversed": 2 * still - own, "frozen": still.expand_as(own)}
+        still = actions[:, :1] if absolute else torch.zeros_like(actions[:, :1])
+        made |= {"reversed": 2 * still - actions, "frozen": still.expand_as(actions)}
     return made
 
 
@@ -256,9 +256,9 @@ def robustness(
     """
     episodes, device = episodes[evenly_spaced(len(episodes), BATCH)], model.state_mean.device
     table, horizon = recording.table, recording.steps(HORIZON_SECONDS)
-    starts, own = recording.starts(model, episodes), recording.actions(episodes, horizon, device)
+    starts, recorded = recording.starts(model, episodes), recording.actions(episodes, horizon, device)
     absolute = absolute_control(table)
-    made = extreme_actions(own, table.action.min(0), table.action.max(0), absolute)
+    made = extreme_actions(recorded, table.action.min(0), table.action.max(0), absolute)
     result = Robustness(len(episodes), horizon, absolute, {}, {})
     for name, actions in made.items():
         imagined = imagine_frames(model, starts, actions)

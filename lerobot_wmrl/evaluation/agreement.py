@@ -22,13 +22,13 @@ def policy_checkpoints(paths: Sequence[str]) -> list[Path]:
     Raises:
         FieldError: there is none.
     """
-    found = []
+    checkpoints = []
     for path in map(Path, paths):
         steps = [each for each in (path / CHECKPOINTS_DIR).glob("*") if each.name.isdigit()]
-        found += sorted(steps, key=lambda each: int(each.name)) or [path]
-    if not found:
+        checkpoints += sorted(steps, key=lambda each: int(each.name)) or [path]
+    if not checkpoints:
         raise FieldError("policies", list(paths), "none", "give checkpoints, or output folders of trainings")
-    return found
+    return checkpoints
 
 
 @dataclass(frozen=True)
@@ -51,9 +51,9 @@ class Agreement:
         imagined, real = ([pair[side].share for pair in self.policies.values()] for side in (0, 1))
         if len(self.policies) < MIN_POLICIES or len(set(imagined)) == 1 or len(set(real)) == 1:
             return (math.nan,) * 3
-        found = pearsonr(imagined, real)
-        interval = found.confidence_interval(0.95)
-        return float(found.statistic), float(interval.low), float(interval.high)
+        correlation = pearsonr(imagined, real)
+        interval = correlation.confidence_interval(0.95)
+        return float(correlation.statistic), float(interval.low), float(interval.high)
 
     def as_json(self) -> dict[str, Any]:
         """R² is the square of Pearson's r: the share of the variance that a straight line explains."""

@@ -99,13 +99,13 @@ def calibrated_rate(
     rank = math.ceil((len(references) + 1) * coverage)
     if len(references) < max(rank, LEAST_REFERENCES):
         return None
-    seen, real = np.array(references).T
-    kept = ~np.eye(len(seen), dtype=bool)
-    lines = [_line(seen[others], real[others]) for others in kept]
-    errors = np.abs([y - line(x) for line, x, y in zip(lines, seen, real, strict=True)])
+    predicted, real = np.array(references).T
+    kept = ~np.eye(len(predicted), dtype=bool)
+    lines = [_line(predicted[mask], real[mask]) for mask in kept]
+    errors = np.abs([y - line(x) for line, x, y in zip(lines, predicted, real, strict=True)])
     values = np.array([line(imagined) for line in lines])
     low, high = np.sort(values - errors)[-rank], np.sort(values + errors)[rank - 1]
-    value = float(np.clip(_line(seen, real)(imagined), low, high))
+    value = float(np.clip(_line(predicted, real)(imagined), low, high))
     return RateEstimate(value, float(low), float(high))
 
 

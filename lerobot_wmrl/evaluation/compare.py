@@ -19,16 +19,16 @@ def require_new_starts(envs: Envs, config: EnvConfig, n_episodes: int) -> None:
     """Raise FieldError if a world model or LIBERO has too few starts: some would count twice."""
     if isinstance(config, WorldModelEnv):
         fewest = min(len(env.env.starts) for env in flat(envs))
-        said, more = "the world model has {} start frames", ", or give more with `env.dataset.max_starts`"
+        problem, more = "the world model has {} start frames", ", or give more with `env.dataset.max_starts`"
     elif counts_resets(config):
         fewest = min(len(states) for env in flat(envs) for states in env.call("_init_states"))
-        said, more = f"{config.type} has {{}} starts", ", or set `env.init_states` to false"
+        problem, more = f"{config.type} has {{}} starts", ", or set `env.init_states` to false"
     else:
         return
     if n_episodes > fewest:
         raise FieldError(
             "n_episodes", n_episodes,
-            f"{said.format(fewest)} for a task, and an episode that is repeated says nothing new",
+            f"{problem.format(fewest)} for a task, and an episode that is repeated says nothing new",
             f"set it to at most {fewest}{more}",
         )  # fmt: skip
 
@@ -54,7 +54,7 @@ def run_comparison(
                 f"the {comparison.starts_per_task} starts so far end within a batch of {batch_size}, after "
                 f"which {config.type} skips some", "choose a new `output_dir`",
             )  # fmt: skip
-        for env in (each for own in envs for each in flat(own)):
+        for env in (each for policy_envs in envs for each in flat(policy_envs)):
             for _ in range(ceil(comparison.starts_per_task / batch_size)):
                 env.reset(options={NEW_ROLLOUT_OPTION: True})
     while not comparison.finished:

@@ -98,7 +98,7 @@ class Comparison:
 
     def rates(self) -> dict[str, Proportion]:
         """Return each policy's success rate."""
-        return {name: Proportion(sum(own), len(own)) for name, own in self._outcomes().items()}
+        return {name: Proportion(sum(outcomes), len(outcomes)) for name, outcomes in self._outcomes().items()}
 
     def rates_by_task(self) -> dict[str, dict[str, Proportion]]:
         """Return the rates of each task, named by its suite and its number there."""
@@ -115,13 +115,13 @@ class Comparison:
         """Return the pairs, each decided at alpha over their number (Bonferroni)."""
         outcomes, names = self._outcomes(), self._pair_names()
         level = self.alpha / len(names) if self.stop_early or self.complete else 0.0
-        found = []
+        pairs = []
         for before, after in names:
             both = outcomes[before], outcomes[after]
             sequential = SequentialTest.between(*both) if self.stop_early else None
             change = PairedChange.between(*both)
-            found.append(Pair(before, after, change, sequential, level))
-        return found
+            pairs.append(Pair(before, after, change, sequential, level))
+        return pairs
 
     def _pair_names(self) -> list[tuple[str, str]]:
         pairs = list(combinations(self.policies, 2))
@@ -146,21 +146,23 @@ class Comparison:
         }
 
     def __str__(self) -> str:
-        found = self.rates_by_task()
-        parts = {f", {task}": rates for task, rates in found.items()} if len(found) > 1 else {}
-        rates = {name + part: own[name] for part, own in {"": self.rates(), **parts}.items() for name in own}
+        by_task = self.rates_by_task()
+        parts = {f", {task}": rates for task, rates in by_task.items()} if len(by_task) > 1 else {}
+        rates = {
+            name + part: each[name] for part, each in {"": self.rates(), **parts}.items() for name in each
+        }
         width = max(map(len, rates))
         lines = [f"{name:<{width}}  {rate}" for name, rate in rates.items()]
         return "\n".join([*lines, "", *map(self._verdict, self.pairs()), self._explanation()])
 
     def _verdict(self, pair: Pair) -> str:
-        found = f"{pair.change.gained} gained, {pair.change.lost} lost, p = {pair.p_value:.2g}"
+        evidence = f"{pair.change.gained} gained, {pair.change.lost} lost, p = {pair.p_value:.2g}"
         if pair.better is None:
-            said = f"not decided after {len(self.episodes)} starts"
+            verdict = f"not decided after {len(self.episodes)} starts"
         else:
             worse = pair.before if pair.better == pair.after else pair.after
-            said = f"{pair.better} succeeds more often than {worse}"
-        return f"{pair.after} against {pair.before}: {found}: {said}"
+            verdict = f"{pair.better} succeeds more often than {worse}"
+        return f"{pair.after} against {pair.before}: {evidence}: {verdict}"
 
     def _explanation(self) -> str:
         valid = "p is valid at any time of stopping" if self.stop_early else "p is McNemar's exact one"

@@ -116,9 +116,9 @@ def read_references(path: Path | None) -> dict[str, Proportion]:
     if path is None:
         return {}
     try:
-        found = json.loads(path.read_text())
-        rates = {name: _rate(policy["k"], policy["n"]) for name, policy in found["policies"].items()}
-        kind = (found.get("env") or {}).get("type")
+        results = json.loads(path.read_text())
+        rates = {name: _rate(policy["k"], policy["n"]) for name, policy in results["policies"].items()}
+        kind = (results.get("env") or {}).get("type")
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise FieldError(
             "references", path, f"no success of policies can be read from it ({first_line(error)})",
@@ -129,11 +129,11 @@ def read_references(path: Path | None) -> dict[str, Proportion]:
         raise FieldError(
             "references", path, "its episodes are imagined ones", "compare the policies in a real environment"
         )
-    if not found.get("finished", True):
+    if not results.get("finished", True):
         raise FieldError("references", path, "the comparison was interrupted", "run its command again")
-    sequential = any(pair.get("test") == "sequential" for pair in found.get("pairs", []))
-    if not found.get("complete", not sequential):
-        early = "stopped early" if "complete" in found else "may have stopped early"
+    sequential = any(pair.get("test") == "sequential" for pair in results.get("pairs", []))
+    if not results.get("complete", not sequential):
+        early = "stopped early" if "complete" in results else "may have stopped early"
         raise FieldError(
             "references", path, f"the comparison {early}, and then the rates lean to the winner",
             "repeat it with --stop_early=false in another folder",
@@ -186,10 +186,10 @@ def learnt_from(world_model: str, rollouts: LabelledRollouts) -> int:
     table, chosen = rollouts.table, rollouts.chosen
     same = [root == rollouts.name or _same(Path(root), Path(rollouts.name)) for root, _ in learnt]
     if any(same):
-        parts = [table.among(episodes) for (_, episodes), own in zip(learnt, same, strict=True) if own]
+        parts = [table.among(episodes) for (_, episodes), equal in zip(learnt, same, strict=True) if equal]
         return int((np.any(parts, axis=0) & ~table.validation)[chosen].sum())
-    others = (digest for root, episodes in learnt for digest in learnt_digests(Path(root), episodes))
-    return len(action_digests(table, chosen) & {*others})
+    digests = (digest for root, episodes in learnt for digest in learnt_digests(Path(root), episodes))
+    return len(action_digests(table, chosen) & {*digests})
 
 
 def learnt_digests(root: Path, episodes: Sequence[int] | None) -> set[str]:
@@ -212,9 +212,9 @@ def _trainings(checkpoint: str, trained: str) -> Iterator[tuple[str, Mapping[str
 
     trained: name of the settings of what was trained, `policy` or `model`.
     """
-    seen = set()
-    while checkpoint and checkpoint not in seen:
-        seen.add(checkpoint)
+    visited = set()
+    while checkpoint and checkpoint not in visited:
+        visited.add(checkpoint)
         settings = stored_settings(resolve_checkpoint(checkpoint) / CONFIG_FILE)
         yield checkpoint, settings
         checkpoint = str((settings.get(trained) or {}).get("pretrained_path") or "")

@@ -293,8 +293,10 @@ def seen_outcomes(
     def judged(episode: int) -> PredictedDone:
         whole = recording.rows(episode)
         rows = slice(whole.start, min(whole.stop, whole.start + length))
-        seen = done.head(torch.from_numpy(np.array(features[rows])).to(model.state_mean.device)).sigmoid()
-        return PredictedDone(episode, torch.cat([seen[1:], seen[-1:]]), table.done[rows])
+        probability = done.head(
+            torch.from_numpy(np.array(features[rows])).to(model.state_mean.device)
+        ).sigmoid()
+        return PredictedDone(episode, torch.cat([probability[1:], probability[-1:]]), table.done[rows])
 
     return Outcomes.stack(judged(int(episode)) for episode in episodes)
 

@@ -116,13 +116,13 @@ class Judgement:
 
     def _row(self, name: str) -> str:
         imagined = self.imagined(name)
-        said = f"{100 * imagined.share:.0f} % ({imagined.k} of {imagined.n}) in imagination"
+        row = f"{100 * imagined.share:.0f} % ({imagined.k} of {imagined.n}) in imagination"
         if name in self.references:
-            said = f"{said}, {100 * self.references[name].share:.0f} % in reality"
+            row = f"{row}, {100 * self.references[name].share:.0f} % in reality"
         if reason := self.refusal(name):
-            return f"{said}; not judged: {reason}"
+            return f"{row}; not judged: {reason}"
         estimate = self.estimate(name)
-        return f"{said}; estimate: {estimate}" if estimate else said
+        return f"{row}; estimate: {estimate}" if estimate else row
 
     def _basis(self) -> str:
         """Say what the intervals rest on."""

@@ -113,7 +113,7 @@ def opened(config: EnvConfig, n_envs: int, trust_remote_code: bool, policies: in
     This project's own are shared. LeRobot's are not: see `counts_resets`. Those of several tasks stay in this
     process: all of them are open at the same time.
     """
-    own, parallel = is_own(config), runs_in_processes(config)
+    shared, parallel = is_own(config), runs_in_processes(config)
 
     def make() -> Envs:
         envs: Envs = make_env(config, n_envs, parallel, trust_remote_code=trust_remote_code)
@@ -122,12 +122,12 @@ def opened(config: EnvConfig, n_envs: int, trust_remote_code: bool, policies: in
         return envs
 
     made = [make()]
-    if parallel and not own and len(flat(made[0])) > 1:
+    if parallel and not shared and len(flat(made[0])) > 1:
         close_envs(made.pop())
         parallel = False
-    made += [make() for _ in range(len(made), 1 if own else policies)]
+    made += [make() for _ in range(len(made), 1 if shared else policies)]
     try:
-        yield made * policies if own else made
+        yield made * policies if shared else made
     finally:
         for envs in made:
             for adapter in flat(envs):
@@ -158,10 +158,10 @@ def run_policy(envs: Envs, config: EnvConfig, policy: LoadedPolicy, episodes: in
         for suite, tasks in envs.items():
             for task, env in tasks.items():
                 counted = StepCounter(env)
-                found = eval_policy(
+                results = eval_policy(
                     counted, policy.policy, *processors, n_episodes=episodes, start_seed=seed
                 )["per_episode"]  # fmt: skip
-                outcomes |= {(suite, task, each["seed"]): bool(each["success"]) for each in found}
+                outcomes |= {(suite, task, each["seed"]): bool(each["success"]) for each in results}
                 steps += counted.steps
     return Evaluated(outcomes, steps)
 
@@ -171,10 +171,10 @@ def run_block(
 ) -> list[Episode]:
     """Run every policy, in environments of its own, from the same `count` starts of each task."""
     outcomes = [
-        run_policy(own, config, policy, count, seed).outcomes
-        for policy, own in zip(policies, envs, strict=True)
+        run_policy(policy_envs, config, policy, count, seed).outcomes
+        for policy, policy_envs in zip(policies, envs, strict=True)
     ]
-    return [Episode(*start, [own[start] for own in outcomes]) for start in outcomes[0]]
+    return [Episode(*start, [by_start[start] for by_start in outcomes]) for start in outcomes[0]]
 
 
 def evaluate_policy(
@@ -188,9 +188,9 @@ def evaluate_policy(
         for task, env in tasks.items():
             freeze_finished(env)
             with closing(env):
-                found = run_policy({suite: {task: env}}, config, policy, episodes, seed)
-            outcomes |= found.outcomes
-            steps += found.steps
+                evaluated = run_policy({suite: {task: env}}, config, policy, episodes, seed)
+            outcomes |= evaluated.outcomes
+            steps += evaluated.steps
     return Evaluated(outcomes, steps)
 
 

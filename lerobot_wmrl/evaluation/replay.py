@@ -150,38 +150,38 @@ def replay_episodes(
     Each is also imagined with the actions of the one before it in `episodes`, for delta-PSNR.
     """
     by_length = np.argsort(recording.table.length[episodes], kind="stable")
-    others = np.roll(episodes, 1)
+    previous = np.roll(episodes, 1)
     with tqdm(total=len(episodes), desc="Replaying episodes", unit="episode") as bar:
         for part in in_batches(by_length):
-            for replay in _replay_batch(model, recording, episodes[part], others[part]):
+            for replay in _replay_batch(model, recording, episodes[part], previous[part]):
                 yield replay
                 bar.update()
 
 
 def _replay_batch(
-    model: ActionWorldModelRewardModel, recording: Recording, episodes: np.ndarray, others: np.ndarray
+    model: ActionWorldModelRewardModel, recording: Recording, episodes: np.ndarray, previous: np.ndarray
 ) -> Iterator[EpisodeReplay]:
     device, table = model.state_mean.device, recording.table
     longest, until = int(table.length[episodes].max()), recording.steps(DELTA_PSNR_SECONDS)
     frames = recording.starts(model, episodes)
     actions = recording.actions(episodes, longest, device)
-    own = imagine_frames(model, frames, actions[:, :COMPARED_FRAMES])
-    probability = own.done_probability
+    imagined = imagine_frames(model, frames, actions[:, :COMPARED_FRAMES])
+    probability = imagined.done_probability
     if longest > COMPARED_FRAMES:
         probability = model.open_loop(frames, actions, with_tokens=False).done_logit.sigmoid()
-    comparable = (table.length[episodes] > until) & (episodes != others)
+    comparable = (table.length[episodes] > until) & (episodes != previous)
     if comparable.any():
-        other = recording.actions(others, until, device)
+        other = recording.actions(previous, until, device)
         shuffled = imagine_frames(model, frames, other).tokens[:, -1]
     for row, episode in enumerate(episodes.tolist()):
         rows, shown = recording.rows(episode), recording.compared_rows(episode)
         steps = slice(0, shown.stop - shown.start)
         yield EpisodeReplay(
-            episode, frames.context[[row]], own.tokens[row, steps],
-            probability[row, : rows.stop - rows.start], own.state[row, steps],
+            episode, frames.context[[row]], imagined.tokens[row, steps],
+            probability[row, : rows.stop - rows.start], imagined.state[row, steps],
             shuffled[row] if comparable[row] else None, table.done[rows],
             recorded_and_imagined_depth(
-                model, recording, shown, None if own.depth is None else own.depth[row, steps]
+                model, recording, shown, None if imagined.depth is None else imagined.depth[row, steps]
             ),
         )  # fmt: skip
 

@@ -166,8 +166,8 @@ def report_action_model(
     ]
     steps, play_steps = by_step(evaluation.accuracy, horizon), by_step(play, COMPARED_FRAMES)
     gates, tasks = sweep(outcomes), by_task(outcomes, recording.table)
-    at_task = {task: gate_at(own, threshold, frames) for task, own in tasks.items()}
-    best_at_task = {task: best_operating_point(sweep(own)) for task, own in tasks.items()}
+    at_task = {task: gate_at(task_outcomes, threshold, frames) for task, task_outcomes in tasks.items()}
+    best_at_task = {task: best_operating_point(sweep(task_outcomes)) for task, task_outcomes in tasks.items()}
     best = best_operating_point(gates)
     extremes = robustness(model, recording, evaluation.attempts, threshold, frames)
     seen = seen_outcomes(model, recording, outcomes.episodes)
@@ -284,8 +284,8 @@ def task_table(gates: Mapping[str, Gate], best: Mapping[str, Gate | None]) -> st
         )
         for task, gate in gates.items()
     ]  # fmt: skip
-    own = "threshold, frames: recall with at most 5 % false positives"
-    table = markdown_table(("task", "false positives", "recall", "AUC", "passed", own), rows)
+    column = "threshold, frames: recall with at most 5 % false positives"
+    table = markdown_table(("task", "false positives", "recall", "AUC", "passed", column), rows)
     blind = [task for task, gate in gates.items() if gate.recall.n and not gate.recall.k]
     if not blind:
         return table

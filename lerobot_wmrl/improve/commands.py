@@ -42,9 +42,9 @@ def stages(progress: Progress) -> list[Stage]:
 
     def leaves_policies(status: int) -> bool:
         """Return whether RL stopped by a rule of its own, and there are policies to compare."""
-        return status == STOPPED and (others() or config.distils)
+        return status == STOPPED and (can_compare() or config.distils)
 
-    def others() -> bool:
+    def can_compare() -> bool:
         """Return whether there is a policy to compare with the one before."""
         return plan.clones or plan.rl_checkpoint.exists()
 
@@ -61,14 +61,14 @@ def stages(progress: Progress) -> list[Stage]:
         *stage("start", "Choose in imagination which policy to improve", start, progress, clones),
         *stage("rl", "Train the policy in imagination", rl, progress, optional=leaves_policies),
         *stage("distilled", "Fit the policy to a planner in imagination", distilled, progress, config.distils,
-               optional=lambda status: others()),
+               optional=lambda status: can_compare()),
         *stage("choice", "Choose the policy to use", choice, progress, config.selects),
         *stage("comparison", "Compare the policies", comparison, progress),
     ]  # fmt: skip
 
 
 def columns(plan: Plan) -> list[str]:
-    root = plan.found.root
+    root = plan.findings.root
     names: Flags = {"operation.feature_names": plan.extra_columns}
     command = edit_command(plan.out / "columns", "remove_feature", names)
     return [*command, f"--repo_id=local/{root.name}", f"--root={root}"]
@@ -81,7 +81,7 @@ def rollouts(plan: Plan) -> list[str]:
     return ["lerobot-wmrl-record", *format_flags({
         "policy.path": plan.policy, **env,
         **({} if plan.in_maniskill else like),
-        "video": "video" in plan.found.columns.values(), "num_episodes": config.rollouts,
+        "video": "video" in plan.findings.columns.values(), "num_episodes": config.rollouts,
         "exploration": config.exploration, "seed": config.seed + ROLLOUT_SEED_OFFSET,
         "output_dir": str(plan.out / "rollouts"),
     })]  # fmt: skip
@@ -112,7 +112,7 @@ def cloned(progress: Progress) -> list[str]:
 
 def tokenizer(plan: Plan) -> list[str]:
     return learn(plan, "frame_tokenizer", "tokenizer", {
-        "model.tokenizer.cameras": plan.found.cameras,
+        "model.tokenizer.cameras": plan.findings.cameras,
         "model.tokenizer.image_size": plan.sizes.side, "model.tokenizer.context": True,
         "model.tokenizer.success": True,
     })  # fmt: skip
@@ -154,8 +154,8 @@ def start(progress: Progress) -> list[str]:
 def rl(progress: Progress) -> list[str]:
     plan, config = progress.plan, progress.plan.config
     real: Flags = {} if config.real_env is None else real_env(plan, "real_env")
-    given: Flags = {} if config.iterations is None else {"iterations": config.iterations}
-    algorithm = {**config.algorithm, **given}
+    iterations: Flags = {} if config.iterations is None else {"iterations": config.iterations}
+    algorithm = {**config.algorithm, **iterations}
     if algorithm["algorithm.type"] == "ppo":
         algorithm = {**algorithm, "algorithm.gamma": plan.discount}
         if config.policy is not None and config.policy.use_peft:  # the standard deviation is in no adapter
@@ -257,12 +257,12 @@ def another_round(progress: Progress) -> list[str] | None:
     plan, config = progress.plan, progress.plan.config
     if not config.rollouts:
         return None
-    given: Flags = {} if config.iterations is None else {"iterations": config.iterations}
+    iterations: Flags = {} if config.iterations is None else {"iterations": config.iterations}
     limit: Flags = {} if plan.in_maniskill else {"max_frames": plan.frame_limit}
     return ["lerobot-wmrl-improve", *format_flags({
         "policy.path": progress.policies[progress.chosen()], **plan.data.flags(),
         **real_env(plan, "real_env"), "rollouts": config.rollouts, "exploration": config.exploration,
-        "size": config.preset, **given, **limit, "selection_episodes": config.selection_episodes,
+        "size": config.preset, **iterations, **limit, "selection_episodes": config.selection_episodes,
         "eval_episodes": config.eval_episodes, "seed": config.seed + config.rollouts,
         "output_dir": f"{plan.out}_again",
     })]  # fmt: skip

@@ -42,15 +42,15 @@ class LearntEpisodes:
     def success_frames(self) -> int:
         """Return the frames of all successful episodes that are learnt from."""
         if not self.plan.config.rollouts:
-            return self.plan.found.success_frames
+            return self.plan.findings.success_frames
         chosen = self.chosen()
         return int(chosen.length[chosen.success].sum())
 
     def fewest_starts(self) -> int:
         """Return the number of episodes that imagination begins in, of the task that has the fewest."""
         branches = self.branches()
-        if not self.plan.config.rollouts and self.plan.found.total * (1 + branches) <= MAX_STARTS:
-            return self.plan.found.fewest
+        if not self.plan.config.rollouts and self.plan.findings.total * (1 + branches) <= MAX_STARTS:
+            return self.plan.findings.fewest
         table = self.chosen()
         begun = chosen_episodes(table, StartFrames(max_starts=MAX_STARTS, branches=branches))
         return int(np.unique(table.column(START_TASK)[begun], return_counts=True)[1].min())
@@ -58,7 +58,7 @@ class LearntEpisodes:
     def spread(self, starts: int) -> int:
         """Return how many starts imagination takes in a comparison on `starts` of them: those of as many
         episodes, spread evenly over the dataset. Of several tasks it takes all, because some may have few."""
-        tasks = self.plan.found.tasks
+        tasks = self.plan.findings.tasks
         if self.plan.config.rollouts:
             tasks = len(np.unique(self.chosen().column(START_TASK)))
         return min(starts * (1 + self.branches()), MAX_STARTS) if tasks == 1 else MAX_STARTS
@@ -70,7 +70,7 @@ class LearntEpisodes:
         does. Where it is as long as the dataset's longest, a rollout of a few more frames has none.
         """
         length = self.plan.length
-        usual = usual_length(self.chosen()) if self.plan.config.rollouts else self.plan.found.usual
+        usual = usual_length(self.chosen()) if self.plan.config.rollouts else self.plan.findings.usual
         return max(0, (ceil if length == LONGEST_IMAGINATION else round)(usual / length) - 1)
 
     def checked(self) -> tuple[Flags, str]:
@@ -79,8 +79,8 @@ class LearntEpisodes:
         Held-out episodes are better than others, and rollouts better than the dataset: the policy that is
         trained will act like them. But they must both succeed and fail.
         """
-        config, found = self.plan.config, self.plan.found
-        holds_out = found.held_out >= ENOUGH_HELD_OUT
+        config, findings = self.plan.config, self.plan.findings
+        holds_out = findings.held_out >= ENOUGH_HELD_OUT
         data = config.dataset.flags(), "validation" if holds_out else "all"
         if config.rollouts < ENOUGH_HELD_OUT:
             return data

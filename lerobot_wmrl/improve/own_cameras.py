@@ -36,19 +36,19 @@ def with_own_cameras(
     """
     if policy.type not in RESIZING:
         return policy
-    given, known = given_names(preprocessor), trained_on(preprocessor)
+    renames, known = given_names(preprocessor), trained_on(preprocessor)
     inputs: dict[str, PolicyFeature] = {}
     for name, feature in (policy.input_features or {}).items():
-        source = given.get(name, name)
-        own = source if source in columns and name not in columns else name
-        if own in columns:
-            seen = feature.type is FeatureType.VISUAL
-            size = (3, *frame_size(columns[own])) if seen else tuple(columns[own]["shape"])
-            if seen or known.get(own) == size:
+        source = renames.get(name, name)
+        column = source if source in columns and name not in columns else name
+        if column in columns:
+            is_image = feature.type is FeatureType.VISUAL
+            size = (3, *frame_size(columns[column])) if is_image else tuple(columns[column]["shape"])
+            if is_image or known.get(column) == size:
                 feature = replace(feature, shape=size)
         elif feature.type is FeatureType.VISUAL and not {name, source} & known.keys():
             continue  # a camera of the base, which the policy has not been trained with
-        inputs[own] = feature
+        inputs[column] = feature
     if inputs == policy.input_features:
         return policy
     changed: Any = deepcopy(policy)
@@ -59,7 +59,7 @@ def with_own_cameras(
 def without_renaming(preprocessor: Any, policy: PreTrainedConfig) -> Any:
     """Return a preprocessor that renames nothing, for a policy that `with_own_cameras` has made."""
 
-    def own(step: Any) -> Any:
+    def adapt(step: Any) -> Any:
         if isinstance(step, RenameObservationsProcessorStep):
             return replace(step, rename_map={})
         if not isinstance(step, NormalizerProcessorStep):
@@ -69,7 +69,7 @@ def without_renaming(preprocessor: Any, policy: PreTrainedConfig) -> Any:
         made.load_state_dict(step.state_dict())
         return made
 
-    return replace(preprocessor, steps=[own(step) for step in preprocessor.steps])
+    return replace(preprocessor, steps=[adapt(step) for step in preprocessor.steps])
 
 
 def given_names(preprocessor: Any) -> dict[str, str]:

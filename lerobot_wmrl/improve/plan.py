@@ -58,7 +58,7 @@ class Plan:
     """
 
     config: ImproveConfig
-    found: Findings
+    findings: Findings
     preprocessor: Any = None
 
     @classmethod
@@ -71,26 +71,26 @@ class Plan:
         assert config.policy is not None
         table = read_episodes(config.dataset.open())
         preprocessor, postprocessor = load_processors(config.policy)
-        own = with_own_cameras(config.policy, preprocessor, table.dataset.features)
-        adapted = without_renaming(preprocessor, own) if own is not config.policy else None
-        found = look(table, own, config.dataset.episodes, config.rollouts)
+        policy = with_own_cameras(config.policy, preprocessor, table.dataset.features)
+        adapted = without_renaming(preprocessor, policy) if policy is not config.policy else None
+        findings = look(table, policy, config.dataset.episodes, config.rollouts)
         chosen = np.flatnonzero(table.among(config.dataset.episodes))
         require_unreported(table, chosen, "choose others with `dataset.episodes`")
         if config.rollouts and isinstance(config.real_env, WmrlManiSkillEnv):
             require_mergeable(table.dataset, config.real_env)
         robot = read_embodiment(table.dataset.meta, Embodiment())
         check_units(
-            own, postprocessor, robot.action_names,
+            policy, postprocessor, robot.action_names,
             torch.tensor(robot.action_low), torch.tensor(robot.action_high), "the dataset",
         )  # fmt: skip
         if config.real_env is not None:
             starts = max(config.eval_episodes, config.selection_episodes)
             # not in this process: stages are forks of it that render too
-            in_fork(check_real_env, own, config.real_env, starts)
+            in_fork(check_real_env, policy, config.real_env, starts)
             check_frame_rate(config.real_env, table.dataset.fps, "the dataset")
         planned = copy(config)
-        planned.policy = own
-        return cls(planned, found, adapted)
+        planned.policy = policy
+        return cls(planned, findings, adapted)
 
     @property
     def duration(self) -> str:
@@ -128,7 +128,7 @@ class Plan:
     @property
     def clones(self) -> bool:
         """Whether a policy is cloned from the successes alone. If all episodes succeed, this one was."""
-        return bool(self.config.rollouts or self.found.failures)
+        return bool(self.config.rollouts or self.findings.failures)
 
     @property
     def rl_checkpoint(self) -> Path:
@@ -150,27 +150,27 @@ class Plan:
         assert real is not None
         assert policy is not None
         recorded = {*ROLLOUT_COLUMNS, *policy.input_features, *env_to_policy_features(real)}
-        return [name for name in self.found.columns if name not in recorded]
+        return [name for name in self.findings.columns if name not in recorded]
 
     @property
     def mergeable(self) -> Path:
         """Folder of the dataset with the columns that rollouts have too."""
-        return self.out / "columns" if self.extra_columns else self.found.root
+        return self.out / "columns" if self.extra_columns else self.findings.root
 
     @property
     def data(self) -> ChosenEpisodes:
         """The episodes that are learnt from: the dataset's, and the rollouts, which are merged with it."""
-        given, count = self.config.dataset, self.config.rollouts
+        dataset, count = self.config.dataset, self.config.rollouts
         if not count:
-            return given
-        chosen = given.episodes
+            return dataset
+        chosen = dataset.episodes
         if chosen is not None:
             chosen = [*chosen, *self.rollout_numbers()]
         return ChosenEpisodes(root=str(self.out / "merged"), episodes=chosen)
 
     def rollout_numbers(self) -> range:
         """Return the numbers of the rollouts among the merged episodes."""
-        return range(self.found.total, self.found.total + self.config.rollouts)
+        return range(self.findings.total, self.findings.total + self.config.rollouts)
 
     @property
     def in_maniskill(self) -> bool:
@@ -184,13 +184,13 @@ class Plan:
         if isinstance(real, WmrlManiSkillEnv):
             return real.horizon
         if not self.config.rollouts:
-            return self.found.longest
-        return self.config.max_frames or self.found.longest * SLOWEST
+            return self.findings.longest
+        return self.config.max_frames or self.findings.longest * SLOWEST
 
     @property
     def length(self) -> int:
         """Frames of an imagined episode."""
-        return min(self.found.longest, LONGEST_IMAGINATION)
+        return min(self.findings.longest, LONGEST_IMAGINATION)
 
     @property
     def discount(self) -> float:
@@ -202,9 +202,11 @@ class Plan:
         """How large frames, batches and rollouts are."""
         assert self.config.policy is not None
         observations = len(self.config.policy.observation_delta_indices or [0])
-        found, cameras = self.found, len(self.found.cameras)
-        return Sizes(self.config.preset, found.frame_side, found.pixels, cameras, self.length, observations)
+        findings, cameras = self.findings, len(self.findings.cameras)
+        return Sizes(
+            self.config.preset, findings.frame_side, findings.pixels, cameras, self.length, observations
+        )
 
     def strict_criterion(self) -> Flags:
         """Return when the check sees success, and imagination too unless that recognises nothing."""
-        return {"done_threshold": DONE_THRESHOLD, "done_frames": min(DONE_FRAMES, max(1, self.found.held))}
+        return {"done_threshold": DONE_THRESHOLD, "done_frames": min(DONE_FRAMES, max(1, self.findings.held))}

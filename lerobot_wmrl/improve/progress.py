@@ -55,8 +55,8 @@ class Progress:
         trained = {SFT: plan.policy}
         if plan.clones:
             trained[CLONED] = str(last_checkpoint(plan.out / "cloned"))
-        others = plan.clones or self.has_distilled
-        if changed := self.has_trained and not (self.kept_start and others):  # else it is one of the others
+        has_others = plan.clones or self.has_distilled
+        if changed := self.has_trained and not (self.kept_start and has_others):  # else it is one of them
             fitted = plan.config.algorithm["algorithm.type"] == "distillation"
             trained[FITTED if fitted else PPO] = str(plan.rl_checkpoint)
         if self.has_distilled:
@@ -88,8 +88,8 @@ class Progress:
         threshold: imagination sees success there instead."""
         if not (self.plan.out / CHECK).is_file():
             return None
-        found = read_check(self.plan.out)
-        return None if found["true_positives"] else found["operating_point"]
+        check = read_check(self.plan.out)
+        return None if check["true_positives"] else check["operating_point"]
 
     def criterion(self) -> Flags:
         """Return when imagination sees success."""

@@ -36,10 +36,10 @@ class Place:
 
 def read_place(name: str, folder: Path, titles: Sequence[str]) -> Place:
     """Read a finished comparison of policies, which have these titles, in this order."""
-    found = read_json(folder / RESULTS)
-    episodes = read_episodes(found)
+    saved = read_json(folder / RESULTS)
+    episodes = read_episodes(saved)
     starts = len({episode.seed for episode in episodes})
-    return Place(name, Comparison(titles, starts, "all", found["alpha"], stop_early=False, episodes=episodes))
+    return Place(name, Comparison(titles, starts, "all", saved["alpha"], stop_early=False, episodes=episodes))
 
 
 def read_check(out: Path) -> dict[str, Any]:
@@ -62,5 +62,5 @@ def read_selection(out: Path) -> dict[int, Record]:
 
 def read_json(path: Path) -> dict[str, Any]:
     """Read what a stage wrote."""
-    found: dict[str, Any] = json.loads(path.read_text())
-    return found
+    content: dict[str, Any] = json.loads(path.read_text())
+    return content

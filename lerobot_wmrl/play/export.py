@@ -108,10 +108,10 @@ def compare(world: World, row: int, folder: Path) -> str:
     wanted = world.model.clip_length + FRAMES_BEYOND
     actions = np.resize(drive.recorded.actions, (wanted, drive.recorded.actions.shape[1]))
     for action, imagined in zip(actions, model.imagine(frames, torch.from_numpy(actions)[None]), strict=True):
-        found = exported.step(action[None])
+        outputs = exported.step(action[None])
         shown = model.decode(imagined.tokens, frames.context).images[0].movedim(1, -1).numpy() * 255
-        colours.append(np.abs(found["pixels"][..., :3] - shown).mean())
-        chances.append(np.abs(found["done_probability"] - imagined.done_logit.sigmoid().numpy()).max())
+        colours.append(np.abs(outputs["pixels"][..., :3] - shown).mean())
+        chances.append(np.abs(outputs["done_probability"] - imagined.done_logit.sigmoid().numpy()).max())
     return (
         f"over {len(actions)} frames with recorded actions, its pictures are {np.mean(colours):.2f} of 255 "
         f"away from the world model's on average, its probabilities of success at most {max(chances):.3f}"

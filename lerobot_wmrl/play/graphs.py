@@ -54,7 +54,7 @@ class WrittenMemory:
     def __init__(self, keys: Tensor, values: Tensor, age: Tensor) -> None:
         slots = torch.arange(keys.shape[-2])
         self.past, self.written = (keys, values), (slots == age)[:, None]
-        self.seen, self.rotation = slots <= age, Rotation.at(age, keys.shape[-1])
+        self.mask, self.rotation = slots <= age, Rotation.at(age, keys.shape[-1])
         self.layers: list[tuple[Tensor, Tensor]] = []
 
     def attend(self, layer: int, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
@@ -64,7 +64,7 @@ class WrittenMemory:
             torch.where(self.written, now, past[layer]) for now, past in zip(new, self.past, strict=True)
         )
         self.layers.append((keys, values))
-        return attention(self.rotation(query), keys, values, self.seen)
+        return attention(self.rotation(query), keys, values, self.mask)
 
     def written_past(self) -> tuple[Tensor, Tensor]:
         """Return keys and values with those of the new frame."""
@@ -85,7 +85,7 @@ class Graph(nn.Module):
         self.model, self.reads = model, tuple(reads)
         self.network = cast(AnchoredDynamics, model.dynamics).network
 
-    def compute(self, given: Tensors) -> Tensors:
+    def compute(self, tensors: Tensors) -> Tensors:
         """Compute named tensors from those named in `reads`."""
         raise NotImplementedError
 
@@ -100,11 +100,11 @@ class ReadStart(Graph):
     def __init__(self, model: ActionWorldModelRewardModel) -> None:
         super().__init__(model, ["pictures", "measured_state"])
 
-    def compute(self, given: Tensors) -> Tensors:
-        tokenizer, pictures = self.model.tokenizer, given["pictures"]
+    def compute(self, tensors: Tensors) -> Tensors:
+        tokenizer, pictures = self.model.tokenizer, tensors["pictures"]
         context = tokenizer.context(pictures)
         codes = self.network.codebook.codes(tokenizer.encode(pictures, context))[:, None]
-        state = self.model.normalize_state(given["measured_state"])[:, None]
+        state = self.model.normalize_state(tensors["measured_state"])[:, None]
         return {"codes": codes, "state": state, **numbered("context", context.maps)}
 
 
@@ -114,9 +114,9 @@ class EncodeScene(Graph):
     def __init__(self, model: ActionWorldModelRewardModel, contexts: int) -> None:
         super().__init__(model, ["codes", "state", *(["context_0"] if contexts else [])])
 
-    def compute(self, given: Tensors) -> Tensors:
-        context = Context((given["context_0"],)) if "context_0" in given else Context()
-        scene, rollout = self.network.encode(given["codes"], given["state"], context)
+    def compute(self, tensors: Tensors) -> Tensors:
+        context = Context((tensors["context_0"],)) if "context_0" in tensors else Context()
+        scene, rollout = self.network.encode(tensors["codes"], tensors["state"], context)
         kept = {"anchor": scene.codes, **dict(zip(SCENE[1:], scene[1:], strict=True))}
         shape = (len(self.network.trajectory), 1, 1, self.network.heads, self.network.window)
         keys = torch.zeros(*shape, self.network.head_width)
@@ -134,15 +134,15 @@ class ImagineStep(Graph):
         maps = [f"context_{index}" for index in range(1, contexts)]
         super().__init__(model, ["action", "age", *SCENE, *ROLLOUT, "keys", "values", *maps])
 
-    def compute(self, given: Tensors) -> Tensors:
+    def compute(self, tensors: Tensors) -> Tensors:
         network, codebook = self.network, self.network.codebook
-        memory = WrittenMemory(given["keys"], given["values"], given["age"])
-        mean = self.model.encode_actions(given["action"][:, None]).mean()
-        scene = EncodedScene(*(given[name] for name in SCENE))
-        rollout = StateRollout(*(given[name] for name in ROLLOUT))
+        memory = WrittenMemory(tensors["keys"], tensors["values"], tensors["age"])
+        mean = self.model.encode_actions(tensors["action"][:, None]).mean()
+        scene = EncodedScene(*(tensors[name] for name in SCENE))
+        rollout = StateRollout(*(tensors[name] for name in ROLLOUT))
         prediction, rollout = network.follow(scene, rollout, mean, memory, None)
         codes = codebook.most_likely(prediction.logits)
-        maps = [given[name] for name in self.reads if name.startswith("context")]
+        maps = [tensors[name] for name in self.reads if name.startswith("context")]
         context = Context((torch.zeros_like(maps[0]), *maps)) if maps else Context()
         images = self.model.tokenizer.decode(codebook.tokens(codes[:, 0]), context)[0]
         keys, values = memory.written_past()
@@ -191,18 +191,18 @@ def export_graphs(model: ActionWorldModelRewardModel, folder: Path) -> None:
             "train one with --model.dynamics.type=anchored, or serve the page instead",
         )  # fmt: skip
     sizes = model.config.tokenizer
-    given: Tensors = {
+    tensors: Tensors = {
         "pictures": torch.rand(1, len(sizes.cameras), 3, sizes.image_size, sizes.image_size),
         "measured_state": model.state_mean[None].clone(),
         "action": model.action_mean[None].clone(),
         "age": torch.zeros(1, dtype=torch.long),
     }
     start = ReadStart(model)
-    contexts = len(model.tokenizer.context(given["pictures"]).maps)
+    contexts = len(model.tokenizer.context(tensors["pictures"]).maps)
     logging.getLogger("onnx_ir").setLevel(logging.ERROR)
     graphs = {"start": start, "scene": EncodeScene(model, contexts), "step": ImagineStep(model, contexts)}
     for name, graph in graphs.items():
-        inputs = {read: given[read] for read in graph.reads}
+        inputs = {read: tensors[read] for read in graph.reads}
         with torch.no_grad(), warnings.catch_warnings(action="ignore"):  # of torch's, about torch's own code
             outputs = graph.eval().compute(inputs)
             program = torch.onnx.export(
@@ -211,7 +211,7 @@ def export_graphs(model: ActionWorldModelRewardModel, folder: Path) -> None:
             )  # fmt: skip
         assert program is not None
         (folder / f"{name}.onnx").write_bytes(in_float16(program.model_proto).SerializeToString())
-        given |= input_names(outputs)
+        tensors |= input_names(outputs)
 
 
 def in_float16(proto: "onnx.ModelProto") -> "onnx.ModelProto":
@@ -264,6 +264,6 @@ class ExportedWorldModel:
 
     def _run(self, name: str) -> None:
         graph = self.graphs[name]
-        found = graph.run(None, {each.name: self.tensors[each.name] for each in graph.get_inputs()})
+        outputs = graph.run(None, {each.name: self.tensors[each.name] for each in graph.get_inputs()})
         names = (each.name for each in graph.get_outputs())
-        self.tensors |= input_names(dict(zip(names, found, strict=True)))
+        self.tensors |= input_names(dict(zip(names, outputs, strict=True)))

@@ -111,8 +111,8 @@ class LabelPage:
 
     def _pictures(self, row: int) -> dict[str, bytes]:
         """Return the pictures of a row of the dataset by camera, as JPEG."""
-        found = self.dataset[row]
-        return {camera: jpeg(to_pixels(found[camera])) for camera in self.cameras}
+        frame = self.dataset[row]
+        return {camera: jpeg(to_pixels(frame[camera])) for camera in self.cameras}
 
     async def _label(self, request: web.Request) -> web.Response:
         try:
@@ -136,14 +136,14 @@ class LabelPage:
         if not self.file.is_file():
             return {}
         try:
-            found = json.loads(self.file.read_text())
-            labels = {int(episode): first for episode, first in found["labels"].items()}
-            own = {name: found[name] for name in self.about} == self.about
+            stored = json.loads(self.file.read_text())
+            labels = {int(episode): first for episode, first in stored["labels"].items()}
+            same = {name: stored[name] for name in self.about} == self.about
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise FieldError("file", self.file, "holds no labels", "choose another file") from error
-        if not own:
+        if not same:
             raise FieldError(
-                "file", self.file, f"holds the labels of {found['dataset']}, as it was then",
+                "file", self.file, f"holds the labels of {stored['dataset']}, as it was then",
                 "choose another file",
             )  # fmt: skip
         return labels

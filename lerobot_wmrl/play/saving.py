@@ -86,13 +86,13 @@ class SavedEpisodes:
         if not folder.is_dir():
             return LeRobotDataset.create(self.name, self.robot.fps, features, root=folder, use_videos=False)
         dataset = LeRobotDataset.resume(self.name, root=folder)
-        found, wanted = (
+        stored, wanted = (
             {name: tuple(each["shape"]) for name, each in columns.items() if name not in DEFAULT_FEATURES}
             for columns in (dataset.features, features)
         )
-        if found != wanted:
+        if stored != wanted:
             raise FieldError(
-                "output_dir", self.folder, f"holds episodes with the columns {found}, these have {wanted}",
+                "output_dir", self.folder, f"holds episodes with the columns {stored}, these have {wanted}",
                 "choose a new folder",
             )  # fmt: skip
         return dataset

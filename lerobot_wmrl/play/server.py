@@ -131,9 +131,9 @@ class PlayServer:
             form = await request.post()
             files = [(name, part.file) for name, part in form.items() if isinstance(part, web.FileField)]
             cameras = self.world.sizes.cameras
-            if (given := sorted(name for name, _ in files)) != sorted(cameras):
+            if (names := sorted(name for name, _ in files)) != sorted(cameras):
                 raise FieldError(
-                    "picture", given, f"the world model sees the cameras {', '.join(cameras)}",
+                    "picture", names, f"the world model sees the cameras {', '.join(cameras)}",
                     "give one picture for each",
                 )  # fmt: skip
             images = {name: read_image(name, file) for name, file in files}

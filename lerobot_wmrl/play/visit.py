@@ -85,10 +85,10 @@ class Visit:
         drive, name = self._driving(message), message.get("driver")
         drive.require_running()
         if name == YOU:
-            given = message.get("action")
-            if not is_numbers(given):
-                raise FieldError("action", given, "must be a list of finite numbers")
-            action = torch.tensor([given], dtype=torch.float32)
+            values = message.get("action")
+            if not is_numbers(values):
+                raise FieldError("action", values, "must be a list of finite numbers")
+            action = torch.tensor([values], dtype=torch.float32)
         elif name in self.drivers:
             if name != self.driver:
                 self.drivers[name].reset()

@@ -44,8 +44,8 @@ class Access:
         own that leads here (DNS rebinding), so the host must be this machine's.
         """
         if self.token:
-            given = request.query.get(TOKEN) or request.cookies.get(TOKEN, "")
-            if not secrets.compare_digest(given.encode(), self.token.encode()):
+            token = request.query.get(TOKEN) or request.cookies.get(TOKEN, "")
+            if not secrets.compare_digest(token.encode(), self.token.encode()):
                 raise web.HTTPUnauthorized(text="open the address with ?token=… that the command has printed")
         elif host_name(request.host) not in LOOPBACK:
             raise web.HTTPForbidden(text=f"the host {request.host} is not this machine")

@@ -122,7 +122,7 @@ class World:
             "planner": self.model.learnt_successes != 0,
             "recorded": self.table is not None,
         }
-        return [name for name, found in there.items() if found]
+        return [name for name, available in there.items() if available]
 
     def driver(self, name: str) -> Driver:
         """Return a visitor's own driver of one of `driver_names`."""

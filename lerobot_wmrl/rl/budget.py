@@ -50,9 +50,9 @@ def check_data(settings: CallbackSettings, env: EnvConfig) -> None:
 
 def check_rounds(settings: CallbackSettings, env: WorldModelEnv) -> None:
     """Raise FieldError for a dataset from which no Dyna round could train the world model further."""
-    given = [DatasetSource(root) for root in settings.dyna.dataset.roots or []]
+    rounds = [DatasetSource(root) for root in settings.dyna.dataset.roots or []]
     config = read_config(env.world_model_path, "action_world_model", field="env.world_model_path")
-    for field, sources in {"dyna.learnt.root": [settings.learnt(env)], "dyna.dataset.roots": given}.items():
+    for field, sources in {"dyna.learnt.root": [settings.learnt(env)], "dyna.dataset.roots": rounds}.items():
         for source in sources:
             with renamed("dataset.root", field):
                 table = read_episodes(source.open())

@@ -121,8 +121,8 @@ class CallbackSettings:
 
     def learnt(self, env: EnvConfig) -> DatasetSource:
         """Return the dataset that the world model was trained on."""
-        own = self.dyna.learnt
-        return own if own.given or not isinstance(env, WorldModelEnv) else env.dataset
+        source = self.dyna.learnt
+        return source if source.given or not isinstance(env, WorldModelEnv) else env.dataset
 
     def _check_selection_and_gate(self) -> None:
         with within("selection"):

@@ -168,8 +168,8 @@ class Distillation(RLAlgorithm):
             for step in tqdm(range(steps), "rollout", leave=False, unit="step", disable=hidden_progress()):
                 rollout.observations.write(step, observation)
                 if step < lead:
-                    seen = pipeline.prepare(rollout.observations.read_step(step))
-                    actions[step] = pipeline.to_action(policy.select_action(seen)).to(env.device)
+                    inputs = pipeline.prepare(rollout.observations.read_step(step))
+                    actions[step] = pipeline.to_action(policy.select_action(inputs)).to(env.device)
                 else:
                     ahead = (step - lead) % self.config.planner.execute
                     if not ahead:

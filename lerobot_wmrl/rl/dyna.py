@@ -89,15 +89,15 @@ class DynaRounds:
 
     def _new_datasets(self, iteration: int, checkpoint: Path, folder: Path) -> list[Path]:
         """Return the datasets of this round. TrainingStopped if one has to be recorded elsewhere first."""
-        number, given = self.iterations.index(iteration), self.config.dataset.roots or []
+        number, roots = self.iterations.index(iteration), self.config.dataset.roots or []
         if self.recorder is not None:
             return [self._record(self.recorder, name, number, checkpoint, folder) for name in NOISE_LEVELS]
-        if number < len(given):
-            return [Path(given[number])]
+        if number < len(roots):
+            return [Path(roots[number])]
         raise TrainingStopped(
             f"Dyna round {number + 1} of {len(self.iterations)}, after iteration {iteration}: record what "
             f"the policy in {checkpoint / PRETRAINED_MODEL_DIR} does, add the dataset to "
-            f"`dyna.dataset.roots` ({len(given)} there now), and repeat the command: it continues from here"
+            f"`dyna.dataset.roots` ({len(roots)} there now), and repeat the command: it continues from here"
         )
 
     def _record(self, recorder: Recorder, noise: str, number: int, checkpoint: Path, folder: Path) -> Path:

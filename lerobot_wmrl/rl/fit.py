@@ -83,11 +83,11 @@ def check_discount(cfg: TrainConfig, longest: int) -> None:
     if reward is None or not isinstance(algorithm, PPOConfig | GRPOConfig):
         return
     discount = algorithm.discount(longest) if isinstance(algorithm, PPOConfig) else 1.0
-    if (own := potential_discount(reward, longest)) != discount:
+    if (reward_discount := potential_discount(reward, longest)) != discount:
         logging.warning(
             "env.reward.gamma=%s: progress is rewarded with this discount, and %s has %s, so that the time "
             "spent near the goal counts too; set --env.reward.gamma=%s",
-            own, algorithm.type.upper(), discount, discount,
+            reward_discount, algorithm.type.upper(), discount, discount,
         )  # fmt: skip
 
 

@@ -90,11 +90,11 @@ class SuccessGate:
     def apply(self, records: Mapping[int, Record]) -> None:
         """Warn in red, or raise TrainingStopped, if the latest verdict is bad."""
         latest = records[max(records)]
-        said = f"{latest['warning']}. {REMEDIES}" if latest["failed"] else latest["warning"]
+        warning = f"{latest['warning']}. {REMEDIES}" if latest["failed"] else latest["warning"]
         if latest["failed"] and self.config.action == "stop":
-            raise TrainingStopped(f"{said}; or train nonetheless with `gate.action=warn`")
-        if said:
-            logging.warning(colored(said, "red", attrs=["bold"]))
+            raise TrainingStopped(f"{warning}; or train nonetheless with `gate.action=warn`")
+        if warning:
+            logging.warning(colored(warning, "red", attrs=["bold"]))
 
     def _new_model(self, iteration: int) -> bool:
         return iteration == 0 or iteration in self.refreshed

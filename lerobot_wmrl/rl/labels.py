@@ -72,12 +72,12 @@ class LabelBatch:
     def batch(self, labels: Tensor) -> dict[str, Any]:
         """Return some of the labels, as LeRobot's datasets would give them: images in [0, 1]."""
         rows = self.rows[labels]
-        own = rows if rows.ndim == 1 else rows[:, -1]
-        seen = {
-            name: value[own if name == INSTRUCTIONS else rows] for name, value in self.observations.items()
+        last = rows if rows.ndim == 1 else rows[:, -1]
+        observations = {
+            name: value[last if name == INSTRUCTIONS else rows] for name, value in self.observations.items()
         }
         actions = {name: value[labels] for name, value in self.actions.items()}
-        return decoded(seen | actions, self.instructions)
+        return decoded(observations | actions, self.instructions)
 
 
 class Labels:

@@ -163,12 +163,12 @@ class PolicyGradient(RLAlgorithm):
     @torch.no_grad()
     def load_state_dict(self, state_dict: dict[str, Tensor], device: str | torch.device = "cpu") -> None:
         """Copy the tensors of `state_dict` into this algorithm's own."""
-        own = self.state_dict()
-        if state_dict.keys() != own.keys():
+        tensors = self.state_dict()
+        if state_dict.keys() != tensors.keys():
             raise ValueError(
-                f"algorithm.type={self.name}: its tensors are {sorted(own)}, got {sorted(state_dict)}"
+                f"algorithm.type={self.name}: its tensors are {sorted(tensors)}, got {sorted(state_dict)}"
             )
-        for name, value in own.items():
+        for name, value in tensors.items():
             value.copy_(state_dict[name])
 
     def check_finite(self, record: dict[str, float]) -> None:
@@ -408,8 +408,8 @@ def training_stats(records: list[dict[str, float]], updates: int) -> TrainingSta
     """Return each metric's mean over minibatches, and the first minibatch's ratio error, which is 0 up to
     rounding if `sample` and `evaluate` agree."""
     names = dict.fromkeys(name for record in records for name in record)
-    seen = {name: [record[name] for record in records if name in record] for name in names}
-    mean = {name: sum(values) / len(values) for name, values in seen.items()}
+    by_name = {name: [record[name] for record in records if name in record] for name in names}
+    mean = {name: sum(values) / len(values) for name, values in by_name.items()}
     losses = {name: mean.pop(name) for name in names if name.endswith(LOSS)}
     norms = {name.removesuffix(NORM): mean.pop(name) for name in names if name.endswith(NORM)}
     first = {"first_ratio_error": records[0][RATIO_ERROR]} if records else {}

@@ -46,13 +46,13 @@ class Selection:
 
     def run(self, iteration: int, checkpoint: Path, folder: Path) -> Record:
         """Return the proportion of successes, `real` and `imagined`."""
-        found = {place: measure() for place, measure in self.measures.items()}
+        results = {place: measure() for place, measure in self.measures.items()}
         shares = {
-            place: Proportion(sum(each.successes), len(each.successes)) for place, each in found.items()
+            place: Proportion(sum(each.successes), len(each.successes)) for place, each in results.items()
         }
         summary = ", ".join(f"{place} success {share}" for place, share in shares.items())
         logging.info("Iteration %d: %s", iteration, summary)
-        steps = found[REAL].steps if REAL in found else 0
+        steps = results[REAL].steps if REAL in results else 0
         return {**{place: share.as_json() for place, share in shares.items()}, REAL_STEPS: steps}
 
     def apply(self, records: Mapping[int, Record]) -> None:

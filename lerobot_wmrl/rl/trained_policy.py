@@ -66,8 +66,8 @@ def summary(cfg: TrainConfig) -> list[str]:
         best = int(checkpoint.resolve().name)
         record = read_record(cfg.output_dir, Selection.name, best, cfg.iterations)
         measured = [place for place in ("real", "imagined") if place in record]
-        found = ", ".join(f"{place} success {success(record, place)}" for place in measured)
-        lines.append(f"best checkpoint: iteration {best}, {found}")
+        rates = ", ".join(f"{place} success {success(record, place)}" for place in measured)
+        lines.append(f"best checkpoint: iteration {best}, {rates}")
     return [*lines, f"next: {evaluation(cfg, str(checkpoint / PRETRAINED_MODEL_DIR))}"]
 
 

@@ -187,7 +187,7 @@ def publish(cfg: EvalWorldModelConfig, metrics: Mapping[str, Any], page: str, ep
 
     dataset = cfg.dataset.repo_id or Path(cfg.dataset.name).name
     pictures = sorted(cfg.output_dir.glob("comparison_*.gif"))
-    said = (
+    summary = (
         f"{episodes} recorded episodes of `{dataset}` ({cfg.split}), imagined from their first frames with "
         f"their own actions. An episode succeeds in imagination when {cfg.done_frames} frames in a row have "
         f"a success probability of at least {cfg.done_threshold}."
@@ -197,7 +197,7 @@ def publish(cfg: EvalWorldModelConfig, metrics: Mapping[str, Any], page: str, ep
         shown.append("*Recorded above, imagined below.*")
     files = {path.name: path.read_bytes() for path in pictures}
     files["metrics.json"] = json.dumps({**metrics, "dataset": dataset}, indent=2).encode()
-    publish_evaluation(cfg.model.path, "\n\n".join(["## What it imagines", said, *shown, page]), files)
+    publish_evaluation(cfg.model.path, "\n\n".join(["## What it imagines", summary, *shown, page]), files)
 
 
 def conclusion(cfg: EvalWorldModelConfig, episodes: int, report: "Report") -> str:
@@ -206,7 +206,7 @@ def conclusion(cfg: EvalWorldModelConfig, episodes: int, report: "Report") -> st
 
     metrics = report.metrics
     psnr, ceiling = (metrics["headline"][name]["value"] for name in ("psnr", "psnr_ceiling"))
-    found = (
+    summary = (
         f"Replayed {episodes} recorded episodes of {cfg.dataset.name} open loop: PSNR {psnr:.1f} dB "
         f"(the tokenizer alone {ceiling:.1f} dB); false positives: {metrics['false_positives']} of "
         f"{metrics['failures']} failures; recall: {metrics['true_positives']} of {metrics['successes']} "
@@ -231,7 +231,7 @@ def conclusion(cfg: EvalWorldModelConfig, episodes: int, report: "Report") -> st
             "are never rewarded. Next: train it longer, replay more episodes, or lower --done_threshold or "
             "--done_frames (the table above has other values)."
         )
-    return f"{found}\n{verdict}\nmetrics.json, metrics.md and pictures are in {cfg.output_dir}"
+    return f"{summary}\n{verdict}\nmetrics.json, metrics.md and pictures are in {cfg.output_dir}"
 
 
 def load_text_model(
@@ -274,12 +274,12 @@ def policies_imagination(cfg: EvalWorldModelConfig, table: "EpisodeTable") -> "W
             done_threshold=cfg.done_threshold, done_frames=cfg.done_frames,
         )  # fmt: skip
     with renamed("dataset.split", "split"):
-        found = len(chosen_episodes(table, starts))
-    if found < cfg.policy_episodes:
+        available = len(chosen_episodes(table, starts))
+    if available < cfg.policy_episodes:
         raise FieldError(
             "policy_episodes", cfg.policy_episodes,
-            f"the dataset has {found} starts, and an episode that is repeated says nothing new",
-            f"set it to at most {found}, or choose another `split`",
+            f"the dataset has {available} starts, and an episode that is repeated says nothing new",
+            f"set it to at most {available}, or choose another `split`",
         )  # fmt: skip
     return imagination
 

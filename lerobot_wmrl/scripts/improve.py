@@ -39,12 +39,12 @@ def improve(cfg: ImproveConfig) -> None:
 
     cfg.validate()
     plan = Plan.of(cfg)
-    print(f"{cfg.dataset.name}:\n{plan.found}\n  {plan.duration}")
+    print(f"{cfg.dataset.name}:\n{plan.findings}\n  {plan.duration}")
     progress = Progress(plan)
     stages = commands.stages(progress)
     assert cfg.policy is not None
     content = {
-        "dataset": fingerprint(plan.found.root),
+        "dataset": fingerprint(plan.findings.root),
         "policy": checkpoint_digest(str(cfg.policy.pretrained_path)),
     }
     with Claim(cfg.output_dir, settings(cfg, stages), content=content, marker=MARKER).held():
@@ -62,10 +62,10 @@ def settings(cfg: ImproveConfig, stages: "list[Stage]") -> dict[str, object]:
     from lerobot_wmrl.common.checkpoints import resolved_name
 
     assert cfg.policy is not None
-    given = {name: value for name, value in draccus.encode(cfg).items() if name != "policy"}
+    settings = {name: value for name, value in draccus.encode(cfg).items() if name != "policy"}
     if cfg.policy_flags:
-        given["policy_flags"] = cfg.policy_flags
-    return given | {
+        settings["policy_flags"] = cfg.policy_flags
+    return settings | {
         "policy": resolved_name(str(cfg.policy.pretrained_path)), "size": cfg.preset,
         "output_dir": str(cfg.output_dir),
         "selection_episodes": cfg.selection_episodes if cfg.selects else 0,

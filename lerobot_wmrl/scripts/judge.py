@@ -216,13 +216,13 @@ def read_both(
 
     known, judged = read_references(cfg.references), read_policies(cfg.policies, env)
     with renamed("policies", "references"):
-        others = read_policies(list(known), env)
-    if both := sorted(judged.keys() & others.keys()):
+        references = read_policies(list(known), env)
+    if both := sorted(judged.keys() & references.keys()):
         raise FieldError(
             "policies", both[0], "its real success is known: it is among the references",
             "leave it out of one of the two",
         )  # fmt: skip
-    return others | judged, dict(zip(others, known.values(), strict=True))
+    return references | judged, dict(zip(references, known.values(), strict=True))
 
 
 def named_content(cfg: JudgeConfig, env: WorldModelEnv, rollouts: Path) -> dict[str, str]:
@@ -252,20 +252,20 @@ def remember(judgement: "Judgement", cfg: JudgeConfig, configs: Collection[str])
     results = cfg.output_dir / RESULTS
     if not results.is_file():
         return
-    found, now = json.loads(results.read_text()), judgement.checkpoints
+    stored, now = json.loads(results.read_text()), judgement.checkpoints
     changed = [
         f"{cfg.dataset.name} or the world model"
         for name, rate in confusion_json(judgement.confusion).items()
-        if found[name] != rate
+        if stored[name] != rate
     ]
-    before = found["checkpoints"]
+    before = stored["checkpoints"]
     changed += [name for name in configs if before.get(name, now[name]) != now[name]]
     if changed:
         raise ValueError(
             f"--output_dir={cfg.output_dir}: {changed[0]} has changed since its episodes were imagined; "
             "choose another folder"
         )
-    for name, outcomes in found["outcomes"].items():
+    for name, outcomes in stored["outcomes"].items():
         (judgement.outcomes if name in configs else judgement.earlier)[name] = outcomes
     judgement.checkpoints = before | now
 
@@ -317,12 +317,14 @@ def starts_of_one_task(envs: "Envs", cfg: JudgeConfig) -> int:
     """Return the number of starts. FieldError if they are of several tasks: one rate says little of these."""
     made = [env for tasks in envs.values() for env in tasks.values()]
     if len(made) > 1:
-        said = f"the starts are of {len(made)} tasks, and success is judged task by task"
+        fault = f"the starts are of {len(made)} tasks, and success is judged task by task"
         if cfg.starts_given:
             raise FieldError(
-                "dataset.tasks", cfg.starts.tasks, said, "choose one of them, and rollouts of the same task"
+                "dataset.tasks", cfg.starts.tasks, fault, "choose one of them, and rollouts of the same task"
             )
-        raise FieldError("dataset.episodes", cfg.dataset.episodes, said, "choose the rollouts of one of them")
+        raise FieldError(
+            "dataset.episodes", cfg.dataset.episodes, fault, "choose the rollouts of one of them"
+        )
     env: Any = made[0]
     return len(env.env.starts)
 

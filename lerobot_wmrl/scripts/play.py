@@ -119,13 +119,13 @@ class PlayConfig(RunConfig):
             raise FieldError(
                 "dataset.root", "", "is missing: an exported page begins in its frames", "give a dataset"
             )
-        for name, given in (
+        for name, value in (
             ("policy.path", self.policy), ("real_env.type", self.real_env),
             ("text_world_model.path", self.text_world_model.path),
         ):  # fmt: skip
-            if given:
+            if value:
                 raise FieldError(
-                    name, getattr(given, "type", given), "is in no exported page", "leave it out"
+                    name, getattr(value, "type", value), "is in no exported page", "leave it out"
                 )
         require_new("export", folder)
         for package in ("onnx", "onnxscript", "onnxruntime"):

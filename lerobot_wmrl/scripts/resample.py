@@ -139,11 +139,11 @@ def scaled_features(features: Mapping[str, Any], summed: np.ndarray, every: int)
     """Return a dataset's own features; the recorded range of components that add up grows with them."""
     from lerobot.utils.constants import ACTION, DEFAULT_FEATURES
 
-    own = {name: dict(each) for name, each in features.items() if name not in DEFAULT_FEATURES}
-    info = dict(own[ACTION].get("info") or {})
+    columns = {name: dict(each) for name, each in features.items() if name not in DEFAULT_FEATURES}
+    info = dict(columns[ACTION].get("info") or {})
     for end in {"low", "high"} & info.keys():
         info[end] = (np.asarray(info[end]) * np.where(summed, every, 1)).tolist()
-    return own | {ACTION: own[ACTION] | ({"info": info} if info else {})}
+    return columns | {ACTION: columns[ACTION] | ({"info": info} if info else {})}
 
 
 def episode_rows(

@@ -247,8 +247,8 @@ def quality(cfg: TrainWorldModelConfig, model: Any, table: EpisodeTable) -> str:
     measured = measured or read_metrics(cfg.output_dir)[-1]
     done = ("done_loss",) if table.done_known else ()
     shown = ("loss", "token_accuracy", "moving_token_accuracy", *done, "state_loss")
-    said = ", ".join(f"{name.replace('_', ' ')} {measured[name]:.3f}" for name in shown if name in measured)
-    return f"On {where}: {said}."
+    values = ", ".join(f"{name.replace('_', ' ')} {measured[name]:.3f}" for name in shown if name in measured)
+    return f"On {where}: {values}."
 
 
 def next_command(cfg: TrainWorldModelConfig) -> str:

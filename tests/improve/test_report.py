@@ -196,7 +196,7 @@ def test_another_round_begins_from_the_policy_to_use_on_all_episodes(
         f"--policy.path={finished.plan.out}/distilled/checkpoints/last/pretrained_model {merged}" in command
     )
     assert f"--seed=27 --output_dir={finished.plan.out}_again" in command
-    assert f"--max_frames={2 * finished.plan.found.longest} " in command, "as many as in this round"
+    assert f"--max_frames={2 * finished.plan.findings.longest} " in command, "as many as in this round"
     write_records(finished)
     table = SimpleNamespace(success=np.arange(60) < 40, among=lambda episodes: None)
     monkeypatch.setattr(table, "subset", lambda among: table, raising=False)

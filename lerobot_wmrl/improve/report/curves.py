@@ -47,15 +47,15 @@ class Curve(NamedTuple):
 def training_curves(progress: Progress) -> dict[str, Curve]:
     """Read losses, and what RL logs, by title."""
     plan, out = progress.plan, progress.plan.out
-    found = {title: curve(read_metrics(out / folder), "loss") for folder, title in MODELS.items()}
+    curves = {title: curve(read_metrics(out / folder), "loss") for folder, title in MODELS.items()}
     if plan.clones:
-        found["Further BC"] = lerobot_train_curve(out / "logs" / "cloned.log")
+        curves["Further BC"] = lerobot_train_curve(out / "logs" / "cloned.log")
     runs = {"rl": str(plan.config.algorithm["algorithm.type"])}
     runs |= {"distilled": "distillation"} if progress.has_distilled else {}
     for folder, algorithm in runs.items():
         rows = read_metrics(out / folder)
-        found |= {title: curve(rows, column, ITERATION) for column, title in PANELS[algorithm].items()}
-    return {title: each for title, each in found.items() if each.x}
+        curves |= {title: curve(rows, column, ITERATION) for column, title in PANELS[algorithm].items()}
+    return {title: each for title, each in curves.items() if each.x}
 
 
 def curve(metrics: Sequence[Mapping[str, Any]], name: str, unit: str = STEP) -> Curve:
@@ -69,8 +69,8 @@ def lerobot_train_curve(log: Path, name: str = "loss") -> Curve:
 
     It writes steps from 1,000 on as thousands (`1K`): the values of each are averaged.
     """
-    found: dict[float, list[float]] = {}
+    values: dict[float, list[float]] = {}
     for step, value in re.findall(rf"step:(\d+K?)\b.*?\b{name}:([-\d.e]+)", log.read_text(errors="replace")):
         at = float(step.rstrip("K")) * (1000 if step.endswith("K") else 1)
-        found.setdefault(at, []).append(float(value))
-    return Curve(sorted(found), [float(np.mean(found[step])) for step in sorted(found)])
+        values.setdefault(at, []).append(float(value))
+    return Curve(sorted(values), [float(np.mean(values[step])) for step in sorted(values)])

@@ -121,13 +121,13 @@ class Page:
 
     def _all_records(self) -> list[dict[str, Any]]:
         """Return the records of all stages: behind that of lerobot-wmrl-improve, if it is one, its own."""
-        found = []
+        records = []
         for record in self.records:
-            found.append(record)
+            records.append(record)
             if shlex.split(record["command"])[0] == "lerobot-wmrl-improve":
-                own = stage_records(self.progress.plan.out, commands.stages(self.progress))
-                found += [{**each, "title": f"– {each['title']}"} for each in own]
-        return found
+                nested = stage_records(self.progress.plan.out, commands.stages(self.progress))
+                records += [{**each, "title": f"– {each['title']}"} for each in nested]
+        return records
 
     def _render(self, summary: Mapping[str, Any]) -> str:
         """Fill the template, with every picture inside the page."""
@@ -153,7 +153,7 @@ class Page:
             choice=choice_line(progress),
             chosen=summary["chosen"],
             bars=figures.success_bars({place.name: place.rates for place in self.places}),
-            data=[*progress.plan.found.lines, *rollouts_line(progress)],
+            data=[*progress.plan.findings.lines, *rollouts_line(progress)],
             missing=lacks(progress),
             trust=[trust(progress), *gate_line(progress)],
             warnings=gate_warnings(progress),

@@ -52,37 +52,37 @@ def rollouts_line(progress: Progress) -> list[str]:
 
 def lacks(progress: Progress) -> list[str]:
     """Say what the data lacks, rollouts included."""
-    found = progress.plan.found.missing
+    missing = progress.plan.findings.missing
     if not progress.plan.config.rollouts:
-        return found
-    return [*found, *few_failures(progress.learnt.chosen(), "Record more rollouts, with more exploration")]
+        return missing
+    return [*missing, *few_failures(progress.learnt.chosen(), "Record more rollouts, with more exploration")]
 
 
 def verdict(progress: Progress, places: Sequence[Place]) -> str:
     """Say in a few lines which policy to use, and how it compares with each other one, and where."""
     paths, chosen = progress.policies, progress.chosen()
-    said = []
+    paragraphs = []
     for place in places:
         rates = [f"- {title}: {rate}, `{paths[title]}`" for title, rate in place.rates.items()]
         changes = [f"- {line}" for line in pair_lines(place, chosen)]
-        said.append("\n".join([f"Success {place.name}, on the same starts:", *rates, *changes]))
+        paragraphs.append("\n".join([f"Success {place.name}, on the same starts:", *rates, *changes]))
     return "\n\n".join([
-        *said, decided_at(places), *lacks(progress), *reservations(progress), choice_line(progress),
+        *paragraphs, decided_at(places), *lacks(progress), *reservations(progress), choice_line(progress),
     ])  # fmt: skip
 
 
 def choice_line(progress: Progress) -> str:
     """Say which policy to use, and why."""
-    chosen, found = progress.chosen(), read_choice(progress)
+    chosen, choice = progress.chosen(), read_choice(progress)
     path = progress.policies[chosen]
-    if found is None:
+    if choice is None:
         return (
             f"The last policy: {chosen}, {path}. RL can make a policy worse: the comparison says "
             "whether to use it."
         )
-    shown = ", ".join(f"{title} {rate}" for title, rate in found.rates.items())
+    shown = ", ".join(f"{title} {rate}" for title, rate in choice.rates.items())
     return (
-        f"Policy to use: {chosen}, {path}. None succeeded more often {found.name}, {set_aside(progress)}: "
+        f"Policy to use: {chosen}, {path}. None succeeded more often {choice.name}, {set_aside(progress)}: "
         f"{shown}. Of equally good ones it is the earliest."
     )
 
@@ -138,28 +138,28 @@ def decided_at(places: Sequence[Place]) -> str:
 
 def reservations(progress: Progress) -> list[str]:
     """Say what a reader must know beside the success rates."""
-    plan, found = progress.plan, []
+    plan, notes = progress.plan, []
     if plan.config.real_env is None:
-        found.append(
+        notes.append(
             "This is what the world model predicts, and shows nothing about the real world. Run the policies "
             "there, label what they did, and run the command again on all episodes."
         )
     if reason := read_record(plan.out, "rl").get(FAILED):
         kept = progress.has_trained and not progress.kept_start
         left = "A checkpoint from before that is compared" if kept else "It left no policy"
-        found.append(f"RL stopped ({plan.out / 'logs' / 'rl.log'}). {left}. {reason}")
+        notes.append(f"RL stopped ({plan.out / 'logs' / 'rl.log'}). {left}. {reason}")
     if progress.kept_start:
-        found.append(
+        notes.append(
             "RL gained nothing: no checkpoint succeeded more often in the real environment than the policy "
             "that it began with, whatever imagination says of them."
         )
     if plan.config.distils and not progress.has_distilled:
         log = plan.out / "logs" / "distilled.log"
-        found.append(
+        notes.append(
             f"Fitting the policy to a planner failed ({log}), and left no policy. To try again, choose "
             "another output_dir."
         )
-    return found
+    return notes
 
 
 def start_line(progress: Progress) -> list[str]:
@@ -176,27 +176,27 @@ def start_line(progress: Progress) -> list[str]:
 
 def trust(progress: Progress) -> str:
     """Say how well the world model tells recorded successes from failures."""
-    found = read_check(progress.plan.out)
-    wins, losses = found["successes"], found["failures"]
-    whose = "rollouts" if Path(found["dataset"]) == progress.plan.out / "merged" else "episodes"
-    held_out = found["split"] == "validation"
+    check = read_check(progress.plan.out)
+    wins, losses = check["successes"], check["failures"]
+    whose = "rollouts" if Path(check["dataset"]) == progress.plan.out / "merged" else "episodes"
+    held_out = check["split"] == "validation"
     kind = f"held-out {whose}" if held_out else f"{whose} (most of which it has learnt from)"
     if not wins or not losses:
         return (
             f"Unknown: of the {kind} {wins} succeed and {losses} fail, and both are needed. Record more."
             f"{taken_instead(progress)}"
         )
-    false, recall = Proportion(found["false_positives"], losses), Proportion(found["true_positives"], wins)
-    said = (
-        f"On {wins + losses} {kind}: false positives {false}, recall {recall}, AUC {found['auc']:.2f} (the "
+    false, recall = Proportion(check["false_positives"], losses), Proportion(check["true_positives"], wins)
+    text = (
+        f"On {wins + losses} {kind}: false positives {false}, recall {recall}, AUC {check['auc']:.2f} (the "
         "probability that a success scores higher than a failure; 0.5 is chance)."
     )
-    if found["auc"] < DOUBTFUL_AUC:
-        said += " That is not enough to trust its reward: record more episodes, failures above all."
-    if (seen := found.get("seen_auc")) is not None:
+    if check["auc"] < DOUBTFUL_AUC:
+        text += " That is not enough to trust its reward: record more episodes, failures above all."
+    if (seen_auc := check.get("seen_auc")) is not None:
         larger = " `--size=cpu` has larger frames." if progress.plan.sizes.could_be_larger else ""
-        said += f" {seen_line(seen, larger)}"
-    return said + taken_instead(progress)
+        text += f" {seen_line(seen_auc, larger)}"
+    return text + taken_instead(progress)
 
 
 def gate_line(progress: Progress) -> list[str]:
