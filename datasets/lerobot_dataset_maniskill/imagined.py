@@ -11,9 +11,9 @@ from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
-from lerobot_dataset_maniskill.manifest import EpisodePlan, Part
+from lerobot_dataset_maniskill.manifest import DatasetPart, EpisodePlan
 from lerobot_dataset_maniskill.worker import EpisodeResult, Report, out_of_range, whole_part
-from lerobot_dataset_maniskill.writer import Outcome, StartColumns, add_step
+from lerobot_dataset_maniskill.writer import StartColumns, StepResult, add_step
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.exploration import ExplorationNoise
 from lerobot_wmrl.common.policies import LoadedPolicy, fit_to_environment
@@ -24,7 +24,7 @@ from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW, ACTION_NA
 from lerobot_wmrl.maniskill.episode import Frame
 from lerobot_wmrl.maniskill.tasks import task_of
 
-Row = tuple[Frame, np.ndarray, Outcome]
+Row = tuple[Frame, np.ndarray, StepResult]
 
 VISIT_SEEDS: Final = 10_000_000
 """Random seeds of one visit of all starts, more than a start's own seed can be."""
@@ -51,15 +51,15 @@ class ImaginedPartRecorder:
         self.policy = LoadedPolicy.load(config.policy)
         self.env.model.check_units(config.policy, self.policy.postprocessor)
 
-    def record(self, part: Part, report: Report) -> None:
+    def record(self, part: DatasetPart, report: Report) -> None:
         """Record a part. Its folder appears under its final name only when it is whole."""
         with whole_part(self.config, self.folder, part, self.cameras, self.side) as dataset:
             for plan, (instruction, rows, clipped) in zip(
                 part.episodes, self._imagine(part.episodes), strict=True
             ):
                 start = StartColumns(instruction, task_of(plan.task).index, plan)
-                for before, action, outcome in rows:
-                    add_step(dataset, start, before, action, outcome)
+                for before, action, result in rows:
+                    add_step(dataset, start, before, action, result)
                 save_episode(dataset)
                 report(EpisodeResult(plan.kind, not rows[-1][-1].truncated, clipped))
 
@@ -83,8 +83,8 @@ class ImaginedPartRecorder:
             observation, reward, terminated, truncated, info = self.env.step(torch.from_numpy(action))
             after = self._frames(info.get("final_obs", observation), reward)
             for index in running:
-                outcome = Outcome(after[index], bool(truncated[index]))
-                rows[index].append((before[index], action[index], outcome))
+                result = StepResult(after[index], bool(truncated[index]))
+                rows[index].append((before[index], action[index], result))
                 clipped[index].append(shares[index])
             running -= set((terminated | truncated).nonzero().flatten().tolist())
             before = after
@@ -122,7 +122,7 @@ def with_success(rows: list[Row], done_frames: int) -> list[Row]:
     if rows[-1][-1].truncated:
         return rows
     solved = [
-        (before, action, replace(outcome, frame=replace(outcome.frame, success=True)))
-        for before, action, outcome in rows[-done_frames:]
+        (before, action, replace(result, frame=replace(result.frame, success=True)))
+        for before, action, result in rows[-done_frames:]
     ]
     return [*rows[:-done_frames], *solved]

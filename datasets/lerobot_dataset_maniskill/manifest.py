@@ -39,7 +39,7 @@ class EpisodePlan:
 
 
 @dataclass(frozen=True)
-class Part:
+class DatasetPart:
     """A sub-dataset: what a worker records at a time."""
 
     index: int
@@ -51,12 +51,12 @@ class Part:
         return f"part-{self.index:05d}"
 
 
-def planned_parts(config: RecordConfig) -> list[Part]:
+def planned_parts(config: RecordConfig) -> list[DatasetPart]:
     """Return all parts of the shard in order."""
     episodes = simulated_episodes(config) if config.imagination is None else imagined_episodes(config)
     size, (shard, shards) = config.part_episodes, config.shard_of
     parts = [
-        Part(index, tuple(episodes[first : first + size]))
+        DatasetPart(index, tuple(episodes[first : first + size]))
         for index, first in enumerate(range(0, len(episodes), size))
     ]
     return parts[shard::shards]

@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.imagined import ImaginedPartRecorder
-from lerobot_dataset_maniskill.manifest import Part, planned_parts
+from lerobot_dataset_maniskill.manifest import DatasetPart, planned_parts
 from lerobot_dataset_maniskill.merging import describe, recorded_settings
 from lerobot_dataset_maniskill.worker import EpisodeResult, PartRecorder, Report, serve_parts
 from lerobot_wmrl.common.actions import warn_of_clipped
@@ -71,7 +71,7 @@ class ManiSkillEpisodes:
 
 
 @contextmanager
-def progress_bar(episodes: int, missing: Sequence[Part]) -> Iterator[Report]:
+def progress_bar(episodes: int, missing: Sequence[DatasetPart]) -> Iterator[Report]:
     """Show the episodes that are reported to it, the time left, and each kind's success rate.
 
     At the end it says how many components of a policy's actions were out of range.
@@ -94,7 +94,7 @@ def progress_bar(episodes: int, missing: Sequence[Part]) -> Iterator[Report]:
 
 
 def record_in_parallel(
-    config: RecordConfig, work: Path, missing: list[Part], count: int, report: Report
+    config: RecordConfig, work: Path, missing: list[DatasetPart], count: int, report: Report
 ) -> None:
     """Record the parts in `count` processes."""
     context = simulating_context()

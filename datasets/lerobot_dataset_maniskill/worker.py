@@ -20,10 +20,10 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
-from lerobot_dataset_maniskill.manifest import EpisodePlan, Part
+from lerobot_dataset_maniskill.manifest import DatasetPart, EpisodePlan
 from lerobot_dataset_maniskill.planners import MOTIONS, follow_plan
 from lerobot_dataset_maniskill.planners.kinds import PLAY_STEPS
-from lerobot_dataset_maniskill.writer import HOLD_FRAMES, Outcome, StartColumns, add_step, create_dataset
+from lerobot_dataset_maniskill.writer import HOLD_FRAMES, StartColumns, StepResult, add_step, create_dataset
 from lerobot_wmrl.common.actions import clip_actions
 from lerobot_wmrl.common.constants import KINDS, PLAY
 from lerobot_wmrl.common.exploration import ExplorationNoise
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from lerobot_wmrl.maniskill.simulation import Simulation
 
 
-class Driver(Protocol):
+class Controller(Protocol):
     """Chooses the actions of an episode: (7,) float32, inside the action box."""
 
     clipped: list[float]
@@ -52,7 +52,7 @@ class Driver(Protocol):
         """Return the action for this frame."""
 
 
-class PlannerDriver:
+class ScriptedController:
     """Follows a plan that depends only on the episode's start and kind, with one of `planners.MOTIONS`."""
 
     def __init__(self, planner: str) -> None:
@@ -70,7 +70,7 @@ class PlannerDriver:
         return self.follower.act(simulation.tcp_position, simulation.object_position)
 
 
-class PolicyDriver:
+class PolicyController:
     """Acts by a LeRobot policy with its own pre- and postprocessors, and exploration noise on its actions."""
 
     def __init__(self, config: PreTrainedConfig, exploration: float) -> None:
@@ -127,7 +127,7 @@ Report = Callable[[EpisodeResult], None]
 
 @contextmanager
 def whole_part(
-    config: RecordConfig, folder: Path, part: Part, cameras: Sequence[str], image_size: int
+    config: RecordConfig, folder: Path, part: DatasetPart, cameras: Sequence[str], image_size: int
 ) -> Iterator[LeRobotDataset]:
     """Yield an empty dataset to fill; unless an error is raised, move it to `folder` as the part."""
     partial = folder / f".{part.name}.{os.getpid()}.partial"
@@ -139,25 +139,25 @@ def whole_part(
 
 
 class PartRecorder:
-    """Records parts one after the other, with one simulation and one driver."""
+    """Records parts one after the other, with one simulation and one controller."""
 
     def __init__(self, config: RecordConfig, folder: Path) -> None:
         env = config.maniskill
         self.config, self.folder = config, folder
         self.simulation = env.create_simulation(config.depth)
-        self.driver: Driver = (
-            PlannerDriver(config.planner)
+        self.controller: Controller = (
+            ScriptedController(config.planner)
             if config.policy is None
-            else PolicyDriver(config.policy, config.exploration)
+            else PolicyController(config.policy, config.exploration)
         )
 
-    def record(self, part: Part, report: Report) -> None:
+    def record(self, part: DatasetPart, report: Report) -> None:
         """Record a part. Its folder appears under its final name only when it is whole."""
         env = self.config.maniskill
         with whole_part(self.config, self.folder, part, env.cameras, env.image_size) as dataset:
             for plan in part.episodes:
                 success = self._record_episode(dataset, plan)
-                report(EpisodeResult(plan.kind, success, self.driver.clipped))
+                report(EpisodeResult(plan.kind, success, self.controller.clipped))
 
     def _steps(self, plan: EpisodePlan) -> int:
         """Return the largest number of rows of an episode."""
@@ -176,18 +176,18 @@ class PartRecorder:
         simulation = self.simulation
         simulation.task = task_of(plan.task)
         frame = simulation.reset(plan.scene, plan.seed)
-        self.driver.begin(simulation, plan)
+        self.controller.begin(simulation, plan)
         start = StartColumns(simulation.instruction, simulation.task.index, plan)
         steps_left = self._steps(plan)
         succeeded = False
         while steps_left > 0:
-            action = self.driver.act(simulation, frame)
+            action = self.controller.act(simulation, frame)
             following = simulation.step(action)
             steps_left -= 1
             if following.success and not succeeded and plan.kind != PLAY:
                 succeeded, steps_left = True, HOLD_FRAMES
-            outcome = Outcome(following, truncated=steps_left == 0 and not succeeded)
-            add_step(dataset, start, frame, action, outcome)
+            result = StepResult(following, truncated=steps_left == 0 and not succeeded)
+            add_step(dataset, start, frame, action, result)
             frame = following
         save_episode(dataset)
         return succeeded
@@ -199,7 +199,7 @@ def serve_parts(config: RecordConfig, folder: Path, parts: Any, results: Any) ->
     Args:
         config: configuration of the recording.
         folder: folder for the sub-datasets.
-        parts: queue of `Part`, ended by None.
+        parts: queue of `DatasetPart`, ended by None.
         results: queue for `EpisodeResult`, the index of each whole part, and errors.
     """
     torch.set_num_threads(1)

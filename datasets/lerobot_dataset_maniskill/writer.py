@@ -108,7 +108,7 @@ class StartColumns:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class StepResult:
     """The frame that an action led to, and whether the episode was truncated there."""
 
     frame: Frame
@@ -116,7 +116,7 @@ class Outcome:
 
 
 def add_step(
-    dataset: LeRobotDataset, start: StartColumns, before: Frame, action: np.ndarray, outcome: Outcome
+    dataset: LeRobotDataset, start: StartColumns, before: Frame, action: np.ndarray, result: StepResult
 ) -> None:
     """Add one row: the frame, the commanded action, and the outcome in the frame that it led to."""
     dataset.add_frame(
@@ -125,10 +125,10 @@ def add_step(
             **{f"observation.images.{camera}_depth": image for camera, image in before.depth.items()},
             "observation.state": before.state,
             "action": np.asarray(action, np.float32),
-            "next.reward": np.array([outcome.frame.reward], np.float32),
-            "next.done": np.array([outcome.frame.success]),
-            "next.success": np.array([outcome.frame.success]),
-            "next.truncated": np.array([outcome.truncated]),
+            "next.reward": np.array([result.frame.reward], np.float32),
+            "next.done": np.array([result.frame.success]),
+            "next.success": np.array([result.frame.success]),
+            "next.truncated": np.array([result.truncated]),
             **start.columns(),
             "task": start.instruction,
         }

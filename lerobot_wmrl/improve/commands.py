@@ -111,7 +111,7 @@ def cloned(progress: Progress) -> list[str]:
 
 
 def tokenizer(plan: Plan) -> list[str]:
-    return learn(plan, "frame_tokenizer", "tokenizer", {
+    return world_model_command(plan, "frame_tokenizer", "tokenizer", {
         "model.tokenizer.cameras": plan.findings.cameras,
         "model.tokenizer.image_size": plan.sizes.side, "model.tokenizer.context": True,
         "model.tokenizer.success": True,
@@ -119,13 +119,13 @@ def tokenizer(plan: Plan) -> list[str]:
 
 
 def world_model(plan: Plan) -> list[str]:
-    return learn(plan, "action_world_model", "world_model", {
+    return world_model_command(plan, "action_world_model", "world_model", {
         "model.tokenizer_path": str(plan.out / "tokenizer"),
         "model.clip_length": plan.length + 2,
     })  # fmt: skip
 
 
-def learn(plan: Plan, model: str, folder: str, flags: Flags) -> list[str]:
+def world_model_command(plan: Plan, model: str, folder: str, flags: Flags) -> list[str]:
     """Return the command that trains a tokenizer or a world model."""
     return sized_command(plan, "lerobot-wmrl-train-world-model", {
         "model.type": model, **flags, **plan.data.flags(), "seed": plan.config.seed,

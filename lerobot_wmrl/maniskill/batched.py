@@ -16,7 +16,7 @@ from torch import Tensor
 from lerobot_wmrl.maniskill.backend import render_backend
 from lerobot_wmrl.maniskill.cameras import Rendering
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW
-from lerobot_wmrl.maniskill.episode import WORKSPACE_FLOOR, Episode
+from lerobot_wmrl.maniskill.episode import WORKSPACE_FLOOR, RunningEpisode
 from lerobot_wmrl.maniskill.objects import ObjectSpec
 from lerobot_wmrl.maniskill.robot import GRIPPER_OPEN
 from lerobot_wmrl.maniskill.scenes import Scene
@@ -55,7 +55,7 @@ class BatchedTabletopEnv(TabletopEnv):
             places[spec.name] = sapien.Pose(p=[x, y, SHELF + spec.half_size[2] + SHELF_GAP])
         return places
 
-    def place_rows(self, rows: Sequence[int], episodes: Sequence[Episode]) -> None:
+    def place_rows(self, rows: Sequence[int], episodes: Sequence[RunningEpisode]) -> None:
         """Set up episodes on the tables `rows` (ascending): what they need at rest, everything else away."""
         self.scene._reset_mask = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self.scene._reset_mask[list(rows)] = True
@@ -117,7 +117,7 @@ class BatchedSimulation:
         self.env.reset(seed=0)
         self.device = self.env.device
         self.names = [*self.env.objects]
-        self.episodes: list[Episode] = []
+        self.episodes: list[RunningEpisode] = []
         self._low = torch.tensor(ACTION_LOW, device=self.device)
         self._high = torch.tensor(ACTION_HIGH, device=self.device)
 
@@ -133,7 +133,9 @@ class BatchedSimulation:
             The frame of all B rows.
         """
         env_scenes = [self.env.scenes[scene.index] for scene in scenes]
-        started = [Episode(self.task, scene, seed) for scene, seed in zip(env_scenes, seeds, strict=True)]
+        started = [
+            RunningEpisode(self.task, scene, seed) for scene, seed in zip(env_scenes, seeds, strict=True)
+        ]
         running = {**dict(enumerate(self.episodes)), **dict(zip(rows, started, strict=True))}
         self.episodes = [running[row] for row in range(self.env.num_envs)]
         self.env.place_rows(rows, started)

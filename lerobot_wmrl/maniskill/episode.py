@@ -34,7 +34,7 @@ class Frame:
     success: bool
 
 
-class Episode:
+class RunningEpisode:
     """What is kept of a running episode to judge it: its start, and where the object was.
 
     Args:

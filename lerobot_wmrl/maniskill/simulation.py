@@ -19,7 +19,7 @@ from lerobot_wmrl.maniskill.actors import build_carpet, build_container, build_o
 from lerobot_wmrl.maniskill.backend import render_backend
 from lerobot_wmrl.maniskill.cameras import Rendering
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW, FPS
-from lerobot_wmrl.maniskill.episode import WORKSPACE_FLOOR, Episode, Frame
+from lerobot_wmrl.maniskill.episode import WORKSPACE_FLOOR, Frame, RunningEpisode
 from lerobot_wmrl.maniskill.objects import CONTAINERS, ObjectSpec
 from lerobot_wmrl.maniskill.rendering import AMBIENT, SUN, SUN_DIRECTION, camera_config
 from lerobot_wmrl.maniskill.robot import (
@@ -196,7 +196,7 @@ class Simulation:
 
     def reset(self, scene: Scene, seed: int) -> Frame:
         """Set up the start of (task, scene, seed). The same arguments give the same frame."""
-        self.episode = Episode(self.task, self.env.scenes[scene.index], seed)
+        self.episode = RunningEpisode(self.task, self.env.scenes[scene.index], seed)
         self.env.place(self.episode.scene, self.episode.start)
         self.episode.begin(self.object_position)
         return self._frame()

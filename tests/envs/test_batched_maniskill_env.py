@@ -13,7 +13,7 @@ from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.evaluation_adapter import EvaluationAdapter
 from lerobot_wmrl.envs.maniskill_env import ManiSkillTensorEnv
 from lerobot_wmrl.maniskill.batched import BatchedFrame, BatchedSimulation
-from lerobot_wmrl.maniskill.episode import Episode
+from lerobot_wmrl.maniskill.episode import RunningEpisode
 from lerobot_wmrl.maniskill.scenes import Scene
 from lerobot_wmrl.maniskill.tasks import TASKS
 
@@ -85,13 +85,13 @@ class MadeUpSimulation:
     device = torch.device("cpu")
 
     def __init__(self, scenes: tuple[Scene, ...]) -> None:
-        self.episodes = [Episode(TASKS["push"], scenes[0], 0)] * 3
+        self.episodes = [RunningEpisode(TASKS["push"], scenes[0], 0)] * 3
         self.height = torch.zeros(3)
 
     def reset(self, scenes: list[Scene], seeds: list[int], rows: list[int]) -> BatchedFrame:
         assert list(rows) == sorted(rows)
         for scene, seed, row in zip(scenes, seeds, rows, strict=True):
-            self.episodes[row] = Episode(TASKS["push"], scene, seed)
+            self.episodes[row] = RunningEpisode(TASKS["push"], scene, seed)
             self.height[row] = 0.0
         return self._frame()
 

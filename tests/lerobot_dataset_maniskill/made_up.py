@@ -10,8 +10,8 @@ from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.manifest import EpisodePlan
 from lerobot_dataset_maniskill.maniskill import ManiSkillEpisodes
 from lerobot_dataset_maniskill.recorder import merge, missing_parts
-from lerobot_dataset_maniskill.worker import PartRecorder, PlannerDriver
-from lerobot_dataset_maniskill.writer import Outcome, StartColumns, add_step
+from lerobot_dataset_maniskill.worker import PartRecorder, ScriptedController
+from lerobot_dataset_maniskill.writer import StartColumns, StepResult, add_step
 from lerobot_wmrl.common.constants import TASKS
 from lerobot_wmrl.maniskill.episode import Frame
 
@@ -29,7 +29,7 @@ class MadeUpRecorder(PartRecorder):
     """Writes made-up episodes where the recorder writes simulated ones."""
 
     def __init__(self, config: RecordConfig, folder: Path) -> None:
-        self.config, self.folder, self.driver = config, folder, PlannerDriver(config.planner)
+        self.config, self.folder, self.controller = config, folder, ScriptedController(config.planner)
 
     def _record_episode(self, dataset: LeRobotDataset, plan: EpisodePlan) -> bool:
         rng = np.random.default_rng(plan.seed)
@@ -38,8 +38,8 @@ class MadeUpRecorder(PartRecorder):
         for row in range(ROWS):
             frame = self._frame(row, rng, success=False)
             following = self._frame(row + 1, rng, success=succeeds and row >= SUCCESS_ROW)
-            outcome = Outcome(following, truncated=row == ROWS - 1 and not succeeds)
-            add_step(dataset, start, frame, np.full(7, row / ROWS), outcome)
+            result = StepResult(following, truncated=row == ROWS - 1 and not succeeds)
+            add_step(dataset, start, frame, np.full(7, row / ROWS), result)
         dataset.save_episode()
         return succeeds
 

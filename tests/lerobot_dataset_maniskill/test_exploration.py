@@ -9,7 +9,7 @@ import pytest
 
 from lerobot_dataset_maniskill.configuration import RecordConfig
 from lerobot_dataset_maniskill.manifest import EpisodePlan
-from lerobot_dataset_maniskill.worker import PolicyDriver
+from lerobot_dataset_maniskill.worker import PolicyController
 from lerobot_wmrl.common.constants import POLICY
 from lerobot_wmrl.common.exploration import ExplorationNoise
 from lerobot_wmrl.common.policies import read_policy_config
@@ -52,14 +52,14 @@ def test_what_a_policy_does_out_of_range_is_counted_and_noise_is_not(
     constant: float, share: float, tmp_path: Path
 ) -> None:
     far = save_untrained_policy(tmp_path / "policy", size=8, actions=7, constant=constant)
-    driver = PolicyDriver(read_policy_config(str(far), []), exploration=1.0)
+    controller = PolicyController(read_policy_config(str(far), []), exploration=1.0)
     frame = Frame({"third_view": np.zeros((8, 8, 3), np.uint8)}, {}, np.zeros(8, np.float32), 0.0, False)
     simulation: Any = SimpleNamespace(instruction="push the cube")
     scene: Any = None  # the policy sees it in the frame alone
     for _ in range(2):
-        driver.begin(simulation, EpisodePlan("push", POLICY, scene, 7))
-        actions = np.stack([driver.act(simulation, frame) for _ in range(5)])
-        assert driver.clipped == pytest.approx([share] * 5)
+        controller.begin(simulation, EpisodePlan("push", POLICY, scene, 7))
+        actions = np.stack([controller.act(simulation, frame) for _ in range(5)])
+        assert controller.clipped == pytest.approx([share] * 5)
     assert (np.abs(actions) <= np.float32(ACTION_HIGH)).all()
 
 

@@ -5,7 +5,14 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from lerobot_dataset_maniskill.planners import MOTIONS, PLANNERS, TASK_KINDS, Follower, Planner, follow_plan
+from lerobot_dataset_maniskill.planners import (
+    MOTIONS,
+    PLANNERS,
+    TASK_KINDS,
+    Follower,
+    TaskPlanner,
+    follow_plan,
+)
 from lerobot_dataset_maniskill.planners.follower import CLOSED, OPEN, OPTIMAL_SPEED, Noise, Plan, Waypoint
 from lerobot_dataset_maniskill.planners.kinds import FINGER_HALF_THICKNESS, PLAY_STEPS
 from lerobot_dataset_maniskill.planners.slide import (
@@ -30,7 +37,7 @@ SPEC = OBJECTS[SCENE.object]
 LAG = 1 / 3
 
 
-def planner(task: str, seed: int, scene: Scene = SCENE) -> Planner:
+def planner(task: str, seed: int, scene: Scene = SCENE) -> TaskPlanner:
     start = TASKS[task].start(scene, seed)
     return PLANNERS[task](OBJECTS[scene.object], CONTAINERS[scene.container], start)
 
@@ -64,7 +71,7 @@ def test_actions_stay_in_the_box_and_repeat_for_a_seed(task: str, kind: str) -> 
 
 @pytest.mark.parametrize(("task", "made", "sign"), [("push", PushPlanner, 1), ("pull", PullPlanner, -1)])
 def test_a_slide_goes_behind_the_object_and_straight_through_its_place(
-    task: str, made: type[Planner], sign: int
+    task: str, made: type[TaskPlanner], sign: int
 ) -> None:
     for seed in range(20):
         path, actions = follow(task, "optimal", seed)

@@ -7,15 +7,15 @@ import numpy as np
 
 from lerobot_dataset_maniskill.planners.follower import Follower, Plan
 from lerobot_dataset_maniskill.planners.grasp import MoveToAimPlanner, PickPlacePlanner
-from lerobot_dataset_maniskill.planners.kinds import TASK_KINDS, Planner
+from lerobot_dataset_maniskill.planners.kinds import TASK_KINDS, TaskPlanner
 from lerobot_dataset_maniskill.planners.slide import PullPlanner, PushPlanner
 from lerobot_wmrl.maniskill.objects import ContainerSpec, ObjectSpec
 from lerobot_wmrl.maniskill.scenes import Scene
 from lerobot_wmrl.maniskill.tasks import Start
 
-__all__ = ["MOTIONS", "PLANNERS", "TASK_KINDS", "Follower", "Motion", "Plan", "Planner", "follow_plan"]
+__all__ = ["MOTIONS", "PLANNERS", "TASK_KINDS", "Follower", "Motion", "Plan", "TaskPlanner", "follow_plan"]
 
-PLANNERS: Final[dict[str, type[Planner]]] = {
+PLANNERS: Final[dict[str, type[TaskPlanner]]] = {
     "push": PushPlanner, "pull": PullPlanner, "pick_place": PickPlacePlanner, "move_to_aim": MoveToAimPlanner,
 }  # fmt: skip
 """Task → planner."""

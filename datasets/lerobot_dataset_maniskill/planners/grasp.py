@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from lerobot_dataset_maniskill.planners.follower import CLOSED, OPEN, Waypoint, Waypoints, above_table
-from lerobot_dataset_maniskill.planners.kinds import Planner
+from lerobot_dataset_maniskill.planners.kinds import TaskPlanner
 from lerobot_wmrl.maniskill.objects import ContainerSpec, ObjectSpec
 from lerobot_wmrl.maniskill.tasks import MoveToAim, Start
 
@@ -27,7 +27,7 @@ DROP_HEIGHT: Final = 0.015
 """The same when the gripper opens (m)."""
 
 
-class GraspPlanner(Planner):
+class GraspPlanner(TaskPlanner):
     """Grasps the object, then delivers it to the task's target."""
 
     def __init__(self, spec: ObjectSpec, container: ContainerSpec, start: Start) -> None:

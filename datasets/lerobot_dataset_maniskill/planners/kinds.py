@@ -58,7 +58,7 @@ TREMOR: Final = 0.003
 """Standard deviation of the noise on human-like actions (m)."""
 
 
-class Planner(ABC):
+class TaskPlanner(ABC):
     """Plans one episode of a task.
 
     Args:

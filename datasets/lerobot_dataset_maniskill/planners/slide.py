@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 
 from lerobot_dataset_maniskill.planners.follower import Waypoint, Waypoints, above_table
-from lerobot_dataset_maniskill.planners.kinds import FINGER_HALF_THICKNESS, Planner
+from lerobot_dataset_maniskill.planners.kinds import FINGER_HALF_THICKNESS, TaskPlanner
 from lerobot_wmrl.maniskill.objects import ContainerSpec, ObjectSpec
 from lerobot_wmrl.maniskill.tasks import Pull, Push, Slide, Start
 
@@ -24,7 +24,7 @@ MAX_DETOUR_X: Final = 0.16
 """Largest x of a detour (m): beyond it the arm is stretched out and gets no further."""
 
 
-class SlidePlanner(Planner):
+class SlidePlanner(TaskPlanner):
     """Plans a push, or a pull (`over_it`: the gripper passes over the object to its far side first)."""
 
     task: type[Slide]
