@@ -116,7 +116,7 @@ def run_command[Config: RunConfig](
     init_logging()
     logging.getLogger("lerobot.configs").setLevel(logging.ERROR)
     try:
-        sys.argv[1:] = expand(with_equals_signs(sys.argv[1:]))
+        sys.argv[1:] = expand(with_home(with_equals_signs(sys.argv[1:])))
         if {"--help", "-h"} & set(sys.argv[1:]):
             print(help_of(function, config_class))
             return
@@ -125,6 +125,17 @@ def run_command[Config: RunConfig](
         kind, status = ("stopped", STOPPED) if isinstance(error, Stopped) else ("error", 1)
         print(f"{kind}: {said_in_flags(cause(error), config_class, sys.argv[1:])}", file=sys.stderr)
         sys.exit(status)
+    except KeyboardInterrupt:
+        sys.exit("\nstopped: run the same command again to continue where it stopped")
+
+
+def with_home(argv: Sequence[str]) -> list[str]:
+    """Write `--name=~/folder` with the home folder's path, as a shell does only for a word of its own."""
+    parts = (argument.partition("=") for argument in argv)
+    return [
+        f"{name}={Path(value).expanduser()}" if value.startswith("~/") else f"{name}{equals}{value}"
+        for name, equals, value in parts
+    ]
 
 
 def with_equals_signs(argv: Sequence[str]) -> list[str]:

@@ -1,6 +1,7 @@
 """LeRobot's own commands as stages, each of which can be called again after an interruption, and its
 environments as flags."""
 
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -46,6 +47,13 @@ def edit_command(folder: Path, operation: str, flags: Flags) -> list[str]:
     """Return lerobot-edit-dataset into a new folder. It refuses what an interrupted call left there."""
     new = {"new_repo_id": f"local/{folder.name}", "new_root": str(folder), "operation.type": operation}
     return ["lerobot-edit-dataset", *format_flags(new | dict(flags))]
+
+
+def edit_advice(root: str | Path, operation: str, flags: Flags) -> str:
+    """Return lerobot-edit-dataset as one types it, to make a changed copy of a dataset on disk beside it."""
+    source = Path(root)
+    flags = {"repo_id": f"local/{source.name}", "root": str(source), **flags}
+    return shlex.join(edit_command(source.with_name(f"{source.name}_edited"), operation, flags))
 
 
 def env_flags(env: EnvConfig, prefix: str = "env") -> Flags:

@@ -10,7 +10,7 @@ from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.default import PeftConfig as AdapterSettings
 from lerobot.configs.types import FeatureType, PolicyFeature
-from lerobot.utils.constants import ACTION, OBS_IMAGE
+from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
@@ -220,6 +220,12 @@ def check_fit(
     cameras = ", ".join(name for name in shown if name.startswith(OBS_IMAGE)) or "none"
     path = config.pretrained_path
     for name, feature in (config.input_features or {}).items():
+        if name not in shown and name != OBS_STATE and not name.startswith(OBS_IMAGE):
+            raise FieldError(
+                "policy.path", path,
+                f"the policy needs {name}, and a policy is shown cameras and {OBS_STATE} alone",
+                "train it on data without that column (lerobot-edit-dataset, remove_feature)",
+            )  # fmt: skip
         if name not in shown:
             raise FieldError(
                 "policy.path", path,
@@ -228,9 +234,11 @@ def check_fit(
             )  # fmt: skip
         if shown[name] != seen_shape(feature):
             needed = f"the policy needs {name} of shape {seen_shape(feature)}"
+            of_images = "use the image size that the policy was trained on"
+            of_state = "use the robot that the policy was trained for, or train it on this one's data"
             raise FieldError(
                 "policy.path", path, f"{needed}, {where} has {shown[name]}",
-                "use the image size that the policy was trained on",
+                of_images if name.startswith(OBS_IMAGE) else of_state,
             )  # fmt: skip
     if config.action_feature is None:
         raise FieldError(

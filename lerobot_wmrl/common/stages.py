@@ -94,8 +94,6 @@ def run_stage_command[Config: RunConfig](
         run_command(function, config_class, expand)
     except StageError as error:
         sys.exit(f"error: {error}")
-    except KeyboardInterrupt:
-        sys.exit("\nstopped: run the same command again to continue where it stopped")
 
 
 def run_stages(

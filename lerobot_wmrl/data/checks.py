@@ -7,6 +7,7 @@ import numpy as np
 from lerobot.utils.constants import OBS_IMAGES
 
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.lerobot_commands import edit_advice
 from lerobot_wmrl.data.episodes import EpisodeTable, success_column
 
 
@@ -99,8 +100,20 @@ def check_statistics(meta: Any, key: str) -> None:
                 "dataset.root", meta.root,
                 f"its statistics (meta/stats.json) say that the {name} of {key} is {values.tolist()}, where "
                 f"{size} finite numbers should be",
-                "compute them again with lerobot-edit-dataset --operation.type=recompute_stats",
+                f"compute them again: {edit_advice(meta.root, 'recompute_stats', {})}",
             )  # fmt: skip
+
+
+def solved_from_the_start(table: EpisodeTable) -> str | None:
+    """Say so if most successes hold from their episodes' first frames on: whole episodes were labelled."""
+    first = table.done[table.start[table.success]]
+    if not first.size or 2 * first.sum() <= first.size:
+        return None
+    return (
+        f"success holds from the first frame on in {first.sum()} of {first.size} successful episodes, so "
+        "imagined episodes will succeed at once. Labels are of frames: lerobot-wmrl-label "
+        "--success.type=ends --success.episodes=[…] says which episodes are solved at their ends"
+    )
 
 
 def check_episode_lengths(meta: Any) -> None:

@@ -14,6 +14,7 @@ from lerobot.utils.constants import ACTION, DONE, OBS_STATE
 from numpy.typing import ArrayLike
 
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.lerobot_commands import edit_advice
 from lerobot_wmrl.common.statistics import evenly_spaced
 
 VALIDATION_EVERY: Final = 20
@@ -254,8 +255,8 @@ def bad_row(
     return FieldError(
         "dataset.root", dataset.root, f"{column} of episode {episode}, frame {frame}, is {value}",
         remedy
-        or "remove the episode with lerobot-edit-dataset --operation.type=delete_episodes "
-        f"--operation.episode_indices=[{episode}]",
+        or "remove the episode: "
+        + edit_advice(dataset.root, "delete_episodes", {"operation.episode_indices": [episode]}),
     )  # fmt: skip
 
 

@@ -12,8 +12,15 @@ from lerobot.utils.constants import ACTION, DONE, OBS_IMAGE, OBS_STATE
 from lerobot_wmrl.common.constants import START_COLUMNS, START_TASK
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.images import camera_key
+from lerobot_wmrl.common.lerobot_commands import edit_advice
 from lerobot_wmrl.common.policies import check_fit
-from lerobot_wmrl.data.checks import camera_names, frame_size, require_shown, shows_colours
+from lerobot_wmrl.data.checks import (
+    camera_names,
+    frame_size,
+    require_shown,
+    shows_colours,
+    solved_from_the_start,
+)
 from lerobot_wmrl.data.embodiment import component_names
 from lerobot_wmrl.data.episodes import EpisodeTable, success_column
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
@@ -92,8 +99,8 @@ def require_mergeable(dataset: LeRobotDataset, env: WmrlManiSkillEnv) -> None:
     if depth := dataset.meta.depth_keys:
         raise FieldError(
             "dataset.root", dataset.root, f"has {', '.join(depth)}, which the rollouts lack",
-            "remove these columns: lerobot-edit-dataset --operation.type=remove_feature "
-            f"--operation.feature_names=[{','.join(depth)}]",
+            "remove these columns: "
+            + edit_advice(dataset.root, "remove_feature", {"operation.feature_names": [*depth]}),
         )  # fmt: skip
 
 
@@ -143,7 +150,8 @@ def look(
     return Findings(
         lines=lines,
         missing=[
-            *missing_labels(table), *([] if rollouts else few_failures(table)), *few_decisions(policy, table)
+            *missing_labels(table), *several_instructions(table),
+            *([] if rollouts else few_failures(table)), *few_decisions(policy, table),
         ],
         cameras=camera_names(keys),
         frame_side=min(map(min, sizes.values())), pixels=sum(h * w for h, w in sizes.values()),
@@ -165,12 +173,25 @@ def usual_length(table: EpisodeTable) -> int:
 
 
 def missing_labels(table: EpisodeTable) -> list[str]:
-    """Say so if success is read from a column that is not about it."""
+    """Say so if success is read from a column that is not about it, or is that of whole episodes."""
+    warnings = [warning] if (warning := solved_from_the_start(table)) else []
     if success_column(table.dataset.features) != DONE:
-        return []
+        return warnings
     everywhere = ". It is in every episode: label those that failed" if table.success.all() else ""
     return [
-        f"next.done is taken for success: there is no next.success (lerobot-wmrl-label adds it){everywhere}"
+        f"next.done is taken for success: there is no next.success (lerobot-wmrl-label adds it){everywhere}",
+        *warnings,
+    ]
+
+
+def several_instructions(table: EpisodeTable) -> list[str]:
+    """Say so if there are several instructions, which the world model of actions does not read."""
+    count = len(set(table.instructions))
+    if count < 2:
+        return []
+    return [
+        f"instructions: {count}, which the world model does not read. Where two tasks are possible in the "
+        "same scene it rewards either of them: improve such tasks one by one (--dataset.episodes)"
     ]
 
 

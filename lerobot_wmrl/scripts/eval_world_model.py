@@ -13,6 +13,7 @@ model with their success in that environment.
 """
 
 import json
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from lerobot_wmrl.data.episodes import EpisodeTable
     from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
     from lerobot_wmrl.evaluation.agreement import Agreement
+    from lerobot_wmrl.evaluation.evidence import LabelledRollouts
     from lerobot_wmrl.evaluation.replay import Recording
     from lerobot_wmrl.evaluation.report import Evaluation, Report
     from lerobot_wmrl.world_models.modeling_world_model import (
@@ -125,6 +127,7 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     from lerobot_wmrl.common.constants import START_SCENE
     from lerobot_wmrl.common.hub import check_login
     from lerobot_wmrl.data.episodes import choose_episodes, read_episodes
+    from lerobot_wmrl.evaluation.evidence import LabelledRollouts
     from lerobot_wmrl.maniskill.recordings import scene_splits
     from lerobot_wmrl.world_models.checkpoint import check_dataset, load_model
 
@@ -141,7 +144,20 @@ def eval_world_model(cfg: EvalWorldModelConfig) -> None:
     chosen = table.among(cfg.dataset.episodes)
     episodes = choose_episodes(table, cfg.split, cfg.max_episodes, scenes, chosen)
     with Claim(cfg.output_dir, draccus.encode(cfg)).held():
+        warn_of_learnt(cfg.model.path, LabelledRollouts(cfg.dataset.name, table, episodes))
         measure(cfg, model, text_model, table, episodes, imagination, policies)
+
+
+def warn_of_learnt(world_model: str, rollouts: "LabelledRollouts") -> None:
+    """Warn if the world model has learnt from the episodes that it is checked on."""
+    from lerobot_wmrl.evaluation.evidence import learnt_from
+
+    if learnt := learnt_from(world_model, rollouts):
+        logging.warning(
+            "%s: the world model has learnt from %d of these %d episodes, and predicts them better than "
+            "others. Take those that were held out (--split=validation), or rollouts that it has not seen",
+            rollouts.name, learnt, len(rollouts.chosen),
+        )  # fmt: skip
 
 
 def measure(

@@ -26,6 +26,7 @@ import numpy as np
 from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.files import require_new, whole_folder, writing
+from lerobot_wmrl.common.lerobot_commands import edit_advice
 from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.data.episodes import SUCCESS
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
@@ -78,8 +79,8 @@ def require_unlabelled(cfg: LabelConfig, dataset: "LeRobotDataset") -> None:
     if SUCCESS in dataset.features and read != SUCCESS:
         raise FieldError(
             "dataset.root", cfg.dataset.root, f"has a column {SUCCESS} already",
-            "train with it, or remove it first: lerobot-edit-dataset --operation.type=remove_feature "
-            f"--operation.feature_names=[{SUCCESS}]",
+            "train with it, or label a copy without it: "
+            + edit_advice(dataset.root, "remove_feature", {"operation.feature_names": [SUCCESS]}),
         )  # fmt: skip
     require_new("output_dir", cfg.output_dir)
 

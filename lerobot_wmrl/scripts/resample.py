@@ -19,6 +19,7 @@ import numpy as np
 
 from lerobot_wmrl.common.command_line import RunConfig, run_command
 from lerobot_wmrl.common.errors import FieldError, require_at_least
+from lerobot_wmrl.common.lerobot_commands import edit_advice
 from lerobot_wmrl.data.dataset import DatasetSource, save_episode
 from lerobot_wmrl.data.episodes import SUCCESS_COLUMNS
 
@@ -97,12 +98,16 @@ def summed_components(cfg: ResampleConfig, dataset: "LeRobotDataset") -> np.ndar
         depth = ", ".join(dataset.meta.depth_keys)
         raise FieldError(
             "dataset.root", dataset.root, f"has depth ({depth}), which is not copied",
-            "remove it first: lerobot-edit-dataset --operation.type=remove_feature",
+            "remove it first: "
+            + edit_advice(
+                dataset.root, "remove_feature", {"operation.feature_names": [*dataset.meta.depth_keys]}
+            ),
         )  # fmt: skip
     if language := [name for name, each in dataset.features.items() if each["dtype"] == "language"]:
         raise FieldError(
             "dataset.root", dataset.root, f"has annotations ({', '.join(language)}), which are not copied",
-            "remove them first: lerobot-edit-dataset --operation.type=remove_feature",
+            "remove them first: "
+            + edit_advice(dataset.root, "remove_feature", {"operation.feature_names": language}),
         )  # fmt: skip
     require_new("output_dir", cfg.output_dir)
     return np.isin(names, cfg.displacements)

@@ -32,7 +32,7 @@ from lerobot_wmrl.common.errors import FieldError, renamed
 from lerobot_wmrl.common.precision import compute_in, training_dtype
 from lerobot_wmrl.common.tracking import log_metrics
 from lerobot_wmrl.common.training_state import load_training_state, save_checkpoint
-from lerobot_wmrl.data.checks import require_shown
+from lerobot_wmrl.data.checks import require_shown, solved_from_the_start
 from lerobot_wmrl.data.clips import ClipSampler, FrameSampler, InTurn
 from lerobot_wmrl.data.dataset import TrainingData
 from lerobot_wmrl.data.episodes import EpisodeTable
@@ -190,13 +190,13 @@ def note_outcomes(
 
     A model that is trained further keeps what it has learnt from before, if that was more.
     """
-    learnt = [
-        table.success[~table.validation & table.among(chosen)]
-        for table, chosen in sources
-        if table.done_known
-    ]
+    labelled = [(table, chosen) for table, chosen in sources if table.done_known]
+    learnt = [table.success[~table.validation & table.among(chosen)] for table, chosen in labelled]
     if not learnt and config.pretrained_path and config.learnt_successes is None:
         return  # what it has learnt before is not known
+    for table, _ in labelled:
+        if warning := solved_from_the_start(table):
+            logging.warning("%s: %s", table.dataset.root, warning)
     successes, failures = config.learnt_successes or 0, config.learnt_failures or 0
     config.learnt_successes = max(successes, sum(int(each.sum()) for each in learnt))
     config.learnt_failures = max(failures, sum(int((~each).sum()) for each in learnt))

@@ -11,8 +11,10 @@ from lerobot_wmrl.common.command_line import (
     RunConfig,
     near_flag,
     parse_flags,
+    run_command,
     said_in_flags,
     with_equals_signs,
+    with_home,
 )
 from lerobot_wmrl.common.errors import FieldError, Stopped
 from lerobot_wmrl.common.output_folders import different_settings
@@ -139,6 +141,22 @@ def test_flags_may_be_written_with_a_space() -> None:
     assert with_equals_signs(argv) == [
         "--preset=tiny", "--resume", "--a.b=1", "--c=-1", "--help", "-h", "--d=x y",
     ]  # fmt: skip
+
+
+def test_the_home_folder_is_expanded_in_flags() -> None:
+    home = str(Path.home())
+    assert with_home(["--a=~/x", "--b=~", "--c=x/~/y", "--resume"]) == [
+        f"--a={home}/x", "--b=~", "--c=x/~/y", "--resume",
+    ]  # fmt: skip
+
+
+def test_ctrl_c_ends_in_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(config: RunConfig) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sys.argv", ["command"])
+    with pytest.raises(SystemExit, match="run the same command again to continue"):
+        run_command(interrupted, RunConfig, list)
 
 
 def test_a_setting_that_another_version_lacks_is_off_there():

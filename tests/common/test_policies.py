@@ -77,6 +77,18 @@ def test_an_environment_that_does_not_fit_is_refused(
         check_fit(config, {IMAGE: (3, 32, 32)}, action_size=3)
 
 
+def test_what_is_not_of_images_is_told_so(tmp_path: Path) -> None:
+    """Such as a column that no world model imagines, and another robot's state."""
+    config = read_policy_config(str(save_untrained_policy(tmp_path)), [])
+    shown = {IMAGE: (3, 32, 32), "observation.state": (14,)}
+    config.input_features["observation.state"] = PolicyFeature(FeatureType.STATE, (6,))
+    with pytest.raises(ValueError, match=r"of shape \(6,\), .* has \(14,\); use the robot"):
+        check_fit(config, shown, action_size=3)
+    config.input_features = {"observation.effort": PolicyFeature(FeatureType.STATE, (14,))}
+    with pytest.raises(ValueError, match=r"needs observation\.effort, and a policy is shown cameras and"):
+        check_fit(config, shown, action_size=3)
+
+
 @pytest.mark.parametrize(
     ("mean", "refused"), [((0.1, 0.0), False), ((-0.9, 1.9), False), ((0.0, 45.0), True)]
 )

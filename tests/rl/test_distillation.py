@@ -163,7 +163,8 @@ def test_the_planners_search_begins_at_what_the_policy_would_do(
     imagined: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With one sample the plan is the proposal."""
-    policy_actions, plan, proposals, plans = WorldModelVectorEnv.policy_actions, Planner.plan, [], []
+    policy_actions, plan = WorldModelVectorEnv.policy_actions, Planner.plan
+    proposals, plans, steps_left = [], [], []
 
     def spied_policy_actions(*args: Any) -> Tensor:
         proposals.append(policy_actions(*args))
@@ -171,6 +172,7 @@ def test_the_planners_search_begins_at_what_the_policy_would_do(
 
     def spied_plan(*args: Any) -> Tensor:
         plans.append(plan(*args))
+        steps_left.append(args[-1])
         return plans[-1]
 
     monkeypatch.setattr(WorldModelVectorEnv, "policy_actions", spied_policy_actions)
@@ -181,6 +183,7 @@ def test_the_planners_search_begins_at_what_the_policy_would_do(
     train(monkeypatch, *flags, "--iterations=1", *imagined, f"--output_dir={tmp_path / 'rl'}")
     assert len(plans) == 2
     assert plans[0].shape == (3, 6, 7)
+    assert steps_left == [4, 2], "the second plan begins after two steps"
     assert all(torch.allclose(*pair) for pair in zip(plans, proposals, strict=True))
 
 

@@ -202,7 +202,7 @@ SPOILED: dict[str, tuple[Callable[[Path], None], str]] = {
     "no statistics": (lambda root: set_statistics(root, ACTION), r"the mean of action is \[\]"),
     "NaN in a frame": (
         lambda root: change_rows(root, ACTION, lambda row, each: [NAN] * 2 if row == 9 else each),
-        r"action of episode 1, frame 1, is \[nan, nan\]; remove the episode with lerobot-edit-dataset",
+        r"action of episode 1, frame 1, is \[nan, nan\]; remove the episode: lerobot-edit-dataset",
     ),
     "a feature that ends midway": (
         lambda root: change_rows(root, OBS_STATE, lambda row, each: None if row > 11 else each),
