@@ -1,10 +1,15 @@
 """What PPO in imagination gains with each reward: the section of docs/results.md."""
 
+from collections.abc import Sequence
 from typing import Final
 
-from experiments.cells import Load
+import numpy as np
+from scipy.stats import ttest_1samp
+
+from experiments.cells import DOMAINS, Load
 from experiments.from_one_policy import changes, tables
-from experiments.value_cells import groups
+from experiments.value_cells import SCENES, Cell, gains, groups
+from lerobot_wmrl.common.files import markdown_table as table
 
 STUDY: Final = "value_rewards"
 BEFORE: Final = "filtered"
@@ -43,5 +48,25 @@ imagined success falls from 77 to 20 % under the one of the hidden state, while 
 def section(load: Load) -> str:
     """Return the section: success with every reward, and what each gains on the policy before it."""
     cells = [cell for each in groups(load, STUDY, ()).values() for cell in each if RIVAL in cell["methods"]]
-    over_rival = [changes(cells, {name: TITLES[name] for name in (RIVAL, *BEST)}, RIVAL)] if cells else []
-    return "\n\n".join([tables(load, STUDY, TITLES, BEFORE), *over_rival, LIMITS])
+    parts = [tables(load, STUDY, TITLES, BEFORE)]
+    if cells:
+        parts.append(changes(cells, {name: TITLES[name] for name in (RIVAL, *BEST)}, RIVAL))
+    if over_seeds := [row for method in BEST if (row := gains_over_seeds(cells, method))]:
+        columns = ["method", *(f"{DOMAINS[domain]} scenes" for domain in SCENES)]
+        parts.append(
+            "Gains over it in points, with intervals of 95 % by Student's t over the seeds alone:\n\n"
+            + table(columns, over_seeds)
+        )
+    return "\n\n".join([*parts, LIMITS])
+
+
+def gains_over_seeds(cells: Sequence[Cell], method: str) -> list[str]:
+    """Return the row of a method that ran with three seeds or more: its mean gain over RIVAL in SCENES."""
+    row = [TITLES[method]]
+    for domain in SCENES:
+        each = 100 * np.array(gains(cells, method, RIVAL, domain))
+        if len(each) < 3:
+            return []
+        interval = ttest_1samp(each, 0).confidence_interval()
+        row.append(f"{each.mean():+.1f} ({interval.low:+.1f} to {interval.high:+.1f})")
+    return row

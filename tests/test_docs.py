@@ -3,6 +3,7 @@
 import json
 import re
 from collections.abc import Sequence
+from math import floor
 from pathlib import Path
 from typing import Any
 
@@ -117,9 +118,8 @@ def test_the_readme_says_what_is_chance() -> None:
         ppo = gains(first, "imagined_ppo", best(first, BASELINES, domain), domain)
         alone.append(f"{100 * np.mean(ppo):.0f}")
         assert ttest_1samp(ppo, 0).pvalue > 0.05
-    assert f"gain {means[0]} points in known and {means[1]} in unseen scenes" in text
-    assert f"by Student's t over seeds {' and '.join(ends)}." in text
-    assert f"PPO alone gains {' and '.join(alone)}, within chance" in text
+    assert f"distilled +{means[0]} and +{means[1]} ({', '.join(ends)})" in text
+    assert f"PPO +{' and +'.join(alone)}, within chance" in text
     best_gains, ppo_gains = [], []
     for cells in others:
         for domain in ("ind", "ood"):
@@ -128,26 +128,33 @@ def test_the_readme_says_what_is_chance() -> None:
             assert ttest_1samp(over, 0).pvalue > 0.05
             best_gains.append(round(100 * np.mean(over)))
             ppo_gains.append(round(100 * np.mean(gains(cells, "imagined_ppo", baseline, domain))))
-    assert f"gains, {min(best_gains)} to {max(best_gains)}, are within chance" in text
+    assert f"Our best methods gain {min(best_gains)} to {max(best_gains)}, within chance" in text
     assert f"PPO alone gains {max(0, min(ppo_gains))} to {max(ppo_gains)}." in text
 
 
 def test_the_readme_compares_on_the_same_recordings() -> None:
     text = (ROOT / "README.md").read_text()
     cells = [json.loads(path.read_text()) for path in (ROOT / "docs/results/value_rewards").glob("*.json")]
-    for method, words in {
-        "longer_filtered": "longer BC has",
-        "success": "PPO",
-        "distilled": "distilled",
-    }.items():
+    assert len(cells) == 3
+    for method, words, gained in (
+        ("longer_filtered", "longer BC {}, PPO", ""),
+        ("success", "PPO {} (Student's t over seeds: at least {} more)", " and "),
+        ("distilled", "distilled {} (at least {}).", " and "),
+    ):
         shares = ([cell["methods"][method][domain]["share"] for cell in cells] for domain in ("ind", "ood"))
-        assert f"{words} {'/'.join(f'{100 * np.mean(each):.0f}' for each in shares)}" in text
+        least = [
+            ttest_1samp(gains(cells, method, "longer_filtered", domain), 0).confidence_interval().low
+            for domain in ("ind", "ood")
+            if gained
+        ]
+        rates = "/".join(f"{100 * np.mean(each):.0f}" for each in shares)
+        assert words.format(rates, gained.join(str(floor(100 * each)) for each in least)) in text
     cells.sort(key=lambda cell: cell["seed"])
     over = [
         [f"{100 * each:.0f}" for each in gains(cells, "distilled", "longer_filtered", domain)]
         for domain in ("ind", "ood")
     ]
-    known, unseen = (" and ".join(each) for each in over)
+    known, unseen = (f"{', '.join(each[:-1])} and {each[-1]}" for each in over)
     said = f"by seed {known} points more than BC in known scenes, {unseen} in unseen ones"
     assert said in (ROOT / "docs" / "objections.md").read_text()
     (simulated,) = (ROOT / "docs/results/value_four_tasks_simulator").glob("*.json")

@@ -140,9 +140,21 @@ def test_methods_of_one_beginning_are_compared_with_it_seed_by_seed(docs: Path) 
     title = rewards_section.TITLES["success"]
     assert f"| {title} | 40, 40 → 40 % (10–70) | 40, 40 → 40 % (10–70) | 7 |" in lines
     assert len([line for line in lines if line.startswith("| 0 |")]) == 1
+    assert not any("Student" in line for line in lines)
     before, over_rival = "\n".join(lines).split("Against filtered BC, three times as many steps")
     assert before.count("| 100000 |") == 3
     assert over_rival.count("| 100000 |") == 2
+
+
+def test_gains_of_three_seeds_have_an_interval_over_these(docs: Path) -> None:
+    for cell in read_cells(ROOT / "experiments" / "value_rewards.yaml"):
+        content = {**made_up_cell(8, cell.variables["seed"]), "starts": 10}
+        content["methods"]["longer_filtered"] = {"ind": FAILING, "ood": FAILING, "minutes": 7.0}
+        content["methods"]["success"] = content["methods"]["filtered"]
+        write_json(docs / cell.results[0], content)
+    title = rewards_section.TITLES["success"]
+    (row,) = [line for line in rewards_section.section(loader(docs)).splitlines() if " to +" in line]
+    assert row == f"| {title} | +36.7 (+22.3 to +51.0) | +36.7 (+22.3 to +51.0) |", "30, 40 and 40 points"
 
 
 MAY_DIFFER = {
