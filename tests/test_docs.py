@@ -3,7 +3,6 @@
 import json
 import re
 from collections.abc import Sequence
-from math import floor
 from pathlib import Path
 from typing import Any
 
@@ -118,8 +117,8 @@ def test_the_readme_says_what_is_chance() -> None:
         ppo = gains(first, "imagined_ppo", best(first, BASELINES, domain), domain)
         alone.append(f"{100 * np.mean(ppo):.0f}")
         assert ttest_1samp(ppo, 0).pvalue > 0.05
-    assert f"distilled +{means[0]} and +{means[1]} ({', '.join(ends)})" in text
-    assert f"PPO +{' and +'.join(alone)}, within chance" in text
+    assert f"distilled +{'/+'.join(means)} ({'/'.join(ends)})" in text
+    assert f"PPO +{'/+'.join(alone)}, within chance" in text
     best_gains, ppo_gains = [], []
     for cells in others:
         for domain in ("ind", "ood"):
@@ -136,19 +135,19 @@ def test_the_readme_compares_on_the_same_recordings() -> None:
     text = (ROOT / "README.md").read_text()
     cells = [json.loads(path.read_text()) for path in (ROOT / "docs/results/value_rewards").glob("*.json")]
     assert len(cells) == 3
-    for method, words, gained in (
-        ("longer_filtered", "longer BC {}, PPO", ""),
-        ("success", "PPO {} (Student's t over seeds: at least {} more)", " and "),
-        ("distilled", "distilled {} (at least {}).", " and "),
+    for method, words in (
+        ("longer_filtered", "longer BC {rates}, PPO"),
+        ("success", "PPO {rates} (+{gained}: Student's t over seeds, uncorrected)"),
+        ("distilled", "distilled {rates} (+{gained})."),
     ):
         shares = ([cell["methods"][method][domain]["share"] for cell in cells] for domain in ("ind", "ood"))
-        least = [
-            ttest_1samp(gains(cells, method, "longer_filtered", domain), 0).confidence_interval().low
+        over = (
+            ttest_1samp(gains(cells, method, "longer_filtered", domain), 0).confidence_interval()
             for domain in ("ind", "ood")
-            if gained
-        ]
+        )
         rates = "/".join(f"{100 * np.mean(each):.0f}" for each in shares)
-        assert words.format(rates, gained.join(str(floor(100 * each)) for each in least)) in text
+        gained = "/+".join(f"{100 * low:.0f} to {100 * high:.0f}" for low, high in over)
+        assert words.format(rates=rates, gained=gained) in text
     cells.sort(key=lambda cell: cell["seed"])
     over = [
         [f"{100 * each:.0f}" for each in gains(cells, "distilled", "longer_filtered", domain)]
