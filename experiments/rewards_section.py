@@ -59,8 +59,8 @@ def section(load: Load) -> str:
     if over_seeds := [row for method in BEST if (row := gains_over_seeds(cells, method))]:
         columns = ["method", *(f"{DOMAINS[domain]} scenes" for domain in SCENES)]
         parts.append(
-            "Gains over it in points, with intervals of 95 % by Student's t over the seeds alone, whose starts "
-            "are the same:\n\n" + table(columns, over_seeds) + f"\n\n{UNCORRECTED}"
+            "Gains over it in points, with intervals of 95 % by Student's t over the seeds alone, whose "
+            "starts are the same:\n\n" + table(columns, over_seeds) + f"\n\n{UNCORRECTED}"
         )
     return "\n\n".join([*parts, LIMITS])
 
