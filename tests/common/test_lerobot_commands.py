@@ -1,0 +1,24 @@
+"""Commands of LeRobot that errors ask for can be typed as they are printed."""
+
+import shlex
+from pathlib import Path
+from typing import Any
+
+import draccus
+import pytest
+from lerobot.scripts.lerobot_edit_dataset import EditDatasetConfig
+
+from lerobot_wmrl.common.lerobot_commands import edit_advice
+
+
+@pytest.mark.parametrize(("operation", "setting", "value"), [
+    ("remove_feature", "feature_names", ["next.success", "observation.depth"]),
+    ("delete_episodes", "episode_indices", [3]),
+])  # fmt: skip
+def test_advice_to_edit_a_dataset_is_a_whole_command(operation: str, setting: str, value: list[Any]) -> None:
+    program, *flags = shlex.split(edit_advice("data/my set", operation, {f"operation.{setting}": value}))
+    config = draccus.parse(EditDatasetConfig, args=flags)
+    assert program == "lerobot-edit-dataset"
+    assert (config.repo_id, str(config.root)) == ("local/my set", "data/my set")
+    assert Path(config.new_root) == Path("data/my set_edited")
+    assert getattr(config.operation, setting) == value
