@@ -197,8 +197,8 @@ def several_instructions(table: EpisodeTable) -> list[str]:
 
 def few_failures(
     table: EpisodeTable,
-    remedy: str = "Record rollouts of the policy (--rollouts with --real_env; on a robot lerobot-rollout, then "
-    "lerobot-wmrl-label)",
+    remedy: str = "Record rollouts of the policy (--rollouts with --real_env; on a robot lerobot-rollout, "
+    "then lerobot-wmrl-label)",
 ) -> list[str]:
     """Say so if few episodes fail, what that costs, and what helps."""
     failures = int((~table.success).sum())
