@@ -126,7 +126,7 @@ def run_command[Config: RunConfig](
         print(f"{kind}: {said_in_flags(cause(error), config_class, sys.argv[1:])}", file=sys.stderr)
         sys.exit(status)
     except KeyboardInterrupt:
-        sys.exit("\nstopped: run the same command again to continue where it stopped")
+        sys.exit("\nstopped: run the same command again; it continues where it can, and else begins again")
 
 
 def with_home(argv: Sequence[str]) -> list[str]:

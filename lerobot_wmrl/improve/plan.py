@@ -53,7 +53,7 @@ class Plan:
 
     Args:
         config: the command's configuration.
-        found: what was found in the dataset.
+        findings: what was found in the dataset.
         preprocessor: the policy's, where a copy of the policy has the dataset's cameras in place of its own.
     """
 

@@ -291,7 +291,7 @@ def imagine(
         if missing := [name for name in configs if name not in judgement.outcomes]:
             with starts_as_typed(cfg):
                 (envs,) = held.enter_context(opened(env, size, False, 1))
-            starts = starts_of_one_task(envs, cfg)
+                starts = starts_of_one_task(envs, cfg)
         held.enter_context(claim.held())
         remember(judgement, cfg, configs)  # what another has added
         write()

@@ -79,7 +79,7 @@ def require_unlabelled(cfg: LabelConfig, dataset: "LeRobotDataset") -> None:
     if SUCCESS in dataset.features and read != SUCCESS:
         raise FieldError(
             "dataset.root", cfg.dataset.root, f"has a column {SUCCESS} already",
-            "train with it, or label a copy without it: "
+            "train with it, or remove it first: "
             + edit_advice(dataset.root, "remove_feature", {"operation.feature_names": [SUCCESS]}),
         )  # fmt: skip
     require_new("output_dir", cfg.output_dir)

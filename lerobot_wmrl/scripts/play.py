@@ -24,7 +24,7 @@ The page is served to this machine alone. With another `--host`, visitors need t
 is printed.
 """
 
-import sys
+from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -162,7 +162,8 @@ def play(cfg: PlayConfig) -> None:
     saved = SavedEpisodes(cfg.output_dir, world.model.embodiment, cfg.done_frames)
     server = PlayServer(world, saved, cfg.host)
     try:
-        serve(server.application(), server.access, cfg.port, "Ctrl-C ends it")
+        with suppress(KeyboardInterrupt):
+            serve(server.application(), server.access, cfg.port, "Ctrl-C ends it")
     finally:
         if saved.count:
             print(f"\n{saved.count} episodes are in {cfg.output_dir}")
@@ -182,10 +183,7 @@ def export(world: "World", folder: Path, starts: int) -> None:
 
 def main() -> None:
     """Run the console command."""
-    try:
-        run_command(play, PlayConfig, list)
-    except KeyboardInterrupt:
-        sys.exit(0)
+    run_command(play, PlayConfig, list)
 
 
 if __name__ == "__main__":

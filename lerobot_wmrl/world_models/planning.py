@@ -112,7 +112,8 @@ class Planner:
             instructions: one a frame.
             proposed: actions (B, T, A) to change. The search samples changes at the knots; its first sample
                 changes nothing. By default the search begins at what is left of the last plans.
-            steps_left: steps until the episodes end, after which success does not count.
+            steps_left: steps until the episodes end, after which success does not count, but for the first
+                `done_frames`; nor does it with goal frames.
 
         Returns:
             (B, T, A)

@@ -155,7 +155,7 @@ def test_ctrl_c_ends_in_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("sys.argv", ["command"])
-    with pytest.raises(SystemExit, match="run the same command again to continue"):
+    with pytest.raises(SystemExit, match="run the same command again; it continues"):
         run_command(interrupted, RunConfig, list)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from lerobot_wmrl.common.checkpoints import Checkpoint, resolve_checkpoint
-from lerobot_wmrl.common.errors import Stopped
+from lerobot_wmrl.common.errors import FieldError, Stopped
 from lerobot_wmrl.common.statistics import Proportion
 from lerobot_wmrl.data.dataset import ChosenEpisodes
 from lerobot_wmrl.data.episodes import EpisodeTable
@@ -144,6 +144,15 @@ def test_starts_of_several_tasks_are_refused(starts, field, remedy):
         starts_of_one_task({"imagination": {0: None, 1: None}}, config)
     assert str(refused.value).startswith(f"{field}:")
     assert str(refused.value).endswith(f"; {remedy}")
+
+
+def test_starts_of_several_tasks_are_refused_by_the_flag_that_was_given(config, seeing, monkeypatch):
+    def refuse(*_):
+        raise FieldError("dataset.tasks", None, "of 2 tasks")
+
+    monkeypatch.setattr("lerobot_wmrl.scripts.judge.starts_of_one_task", refuse)
+    with pytest.raises(ValueError, match=r"^starts\.tasks"):
+        judge(replace(config, starts=StartFrames(root=config.dataset.root)))
 
 
 def test_rollouts_that_bias_the_confusion_are_warned_about():

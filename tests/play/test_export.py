@@ -298,6 +298,14 @@ def config(small_dataset, trained_models, tmp_path) -> PlayConfig:
     return found
 
 
+def test_ctrl_c_ends_the_server_and_is_no_error(config, monkeypatch, tmp_path):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("lerobot_wmrl.play.web.serve", interrupted)
+    play(replace(config, export=None, output_dir=tmp_path / "driven"))
+
+
 def test_a_page_without_frames_and_a_full_folder_are_refused(config, tmp_path):
     (tmp_path / "page").mkdir()
     (tmp_path / "page" / "note.txt").touch()

@@ -183,7 +183,7 @@ def test_the_planners_search_begins_at_what_the_policy_would_do(
     train(monkeypatch, *flags, "--iterations=1", *imagined, f"--output_dir={tmp_path / 'rl'}")
     assert len(plans) == 2
     assert plans[0].shape == (3, 6, 7)
-    assert steps_left == [4, 2], "the second plan begins after two steps"
+    assert steps_left == [6, 4], "the second plan begins after two steps"
     assert all(torch.allclose(*pair) for pair in zip(plans, proposals, strict=True))
 
 
