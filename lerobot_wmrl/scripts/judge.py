@@ -176,7 +176,11 @@ def judge(cfg: JudgeConfig) -> None:
             "--done_threshold or --done_frames (lerobot-wmrl-eval-world-model shows what they do), or train "
             "the world model on more failures"
         )
-    warnings = [*unfit(rollouts, cfg.world_model.path), *pooled_instructions(rollouts), *warnings]
+    warnings = [
+        *warnings_of_learnt(rollouts, cfg.world_model.path),
+        *pooled_instructions(rollouts),
+        *warnings,
+    ]
     refused = {name: why for name in configs if (why := trained_inside(name, cfg.world_model.path))}
     checkpoints = {name: checkpoint_digest(name) for name in configs}
     judgement = Judgement(confusion, references, refused, cfg.coverage, warnings, checkpoints=checkpoints)
@@ -190,7 +194,7 @@ def judge(cfg: JudgeConfig) -> None:
     )
 
 
-def unfit(rollouts: "LabelledRollouts", world_model: str) -> list[str]:
+def warnings_of_learnt(rollouts: "LabelledRollouts", world_model: str) -> list[str]:
     """Return a warning if the world model has learnt from the rollouts."""
     from lerobot_wmrl.evaluation.evidence import learnt_from
 

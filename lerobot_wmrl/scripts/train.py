@@ -66,17 +66,16 @@ def train_policy(cfg: TrainConfig) -> None:
     PartialState(cpu=config.device == "cpu", timeout=LONGEST_WAIT)
     content, done = named_content(cfg, config), finished(cfg)
     wait_for_all()  # no process has written anything before all have looked
+    # encoded now, because an environment of the hub tells its configuration of its actions
+    claim = Claim(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER, content)
+    claim.check()
     if done:
-        Claim(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER, content).check()
         if is_first_process():
             link_latest(cfg.output_dir)
         print(f"{cfg.output_dir}: already trained for {cfg.iterations} iterations")
     else:
         set_seed(cfg.seed)
         policy = LoadedPolicy.load(config)
-        # now, because an environment of the hub tells its configuration of its actions
-        claim = Claim(cfg.output_dir, draccus.encode(cfg), MAY_DIFFER, content)
-        claim.check()
         with within("env"):
             env = make_tensor_env(cfg.env, cfg.num_envs, config.device or "cpu")
         try:
