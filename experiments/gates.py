@@ -57,6 +57,16 @@ def four_tasks(study: Study) -> Results:
     return {"world_model_four_tasks": kept(study, "check")}
 
 
+def instructions(study: Study) -> Results:
+    """The gate of each task, by world models that read the instruction and that do not."""
+    rates = {
+        reads: {domain: kept(study, f"gate_{reads}_{domain}") for domain in ("ind", "ood")}
+        for reads in study.variables["readers"]
+    }
+    settings = {name: study.variables[name] for name in ("demonstrations", "rollouts", "seed", "judged")}
+    return {study.variables["cell"]: {**settings, "reads": rates}}
+
+
 def variants(study: Study) -> Results:
     """RoboScape's options."""
     return {"world_model_ablation": _trainings(study)}

@@ -179,10 +179,11 @@ class FrameSampler:
         share = float((counts / length).mean())
         self.extra = max(0.0, (SUCCESS_SHARE - share) / (1 - share)) if counts.any() else 0.0
 
-    def __call__(self, step: int) -> dict[str, Tensor]:
+    def __call__(self, step: int) -> dict[str, Any]:
         """Draw the batch of one step.
 
-        `observation.images.*` and `reference.*`, (B, 3, H, W) each, and `success` (B,), whether it holds.
+        `observation.images.*` and `reference.*`, (B, 3, H, W) each; `success` (B,), whether it holds; and
+        `task`, the instructions.
         """
         rng = np.random.default_rng([self.seed, step])
         episodes = rng.choice(self.episodes, self.batch_size)
@@ -195,7 +196,10 @@ class FrameSampler:
         start = self.table.start[episodes]
         rows = start + offsets
         images, reference = (frames_to_tensor(self.frames[index]).to(self.device) for index in (rows, start))
-        batch = {"success": torch.from_numpy(self.shown[rows]).to(self.device)}
+        batch: dict[str, Any] = {
+            "success": torch.from_numpy(self.shown[rows]).to(self.device),
+            "task": [self.table.instructions[episode] for episode in episodes],
+        }
         for index, camera in enumerate(self.cameras):
             batch[camera_key(camera)] = images[:, index]
             batch[f"reference.{camera}"] = reference[:, index]

@@ -370,7 +370,10 @@ def load_starts(
         if text_model is not None:
             features.append(measure.features(decoded))
     begin = Frames(torch.cat(tokens), state, Context.joined(contexts))
-    start_frames = replace(begin, state=state[:, : model.config.state_size], depth=frames.depth(model))
+    start_frames = replace(
+        begin, state=state[:, : model.config.state_size], depth=frames.depth(model),
+        instruction=model.read_instructions(frames.instructions, len(state)),
+    )  # fmt: skip
     starts = Starts(start_frames, torch.cat(images), frames.instructions)
     if text_model is None:
         return starts, None

@@ -293,9 +293,8 @@ def seen_outcomes(
     def judged(episode: int) -> PredictedDone:
         whole = recording.rows(episode)
         rows = slice(whole.start, min(whole.stop, whole.start + length))
-        probability = done.head(
-            torch.from_numpy(np.array(features[rows])).to(model.state_mean.device)
-        ).sigmoid()
+        seen = torch.from_numpy(np.array(features[rows])).to(model.state_mean.device)
+        probability = done.head(seen, model.read_instructions([table.instructions[episode]], 1)).sigmoid()
         return PredictedDone(episode, torch.cat([probability[1:], probability[-1:]]), table.done[rows])
 
     return Outcomes.stack(judged(int(episode)) for episode in episodes)

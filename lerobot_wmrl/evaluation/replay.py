@@ -71,7 +71,11 @@ class Recording:
         tokens, context = self.first_frames(episodes, model.tokenizer)
         rows = self.table.start[episodes]
         state = torch.from_numpy(self.table.state[rows]).to(tokens.device)
-        return Frames(tokens, state, context, model.recorded_depth(self.table.dataset, rows))
+        instructions = [self.table.instructions[episode] for episode in episodes]
+        return Frames(
+            tokens, state, context, model.recorded_depth(self.table.dataset, rows),
+            model.read_instructions(instructions, len(episodes)),
+        )  # fmt: skip
 
     def actions(self, episodes: np.ndarray, steps: int, device: torch.device) -> Tensor:
         """Return the first `steps` actions of E episodes; short episodes repeat their last. (E, steps, A)"""

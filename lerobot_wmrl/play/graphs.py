@@ -24,6 +24,7 @@ from lerobot_wmrl.world_models.anchored.dynamics import AnchoredDynamics
 from lerobot_wmrl.world_models.anchored.network import EncodedScene, StateRollout
 from lerobot_wmrl.world_models.layers import Rotation, attention
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
+from lerobot_wmrl.world_models.text import MAX_TOKENS
 
 if TYPE_CHECKING:
     import onnx
@@ -32,6 +33,14 @@ GRAPHS: Final = ("start", "scene", "step")
 NEXT: Final = "next_"
 Tensors = dict[str, Tensor]
 """Named tensors of one imagination, between the graphs."""
+
+BYTES: Final = "instruction_bytes"
+
+FIRST_BYTE: Final = 3
+"""ByT5's number of the byte 0."""
+
+END: Final = 1
+"""ByT5's number of the end of a text."""
 
 LARGE: Final = 1024
 """Tensors of at least so many weights are stored in 16 bits."""
@@ -95,17 +104,26 @@ class Graph(nn.Module):
 
 
 class ReadStart(Graph):
-    """The pictures (1, N, 3, S, S) in [0, 1] and the state (1, P) in which an episode begins."""
+    """The pictures (1, N, 3, S, S) in [0, 1] and the state (1, P) in which an episode begins.
+
+    And the bytes of its instruction, if success depends on it, see `instruction_bytes`.
+    """
 
     def __init__(self, model: ActionWorldModelRewardModel) -> None:
-        super().__init__(model, ["pictures", "measured_state"])
+        reads = [BYTES] if model.config.reads_instructions else []
+        super().__init__(model, ["pictures", "measured_state", *reads])
 
     def compute(self, tensors: Tensors) -> Tensors:
         tokenizer, pictures = self.model.tokenizer, tensors["pictures"]
         context = tokenizer.context(pictures)
         codes = self.network.codebook.codes(tokenizer.encode(pictures, context))[:, None]
         state = self.model.normalize_state(tensors["measured_state"])[:, None]
-        return {"codes": codes, "state": state, **numbered("context", context.maps)}
+        read = {}
+        if BYTES in tensors:
+            classifier: Any = tokenizer.success
+            ids, mask = tensors[BYTES], tensors[BYTES] != 0
+            read["instruction"] = classifier.instructions.read(ids, mask)
+        return {"codes": codes, "state": state, **numbered("context", context.maps), **read}
 
 
 class EncodeScene(Graph):
@@ -132,15 +150,18 @@ class ImagineStep(Graph):
 
     def __init__(self, model: ActionWorldModelRewardModel, contexts: int) -> None:
         maps = [f"context_{index}" for index in range(1, contexts)]
-        super().__init__(model, ["action", "age", *SCENE, *ROLLOUT, "keys", "values", *maps])
+        read = ["instruction"] if model.config.reads_instructions else []
+        super().__init__(model, ["action", "age", *SCENE, *ROLLOUT, "keys", "values", *maps, *read])
 
     def compute(self, tensors: Tensors) -> Tensors:
         network, codebook = self.network, self.network.codebook
         memory = WrittenMemory(tensors["keys"], tensors["values"], tensors["age"])
-        mean = self.model.encode_actions(tensors["action"][:, None]).mean()
+        condition = self.model.encode_actions(tensors["action"][:, None], tensors.get("instruction"))
         scene = EncodedScene(*(tensors[name] for name in SCENE))
         rollout = StateRollout(*(tensors[name] for name in ROLLOUT))
-        prediction, rollout = network.follow(scene, rollout, mean, memory, None)
+        prediction, rollout = network.follow(
+            scene, rollout, condition.mean(), memory, None, condition.instruction
+        )
         codes = codebook.most_likely(prediction.logits)
         maps = [tensors[name] for name in self.reads if name.startswith("context")]
         context = Context((torch.zeros_like(maps[0]), *maps)) if maps else Context()
@@ -155,6 +176,18 @@ class ImagineStep(Graph):
             f"{NEXT}keys": keys,
             f"{NEXT}values": values,
         }
+
+
+def instruction_bytes(instruction: str) -> np.ndarray:
+    """Return an instruction as ByT5 reads it: its bytes, the end, and zeros up to `MAX_TOKENS`. (1, L) int64
+
+    Raises:
+        ValueError: it is too long.
+    """
+    ids = [FIRST_BYTE + byte for byte in instruction.encode()] + [END]
+    if len(ids) > MAX_TOKENS:
+        raise ValueError(f"task: an instruction of {len(ids) - 1} bytes; at most {MAX_TOKENS - 1} are read")
+    return np.array([ids + [0] * (MAX_TOKENS - len(ids))])
 
 
 def numbered(name: str, tensors: Sequence[Tensor]) -> Tensors:
@@ -196,6 +229,7 @@ def export_graphs(model: ActionWorldModelRewardModel, folder: Path) -> None:
         "measured_state": model.state_mean[None].clone(),
         "action": model.action_mean[None].clone(),
         "age": torch.zeros(1, dtype=torch.long),
+        BYTES: torch.from_numpy(instruction_bytes("push")),
     }
     start = ReadStart(model)
     contexts = len(model.tokenizer.context(tensors["pictures"]).maps)
@@ -246,9 +280,11 @@ class ExportedWorldModel:
         self.window = window
         self.graphs = {name: onnxruntime.InferenceSession(folder / f"{name}.onnx") for name in GRAPHS}
 
-    def begin(self, pictures: np.ndarray, state: np.ndarray) -> None:
+    def begin(self, pictures: np.ndarray, state: np.ndarray, instruction: str = "") -> None:
         """Begin in pictures (1, N, 3, S, S), in [0, 1], and a state (1, P)."""
-        self.tensors: dict[str, np.ndarray] = {"pictures": pictures, "measured_state": state}
+        self.tensors: dict[str, np.ndarray] = {
+            "pictures": pictures, "measured_state": state, BYTES: instruction_bytes(instruction),
+        }  # fmt: skip
         self.imagined = 0
         self._run("start")
 

@@ -44,6 +44,8 @@ class TokenizerConfig:
         context: show encoder and decoder the episode's first frame too, so that tokens encode what moves.
         success: learn to classify success in frames too. An anchored world model then predicts the
             classifier's features, and reads success from them. Needs labels of success, and `context`.
+        instructions: whether success depends on the episode's instruction too; with `success`. By default it
+            does where the dataset has several instructions.
         frame_sizes: height and width of each camera's frames, read from the dataset.
     """
 
@@ -54,6 +56,7 @@ class TokenizerConfig:
     levels: list[int] = field(default_factory=lambda: [5, 5, 5, 5, 5, 5])
     context: bool = False
     success: bool = False
+    instructions: bool | None = None
     frame_sizes: list[list[int]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -64,6 +67,11 @@ class TokenizerConfig:
                 "tokenizer.success", True,
                 "success can depend on the episode's first frame, which tokens without `tokenizer.context` "
                 "do not show", "set `tokenizer.context` to true",
+            )  # fmt: skip
+        if self.instructions and not self.success:
+            raise FieldError(
+                "tokenizer.instructions", True, "they are read where success is classified, which is off",
+                "set `tokenizer.success` to true",
             )  # fmt: skip
         self._check_sizes()
         self._check_levels()

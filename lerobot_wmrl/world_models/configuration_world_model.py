@@ -138,6 +138,11 @@ class WorldModelConfig(RewardModelConfig):
         return self.tokenizer is not None and self.tokenizer.success and self.dynamics.predicts_success
 
     @property
+    def reads_instructions(self) -> bool:
+        """Whether success depends on the instruction."""
+        return self.predicts_success and bool(self.trained_tokenizer.instructions)
+
+    @property
     def observation_delta_indices(self) -> list[int]:
         return list(range(1 - self.clip_length, 1))
 

@@ -10,8 +10,9 @@ from torch import Tensor, nn
 from lerobot_wmrl.common.precision import imagination_dtype
 from lerobot_wmrl.data.clips import Clip
 from lerobot_wmrl.data.frames import NO_CONTEXT, Context, Frames
+from lerobot_wmrl.world_models.condition import Condition
 from lerobot_wmrl.world_models.kv_cache import KVCache
-from lerobot_wmrl.world_models.layers import Condition, FrameNetwork, Prediction
+from lerobot_wmrl.world_models.layers import FrameNetwork, Prediction
 
 
 class Imagined(NamedTuple):
@@ -47,7 +48,8 @@ class Imagination:
     """State of B imaginations: their newest frames, and the keys and values of the frames before.
 
     codes (B, 1, S, C) and state (B, 1, P), normalised, are of the newest frames; the context is that
-    of the frames where the imaginations began; the condition is set if it is the same at every step.
+    of the frames where the imaginations began; instruction (B, E) is what success is read by, for models that
+    read it; the condition is set if it is the same at every step.
     A step advances its tensors in place; that of autoregressive dynamics can be captured in a CUDA graph.
     """
 
@@ -55,6 +57,7 @@ class Imagination:
     state: Tensor
     cache: KVCache
     context: Context = NO_CONTEXT
+    instruction: Tensor | None = None
     condition: Condition | None = None
 
     @property
@@ -114,12 +117,15 @@ class Dynamics(nn.Module):
     def newest(self, imagination: Imagination) -> Frames:
         """Return the newest frames."""
         tokens = self.network.codebook.tokens(imagination.codes[:, 0])
-        return Frames(tokens, imagination.state[:, 0].clone(), imagination.context)
+        state = imagination.state[:, 0].clone()
+        return Frames(tokens, state, imagination.context, instruction=imagination.instruction)
 
     def restart(self, imagination: Imagination, mask: Tensor, frames: Frames) -> None:
         """Begin anew in the environments in `mask` (B,); frames are of all B."""
         self.show(imagination, mask, frames)
         imagination.context = imagination.context.replaced(mask, frames.context)
+        if imagination.instruction is not None and frames.instruction is not None:
+            imagination.instruction = torch.where(mask[:, None], frames.instruction, imagination.instruction)
         imagination.restart(mask)
 
     def step(self, imagination: Imagination, condition: Condition) -> Imagined:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,15 @@ from torch import Tensor
 from lerobot_wmrl.common.precision import compute_in, imagination_dtype
 from lerobot_wmrl.data.frame_cache import cached_depth
 from lerobot_wmrl.data.frames import NO_CONTEXT, Context, Frames
-from lerobot_wmrl.world_models.dynamics import Dynamics, Imagination, Imagined, OpenLoopPrediction
+from lerobot_wmrl.world_models.condition import Condition
+from lerobot_wmrl.world_models.dynamics import (
+    Dynamics,
+    Imagination,
+    Imagined,
+    OpenLoopPrediction,
+    spread_rows,
+)
 from lerobot_wmrl.world_models.frame_tokenizer import Decoded, FrameTokenizer
-from lerobot_wmrl.world_models.layers import Condition
 
 
 class ImaginationMixin:
@@ -41,11 +48,13 @@ class ImaginationMixin:
         """Begin to imagine at B frames.
 
         Args:
-            frames: where the imaginations begin. ValueError if depth that the model looks at is missing; a
-                missing context raises it in the first step.
+            frames: where the imaginations begin. ValueError if depth that the model looks at is missing, or
+                the instruction that it reads; a missing context raises it in the first step.
             instructions: one an imagination, of a model that is conditioned on text.
             dtype: what the network computes in, by default the fastest format; what is returned is float32.
         """
+        if instructions is None:
+            self._check_read(frames)
         imagination = self.dynamics.start(self._normalized(frames), dtype)
         if instructions is not None:
             imagination.condition = self.encode_instructions(instructions, len(frames))
@@ -58,12 +67,15 @@ class ImaginationMixin:
             raise ValueError(
                 "restart: its instructions are those of the start; start a new imagination instead"
             )
+        self._check_read(frames)
         self.dynamics.restart(imagination, mask, self._normalized(frames))
 
     @torch.no_grad()
     def step(self, imagination: Imagination, action: Tensor | None = None) -> Imagined:
         """Imagine the next frame of every environment: action (B, A) in the dataset's units."""
-        condition = imagination.condition if action is None else self.encode_actions(action[:, None])
+        condition = imagination.condition
+        if action is not None:
+            condition = self.encode_actions(action[:, None], imagination.instruction)
         if condition is None:
             raise ValueError("this imagination needs an action each step, or an instruction at the start")
         imagined = self.dynamics.step(imagination, condition)
@@ -115,8 +127,12 @@ class ImaginationMixin:
         Anchored dynamics encode each frame once for its J sequences and render no frame but the last, and
         without `with_tokens` none, so it is much faster than `imagine`.
         """
-        normalized = self._normalized(frames)
-        prediction = self.dynamics.open_loop(normalized, actions, self.encode_actions, with_tokens)
+        self._check_read(frames)
+        instruction = frames.instruction
+        if instruction is not None:
+            instruction = instruction[spread_rows(len(frames), len(actions), actions.device)]
+        encode = partial(self.encode_actions, instruction=instruction)
+        prediction = self.dynamics.open_loop(self._normalized(frames), actions, encode, with_tokens)
         return prediction._replace(state=self.denormalize_state(prediction.state))
 
     @torch.no_grad()
@@ -126,13 +142,26 @@ class ImaginationMixin:
             images, features = self.tokenizer.decode_with_features(tokens, context)
         return Decoded(images.float(), [feature.float() for feature in features])
 
-    def encode_actions(self, actions: Tensor) -> Condition:
-        """Actions (B, T, A) in dataset units → condition."""
+    def encode_actions(self, actions: Tensor, instruction: Tensor | None = None) -> Condition:
+        """Actions (B, T, A) in dataset units, and what success is read by (B, E), if it is → condition."""
         raise NotImplementedError(f"{self.name} is not conditioned on actions")
 
     def encode_instructions(self, instructions: Sequence[str], batch: int) -> Condition:
         """One instruction for each of `batch` episodes → condition."""
         raise NotImplementedError(f"{self.name} is not conditioned on text")
+
+    def read_instructions(self, instructions: Sequence[str], batch: int) -> Tensor | None:
+        """Return what success is read by in each of `batch` episodes (B, E), None if it is read from pictures
+        alone. ValueError unless there is one instruction for each."""
+        raise NotImplementedError
+
+    def _check_read(self, frames: Frames) -> None:
+        """Raise ValueError if success depends on the instruction, and the frames lack it."""
+        if self.config.reads_instructions and frames.instruction is None:
+            raise ValueError(
+                "task: this world model tells success by the instruction, and the frames have none; give one "
+                "for each episode"
+            )
 
     def normalize_state(self, state: Tensor) -> Tensor:
         """Scale states from dataset units to zero mean and unit variance. (…, P) → (…, P)"""

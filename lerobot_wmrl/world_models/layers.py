@@ -51,23 +51,6 @@ class Rotation(NamedTuple):
         return torch.cat([a * cos - b * sin, a * sin + b * cos], -1)
 
 
-class Condition(NamedTuple):
-    """The condition c of eq. 1.
-
-    tokens (B, T or 1, M, D); mask (B, 1, 1, 1, M), True for the tokens that count, None if all do.
-    """
-
-    tokens: Tensor
-    mask: Tensor | None = None
-
-    def mean(self) -> Tensor:
-        """Mean of the tokens that count. → (B, T or 1, D)"""
-        if self.mask is None:
-            return self.tokens.mean(2)
-        kept = self.mask[:, :, 0, 0, :, None].to(self.tokens.dtype)
-        return (self.tokens * kept).sum(2) / kept.sum(2).clamp_min(1)
-
-
 class Prediction(NamedTuple):
     """Predictions of frame t + 1 for each of T frames.
 

@@ -1,7 +1,7 @@
 """The frame tokenizer as a LeRobot reward model: trained, saved and published like one."""
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -91,18 +91,35 @@ class FrameTokenizerRewardModel(HubCard, PreTrainedRewardModel):
         if dataset_meta is not None:
             check_cameras(dataset_meta.features, config.tokenizer.camera_keys, "tokenizer.cameras")
             sized = with_frame_sizes(config.tokenizer, dataset_meta.features)
+            if sized.instructions is None and not config.pretrained_path:
+                sized = replace(sized, instructions=sized.success and len(dataset_meta.tasks) > 1)
             config = replace(config, tokenizer=sized)
         super().__init__(config)
         self.config: FrameTokenizerConfig = config
         if dataset_meta is not None and config.perceptual_weight:
             require_backbone("vgg", "perceptual_weight", config.perceptual_weight, "0")
         self.tokenizer = FrameTokenizer(config.tokenizer)
+        if dataset_meta is not None and config.tokenizer.instructions:
+            self._check_instructions(dataset_meta.tasks.index)
 
-    def forward(self, batch: dict[str, Tensor], progress: float = 1.0) -> tuple[Tensor, dict[str, float]]:
+    def _check_instructions(self, instructions: Iterable[str]) -> None:
+        """Raise FieldError for one that cannot be read."""
+        assert self.tokenizer.success is not None
+        assert self.tokenizer.success.instructions is not None
+        try:
+            self.tokenizer.success.instructions.encoder.check(instructions)
+        except ValueError as error:
+            raise FieldError(
+                "tokenizer.instructions", True, str(error), "or set it to false: success then depends on "
+                "pictures alone",
+            ) from error  # fmt: skip
+
+    def forward(self, batch: dict[str, Any], progress: float = 1.0) -> tuple[Tensor, dict[str, float]]:
         """Return the reconstruction loss of `observation.images.*` (B, 3, H, W) and metrics.
 
         `reference.*` are the episodes' first frames, needed with the option `context`; `success` (B,) bool,
-        whether it holds at the frames, is needed with the option `success`, which adds the classifier's loss.
+        whether it holds at the frames, is needed with the option `success`, which adds the classifier's loss,
+        and `task`, the instructions, if they are read.
         The loss is the same at any `progress` of the training.
 
         Raises:
@@ -119,7 +136,9 @@ class FrameTokenizerRewardModel(HubCard, PreTrainedRewardModel):
         if self.tokenizer.success is None:
             return loss, metrics
         assert reference is not None  # success needs context, and context the reference
-        success_loss, success_metrics = self.tokenizer.success.loss(reference, images, batch["success"])
+        success_loss, success_metrics = self.tokenizer.success.loss(
+            reference, images, batch["success"], batch.get("task", ())
+        )
         return loss + SUCCESS_WEIGHT * success_loss, metrics | success_metrics
 
     def _require_distinct(self, distinct: float) -> None:

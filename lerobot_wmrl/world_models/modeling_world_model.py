@@ -27,6 +27,7 @@ from lerobot_wmrl.world_models.anchored.dynamics import AnchoredDynamics
 from lerobot_wmrl.world_models.autoregressive.configuration import AutoregressiveConfig
 from lerobot_wmrl.world_models.autoregressive.dynamics import AutoregressiveDynamics
 from lerobot_wmrl.world_models.checkpoint import check_dataset, check_tokenizer_source, load_model
+from lerobot_wmrl.world_models.condition import Condition
 from lerobot_wmrl.world_models.configuration_world_model import (
     ActionWorldModelConfig,
     AnchoredConfig,
@@ -38,7 +39,7 @@ from lerobot_wmrl.world_models.frame_tokenizer import FrameTokenizer
 from lerobot_wmrl.world_models.goal import imagine_goal, similarity_to_goal
 from lerobot_wmrl.world_models.hub_card import HubCard
 from lerobot_wmrl.world_models.imagination import ImaginationMixin
-from lerobot_wmrl.world_models.layers import Condition, FrameSizes, Prediction
+from lerobot_wmrl.world_models.layers import FrameSizes, Prediction
 from lerobot_wmrl.world_models.modeling_frame_tokenizer import (
     stack_cameras,
     stretch_cameras,
@@ -176,6 +177,14 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
         state = state[..., : self.config.state_size]
         return ((state - self.state_mean) / self.state_std).clamp(-STATE_LIMIT, STATE_LIMIT)
 
+    def read_instructions(self, instructions: Sequence[str], batch: int) -> Tensor | None:
+        if not self.config.reads_instructions:
+            return None
+        check_one_each(instructions, batch)
+        read: Any = self.tokenizer.success
+        instruction: Tensor = read.instructions(instructions)
+        return instruction
+
     def condition(self, clip: Clip) -> Condition:
         """Return the condition (eq. 1's c) of every row of a clip, tokens (B, T or 1, M, D)."""
         raise NotImplementedError
@@ -303,17 +312,18 @@ class ActionWorldModelRewardModel(WorldModelRewardModel):
         """Return a compact observation with frames of the dataset's sizes; those that have them stay."""
         return stretch_cameras(observation, self.config.trained_tokenizer.frame_shapes)
 
-    def encode_actions(self, actions: Tensor) -> Condition:
+    def encode_actions(self, actions: Tensor, instruction: Tensor | None = None) -> Condition:
         if actions.shape[-1] != self.config.action_size:
             raise ValueError(
                 f"action: {actions.shape[-1]} components, but the world model was trained with "
                 f"{self.config.action_size}; use a dataset or policy with the same actions"
             )
         normalised = (actions - self.action_mean) / self.action_std
-        return Condition(self.embed_action(normalised).unflatten(-1, (CONDITION_TOKENS, -1)))
+        tokens = self.embed_action(normalised).unflatten(-1, (CONDITION_TOKENS, -1))
+        return Condition(tokens, instruction=None if instruction is None else instruction[:, None])
 
     def condition(self, clip: Clip) -> Condition:
-        return self.encode_actions(clip.action)
+        return self.encode_actions(clip.action, self.read_instructions(clip.instructions, len(clip.tokens)))
 
     @torch.no_grad()
     def compute_reward(self, batch: dict[str, Any]) -> Tensor:
@@ -366,7 +376,9 @@ class TextWorldModelRewardModel(WorldModelRewardModel):
 
     def encode_instructions(self, instructions: Sequence[str], batch: int) -> Condition:
         check_one_each(instructions, batch)
-        return self.text_encoder(instructions)
+        instruction = self.read_instructions(instructions, batch)
+        condition: Condition = self.text_encoder(instructions)
+        return condition._replace(instruction=None if instruction is None else instruction[:, None])
 
     def condition(self, clip: Clip) -> Condition:
         return self.encode_instructions(clip.instructions, len(clip.tokens))

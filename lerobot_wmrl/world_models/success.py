@@ -5,9 +5,13 @@ are many, and shifted and brightened copies are more, so a classifier of frames 
 features say where things are. A world model that predicts them in every frame (latent prediction, as in
 TD-MPC2, Hansen et al. 2024) learns what decides success, and reads success from the predicted features.
 
-B frames of N cameras, F features.
+Where a dataset has several instructions, each reads success from the same features in its own way: what one
+asks for may happen while another is followed. What happens next does not depend on the instruction.
+
+B frames of N cameras, F features, E numbers that an instruction becomes.
 """
 
+from collections.abc import Sequence
 from typing import Final
 
 import torch
@@ -15,6 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lerobot_wmrl.common.images import coordinates, random_shift, soft_positions
+from lerobot_wmrl.world_models.text import ByteTextEncoder
 
 WIDTH: Final = 16
 """Channels of the first convolution."""
@@ -78,14 +83,45 @@ class SuccessHead(nn.Module):
         self.scale = nn.BatchNorm1d(num_features(cameras), affine=False, momentum=SCALE_MOMENTUM)
         self.linear = nn.Linear(HIDDEN, 1)
 
-    def forward(self, features: Tensor) -> Tensor:
-        """Scaled features (…, F) → logits of success (…)."""
+    def forward(self, features: Tensor, instruction: Tensor | None = None) -> Tensor:
+        """Scaled features (…, F) → logits of success (…). instruction: as `read` takes it."""
         hidden = slice(-HIDDEN, None)
         mean, variance = self.scale.running_mean, self.scale.running_var
         assert mean is not None
         assert variance is not None
         std = (variance[hidden] + self.scale.eps).sqrt()
-        return self.linear(features[..., hidden] * std + mean[hidden]).squeeze(-1)
+        return self.read(features[..., hidden] * std + mean[hidden], instruction)
+
+    def read(self, hidden: Tensor, instruction: Tensor | None) -> Tensor:
+        """Return logits of success.
+
+        Args:
+            hidden: what all cameras show, unscaled, (…, HIDDEN).
+            instruction: what it adds to the weights and the bias, (…, E = HIDDEN + 1). None: nothing.
+        """
+        logit: Tensor = self.linear(hidden).squeeze(-1)
+        if instruction is None:
+            return logit
+        return logit + (hidden * instruction[..., :-1]).sum(-1) + instruction[..., -1]
+
+
+class InstructionReader(nn.Module):
+    """What an instruction adds to the weights and the bias that read success; at first nothing."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.encoder = ByteTextEncoder(HIDDEN + 1)
+        nn.init.zeros_(self.encoder.project.weight)
+        nn.init.zeros_(self.encoder.project.bias)
+
+    def forward(self, instructions: Sequence[str]) -> Tensor:
+        """B instructions → (B, E). ValueError for an empty one, and for one that is too long."""
+        return self.encoder(instructions).mean()[:, 0]
+
+    def read(self, ids: Tensor, mask: Tensor) -> Tensor:
+        """Read instructions that are given as bytes, see `ByteTextEncoder.embed`. (B, M) twice → (B, E)"""
+        kept = mask[..., None].float()
+        return (self.encoder.embed(ids, mask.long()) * kept).sum(1) / kept.sum(1)
 
 
 class SuccessClassifier(nn.Module):
@@ -95,9 +131,10 @@ class SuccessClassifier(nn.Module):
 
     Args:
         cameras: N.
+        instructions: whether it reads what the episode's instruction asks for.
     """
 
-    def __init__(self, cameras: int) -> None:
+    def __init__(self, cameras: int, instructions: bool = False) -> None:
         super().__init__()
         self.encoders = nn.ModuleList(PairEncoder() for _ in range(cameras))
         encoded = cameras * (4 * WIDTH + GRID_CHANNELS * GRID**2)
@@ -106,6 +143,7 @@ class SuccessClassifier(nn.Module):
             nn.Linear(HIDDEN, HIDDEN), nn.SiLU(),
         )  # fmt: skip
         self.head = SuccessHead(cameras)
+        self.instructions = InstructionReader() if instructions else None
 
     def unscaled(self, first: Tensor, frames: Tensor) -> Tensor:
         """Return positions, then what all cameras show. (B, N, 3, H, W) in [0, 1], twice → (B, F)"""
@@ -118,11 +156,21 @@ class SuccessClassifier(nn.Module):
         """Return features of mean 0 and variance 1. (B, N, 3, H, W) in [0, 1], twice → (B, F)"""
         return self.head.scale(self.unscaled(first, frames))
 
-    def loss(self, first: Tensor, frames: Tensor, success: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """Return binary cross-entropy on shifted and brightened frames, and metrics. success: (B,) bool"""
+    def loss(
+        self, first: Tensor, frames: Tensor, success: Tensor, instructions: Sequence[str] = ()
+    ) -> tuple[Tensor, dict[str, float]]:
+        """Return binary cross-entropy on shifted and brightened frames, and metrics.
+
+        Args:
+            first: first frames of the frames' episodes, (B, N, 3, H, W) in [0, 1].
+            frames: of the same shape.
+            success: whether it holds, (B,) bool.
+            instructions: of the episodes, read only if this classifier reads them.
+        """
         unscaled = self.unscaled(*augment(first, frames))
         self.head.scale(unscaled.detach())  # which follows their mean and variance
-        logit = self.head.linear(unscaled[:, -HIDDEN:]).squeeze(-1)
+        instruction = None if self.instructions is None else self.instructions(instructions)
+        logit = self.head.read(unscaled[:, -HIDDEN:], instruction)
         weight = logit.new_tensor(POSITIVE_WEIGHT)
         loss = F.binary_cross_entropy_with_logits(logit, success.float(), pos_weight=weight)
         right = ((logit > 0) == success).float().mean()
@@ -142,9 +190,9 @@ class PredictedSuccess(nn.Module):
         self.features = nn.Linear(width, num_features(cameras))
         self.head = SuccessHead(cameras).requires_grad_(False)  # the classifier's own
 
-    def forward(self, hidden: Tensor) -> Tensor:
-        """Hidden states (…, D) → logits of success (…, 1)."""
-        return self.head(self.features(hidden)).unsqueeze(-1)
+    def forward(self, hidden: Tensor, instruction: Tensor | None = None) -> Tensor:
+        """Hidden states (…, D), and what the instruction adds (…, E), if it is read → logits (…, 1)."""
+        return self.head(self.features(hidden), instruction).unsqueeze(-1)
 
 
 def num_features(cameras: int) -> int:

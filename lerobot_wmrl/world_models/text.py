@@ -20,7 +20,7 @@ from transformers import (
 from transformers.tokenization_utils_base import VERY_LARGE_INTEGER
 
 from lerobot_wmrl.common.errors import FieldError, first_line
-from lerobot_wmrl.world_models.layers import Condition
+from lerobot_wmrl.world_models.condition import Condition
 
 MAX_TOKENS: Final = 512
 """Limit where a tokenizer states none of its own: the length T5 was trained with (Raffel et al. 2020)."""
@@ -54,8 +54,7 @@ def tokenize(tokenizer: Any, instructions: Sequence[str]) -> Any:
     """
     if not all(text.strip() for text in instructions):
         raise ValueError(
-            "task='': an instruction is empty, and it is what tells the text world model which goal to "
-            "imagine; give every episode a task"
+            "task='': an instruction is empty, and it is what says what success is; give every episode a task"
         )
     batch = tokenizer(list(instructions), padding=True, return_tensors="pt")
     limit = token_limit(tokenizer)
@@ -184,7 +183,12 @@ class ByteTextEncoder(TextEncoder):
 
     def encode(self, instructions: Sequence[str]) -> tuple[Tensor, Tensor]:
         batch = tokenize(self.tokenizer, instructions).to(self.project.weight.device)
-        return self.project(self.encoder(**batch).last_hidden_state), batch["attention_mask"].bool()
+        return self.embed(**batch), batch["attention_mask"].bool()
+
+    def embed(self, input_ids: Tensor, attention_mask: Tensor) -> Tensor:
+        """Bytes as ByT5 numbers them (U, M) and where there are any (U, M) → condition tokens (U, M, D)."""
+        tokens: Tensor = self.project(self.encoder(input_ids, attention_mask).last_hidden_state)
+        return tokens
 
 
 class FrozenTextEncoder(TextEncoder):

@@ -90,7 +90,9 @@ class WmMpcPolicy(PreTrainedPolicy):
             self._context = model.tokenizer.context(images)
         tokens = model.tokenizer.encode(images, self._context)
         state = batch.get(OBS_STATE, tokens.new_zeros(len(tokens), 0, dtype=torch.float32))
-        frames, instructions = Frames(tokens, state, self._context), list(batch.get("task", []))
+        instructions = list(batch.get("task", []))
+        read = model.read_instructions(instructions, len(tokens))
+        frames = Frames(tokens, state, self._context, instruction=read)
         proposed = None
         if self.proposal is not None:
             proposed = self.proposal.actions(frames, batch, images, self.config.horizon)

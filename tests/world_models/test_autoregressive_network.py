@@ -5,7 +5,8 @@ from vector_quantize_pytorch import FSQ
 from lerobot_wmrl.world_models.autoregressive.configuration import AutoregressiveConfig
 from lerobot_wmrl.world_models.autoregressive.network import NextFrameNetwork
 from lerobot_wmrl.world_models.codebook import CodeBook
-from lerobot_wmrl.world_models.layers import Condition, FrameSizes
+from lerobot_wmrl.world_models.condition import Condition
+from lerobot_wmrl.world_models.layers import FrameSizes
 
 LEVELS = (8, 5, 3)
 

@@ -7,8 +7,9 @@ from torch import Tensor
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.world_models.autoregressive.configuration import CONDITIONINGS, AutoregressiveConfig
 from lerobot_wmrl.world_models.autoregressive.network import CONDITIONING_CLASSES, SpatialTemporalTransformer
+from lerobot_wmrl.world_models.condition import Condition
 from lerobot_wmrl.world_models.kv_cache import KVCache
-from lerobot_wmrl.world_models.layers import ClipMemory, Condition
+from lerobot_wmrl.world_models.layers import ClipMemory
 
 WINDOW, TOKENS, WIDTH = 5, 6, 16
 

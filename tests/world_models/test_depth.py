@@ -12,8 +12,8 @@ from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.world_models import losses
 from lerobot_wmrl.world_models.autoregressive.depth import FAR, depth_loss, metres, normalize_depth
 from lerobot_wmrl.world_models.autoregressive.dynamics import Inputs
+from lerobot_wmrl.world_models.condition import Condition
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig
-from lerobot_wmrl.world_models.layers import Condition
 from lerobot_wmrl.world_models.modeling_world_model import ActionWorldModelRewardModel
 from tests.trained import nested, small_tokenizer
 

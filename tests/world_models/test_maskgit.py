@@ -15,7 +15,8 @@ from lerobot_wmrl.world_models.autoregressive.maskgit import (
     most_confident,
 )
 from lerobot_wmrl.world_models.autoregressive.network import NextFrameNetwork
-from lerobot_wmrl.world_models.layers import Condition, FrameSizes
+from lerobot_wmrl.world_models.condition import Condition
+from lerobot_wmrl.world_models.layers import FrameSizes
 
 LEVELS, TOKENS, WIDTH, FRAMES = (5, 3), 4, 32, 4
 

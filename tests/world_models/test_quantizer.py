@@ -13,7 +13,8 @@ from lerobot_wmrl.world_models.autoregressive.configuration import Autoregressiv
 from lerobot_wmrl.world_models.autoregressive.network import NextFrameNetwork
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.codebook import BinaryCodeBook, CodeBook
-from lerobot_wmrl.world_models.layers import Condition, FrameSizes
+from lerobot_wmrl.world_models.condition import Condition
+from lerobot_wmrl.world_models.layers import FrameSizes
 from lerobot_wmrl.world_models.losses import (
     corrupt_codes,
 )

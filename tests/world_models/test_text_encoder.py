@@ -25,7 +25,7 @@ def encoder(request, tmp_path_factory) -> TextEncoder:
 
 
 def test_shapes_and_scale_are_those_cross_attention_expects(encoder):
-    condition, mask = encoder([SHORT, LONG])
+    condition, mask, _ = encoder([SHORT, LONG])
     length = len(encoder.tokenizer(LONG).input_ids)
     assert condition.shape == (2, 1, length, WIDTH)
     assert mask.shape == (2, 1, 1, 1, length)
@@ -38,7 +38,7 @@ def test_shapes_and_scale_are_those_cross_attention_expects(encoder):
 @torch.no_grad()
 def test_an_instruction_means_the_same_whatever_is_beside_it(encoder):
     alone, _ = encoder([SHORT])
-    beside, mask = encoder([LONG, SHORT, LONG])
+    beside, mask, _ = encoder([LONG, SHORT, LONG])
     kept = mask[1, 0, 0, 0]
     torch.testing.assert_close(beside[1, :, kept], alone[0], atol=1e-5, rtol=1e-4)
     assert torch.equal(beside[0], beside[2])

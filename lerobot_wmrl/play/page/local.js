@@ -4,7 +4,7 @@
 import * as ort from "./ort.wasm.min.js";
 
 const NEXT = "next_"; // before the name of an output that the same graph's next run reads
-const MOST_UPLOADS = 16;
+const MOST_UPLOADS = 16, MOST_TOKENS = 512;
 const here = (name) => new URL(`./${name}`, import.meta.url).href;
 ort.env.wasm.wasmPaths = { mjs: here("ort-wasm-simd-threaded.js"), wasm: here("ort-wasm-simd-threaded.wasm") };
 const graphs = {};
@@ -61,9 +61,8 @@ async function fetched(path) {
 async function begin({ do: _, ...place }) {
   const start = "picture" in place ? uploads.get(place.picture) : await recorded(place);
   if (!start) throw new Error("picture: is none that was uploaded; upload it again");
-  const begun = {
-    place, start, task: place.instruction ?? start.task, actions: [], episode: await newEpisode(start),
-  };
+  const task = place.instruction ?? start.task;
+  const begun = { place, start, task, actions: [], episode: await newEpisode(start, task) };
   drive = { ...begun, views: [viewOf(begun, start.squares, "", {})] };
   return resume();
 }
@@ -105,7 +104,8 @@ async function step({ driver, action }) {
 
 // Imagine the past anew; the drive stays as it is until that is done.
 async function rewind({ frame }) {
-  const { start, actions, views } = driving(), episode = await newEpisode(start), kept = actions.slice(0, frame);
+  const { start, task, actions, views } = driving(), kept = actions.slice(0, frame);
+  const episode = await newEpisode(start, task);
   for (const action of kept) await imagine(episode, action);
   Object.assign(drive, { episode, actions: kept, views: views.slice(0, frame + 1) });
   return {};
@@ -119,7 +119,7 @@ function driving() {
 // ---- the world model ---------------------------------------------------------------------------------------
 
 // An imagined episode before its first action.
-async function newEpisode({ squares, state }) {
+async function newEpisode({ squares, state }, task) {
   const area = world.side ** 2, seen = new Float32Array(squares.length * 3 * area);
   squares.forEach((canvas, index) => {
     const { data } = canvas.getContext("2d").getImageData(0, 0, world.side, world.side);
@@ -133,8 +133,20 @@ async function newEpisode({ squares, state }) {
     pictures: new ort.Tensor("float32", seen, [1, squares.length, 3, world.side, world.side]),
     measured_state: new ort.Tensor("float32", state, [1, state.length]),
   } };
+  if (graphs.start.inputNames.includes("instruction_bytes")) episode.tensors.instruction_bytes = bytesOf(task);
   await run("start", episode);
   return episode;
+}
+
+// An instruction as ByT5 reads it (instruction_bytes in lerobot_wmrl/play/graphs.py).
+function bytesOf(task) {
+  const bytes = new TextEncoder().encode(task), ids = new BigInt64Array(MOST_TOKENS);
+  if (bytes.length >= MOST_TOKENS) {
+    throw new Error(`instruction: has ${bytes.length} bytes; at most ${MOST_TOKENS - 1} are read`);
+  }
+  bytes.forEach((byte, index) => { ids[index] = BigInt(byte + 3); });
+  ids[bytes.length] = 1n;
+  return new ort.Tensor("int64", ids, [1, MOST_TOKENS]);
 }
 
 // Imagine the frame after an action, and return what is measured in it.

@@ -11,10 +11,11 @@ from lerobot_wmrl.data.clips import Clip, known_transitions, take_steps
 from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.world_models.anchored.imagination import AnchoredImagination
 from lerobot_wmrl.world_models.anchored.network import AnchoredNetwork
+from lerobot_wmrl.world_models.condition import Condition
 from lerobot_wmrl.world_models.configuration_world_model import AnchoredConfig
 from lerobot_wmrl.world_models.dynamics import Dynamics, Imagination, Imagined, OpenLoopPrediction
 from lerobot_wmrl.world_models.kv_cache import KVCache
-from lerobot_wmrl.world_models.layers import Condition, FrameSizes, Prediction
+from lerobot_wmrl.world_models.layers import FrameSizes, Prediction
 from lerobot_wmrl.world_models.losses import (
     FEATURE_WEIGHT,
     corrupt_codes,
@@ -77,7 +78,8 @@ class AnchoredDynamics(Dynamics):
         network = self.network
         codes, state, dtype = self._first(frames, dtype)
         shape = (len(network.trajectory), len(codes), 1, network.heads, network.window, network.head_width)
-        return AnchoredImagination(codes, state, KVCache.empty(shape, codes.device, dtype), frames.context)
+        cache = KVCache.empty(shape, codes.device, dtype)
+        return AnchoredImagination(codes, state, cache, frames.context, frames.instruction)
 
     @torch.no_grad()
     def step(self, imagination: Imagination, condition: Condition) -> Imagined:
@@ -92,8 +94,9 @@ class AnchoredDynamics(Dynamics):
             assert imagination.scene is not None
             assert imagination.rollout is not None
             prediction, rollout = network.follow(
-                imagination.scene, imagination.rollout, condition.mean(), imagination.advance(), None
-            )
+                imagination.scene, imagination.rollout, condition.mean(), imagination.advance(), None,
+                condition.instruction,
+            )  # fmt: skip
             imagination.rollout = rollout.last()
             codes = network.codebook.most_likely(prediction.logits)
         return self._advance(imagination, prediction, codes)

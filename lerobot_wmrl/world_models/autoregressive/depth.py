@@ -14,7 +14,8 @@ from torch import Tensor, nn
 from lerobot_wmrl.data.clips import known_transitions
 from lerobot_wmrl.world_models.autoregressive.configuration import AutoregressiveConfig
 from lerobot_wmrl.world_models.autoregressive.network import SpatialTemporalTransformer
-from lerobot_wmrl.world_models.layers import Condition, FrameEmbedding, FrameHead, FrameSizes, TemporalMemory
+from lerobot_wmrl.world_models.condition import Condition
+from lerobot_wmrl.world_models.layers import FrameEmbedding, FrameHead, FrameSizes, TemporalMemory
 from lerobot_wmrl.world_models.losses import masked_mean
 
 FAR: Final = 2.5

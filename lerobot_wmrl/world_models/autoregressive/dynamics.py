@@ -15,8 +15,9 @@ from lerobot_wmrl.world_models.autoregressive.keypoints import keypoint_loss
 from lerobot_wmrl.world_models.autoregressive.maskgit import FirstPass, MaskGit
 from lerobot_wmrl.world_models.autoregressive.network import NextFrameNetwork
 from lerobot_wmrl.world_models.codebook import CodeBook
+from lerobot_wmrl.world_models.condition import Condition
 from lerobot_wmrl.world_models.dynamics import Dynamics, Imagination, Imagined
-from lerobot_wmrl.world_models.layers import Condition, FrameSizes, Prediction
+from lerobot_wmrl.world_models.layers import FrameSizes, Prediction
 from lerobot_wmrl.world_models.losses import corrupt_codes, next_frame_loss, weighted_frames
 
 DEPTH_WEIGHT: Final = 1.0
@@ -157,7 +158,7 @@ class AutoregressiveDynamics(Dynamics):
 
         condition (B, `steps` or more, M, D) or (B, 1, M, D), float32. Draws no random number.
         """
-        imagination, (tokens, mask) = self.start(first, dtype), condition
+        imagination, tokens, mask = self.start(first, dtype), condition.tokens, condition.mask
         frames = [_newest(imagination)]
         for step in range(steps):
             now = tokens[:, step : step + 1] if tokens.shape[1] > 1 else tokens

@@ -15,8 +15,9 @@ from torch import Tensor, nn
 
 from lerobot_wmrl.world_models.autoregressive.configuration import AutoregressiveConfig
 from lerobot_wmrl.world_models.autoregressive.network import NextFrameNetwork
+from lerobot_wmrl.world_models.condition import Condition
 from lerobot_wmrl.world_models.kv_cache import KVCache
-from lerobot_wmrl.world_models.layers import ClipMemory, Condition, Prediction, Rotation
+from lerobot_wmrl.world_models.layers import ClipMemory, Prediction, Rotation
 from lerobot_wmrl.world_models.losses import masked_mean
 
 

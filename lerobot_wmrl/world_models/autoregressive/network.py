@@ -13,11 +13,11 @@ from torch import Tensor, nn
 
 from lerobot_wmrl.common.precision import compute_in
 from lerobot_wmrl.world_models.autoregressive.configuration import AutoregressiveConfig
+from lerobot_wmrl.world_models.condition import Condition
 from lerobot_wmrl.world_models.kv_cache import KVCache
 from lerobot_wmrl.world_models.layers import (
     STATE_STEP,
     ClipMemory,
-    Condition,
     CrossAttention,
     FrameNetwork,
     FrameSizes,
