@@ -4,8 +4,11 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from lerobot_wmrl.data.dataset import TrainingData
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig, train_world_model
+from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig, TokenizerConfig
 from lerobot_wmrl.world_models.configuration_world_model import (
     ActionWorldModelConfig,
@@ -55,6 +58,20 @@ def action_config(tokenizer: Path, **settings: Any) -> ActionWorldModelConfig:
     """A small action world model; settings of its dynamics stand beside the others."""
     options = {**SIZES, "clip_length": CLIP_LENGTH, **settings}
     return ActionWorldModelConfig(tokenizer_path=str(tokenizer), device="cpu", **nested(options))
+
+
+PUSH, PULL = "push the red square", "pull the red square"
+
+
+def told_apart(root: Path, folder: Path) -> Path:
+    """An action world model of a dataset with both instructions, which read success very differently."""
+    tokenizer = run_training(tokenizer_config(context=True, success=True), root, folder / "frame_tokenizer")
+    path = run_training(action_config(tokenizer), root, folder / "action_world_model")
+    model = load_model(path, "action_world_model")
+    torch.manual_seed(0)
+    torch.nn.init.normal_(model.tokenizer.success.instructions.encoder.project.weight, std=0.5)
+    model.save_pretrained(folder / "told_apart")
+    return folder / "told_apart"
 
 
 def text_config(tokenizer: Path, **settings: Any) -> TextWorldModelConfig:

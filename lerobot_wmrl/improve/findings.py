@@ -150,7 +150,7 @@ def look(
     return Findings(
         lines=lines,
         missing=[
-            *missing_labels(table), *several_instructions(table),
+            *missing_labels(table), *one_sided_instructions(table),
             *([] if rollouts else few_failures(table)), *few_decisions(policy, table),
         ],
         cameras=camera_names(keys),
@@ -184,14 +184,23 @@ def missing_labels(table: EpisodeTable) -> list[str]:
     ]
 
 
-def several_instructions(table: EpisodeTable) -> list[str]:
-    """Say so if there are several instructions, which the world model of actions does not read."""
-    count = len(set(table.instructions))
-    if count < 2:
+def one_sided_instructions(table: EpisodeTable) -> list[str]:
+    """Say so if the world model, which tells success by the instruction, knows one outcome alone of some."""
+    outcomes: dict[str, set[bool]] = {}
+    for instruction, success in zip(table.instructions, table.success.tolist(), strict=True):
+        outcomes.setdefault(instruction, set()).add(success)
+    lacking = {
+        name: [instruction for instruction, seen in outcomes.items() if seen == {other}]
+        for name, other in (("success", False), ("failure", True))
+    }
+    if len(outcomes) < 2 or not any(lacking.values()):
         return []
+    counts = " and ".join(
+        f"{len(found)} without a {name} (such as {found[0]!r})" for name, found in lacking.items() if found
+    )
     return [
-        f"instructions: {count}, which the world model does not read. Where two tasks are possible in the "
-        "same scene it rewards either of them: improve such tasks one by one (--dataset.episodes)"
+        f"instructions: {len(outcomes)}, by which success is told; {counts}. What each asks for is "
+        "learnt from its own episodes: record some of both outcomes"
     ]
 
 

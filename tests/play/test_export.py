@@ -22,15 +22,26 @@ from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.wait import WebDriverWait
 
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.data.dataset import DatasetSource
 from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
+from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
 from lerobot_wmrl.play.export import export_page
 from lerobot_wmrl.play.graphs import ExportedWorldModel, export_graphs
-from lerobot_wmrl.play.world import World
+from lerobot_wmrl.play.world import World, load_world
+from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.scripts.play import PlayConfig, play
 from lerobot_wmrl.world_models.checkpoint import load_model
 from tests.play.page import Page
-from tests.trained import CLIP_LENGTH, action_config, run_training, tokenizer_config
+from tests.trained import (
+    CLIP_LENGTH,
+    PULL,
+    PUSH,
+    action_config,
+    run_training,
+    tokenizer_config,
+    told_apart,
+)
 
 STARTS = 3
 
@@ -153,6 +164,33 @@ def ask(page: Page, message: dict[str, Any]) -> Any:
         """,
         message,
     )  # fmt: skip
+
+
+def test_a_page_reads_the_instruction_that_it_is_given(make_synthetic_dataset, tmp_path, chromium):
+    """As the world model does, which knows two; other words and none too."""
+    root = make_synthetic_dataset(tmp_path / "data", length=12, instructions=(PUSH, PULL)).root
+    config = WorldModelEnv(
+        world_model_path=str(told_apart(Path(root), tmp_path)), reward=GeneralConfig(alpha=1), device="cpu"
+    )
+    world = load_world(config, DatasetSource(root=str(root)), None, None)
+    folder = tmp_path / "page"
+    export_page(world, folder, STARTS)
+    pictures, state, actions = first_frame(folder, 0)
+    exported, chances = ExportedWorldModel(folder, CLIP_LENGTH), []
+    with served(folder) as address:
+        page = Page(chromium, address)
+        for given in ({}, {"instruction": PULL}, {"instruction": "zieh das Stück"}):
+            ask(page, {"do": "begin", "episode": 0, "frame": 0, **given})
+            shown = ask(page, {"do": "step", "driver": "recorded"})["view"]["measured"]["done_probability"]
+            exported.begin(pictures, state, given.get("instruction", PUSH))
+            expected = exported.step(actions[:1])["done_probability"]
+            assert shown == pytest.approx(float(expected[0]), abs=1e-3)
+            chances.append(shown)
+        for text, wrong in ((" ", "is empty"), ("x" * 600, "has 600 bytes; at most 511")):
+            assert f"instruction: {wrong}" in ask(
+                page, {"do": "begin", "episode": 0, "frame": 0, "instruction": text}
+            )
+    assert len({round(chance, 3) for chance in chances}) == 3
 
 
 def test_an_error_midway_leaves_the_drive_as_it_was(page, folder):

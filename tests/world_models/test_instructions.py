@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from lerobot.policies.factory import get_policy_class
-from torch import Tensor, nn
+from torch import Tensor
 
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.data.episodes import read_episodes
@@ -25,9 +25,17 @@ from lerobot_wmrl.world_models.modeling_frame_tokenizer import FrameTokenizerRew
 from lerobot_wmrl.world_models.success import SuccessClassifier
 from lerobot_wmrl.world_models.text import ByteTextEncoder
 from lerobot_wmrl.world_models.training import make_sampler
-from tests.trained import CLIP_LENGTH, SIZES, action_config, nested, run_training, tokenizer_config
+from tests.trained import (
+    CLIP_LENGTH,
+    PULL,
+    PUSH,
+    SIZES,
+    nested,
+    run_training,
+    tokenizer_config,
+    told_apart,
+)
 
-PUSH, PULL = "push the red square", "pull the red square"
 RIGHT, LEFT = "move the square to the right", "move the square to the left"
 
 
@@ -39,15 +47,8 @@ def two_tasks(make_synthetic_dataset, tmp_path_factory) -> Any:
 
 @pytest.fixture(scope="module")
 def trained(two_tasks, tmp_path_factory) -> Path:
-    """An action world model of both tasks, three steps, whose instructions then read very differently."""
-    root, folder = Path(two_tasks.root), tmp_path_factory.mktemp("instructions")
-    tokenizer = run_training(tokenizer_config(context=True, success=True), root, folder / "frame_tokenizer")
-    path = run_training(action_config(tokenizer), root, folder / "action_world_model")
-    model = load_model(path, "action_world_model")
-    torch.manual_seed(0)
-    nn.init.normal_(model.tokenizer.success.instructions.encoder.project.weight, std=0.5)
-    model.save_pretrained(folder / "told_apart")
-    return folder / "told_apart"
+    """An action world model of both tasks."""
+    return told_apart(Path(two_tasks.root), tmp_path_factory.mktemp("instructions"))
 
 
 @pytest.fixture

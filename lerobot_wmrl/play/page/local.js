@@ -140,6 +140,7 @@ async function newEpisode({ squares, state }, task) {
 
 // An instruction as ByT5 reads it (instruction_bytes in lerobot_wmrl/play/graphs.py).
 function bytesOf(task) {
+  if (!task?.trim()) throw new Error("instruction: is empty, and it says what success is");
   const bytes = new TextEncoder().encode(task), ids = new BigInt64Array(MOST_TOKENS);
   if (bytes.length >= MOST_TOKENS) {
     throw new Error(`instruction: has ${bytes.length} bytes; at most ${MOST_TOKENS - 1} are read`);
