@@ -73,6 +73,11 @@ class RunConfig:
         """What the command line says of each of `path_fields`: nothing, unless `parse_flags` noted it."""
         return {name: GivenPath(None, []) for name in self.path_fields}
 
+    @cached_property
+    def typed_preset(self) -> list[str]:
+        """`--preset=NAME` as it was typed, for the commands that are suggested; empty without."""
+        return []
+
     def save_pretrained(self, folder: Path) -> None:
         """Write the configuration as LeRobot does, `train_config.json`."""
         write_json(folder / CONFIG_FILE, draccus.encode(self))
@@ -116,11 +121,14 @@ def run_command[Config: RunConfig](
     init_logging()
     logging.getLogger("lerobot.configs").setLevel(logging.ERROR)
     try:
-        sys.argv[1:] = expand(with_home(with_equals_signs(sys.argv[1:])))
+        typed = with_home(with_equals_signs(sys.argv[1:]))
+        sys.argv[1:] = expand(typed)
         if {"--help", "-h"} & set(sys.argv[1:]):
             print(help_of(function, config_class))
             return
-        function(parse_flags(config_class))
+        config = parse_flags(config_class)
+        config.typed_preset.extend(argument for argument in typed if argument.startswith("--preset="))
+        function(config)
     except (ValueError, OSError, ParsingError) as error:
         kind, status = ("stopped", STOPPED) if isinstance(error, Stopped) else ("error", 1)
         print(f"{kind}: {said_in_flags(cause(error), config_class, sys.argv[1:])}", file=sys.stderr)

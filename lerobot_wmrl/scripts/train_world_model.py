@@ -255,9 +255,13 @@ def next_command(cfg: TrainWorldModelConfig) -> str:
     """Return the command that usually follows."""
     data, folder = shlex.join(format_flags(cfg.dataset.flags())), cfg.output_dir.parent
     if cfg.model.type == "frame_tokenizer":
+        flags = [
+            *cfg.typed_preset,
+            "--model.type=action_world_model",
+            f"--model.tokenizer_path={cfg.output_dir}",
+        ]
         return (
-            "lerobot-wmrl-train-world-model --model.type=action_world_model "
-            f"--model.tokenizer_path={cfg.output_dir} {data} "
+            f"lerobot-wmrl-train-world-model {shlex.join(flags)} {data} "
             f"--output_dir={folder / 'action_world_model'}"
         )
     if cfg.model.type == "text_world_model":

@@ -159,6 +159,7 @@ def test_rl_that_stopped_early_is_named(finished: Progress) -> None:
 def test_a_success_in_imagination_is_said_to_be_a_belief(finished: Progress) -> None:
     warned = "shows nothing about the real world"
     assert warned not in text_of(finished)
+    assert f"The world model: {trust(finished)}" in verdict(finished, [compared(finished)])
     finished.plan.config.real_env = None
     page = text_of(finished)
     assert warned in page

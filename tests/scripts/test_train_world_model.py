@@ -186,6 +186,10 @@ def test_a_training_ends_with_what_it_made_how_good_it_is_and_what_comes_next(
     assert following[:2] == ["lerobot-wmrl-train-world-model", "--model.type=action_world_model"]
     assert f"--model.tokenizer_path={tokenizer}" in following
     tiny = ["--preset=tiny", "--steps=1", "--batch_size=2", "--model.device=cpu"]
+    monkeypatch.setattr(sys, "argv", [*flags(root, tmp_path / "again"), "--preset", "tiny"])
+    main()
+    again = capsys.readouterr().out.strip().splitlines()[-1].split()
+    assert again[:3] == [following[0], "--preset=tiny", *following[1:2]]
     monkeypatch.setattr(sys, "argv", [*following, *tiny])
     main()
     said = capsys.readouterr().out

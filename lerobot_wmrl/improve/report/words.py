@@ -67,7 +67,8 @@ def verdict(progress: Progress, places: Sequence[Place]) -> str:
         changes = [f"- {line}" for line in pair_lines(place, chosen)]
         paragraphs.append("\n".join([f"Success {place.name}, on the same starts:", *rates, *changes]))
     return "\n\n".join([
-        *paragraphs, decided_at(places), *lacks(progress), *reservations(progress), choice_line(progress),
+        *paragraphs, decided_at(places), f"The world model: {trust(progress)}", *lacks(progress),
+        *reservations(progress), choice_line(progress),
     ])  # fmt: skip
 
 
