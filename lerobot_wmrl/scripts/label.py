@@ -125,6 +125,11 @@ def report(runs: Sequence[int], cfg: LabelConfig) -> list[str]:
             f"{short} of them for fewer than {DONE_FRAMES}: these count with --env.done_frames={held.min()} "
             f"in lerobot-wmrl-train and --done_frames={held.min()} in lerobot-wmrl-eval-world-model."
         )
+    if isinstance(cfg.success, EndsRule) and cfg.success.episodes is None:
+        lines.append(
+            "Every episode was taken for a success. If some fail, label the dataset again, with "
+            "--success.episodes=[…], those that succeed, or by another --success.type."
+        )
     if not failures:
         lines.append(
             "There is no failure: a world model cannot learn to predict one from this dataset alone, and "

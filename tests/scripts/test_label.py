@@ -51,6 +51,7 @@ def test_demonstrations_succeed_at_their_ends(
     said = capsys.readouterr().out
     assert "6 episodes, of which 6 succeed and 0 fail" in said
     assert "There is no failure" in said
+    assert "Every episode was taken for a success" in said
     before, after = LeRobotDataset("a", unlabelled), LeRobotDataset("b", tmp_path / "labelled")
     assert {*after.features} == {*before.features, "next.success"}
     for row in (0, len(before) - 1):
@@ -99,6 +100,7 @@ def test_the_others_fail_where_successes_are_named(
     said = capsys.readouterr().out
     assert "2 of them for fewer than 3: these count with --env.done_frames=2" in said
     assert "There is no failure" not in said
+    assert "Every episode was taken" not in said
 
 
 @pytest.mark.parametrize("flags", [
