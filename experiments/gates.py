@@ -58,9 +58,12 @@ def four_tasks(study: Study) -> Results:
 
 
 def instructions(study: Study) -> Results:
-    """The gate of each task, by world models that read the instruction and that do not."""
+    """How success is told in each task, by classifiers that read the instruction and that do not."""
     rates = {
-        reads: {domain: kept(study, f"gate_{reads}_{domain}") for domain in ("ind", "ood")}
+        reads: {
+            domain: json.loads((study.folder / f"told_{reads}_{domain}.json").read_text())
+            for domain in ("ind", "ood")
+        }
         for reads in study.variables["readers"]
     }
     settings = {name: study.variables[name] for name in ("demonstrations", "rollouts", "seed", "judged")}

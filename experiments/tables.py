@@ -21,6 +21,7 @@ from experiments import (
     four_tasks_section,
     judged,
     rewards_section,
+    same_recordings_section,
     value_cells,
     value_figure,
 )
@@ -75,6 +76,7 @@ SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     "value_imagined": ("Policies", partial(value.rows_above, ["imagined_cloning"])),
     "value_distilled_ppo": ("Policies", partial(value.rows_above, ["distilled_ppo"])),
     "value_ppo_distilled": ("Policies", partial(value.rows_above, ["ppo_distilled"])),
+    "value_same_recordings": ("Policies", same_recordings_section.section),
     "value_act": ("Policies", act_section.section),
     "value_act_controls": ("Policies", act_section.controls_section),
     "value_rewards": ("Policies", rewards_section.section),
@@ -96,6 +98,7 @@ SECTIONS: Final[Mapping[str, tuple[str, Callable[[Load], str]]]] = {
     "judge": ("Trust", judged.section),
     "reward_curves": ("Trust", world_models.reward_curves),
     "four_tasks": ("World models", world_models.four_tasks),
+    "instructions": ("World models", world_models.instructions),
     "learning_curve": ("World models", world_models.learning_curve),
     "text_dynamics": ("World models", world_models.text_dynamics),
     "ablation": ("World models", world_models.ablation),

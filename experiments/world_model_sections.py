@@ -3,7 +3,9 @@
 from collections.abc import Mapping
 from typing import Any, Final
 
-from experiments.cells import Load, counted, estimate, share
+from experiments.cells import DOMAINS, Load, counted, estimate, share
+from experiments.study import ROOT, read_cells
+from experiments.value_cells import published
 from lerobot_wmrl.common.files import markdown_table as table
 
 
@@ -112,6 +114,36 @@ of training; delta-PSNR after 0.6 s is {estimate(head["delta_psnr_0_6s"])} dB.
 {table(["", *columns], rows)}
 
 153 held-out episodes of planners, which are easier than a policy's rollouts; anchored dynamics, one seed."""
+
+
+def instructions(load: Load) -> str:
+    studies = read_cells(ROOT / "experiments" / "instructions.yaml")
+    cells = [cell for each in studies if (cell := published(load, "instructions", each.variables["cell"]))]
+    rows = [
+        [
+            cell["seed"],
+            DOMAINS[domain],
+            task.replace("_", " "),
+            kind,
+            *told(cell["reads"][reads][domain][task]),
+        ]
+        for cell in cells
+        for domain in DOMAINS
+        if domain in cell["reads"]["true"]
+        for task in cell["reads"]["true"][domain]
+        for reads, kind in (("true", "reads it"), ("false", "does not"))
+    ]
+    columns = ["false positives", "recall", "AUC", "successes that count under another task's instruction"]
+    return table(["seed", "scenes", "task", "the classifier", *columns], rows)
+
+
+def told(gate: Mapping[str, Any]) -> list[str]:
+    """Return false positives, recall, AUC and confusions of a success classifier, in short."""
+    false, recall, confused = (
+        f"{gate[name]['k']} of {gate[name]['n']}"
+        for name in ("false_positive_rate", "recall", "under_another_instruction")
+    )
+    return [false, recall, "–" if gate["auc"] is None else f"{gate['auc']:.2f}", confused]
 
 
 def training_rows(variants: Mapping[str, Mapping[str, Any]]) -> str:

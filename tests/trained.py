@@ -65,7 +65,8 @@ PUSH, PULL = "push the red square", "pull the red square"
 
 def told_apart(root: Path, folder: Path) -> Path:
     """An action world model of a dataset with both instructions, which read success very differently."""
-    tokenizer = run_training(tokenizer_config(context=True, success=True), root, folder / "frame_tokenizer")
+    config = tokenizer_config(context=True, success=True, instructions=True)
+    tokenizer = run_training(config, root, folder / "frame_tokenizer")
     path = run_training(action_config(tokenizer), root, folder / "action_world_model")
     model = load_model(path, "action_world_model")
     torch.manual_seed(0)

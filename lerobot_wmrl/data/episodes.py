@@ -13,9 +13,13 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import ACTION, DONE, OBS_STATE
 from numpy.typing import ArrayLike
 
+from lerobot_wmrl.common.constants import START_TASK
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.lerobot_commands import edit_advice
 from lerobot_wmrl.common.statistics import evenly_spaced
+
+EPISODES_A_TASK: Final = 5
+"""Episodes that an instruction has on average where each is a task of its own."""
 
 VALIDATION_EVERY: Final = 20
 """Every twentieth episode is held out from the training of tokenizers and world models."""
@@ -126,6 +130,19 @@ class EpisodeTable:
                     f"it has episodes 0 to {len(indices) - 1}",
                 )  # fmt: skip
         return indices >= 0 if chosen is None else np.isin(indices, chosen)
+
+
+def count_tasks(tables: Sequence[EpisodeTable]) -> int:
+    """Return how many tasks the episodes of several datasets are of.
+
+    The column `start.task` says so where all have it. Else each instruction is a task, if it has
+    `EPISODES_A_TASK` episodes on average; if not, they are other words of the same one.
+    """
+    tasks = np.concatenate([table.column(START_TASK) for table in tables])
+    if (tasks >= 0).all():
+        return len(np.unique(tasks))
+    instructions = {text for table in tables for text in table.instructions}
+    return len(instructions) if len(tasks) >= EPISODES_A_TASK * len(instructions) else 1
 
 
 def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:

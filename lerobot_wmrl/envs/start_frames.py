@@ -372,7 +372,7 @@ def load_starts(
     begin = Frames(torch.cat(tokens), state, Context.joined(contexts))
     start_frames = replace(
         begin, state=state[:, : model.config.state_size], depth=frames.depth(model),
-        instruction=model.read_instructions(frames.instructions, len(state)),
+        success_weights=model.success_weights(frames.instructions, len(state)),
     )  # fmt: skip
     starts = Starts(start_frames, torch.cat(images), frames.instructions)
     if text_model is None:

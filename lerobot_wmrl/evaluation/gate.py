@@ -294,7 +294,7 @@ def seen_outcomes(
         whole = recording.rows(episode)
         rows = slice(whole.start, min(whole.stop, whole.start + length))
         seen = torch.from_numpy(np.array(features[rows])).to(model.state_mean.device)
-        probability = done.head(seen, model.read_instructions([table.instructions[episode]], 1)).sigmoid()
+        probability = done.head(seen, model.success_weights([table.instructions[episode]], 1)).sigmoid()
         return PredictedDone(episode, torch.cat([probability[1:], probability[-1:]]), table.done[rows])
 
     return Outcomes.stack(judged(int(episode)) for episode in episodes)

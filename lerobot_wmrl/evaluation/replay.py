@@ -74,7 +74,7 @@ class Recording:
         instructions = [self.table.instructions[episode] for episode in episodes]
         return Frames(
             tokens, state, context, model.recorded_depth(self.table.dataset, rows),
-            model.read_instructions(instructions, len(episodes)),
+            model.success_weights(instructions, len(episodes)),
         )  # fmt: skip
 
     def actions(self, episodes: np.ndarray, steps: int, device: torch.device) -> Tensor:

@@ -22,7 +22,7 @@ from lerobot_wmrl.data.checks import (
     solved_from_the_start,
 )
 from lerobot_wmrl.data.embodiment import component_names
-from lerobot_wmrl.data.episodes import EpisodeTable, success_column
+from lerobot_wmrl.data.episodes import EpisodeTable, count_tasks, success_column
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 
 LONGEST_IMAGINATION = 98
@@ -150,8 +150,8 @@ def look(
     return Findings(
         lines=lines,
         missing=[
-            *missing_labels(table), *one_sided_instructions(table),
-            *([] if rollouts else few_failures(table)), *few_decisions(policy, table),
+            *missing_labels(table), *([] if rollouts else [*one_sided_tasks(table), *few_failures(table)]),
+            *few_decisions(policy, table),
         ],
         cameras=camera_names(keys),
         frame_side=min(map(min, sizes.values())), pixels=sum(h * w for h, w in sizes.values()),
@@ -184,8 +184,11 @@ def missing_labels(table: EpisodeTable) -> list[str]:
     ]
 
 
-def one_sided_instructions(table: EpisodeTable) -> list[str]:
-    """Say so if the world model, which tells success by the instruction, knows one outcome alone of some."""
+def one_sided_tasks(table: EpisodeTable) -> list[str]:
+    """Say so if, in data of several tasks and both outcomes, an instruction has one outcome alone: the world
+    model learns what it asks for from its own episodes."""
+    if count_tasks([table]) < 2 or len(set(table.success.tolist())) < 2:
+        return []
     outcomes: dict[str, set[bool]] = {}
     for instruction, success in zip(table.instructions, table.success.tolist(), strict=True):
         outcomes.setdefault(instruction, set()).add(success)
@@ -193,7 +196,7 @@ def one_sided_instructions(table: EpisodeTable) -> list[str]:
         name: [instruction for instruction, seen in outcomes.items() if seen == {other}]
         for name, other in (("success", False), ("failure", True))
     }
-    if len(outcomes) < 2 or not any(lacking.values()):
+    if not any(lacking.values()):
         return []
     counts = " and ".join(
         f"{len(found)} without a {name} (such as {found[0]!r})" for name, found in lacking.items() if found

@@ -1,6 +1,7 @@
 """A world model as three ONNX graphs, which a page without a server runs in the visitor's browser.
 
-`start` reads the pictures and the state in which an episode begins. `scene` encodes a frame, from which
+`start` reads the pictures and the state in which an episode begins, and its instruction if success depends
+on it. `scene` encodes a frame, from which
 `step` then imagines one action after the other; after as many steps as a training clip has, `scene` is run
 again on the newest frame. All shapes are constant.
 
@@ -121,8 +122,8 @@ class ReadStart(Graph):
         read = {}
         if BYTES in tensors:
             classifier: Any = tokenizer.success
-            ids, mask = tensors[BYTES], tensors[BYTES] != 0
-            read["instruction"] = classifier.instructions.read(ids, mask)
+            ids = tensors[BYTES]
+            read["success_weights"] = classifier.instructions.weights(ids, (ids != 0).long())
         return {"codes": codes, "state": state, **numbered("context", context.maps), **read}
 
 
@@ -150,17 +151,17 @@ class ImagineStep(Graph):
 
     def __init__(self, model: ActionWorldModelRewardModel, contexts: int) -> None:
         maps = [f"context_{index}" for index in range(1, contexts)]
-        read = ["instruction"] if model.config.reads_instructions else []
+        read = ["success_weights"] if model.config.reads_instructions else []
         super().__init__(model, ["action", "age", *SCENE, *ROLLOUT, "keys", "values", *maps, *read])
 
     def compute(self, tensors: Tensors) -> Tensors:
         network, codebook = self.network, self.network.codebook
         memory = WrittenMemory(tensors["keys"], tensors["values"], tensors["age"])
-        condition = self.model.encode_actions(tensors["action"][:, None], tensors.get("instruction"))
+        condition = self.model.encode_actions(tensors["action"][:, None], tensors.get("success_weights"))
         scene = EncodedScene(*(tensors[name] for name in SCENE))
         rollout = StateRollout(*(tensors[name] for name in ROLLOUT))
         prediction, rollout = network.follow(
-            scene, rollout, condition.mean(), memory, None, condition.instruction
+            scene, rollout, condition.mean(), memory, None, condition.success_weights
         )
         codes = codebook.most_likely(prediction.logits)
         maps = [tensors[name] for name in self.reads if name.startswith("context")]
@@ -280,7 +281,7 @@ class ExportedWorldModel:
         self.window = window
         self.graphs = {name: onnxruntime.InferenceSession(folder / f"{name}.onnx") for name in GRAPHS}
 
-    def begin(self, pictures: np.ndarray, state: np.ndarray, instruction: str = "") -> None:
+    def begin(self, pictures: np.ndarray, state: np.ndarray, instruction: str) -> None:
         """Begin in pictures (1, N, 3, S, S), in [0, 1], and a state (1, P)."""
         self.tensors: dict[str, np.ndarray] = {
             "pictures": pictures, "measured_state": state, BYTES: instruction_bytes(instruction),

@@ -151,7 +151,7 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
     from lerobot_wmrl.common.checkpoints import latest_checkpoint, link_latest, require_resumable
     from lerobot_wmrl.data.episodes import read_episodes
     from lerobot_wmrl.world_models.checkpoint import config_to_continue
-    from lerobot_wmrl.world_models.training import build_model
+    from lerobot_wmrl.world_models.training import build_model, decide_on_instructions
 
     path, settings = cfg.given["model"]
     if path:
@@ -171,6 +171,7 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
     claim.check()
     if is_first_process():
         link_latest(cfg.output_dir)
+    decide_on_instructions(cfg.model, table, cfg.dataset)
     model: Any = build_model(cfg.model, table, cfg.output_dir)
     if checkpoint is not None and int(checkpoint.name) >= cfg.steps:
         print(f"{cfg.output_dir}: already trained for {cfg.steps} steps")

@@ -45,7 +45,8 @@ class TokenizerConfig:
         success: learn to classify success in frames too. An anchored world model then predicts the
             classifier's features, and reads success from them. Needs labels of success, and `context`.
         instructions: whether success depends on the episode's instruction too; with `success`. By default it
-            does where the dataset has several instructions.
+            does where the datasets have several tasks: by their column `start.task`, else by instructions
+            with five episodes each on average; with fewer these are taken for other words of one task.
         frame_sizes: height and width of each camera's frames, read from the dataset.
     """
 

@@ -57,9 +57,8 @@ class FrameTokenizer(nn.Module):
         self.quantizer = make_quantizer(config.quantizer, config.levels)
         self.whiten = nn.ModuleList(nn.BatchNorm2d(width, affine=False) for width in (widths[-1], widths[0]))
         self.context_encoder = ContextEncoder(widths) if context else None
-        self.success = None
-        if config.success:
-            self.success = SuccessClassifier(self.num_cameras, bool(config.instructions))
+        reads = bool(config.instructions)
+        self.success = SuccessClassifier(self.num_cameras, reads) if config.success else None
 
     @property
     def tokens_per_frame(self) -> int:

@@ -54,7 +54,7 @@ class ImaginationMixin:
             dtype: what the network computes in, by default the fastest format; what is returned is float32.
         """
         if instructions is None:
-            self._check_read(frames)
+            self._require_success_weights(frames)
         imagination = self.dynamics.start(self._normalized(frames), dtype)
         if instructions is not None:
             imagination.condition = self.encode_instructions(instructions, len(frames))
@@ -67,7 +67,7 @@ class ImaginationMixin:
             raise ValueError(
                 "restart: its instructions are those of the start; start a new imagination instead"
             )
-        self._check_read(frames)
+        self._require_success_weights(frames)
         self.dynamics.restart(imagination, mask, self._normalized(frames))
 
     @torch.no_grad()
@@ -75,7 +75,7 @@ class ImaginationMixin:
         """Imagine the next frame of every environment: action (B, A) in the dataset's units."""
         condition = imagination.condition
         if action is not None:
-            condition = self.encode_actions(action[:, None], imagination.instruction)
+            condition = self.encode_actions(action[:, None], imagination.success_weights)
         if condition is None:
             raise ValueError("this imagination needs an action each step, or an instruction at the start")
         imagined = self.dynamics.step(imagination, condition)
@@ -127,11 +127,11 @@ class ImaginationMixin:
         Anchored dynamics encode each frame once for its J sequences and render no frame but the last, and
         without `with_tokens` none, so it is much faster than `imagine`.
         """
-        self._check_read(frames)
-        instruction = frames.instruction
-        if instruction is not None:
-            instruction = instruction[spread_rows(len(frames), len(actions), actions.device)]
-        encode = partial(self.encode_actions, instruction=instruction)
+        self._require_success_weights(frames)
+        weights = frames.success_weights
+        if weights is not None:
+            weights = weights[spread_rows(len(frames), len(actions), actions.device)]
+        encode = partial(self.encode_actions, success_weights=weights)
         prediction = self.dynamics.open_loop(self._normalized(frames), actions, encode, with_tokens)
         return prediction._replace(state=self.denormalize_state(prediction.state))
 
@@ -142,22 +142,28 @@ class ImaginationMixin:
             images, features = self.tokenizer.decode_with_features(tokens, context)
         return Decoded(images.float(), [feature.float() for feature in features])
 
-    def encode_actions(self, actions: Tensor, instruction: Tensor | None = None) -> Condition:
-        """Actions (B, T, A) in dataset units, and what success is read by (B, E), if it is → condition."""
+    def encode_actions(self, actions: Tensor, success_weights: Tensor | None = None) -> Condition:
+        """Actions (B, T, A) in dataset units, and the weights of the instructions (B, E) → condition."""
         raise NotImplementedError(f"{self.name} is not conditioned on actions")
 
     def encode_instructions(self, instructions: Sequence[str], batch: int) -> Condition:
         """One instruction for each of `batch` episodes → condition."""
         raise NotImplementedError(f"{self.name} is not conditioned on text")
 
-    def read_instructions(self, instructions: Sequence[str], batch: int) -> Tensor | None:
-        """Return what success is read by in each of `batch` episodes (B, E), None if it is read from pictures
-        alone. ValueError unless there is one instruction for each."""
+    def success_weights(self, instructions: Sequence[str], batch: int) -> Tensor | None:
+        """Return what each instruction of `batch` episodes adds to the weights by which success is read.
+
+        Returns:
+            (B, E), or None if success is read from pictures alone.
+
+        Raises:
+            ValueError: there is not one for each, or one is empty or too long.
+        """
         raise NotImplementedError
 
-    def _check_read(self, frames: Frames) -> None:
-        """Raise ValueError if success depends on the instruction, and the frames lack it."""
-        if self.config.reads_instructions and frames.instruction is None:
+    def _require_success_weights(self, frames: Frames) -> None:
+        """Raise ValueError if success depends on the instruction, and the frames lack its weights."""
+        if self.config.reads_instructions and frames.success_weights is None:
             raise ValueError(
                 "task: this world model tells success by the instruction, and the frames have none; give one "
                 "for each episode"

@@ -1,7 +1,7 @@
 """The frame tokenizer as a LeRobot reward model: trained, saved and published like one."""
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -91,28 +91,12 @@ class FrameTokenizerRewardModel(HubCard, PreTrainedRewardModel):
         if dataset_meta is not None:
             check_cameras(dataset_meta.features, config.tokenizer.camera_keys, "tokenizer.cameras")
             sized = with_frame_sizes(config.tokenizer, dataset_meta.features)
-            if sized.instructions is None and not config.pretrained_path:
-                sized = replace(sized, instructions=sized.success and len(dataset_meta.tasks) > 1)
             config = replace(config, tokenizer=sized)
         super().__init__(config)
         self.config: FrameTokenizerConfig = config
         if dataset_meta is not None and config.perceptual_weight:
             require_backbone("vgg", "perceptual_weight", config.perceptual_weight, "0")
         self.tokenizer = FrameTokenizer(config.tokenizer)
-        if dataset_meta is not None and config.tokenizer.instructions:
-            self._check_instructions(dataset_meta.tasks.index)
-
-    def _check_instructions(self, instructions: Iterable[str]) -> None:
-        """Raise FieldError for one that cannot be read."""
-        assert self.tokenizer.success is not None
-        assert self.tokenizer.success.instructions is not None
-        try:
-            self.tokenizer.success.instructions.encoder.check(instructions)
-        except ValueError as error:
-            raise FieldError(
-                "tokenizer.instructions", True, str(error), "or set it to false: success then depends on "
-                "pictures alone",
-            ) from error  # fmt: skip
 
     def forward(self, batch: dict[str, Any], progress: float = 1.0) -> tuple[Tensor, dict[str, float]]:
         """Return the reconstruction loss of `observation.images.*` (B, 3, H, W) and metrics.

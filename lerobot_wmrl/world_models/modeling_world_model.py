@@ -115,6 +115,7 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
         if source is not None:
             self.tokenizer.load_state_dict(source.tokenizer.state_dict())
         self.tokenizer.eval()
+        self._success_weights: dict[str, Tensor] = {}
         self.dynamics = make_dynamics(config, self.tokenizer.grid)
         done: Any = self.dynamics.network.done
         if config.predicts_success:
@@ -177,13 +178,17 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
         state = state[..., : self.config.state_size]
         return ((state - self.state_mean) / self.state_std).clamp(-STATE_LIMIT, STATE_LIMIT)
 
-    def read_instructions(self, instructions: Sequence[str], batch: int) -> Tensor | None:
+    @torch.no_grad()
+    def success_weights(self, instructions: Sequence[str], batch: int) -> Tensor | None:
         if not self.config.reads_instructions:
             return None
         check_one_each(instructions, batch)
-        read: Any = self.tokenizer.success
-        instruction: Tensor = read.instructions(instructions)
-        return instruction
+        classifier: Any = self.tokenizer.success
+        row_of = {text: row for row, text in enumerate(dict.fromkeys(instructions))}
+        for text in row_of.keys() - self._success_weights.keys():  # the tokenizer is fixed
+            self._success_weights[text] = classifier.instructions([text])[0]
+        rows = torch.stack([self._success_weights[text].to(self.state_mean.device) for text in row_of])
+        return rows[[row_of[text] for text in instructions]]
 
     def condition(self, clip: Clip) -> Condition:
         """Return the condition (eq. 1's c) of every row of a clip, tokens (B, T or 1, M, D)."""
@@ -312,7 +317,7 @@ class ActionWorldModelRewardModel(WorldModelRewardModel):
         """Return a compact observation with frames of the dataset's sizes; those that have them stay."""
         return stretch_cameras(observation, self.config.trained_tokenizer.frame_shapes)
 
-    def encode_actions(self, actions: Tensor, instruction: Tensor | None = None) -> Condition:
+    def encode_actions(self, actions: Tensor, success_weights: Tensor | None = None) -> Condition:
         if actions.shape[-1] != self.config.action_size:
             raise ValueError(
                 f"action: {actions.shape[-1]} components, but the world model was trained with "
@@ -320,10 +325,11 @@ class ActionWorldModelRewardModel(WorldModelRewardModel):
             )
         normalised = (actions - self.action_mean) / self.action_std
         tokens = self.embed_action(normalised).unflatten(-1, (CONDITION_TOKENS, -1))
-        return Condition(tokens, instruction=None if instruction is None else instruction[:, None])
+        weights = None if success_weights is None else success_weights[:, None]
+        return Condition(tokens, success_weights=weights)
 
     def condition(self, clip: Clip) -> Condition:
-        return self.encode_actions(clip.action, self.read_instructions(clip.instructions, len(clip.tokens)))
+        return self.encode_actions(clip.action, self.success_weights(clip.instructions, len(clip.tokens)))
 
     @torch.no_grad()
     def compute_reward(self, batch: dict[str, Any]) -> Tensor:
@@ -376,9 +382,9 @@ class TextWorldModelRewardModel(WorldModelRewardModel):
 
     def encode_instructions(self, instructions: Sequence[str], batch: int) -> Condition:
         check_one_each(instructions, batch)
-        instruction = self.read_instructions(instructions, batch)
+        weights = self.success_weights(instructions, batch)
         condition: Condition = self.text_encoder(instructions)
-        return condition._replace(instruction=None if instruction is None else instruction[:, None])
+        return condition._replace(success_weights=None if weights is None else weights[:, None])
 
     def condition(self, clip: Clip) -> Condition:
         return self.encode_instructions(clip.instructions, len(clip.tokens))

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lerobot_wmrl.common.images import coordinates, random_shift, soft_positions
-from lerobot_wmrl.world_models.text import ByteTextEncoder
+from lerobot_wmrl.world_models.text import ByteTextEncoder, check_one_each
 
 WIDTH: Final = 16
 """Channels of the first convolution."""
@@ -83,30 +83,30 @@ class SuccessHead(nn.Module):
         self.scale = nn.BatchNorm1d(num_features(cameras), affine=False, momentum=SCALE_MOMENTUM)
         self.linear = nn.Linear(HIDDEN, 1)
 
-    def forward(self, features: Tensor, instruction: Tensor | None = None) -> Tensor:
-        """Scaled features (…, F) → logits of success (…). instruction: as `read` takes it."""
+    def forward(self, features: Tensor, weights: Tensor | None = None) -> Tensor:
+        """Scaled features (…, F) → logits of success (…). weights: as `read` takes them."""
         hidden = slice(-HIDDEN, None)
         mean, variance = self.scale.running_mean, self.scale.running_var
         assert mean is not None
         assert variance is not None
         std = (variance[hidden] + self.scale.eps).sqrt()
-        return self.read(features[..., hidden] * std + mean[hidden], instruction)
+        return self.read(features[..., hidden] * std + mean[hidden], weights)
 
-    def read(self, hidden: Tensor, instruction: Tensor | None) -> Tensor:
+    def read(self, hidden: Tensor, weights: Tensor | None) -> Tensor:
         """Return logits of success.
 
         Args:
             hidden: what all cameras show, unscaled, (…, HIDDEN).
-            instruction: what it adds to the weights and the bias, (…, E = HIDDEN + 1). None: nothing.
+            weights: what the instruction adds to weights and bias, (…, E = HIDDEN + 1). None: nothing.
         """
         logit: Tensor = self.linear(hidden).squeeze(-1)
-        if instruction is None:
+        if weights is None:
             return logit
-        return logit + (hidden * instruction[..., :-1]).sum(-1) + instruction[..., -1]
+        return logit + (hidden * weights[..., :-1]).sum(-1) + weights[..., -1]
 
 
 class InstructionReader(nn.Module):
-    """What an instruction adds to the weights and the bias that read success; at first nothing."""
+    """What an instruction adds to the weights and the bias by which success is read; at first nothing."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -116,12 +116,14 @@ class InstructionReader(nn.Module):
 
     def forward(self, instructions: Sequence[str]) -> Tensor:
         """B instructions → (B, E). ValueError for an empty one, and for one that is too long."""
-        return self.encoder(instructions).mean()[:, 0]
+        row_of = {text: row for row, text in enumerate(dict.fromkeys(instructions))}
+        batch = self.encoder.tokens(list(row_of))
+        return self.weights(**batch)[[row_of[text] for text in instructions]]
 
-    def read(self, ids: Tensor, mask: Tensor) -> Tensor:
-        """Read instructions that are given as bytes, see `ByteTextEncoder.embed`. (B, M) twice → (B, E)"""
-        kept = mask[..., None].float()
-        return (self.encoder.embed(ids, mask.long()) * kept).sum(1) / kept.sum(1)
+    def weights(self, input_ids: Tensor, attention_mask: Tensor) -> Tensor:
+        """Bytes as ByT5 numbers them (U, M), and where there are any (U, M) → (U, E)."""
+        kept = attention_mask[..., None].float()
+        return (self.encoder.embed(input_ids, attention_mask) * kept).sum(1) / kept.sum(1)
 
 
 class SuccessClassifier(nn.Module):
@@ -165,12 +167,18 @@ class SuccessClassifier(nn.Module):
             first: first frames of the frames' episodes, (B, N, 3, H, W) in [0, 1].
             frames: of the same shape.
             success: whether it holds, (B,) bool.
-            instructions: of the episodes, read only if this classifier reads them.
+            instructions: one for each frame, read only if this classifier reads them.
+
+        Raises:
+            ValueError: there is not one instruction for each frame.
         """
         unscaled = self.unscaled(*augment(first, frames))
         self.head.scale(unscaled.detach())  # which follows their mean and variance
-        instruction = None if self.instructions is None else self.instructions(instructions)
-        logit = self.head.read(unscaled[:, -HIDDEN:], instruction)
+        weights = None
+        if self.instructions is not None:
+            check_one_each(instructions, len(frames))
+            weights = self.instructions(instructions)
+        logit = self.head.read(unscaled[:, -HIDDEN:], weights)
         weight = logit.new_tensor(POSITIVE_WEIGHT)
         loss = F.binary_cross_entropy_with_logits(logit, success.float(), pos_weight=weight)
         right = ((logit > 0) == success).float().mean()
@@ -190,9 +198,9 @@ class PredictedSuccess(nn.Module):
         self.features = nn.Linear(width, num_features(cameras))
         self.head = SuccessHead(cameras).requires_grad_(False)  # the classifier's own
 
-    def forward(self, hidden: Tensor, instruction: Tensor | None = None) -> Tensor:
+    def forward(self, hidden: Tensor, weights: Tensor | None = None) -> Tensor:
         """Hidden states (…, D), and what the instruction adds (…, E), if it is read → logits (…, 1)."""
-        return self.head(self.features(hidden), instruction).unsqueeze(-1)
+        return self.head(self.features(hidden), weights).unsqueeze(-1)
 
 
 def num_features(cameras: int) -> int:

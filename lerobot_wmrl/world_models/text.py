@@ -54,7 +54,8 @@ def tokenize(tokenizer: Any, instructions: Sequence[str]) -> Any:
     """
     if not all(text.strip() for text in instructions):
         raise ValueError(
-            "task='': an instruction is empty, and it is what says what success is; give every episode a task"
+            "task='': an instruction is empty, and the model has to know what is asked for; give every "
+            "episode a task"
         )
     batch = tokenizer(list(instructions), padding=True, return_tensors="pt")
     limit = token_limit(tokenizer)
@@ -71,6 +72,15 @@ def token_limit(tokenizer: Any) -> int:
     """Return the tokenizer's own maximum, `MAX_TOKENS` if it states none."""
     limit = tokenizer.model_max_length
     return MAX_TOKENS if limit >= VERY_LARGE_INTEGER else int(limit)
+
+
+def unreadable(instructions: Iterable[str]) -> str:
+    """Return what keeps `ByteTextEncoder` from reading one of the instructions; nothing if it reads all."""
+    try:
+        tokenize(ByT5Tokenizer(), list(dict.fromkeys(instructions)))
+    except ValueError as error:
+        return str(error)
+    return ""
 
 
 def check_one_each(instructions: Sequence[str], batch: int) -> None:
@@ -182,8 +192,12 @@ class ByteTextEncoder(TextEncoder):
         self.project = nn.Linear(config.d_model, width)
 
     def encode(self, instructions: Sequence[str]) -> tuple[Tensor, Tensor]:
-        batch = tokenize(self.tokenizer, instructions).to(self.project.weight.device)
+        batch = self.tokens(instructions)
         return self.embed(**batch), batch["attention_mask"].bool()
+
+    def tokens(self, instructions: Sequence[str]) -> Any:
+        """Return `input_ids` and `attention_mask` (U, M) of U instructions, on the parameters' device."""
+        return tokenize(self.tokenizer, instructions).to(self.project.weight.device)
 
     def embed(self, input_ids: Tensor, attention_mask: Tensor) -> Tensor:
         """Bytes as ByT5 numbers them (U, M) and where there are any (U, M) → condition tokens (U, M, D)."""

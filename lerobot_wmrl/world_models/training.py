@@ -8,6 +8,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -35,7 +36,7 @@ from lerobot_wmrl.common.training_state import load_training_state, save_checkpo
 from lerobot_wmrl.data.checks import require_shown, solved_from_the_start
 from lerobot_wmrl.data.clips import ClipSampler, FrameSampler, InTurn
 from lerobot_wmrl.data.dataset import TrainingData
-from lerobot_wmrl.data.episodes import EpisodeTable
+from lerobot_wmrl.data.episodes import EpisodeTable, count_tasks
 from lerobot_wmrl.data.frame_cache import (
     cached_context,
     cached_depth,
@@ -44,8 +45,9 @@ from lerobot_wmrl.data.frame_cache import (
     cached_tokens,
 )
 from lerobot_wmrl.world_models.checkpoint import check_dataset, load_model, load_model_to_continue
-from lerobot_wmrl.world_models.configuration_frame_tokenizer import cosine_schedule
+from lerobot_wmrl.world_models.configuration_frame_tokenizer import FrameTokenizerConfig, cosine_schedule
 from lerobot_wmrl.world_models.configuration_world_model import ActionWorldModelConfig, TextWorldModelConfig
+from lerobot_wmrl.world_models.text import unreadable
 
 HELD_OUT_BATCHES = 8
 """Held-out batches on which a trained world model is measured, which takes a few seconds."""
@@ -73,6 +75,37 @@ def build_model(config: RewardModelConfig, table: EpisodeTable, output_dir: Path
     if not config.pretrained_path:
         return make_reward_model(config, dataset_stats=meta.stats, dataset_meta=meta)
     return load_model_to_continue(config, meta)
+
+
+def decide_on_instructions(config: RewardModelConfig, table: EpisodeTable, data: TrainingData) -> None:
+    """Say in a new tokenizer's configuration whether success depends on the instruction, unless it says so.
+
+    It does where the episodes that are learnt from are of several tasks, and all instructions can be read.
+
+    Raises:
+        FieldError: it is asked for, and an instruction cannot be read.
+    """
+    if not isinstance(config, FrameTokenizerConfig) or not config.tokenizer.success or config.pretrained_path:
+        return
+    asked = config.tokenizer.instructions
+    tables = [table.subset(learnt_episodes(table, data.episodes))]
+    tables += [each.subset(learnt_episodes(each, None)) for each in data.read_more()]
+    reads = count_tasks(tables) > 1 if asked is None else asked
+    problem = reads and unreadable(text for each in tables for text in each.instructions)
+    if problem and asked:
+        raise FieldError(
+            "tokenizer.instructions", True, problem,
+            "or set it to false: success then depends on pictures alone",
+        )  # fmt: skip
+    if problem:
+        logging.warning("success is told without the instructions, one of which cannot be read: %s", problem)
+    config.tokenizer = replace(config.tokenizer, instructions=reads and not problem)
+
+
+def learnt_episodes(table: EpisodeTable, chosen: Sequence[int] | None) -> np.ndarray:
+    """Mark the `chosen` episodes (all if None) that are not held out. (E,)"""
+    marked: np.ndarray = ~table.validation & table.among(chosen)
+    return marked
 
 
 def golden_episodes(table: EpisodeTable) -> np.ndarray:
@@ -103,7 +136,7 @@ def make_sampler(
     Raises:
         FieldError: there is no episode to learn from.
     """
-    episodes = ~table.validation & table.among(chosen)
+    episodes = learnt_episodes(table, chosen)
     if not episodes.any():
         raise FieldError(
             "dataset.root", table.dataset.root, "has no episode to train on",
@@ -143,6 +176,18 @@ def make_clip_sampler(
 ) -> ClipSampler:
     """Make a sampler of clips from these episodes, with what else the model looks at or predicts."""
     config, tokenizer, dataset = model.config, model.tokenizer, table.dataset
+    chosen = table.subset(episodes)
+    if config.reads_instructions and (problem := unreadable(chosen.instructions)):
+        raise FieldError(
+            "dataset.root", dataset.root, problem,
+            "or train a tokenizer with `tokenizer.instructions`=false, and the world model on it",
+        )  # fmt: skip
+    if config.predicts_success and not config.reads_instructions and count_tasks([chosen]) > 1:
+        logging.warning(
+            "%s: has several tasks, and success is told without the instruction: what one task asks for "
+            "counts in another too. A tokenizer with --model.tokenizer.instructions=true reads it",
+            dataset.root,
+        )
     longer, longest = table.length[episodes] > config.clip_length, int(table.length[episodes].max())
     if 2 * longer.sum() > len(episodes) and not config.context_channels:
         logging.warning(
@@ -191,7 +236,7 @@ def note_outcomes(
     A model that is trained further keeps what it has learnt from before, if that was more.
     """
     labelled = [(table, chosen) for table, chosen in sources if table.done_known]
-    learnt = [table.success[~table.validation & table.among(chosen)] for table, chosen in labelled]
+    learnt = [table.success[learnt_episodes(table, chosen)] for table, chosen in labelled]
     if not learnt and config.pretrained_path and config.learnt_successes is None:
         return  # what it has learnt before is not known
     for table, _ in labelled:

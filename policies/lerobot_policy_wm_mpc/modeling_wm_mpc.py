@@ -91,8 +91,8 @@ class WmMpcPolicy(PreTrainedPolicy):
         tokens = model.tokenizer.encode(images, self._context)
         state = batch.get(OBS_STATE, tokens.new_zeros(len(tokens), 0, dtype=torch.float32))
         instructions = list(batch.get("task", []))
-        read = model.read_instructions(instructions, len(tokens))
-        frames = Frames(tokens, state, self._context, instruction=read)
+        weights = model.success_weights(instructions, len(tokens))
+        frames = Frames(tokens, state, self._context, success_weights=weights)
         proposed = None
         if self.proposal is not None:
             proposed = self.proposal.actions(frames, batch, images, self.config.horizon)

@@ -25,7 +25,7 @@ from lerobot_wmrl.data.dataset import ChosenEpisodes, open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.improve import commands, learnt
-from lerobot_wmrl.improve.findings import few_decisions, one_sided_instructions, usual_length
+from lerobot_wmrl.improve.findings import few_decisions, one_sided_tasks, usual_length
 from lerobot_wmrl.improve.progress import CLONED, DISTILLED, FITTED, PPO, SFT
 from lerobot_wmrl.improve.report.words import reservations
 from lerobot_wmrl.scripts.compare import CompareConfig
@@ -446,14 +446,17 @@ def test_instructions_of_one_outcome_are_named() -> None:
     table: Any = SimpleNamespace(
         instructions=["push", "push", "pull", "pull", "lift", "lift"],
         success=np.array([True, False, True, True, False, False]),
+        column=lambda name: np.arange(6) // 2,
     )
-    (warning,) = one_sided_instructions(table)
+    (warning,) = one_sided_tasks(table)
     assert "3, by which success is told; 1 without a success (such as 'lift')" in warning
     assert "and 1 without a failure (such as 'pull')" in warning
-    table.success = np.array([True, False] * 3)
-    assert not one_sided_instructions(table)
-    table.success, table.instructions = np.ones(6, bool), ["push"] * 6
-    assert not one_sided_instructions(table)
+    table.column = lambda name: np.zeros(6)
+    assert not one_sided_tasks(table), "other words of one task"
+    table.column = lambda name: np.arange(6) // 2
+    for success in ([True, False] * 3, [True] * 6):
+        table.success = np.array(success)
+        assert not one_sided_tasks(table)
 
 
 @pytest.mark.parametrize(("held", "frames"), [(0, 1), (1, 1), (2, 2), (9, 2)])

@@ -105,13 +105,20 @@ def test_the_page_is_self_contained_and_says_the_numbers(finished: Progress) -> 
     assert page.count("data:image/png;base64,") == 8, "bars, the replayed episode, and six curves"
 
 
+def labelled(success: np.ndarray) -> SimpleNamespace:
+    """A table of episodes of one task."""
+    return SimpleNamespace(
+        success=success, among=lambda episodes: None, column=lambda name: np.zeros(len(success))
+    )
+
+
 @pytest.mark.usefixtures("without_drawing")
 def test_failures_among_the_rollouts_count(finished: Progress, monkeypatch: pytest.MonkeyPatch) -> None:
     """Demonstrations alone lack them, and that was said before there were rollouts."""
     finished.plan.config.rollouts = 20
     write_records(finished)
     for failures, lacking in ((3, True), (20, False)):
-        table = SimpleNamespace(success=np.arange(60) < 60 - failures, among=lambda episodes: None)
+        table = labelled(np.arange(60) < 60 - failures)
         monkeypatch.setattr(table, "subset", lambda among, table=table: table, raising=False)
         monkeypatch.setattr(LearntEpisodes, "table", property(lambda learnt, table=table: table))
         page = text_of(finished)
@@ -199,7 +206,7 @@ def test_another_round_begins_from_the_policy_to_use_on_all_episodes(
     assert f"--seed=27 --output_dir={finished.plan.out}_again" in command
     assert f"--max_frames={2 * finished.plan.findings.longest} " in command, "as many as in this round"
     write_records(finished)
-    table = SimpleNamespace(success=np.arange(60) < 40, among=lambda episodes: None)
+    table = labelled(np.arange(60) < 40)
     monkeypatch.setattr(table, "subset", lambda among: table, raising=False)
     monkeypatch.setattr(LearntEpisodes, "table", property(lambda learnt: table))
     page = text_of(finished)

@@ -86,7 +86,7 @@ def first_frame(folder: Path, episode: int) -> tuple[np.ndarray, np.ndarray, np.
 def agreement(model: Any, folder: Path, pictures: np.ndarray, state: np.ndarray, steps: int) -> float:
     """Return the share of tokens that the graphs and the model agree on, over random actions."""
     exported = ExportedWorldModel(folder, model.config.clip_length)
-    exported.begin(pictures, state)
+    exported.begin(pictures, state, PUSH)
     images = torch.from_numpy(pictures)
     context = model.tokenizer.context(images)
     tokens = model.tokenizer.encode(images, context)
@@ -138,7 +138,7 @@ def test_the_page_imagines_what_the_graphs_imagine(page, folder):
         page["next"].click()
         page.wait(lambda frame=frame: page.frame == frame)
     exported = ExportedWorldModel(folder, CLIP_LENGTH)
-    exported.begin(pictures, state)
+    exported.begin(pictures, state, PUSH)
     for action in actions[:3]:
         found = exported.step(action[None])
     assert np.abs(pixels(page.image) - found["pixels"][0, ..., :3].astype(float)).mean() < 1

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,8 @@ from lerobot.policies.factory import get_policy_class
 from torch import Tensor
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.episodes import read_episodes
+from lerobot_wmrl.data.dataset import TrainingData, open_dataset
+from lerobot_wmrl.data.episodes import EpisodeTable, count_tasks, read_episodes
 from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.evaluation.gate import predict_done, seen_outcomes
@@ -21,15 +23,15 @@ from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
 from lerobot_wmrl.world_models.configuration_world_model import TextWorldModelConfig
-from lerobot_wmrl.world_models.modeling_frame_tokenizer import FrameTokenizerRewardModel
 from lerobot_wmrl.world_models.success import SuccessClassifier
 from lerobot_wmrl.world_models.text import ByteTextEncoder
-from lerobot_wmrl.world_models.training import make_sampler
+from lerobot_wmrl.world_models.training import decide_on_instructions, make_sampler
 from tests.trained import (
     CLIP_LENGTH,
     PULL,
     PUSH,
     SIZES,
+    action_config,
     nested,
     run_training,
     tokenizer_config,
@@ -60,7 +62,7 @@ def first_frames(model: Any, dataset: Any, instructions: list[str]) -> Frames:
     """The first frame of the first episode, once for each instruction."""
     recording = Recording.read(read_episodes(dataset), model)
     frames = recording.starts(model, np.zeros(len(instructions), int))
-    return replace(frames, instruction=model.read_instructions(instructions, len(instructions)))
+    return replace(frames, success_weights=model.success_weights(instructions, len(instructions)))
 
 
 def moved_squares(count: int, seed: int) -> tuple[Tensor, Tensor, Tensor, list[str]]:
@@ -98,27 +100,64 @@ def test_the_classifier_learns_success_that_depends_on_the_instruction(reads):
     assert right > 0.95 if reads else right < 0.7
 
 
-def test_a_dataset_decides_whether_instructions_are_read(trained, two_tasks, small_dataset):
-    """Several are, unless it is asked not to; a single one is not."""
+@pytest.mark.parametrize(("instructions", "tasks", "count"), [
+    (["push"] * 10 + ["pull"] * 10, [-1] * 20, 2),
+    (["push"] * 10 + ["pull"] * 9 + ["pull it"], [-1] * 20, 3),
+    ([f"push cube {number // 3}" for number in range(20)], [-1] * 20, 1),
+    ([f"push cube {number // 3}" for number in range(20)], [0] * 19 + [2], 2),
+    (["push"] * 10 + ["pull"] * 10, [0] * 20, 1),
+    (["push"] * 10 + ["pull"] * 10, [0] * 10 + [-1] * 10, 2),
+    (["push"] * 20, [-1] * 20, 1),
+])  # fmt: skip
+def test_tasks_are_told_by_their_column_or_by_instructions_that_are_repeated(instructions, tasks, count):
+    """In one dataset, or in two."""
 
-    def reads(dataset: Any, **settings: Any) -> bool:
-        config = tokenizer_config(context=True, **settings)
-        tokenizer = FrameTokenizerRewardModel(config, dataset_meta=dataset.meta)
-        assert (tokenizer.tokenizer.success is not None) == settings.get("success", False)
-        return tokenizer.config.tokenizer.instructions
+    def table(rows: slice) -> Any:
+        return SimpleNamespace(instructions=instructions[rows], column=lambda name: np.array(tasks[rows]))
 
-    assert reads(two_tasks, success=True) is True
-    assert reads(two_tasks, success=True, instructions=False) is False
-    assert reads(small_dataset, success=True) is False
-    assert reads(two_tasks) is False
-    assert load_model(trained, "action_world_model").config.reads_instructions
+    assert count_tasks([table(slice(20))]) == count_tasks([table(slice(7)), table(slice(7, 20))]) == count
 
 
-def test_a_tokenizer_from_before_instructions_were_read_does_not_begin_to(two_tasks):
+def decided(root: Path, *more: Path, episodes: list[int] | None = None, **settings: Any) -> bool | None:
+    """What a new tokenizer is told of its data."""
+    config = tokenizer_config(**{"context": True, "success": True, **settings})
+    data = TrainingData(root=str(root), episodes=episodes, more=[*map(str, more)])
+    decide_on_instructions(config, read_episodes(data.open()), data)
+    return config.tokenizer.instructions
+
+
+@pytest.fixture
+def by_instruction(monkeypatch) -> None:
+    """Tell tasks by instructions alone, each of which may have a single episode."""
+    monkeypatch.setattr(EpisodeTable, "column", lambda table, name: np.full(len(table.start), -1))
+    monkeypatch.setattr("lerobot_wmrl.data.episodes.EPISODES_A_TASK", 1)
+
+
+@pytest.mark.usefixtures("by_instruction")
+def test_instructions_are_read_where_what_is_learnt_from_has_several_tasks(
+    two_tasks, small_dataset, make_synthetic_dataset, tmp_path
+):
+    """Further datasets count; episodes that are not chosen do not."""
+    two, one = Path(two_tasks.root), Path(small_dataset.root)
+    other = Path(make_synthetic_dataset(tmp_path / "pull", episodes=2, length=5, instructions=(PULL,)).root)
+    assert decided(two) is True
+    assert decided(two, instructions=False) is False
+    assert decided(two, episodes=[0, 2, 4]) is False
+    assert decided(one) is False
+    assert decided(one, other) is True
+    assert decided(two, success=False) is None
     config = tokenizer_config(context=True, success=True)
-    config.pretrained_path = Path("trained_before")
-    model = FrameTokenizerRewardModel(config, dataset_meta=two_tasks.meta)
-    assert model.tokenizer.success.instructions is None
+    config.pretrained_path = Path("trained_before_instructions_were_read")
+    decide_on_instructions(config, read_episodes(two_tasks), TrainingData(root=str(two)))
+    assert not config.tokenizer.instructions
+
+
+def test_a_training_keeps_what_was_decided(trained, two_tasks, tmp_path):
+    """The synthetic datasets' column says that all episodes are of one task."""
+    assert load_model(trained, "action_world_model").config.reads_instructions
+    config = tokenizer_config(context=True, success=True)
+    path = run_training(config, Path(two_tasks.root), tmp_path / "tokenizer")
+    assert load_model(path, "frame_tokenizer").config.tokenizer.instructions is False
 
 
 def test_success_of_the_same_actions_depends_on_the_instruction_alone(model, two_tasks):
@@ -150,12 +189,13 @@ def test_an_episode_that_begins_anew_has_its_own_instruction(model, two_tasks):
     expected = model.step(model.start(first_frames(model, two_tasks, [PUSH, PULL])), action).done_logit
     torch.testing.assert_close(found, expected)
     assert torch.equal(
-        model.newest(imagination).instruction, first_frames(model, two_tasks, [PUSH, PULL]).instruction
+        model.newest(imagination).success_weights,
+        first_frames(model, two_tasks, [PUSH, PULL]).success_weights,
     )
 
 
 def test_frames_without_an_instruction_are_refused(model, two_tasks):
-    frames = replace(first_frames(model, two_tasks, [PUSH]), instruction=None)
+    frames = replace(first_frames(model, two_tasks, [PUSH]), success_weights=None)
     for imagine in (model.start, lambda each: model.open_loop(each, torch.zeros(1, 3, 7))):
         with pytest.raises(ValueError, match=r"^task: this world model tells success by the instruction"):
             imagine(frames)
@@ -163,7 +203,7 @@ def test_frames_without_an_instruction_are_refused(model, two_tasks):
     with pytest.raises(ValueError, match=r"^task: this world model"):
         model.restart(imagination, torch.tensor([True]), frames)
     with pytest.raises(ValueError, match=r"^task: 1 instructions for 2 episodes"):
-        model.read_instructions([PUSH], 2)
+        model.success_weights([PUSH], 2)
 
 
 def test_the_environment_reads_the_instruction_of_each_start(trained, two_tasks):
@@ -181,7 +221,7 @@ def test_the_environment_reads_the_instruction_of_each_start(trained, two_tasks)
     model = env.model
     chances = []
     for asked in (texts, texts[::-1]):
-        frames = replace(env.starts.frames, instruction=model.read_instructions(asked, 6))
+        frames = replace(env.starts.frames, success_weights=model.success_weights(asked, 6))
         chances.append(model.step(model.start(frames), torch.zeros(6, 7)).done_logit.sigmoid())
     torch.testing.assert_close(info["reward_parts"]["done_probability"], chances[0])
     assert (chances[0] - chances[1]).abs().min() > 1e-3
@@ -230,7 +270,7 @@ def test_a_text_world_model_reads_success_by_its_instruction_too(two_tasks, trai
     config = TextWorldModelConfig(tokenizer_path=str(tokenizer), device="cpu", **nested(settings))
     path = run_training(config, Path(two_tasks.root), tmp_path / "text")
     text = load_model(path, "text_world_model")
-    assert text.encode_instructions([PUSH, PULL], 2).instruction.shape[:2] == (2, 1)
+    assert text.encode_instructions([PUSH, PULL], 2).success_weights.shape[:2] == (2, 1)
     assert text.config.reads_instructions
 
 
@@ -260,17 +300,35 @@ def test_bytes_of_an_instruction_are_those_of_byt5():
         instruction_bytes("x" * 600)
 
 
+@pytest.mark.usefixtures("by_instruction")
 @pytest.mark.parametrize("instruction", [" ", "x" * 600])
 def test_an_instruction_that_cannot_be_read_is_named_before_training(
-    make_synthetic_dataset, tmp_path, instruction
+    make_synthetic_dataset, trained, tmp_path, caplog, instruction
 ):
     root = make_synthetic_dataset(tmp_path / "odd", episodes=2, instructions=(PUSH, instruction)).root
-    config = tokenizer_config(context=True, success=True)
     with pytest.raises(FieldError, match=r"tokenizer\.instructions=True: task=.*set it to false"):
-        run_training(config, Path(root), tmp_path / "tokenizer")
-    run_training(
-        tokenizer_config(context=True, success=True, instructions=False), Path(root), tmp_path / "tokenizer"
-    )
+        decided(Path(root), instructions=True)
+    model = load_model(trained, "action_world_model")
+    with pytest.raises(FieldError, match=r"dataset\.root=.*odd: task=.*`tokenizer\.instructions`=false"):
+        make_sampler(model, read_episodes(open_dataset(root)), None, batch_size=2, seed=0)
+    assert decided(Path(root)) is False
+    assert "success is told without the instructions, one of which cannot be read: task=" in caplog.text
+
+
+def test_one_instruction_is_needed_for_each_frame():
+    first, frames, success, _ = moved_squares(4, 0)
+    with pytest.raises(ValueError, match=r"^task: 1 instructions for 4 episodes"):
+        SuccessClassifier(1, instructions=True).loss(first, frames, success, [RIGHT])
+
+
+def test_several_tasks_are_warned_of_where_the_instruction_is_not_read(
+    two_tasks, small_dataset, tmp_path, caplog, by_instruction
+):
+    config = tokenizer_config(context=True, success=True, instructions=False)
+    tokenizer = run_training(config, Path(two_tasks.root), tmp_path / "tokenizer")
+    for dataset, warned in ((small_dataset, False), (two_tasks, True)):
+        run_training(action_config(tokenizer), Path(dataset.root), tmp_path / str(warned), steps=1)
+        assert ("has several tasks, and success is told without the instruction" in caplog.text) == warned
 
 
 def test_instructions_are_read_with_success_alone():

@@ -37,7 +37,7 @@ def test_shapes_and_scale_are_those_cross_attention_expects(encoder):
 
 @torch.no_grad()
 def test_an_instruction_means_the_same_whatever_is_beside_it(encoder):
-    alone, _ = encoder([SHORT])
+    alone, *_ = encoder([SHORT])
     beside, mask, _ = encoder([LONG, SHORT, LONG])
     kept = mask[1, 0, 0, 0]
     torch.testing.assert_close(beside[1, :, kept], alone[0], atol=1e-5, rtol=1e-4)

@@ -10,7 +10,7 @@ from lerobot_wmrl.envs.lerobot_env import counts_resets
 from lerobot_wmrl.evaluation.comparison import Pair
 from lerobot_wmrl.evaluation.gate import DOUBTFUL_AUC
 from lerobot_wmrl.evaluation.report import seen_line
-from lerobot_wmrl.improve.findings import few_failures
+from lerobot_wmrl.improve.findings import few_failures, one_sided_tasks
 from lerobot_wmrl.improve.plan import DONE_THRESHOLD
 from lerobot_wmrl.improve.progress import CLONED, SFT, Progress
 from lerobot_wmrl.improve.results import (
@@ -55,7 +55,9 @@ def lacks(progress: Progress) -> list[str]:
     missing = progress.plan.findings.missing
     if not progress.plan.config.rollouts:
         return missing
-    return [*missing, *few_failures(progress.learnt.chosen(), "Record more rollouts, with more exploration")]
+    learnt = progress.learnt.chosen()
+    few = few_failures(learnt, "Record more rollouts, with more exploration")
+    return [*missing, *one_sided_tasks(learnt), *few]
 
 
 def verdict(progress: Progress, places: Sequence[Place]) -> str:
