@@ -230,7 +230,6 @@ def test_the_readme_says_what_was_measured() -> None:
     words = {
         ("world_model_gate_anchored", "known"): "{} % of failures in known",
         ("world_model_gate_anchored", "unseen"): "{} % in unseen scenes",
-        ("world_model_gate_one_scene", "known"): "one of a single scene for {} %",
     }
     for (stem, domain), phrase in words.items():
         gate = json.loads((results / f"{stem}.json").read_text())[domain]
