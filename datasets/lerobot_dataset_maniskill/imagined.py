@@ -95,7 +95,7 @@ class ImaginedPartRecorder:
         self, observation: dict[str, Any], noises: list[ExplorationNoise]
     ) -> tuple[np.ndarray, list[float]]:
         """Return actions (B, 7) inside the action box, and the shares of the policy's that were not (B,)."""
-        actions = self.policy.act(observation).cpu()
+        actions = self.policy.act(observation).cpu().float()
         shares, action = out_of_range(actions), actions.numpy()
         action[: len(noises), :3] += np.stack([noise() for noise in noises])
         return np.clip(action, ACTION_LOW, ACTION_HIGH).astype(np.float32), shares

@@ -52,14 +52,15 @@ class DatasetPart:
 
 
 def planned_parts(config: RecordConfig) -> list[DatasetPart]:
-    """Return all parts of the shard in order."""
+    """Return all parts of the shard in order. Shards one after the other have the order of the whole."""
     episodes = simulated_episodes(config) if config.imagination is None else imagined_episodes(config)
     size, (shard, shards) = config.part_episodes, config.shard_of
     parts = [
         DatasetPart(index, tuple(episodes[first : first + size]))
         for index, first in enumerate(range(0, len(episodes), size))
     ]
-    return parts[shard::shards]
+    first, end = (len(parts) * number // shards for number in (shard, shard + 1))
+    return parts[first:end]
 
 
 def simulated_episodes(config: RecordConfig) -> list[EpisodePlan]:

@@ -84,7 +84,7 @@ class PolicyController:
         self.policy.reset()
 
     def act(self, simulation: "Simulation", frame: Frame) -> np.ndarray:
-        chosen = self.policy.act(policy_observation(frame, simulation.instruction)).cpu()
+        chosen = self.policy.act(policy_observation(frame, simulation.instruction)).cpu().float()
         self.clipped += out_of_range(chosen)
         action = chosen.squeeze(0).numpy()
         action[:3] += self.noise()
@@ -93,7 +93,7 @@ class PolicyController:
 
 def out_of_range(actions: Tensor) -> list[float]:
     """Return the share of the components of each action (B, 7) that are outside the action box."""
-    _, shares = clip_actions(actions.float(), torch.tensor(ACTION_LOW), torch.tensor(ACTION_HIGH))
+    _, shares = clip_actions(actions, torch.tensor(ACTION_LOW), torch.tensor(ACTION_HIGH))
     return shares.tolist()
 
 

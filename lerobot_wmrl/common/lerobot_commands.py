@@ -51,7 +51,7 @@ def edit_command(folder: Path, operation: str, flags: Flags) -> list[str]:
 
 def edit_advice(root: str | Path, operation: str, flags: Flags) -> str:
     """Return lerobot-edit-dataset as one types it, to make a changed copy of a dataset on disk beside it."""
-    source = Path(root)
+    source = Path(root).absolute() if not Path(root).name else Path(root)
     flags = {"repo_id": f"local/{source.name}", "root": str(source), **flags}
     return shlex.join(edit_command(source.with_name(f"{source.name}_edited"), operation, flags))
 

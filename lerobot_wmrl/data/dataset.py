@@ -12,6 +12,7 @@ from lerobot.datasets.utils import EPISODES_DIR, BackwardCompatibilityError
 from lerobot.utils.utils import SuppressProgressBars
 
 from lerobot_wmrl.common.errors import FieldError, first_line, renamed
+from lerobot_wmrl.data.embodiment import whole_rate
 from lerobot_wmrl.data.episodes import EpisodeTable, parquet_files, read_episodes
 
 VIDEO_BACKEND: Final = "pyav"
@@ -64,6 +65,10 @@ class DatasetSource:
         Raises:
             FieldError: there is none, it is not whole, or it cannot be downloaded.
         """
+        if not self.given:
+            raise FieldError(
+                "dataset.root", self.root, "no dataset is named", "give `dataset.root` or `dataset.repo_id`"
+            )
         if not self.repo_id or (self.root and is_whole(Path(self.root))):
             return open_dataset(self.root, self.repo_id)
         try:
@@ -112,7 +117,7 @@ def open_dataset(root: str | Path, repo_id: str | None = None) -> LeRobotDataset
         raise FieldError(
             "dataset.root", root, "no LeRobotDataset there (meta/info.json is missing)", "record one first"
         )
-    name = repo_id or Path(root).name
+    name = repo_id or Path(root).absolute().name
     try:
         missing = missing_files(Path(root))
         if not missing:
@@ -137,17 +142,8 @@ def open_dataset(root: str | Path, repo_id: str | None = None) -> LeRobotDataset
 
 
 def with_whole_rate(dataset: LeRobotDataset, field: str, value: object) -> LeRobotDataset:
-    """Return the dataset with its frame rate as the whole number that it is.
-
-    LeRobot converted older datasets to 30.0 frames a second for a time. FieldError for 29.97, of `field`.
-    """
-    rate = dataset.meta.info.fps
-    if rate != round(rate):
-        raise FieldError(
-            field, value, f"has {rate} frames a second, which is no whole number",
-            "record or convert it at a rate that is",
-        )  # fmt: skip
-    dataset.meta.info.fps = round(rate)
+    """Return the dataset with its frame rate as the whole number that it is. FieldError if it is none."""
+    dataset.meta.info.fps = whole_rate(dataset.meta.info.fps, field, value)
     return dataset
 
 

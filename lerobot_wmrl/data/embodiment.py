@@ -84,7 +84,7 @@ def read_embodiment(meta: Any, given: Embodiment) -> Embodiment:
 
     Raises:
         FieldError: the range that is given or recorded has another number of components, is not finite, or
-            has a lower end above the upper one.
+            has a lower end above the upper one; or the frame rate is no whole number.
     """
     names = component_names(meta.features[ACTION])
     recorded = recorded_range(meta.features[ACTION])
@@ -98,13 +98,27 @@ def read_embodiment(meta: Any, given: Embodiment) -> Embodiment:
         (low, high), source = recorded, "dataset"
     if not low:
         (low, high), source = observed_range(meta), "recorded actions"
-    check_range(low, high, names)
+    check_range(low, high, names, "action.info.{}" if source == "dataset" else "embodiment.action_{}")
     embodiment = replace(
-        given, fps=meta.fps, action_names=names, action_low=list(low), action_high=list(high),
+        given, fps=whole_rate(meta.fps, "dataset.root", meta.root),
+        action_names=names, action_low=list(low), action_high=list(high),
         state_names=component_names(meta.features[OBS_STATE]) if OBS_STATE in meta.features else [],
     )  # fmt: skip
     logging.info("range of the actions, from the %s: %s", source, embodiment.range_text())
     return embodiment
+
+
+def whole_rate(rate: float, field: str, value: object) -> int:
+    """Return a dataset's frame rate as the whole number that it is.
+
+    LeRobot converted older datasets to 30.0 frames a second for a time. FieldError for 29.97, of `field`.
+    """
+    if rate != round(rate):
+        raise FieldError(
+            field, value, f"has {rate} frames a second, which is no whole number",
+            "record or convert it at a rate that is",
+        )  # fmt: skip
+    return round(rate)
 
 
 def recorded_range(feature: Mapping[str, Any]) -> tuple[list[float], list[float]] | None:
@@ -147,18 +161,23 @@ def observed_range(meta: Any) -> tuple[list[float], list[float]]:
     return low.tolist(), high.tolist()
 
 
-def check_range(low: Sequence[float], high: Sequence[float], names: Sequence[str]) -> None:
-    """Raise FieldError unless the ends are finite, in order, and one for each component."""
-    for name, end in (("action_low", low), ("action_high", high)):
+def check_range(
+    low: Sequence[float], high: Sequence[float], names: Sequence[str], setting: str = "embodiment.action_{}"
+) -> None:
+    """Raise FieldError unless the ends are finite, in order, and one for each component.
+
+    setting: name of each end, `low` and `high`.
+    """
+    for name, end in ((LOW, low), (HIGH, high)):
         if len(end) != len(names):
             raise FieldError(
-                f"embodiment.{name}", list(end), f"the dataset's action has {len(names)} components: "
+                setting.format(name), list(end), f"the dataset's action has {len(names)} components: "
                 f"{', '.join(names)}", "give one number for each",
             )  # fmt: skip
     for name, least, most in zip(names, low, high, strict=True):
         if not (np.isfinite([least, most]).all() and least <= most):
             raise FieldError(
-                "embodiment.action_low", list(low), f"{name} would range from {least} to {most}",
+                setting.format(LOW), list(low), f"{name} would range from {least} to {most}",
                 "give finite numbers, the lower end first",
             )  # fmt: skip
 

@@ -153,6 +153,12 @@ def read_episodes(dataset: LeRobotDataset) -> EpisodeTable:
             f"the feature {ACTION!r} is missing (it has {', '.join(dataset.features)})",
             "world models need what was done beside what was seen",
         )  # fmt: skip
+    for name in (ACTION, OBS_STATE):
+        if len(shape := dataset.features.get(name, {"shape": (1,)})["shape"]) != 1:
+            raise FieldError(
+                "dataset.root", dataset.root, f"{name} has the shape {tuple(shape)}, which is no vector",
+                "store it as one, as LeRobot's policies read it",
+            )  # fmt: skip
     success = success_column(dataset.features)
     labels = () if success is None else (success,)
     measured = [name for name in (ACTION, OBS_STATE, *labels) if name in dataset.features]
@@ -279,7 +285,7 @@ def bad_row(
 
 def parquet_files(root: Path) -> list[Path]:
     """Return the files that hold a dataset's rows, in order."""
-    return sorted((root / "data").rglob("*.parquet"))
+    return sorted((root / "data").glob("*/*.parquet"))
 
 
 def read_actions(root: Path) -> np.ndarray:

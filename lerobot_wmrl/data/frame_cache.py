@@ -207,7 +207,8 @@ def token_depth(metres: Tensor, grid: int) -> Tensor:
 def cached_depth(dataset: LeRobotDataset, camera_keys: Sequence[str], grid: int) -> np.ndarray:
     """Return all frames' depth as a read-only memory map, float32 (rows, S) metres; decoded once."""
     keys = [depth_key(camera) for camera in camera_keys]
-    key = digest([dataset.num_episodes, dataset.num_frames, grid, *keys, *file_stamps(dataset)])
+    units = [dataset.features[name].get("info") for name in keys]
+    key = digest([dataset.num_episodes, dataset.num_frames, grid, *keys, *units, *file_stamps(dataset)])
 
     def write(target: np.ndarray, episode: int) -> None:
         for rows in parts_of(dataset, episode):
@@ -215,8 +216,8 @@ def cached_depth(dataset: LeRobotDataset, camera_keys: Sequence[str], grid: int)
             target[rows] = torch.cat(cameras, 1).numpy()
 
     shape = (dataset.num_frames, len(keys) * grid**2)
-    units = Units(dataset.num_episodes, write, "Decoding depth")
-    return memory_map(cache_dir(dataset) / f"depth-{key}.npy", shape, np.float32, units)
+    episodes = Units(dataset.num_episodes, write, "Decoding depth")
+    return memory_map(cache_dir(dataset) / f"depth-{key}.npy", shape, np.float32, episodes)
 
 
 def depth_of_windows(batch: Mapping[str, Any], camera_keys: Sequence[str], grid: int) -> Tensor:

@@ -70,12 +70,24 @@ def test_a_rate_of_frames_is_a_whole_number(rate: float, whole: bool, tmp_path: 
     record(tmp_path / "data", degrees())
     path = tmp_path / "data" / "meta" / "info.json"
     path.write_text(path.read_text().replace('"fps": 50', f'"fps": {rate}'))
+    by_lerobot = LeRobotDatasetMetadata("local/joints", root=tmp_path / "data")  # as lerobot-train reads it
     if whole:
-        found = read_embodiment(open_dataset(tmp_path / "data").meta, Embodiment())
-        assert json.dumps(found.fps) == "50"
+        for meta in (open_dataset(tmp_path / "data").meta, by_lerobot):
+            assert json.dumps(read_embodiment(meta, Embodiment()).fps) == "50"
     else:
-        with pytest.raises(FieldError, match=r"dataset.root=.*has 29\.97 frames a second"):
-            open_dataset(tmp_path / "data")
+        for read in (
+            lambda: open_dataset(tmp_path / "data"),
+            lambda: read_embodiment(by_lerobot, Embodiment()),
+        ):
+            with pytest.raises(FieldError, match=r"dataset.root=.*has 29\.97 frames a second"):
+                read()
+
+
+def test_a_wrong_range_in_a_dataset_is_not_said_to_be_a_setting(tmp_path: Path) -> None:
+    info = {"low": [0.0, 0.0, 5.0], "high": [1.0, 1.0, 1.0]}
+    meta = record(tmp_path / "data", degrees(), info=info)
+    with pytest.raises(FieldError, match=rf"^action\.info\.low=.*{JOINTS[2]} would range from 5\.0 to 1\.0"):
+        read_embodiment(meta, Embodiment())
 
 
 def test_one_wrong_value_does_not_widen_the_range(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

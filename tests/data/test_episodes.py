@@ -9,6 +9,7 @@ import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_wmrl.common.errors import FieldError
+from lerobot_wmrl.common.lerobot_commands import edit_advice
 from lerobot_wmrl.data.checks import frame_size, require_shown
 from lerobot_wmrl.data.dataset import DatasetSource, fingerprint, open_dataset
 from lerobot_wmrl.data.episodes import read_episodes
@@ -119,3 +120,32 @@ def test_where_no_frame_shows_success_the_last_ones_are_taken_for_it(
     assert table.done.astype(int).tolist() == [frame for episode in recorded for frame in episode]
     assert table.success.tolist() == [any(episode) for episode in recorded]
     assert ("no frame shows success" in caplog.text) == (recorded != read)
+
+
+def test_a_dataset_behind_links_is_the_same_data(small_dataset, tmp_path):
+    """Its rows too: LeRobot follows a link to a folder."""
+    shutil.copytree(small_dataset.root, tmp_path / "data")
+    chunk = tmp_path / "data" / "data" / "chunk-000"
+    chunk.rename(tmp_path / "elsewhere")
+    chunk.symlink_to(tmp_path / "elsewhere")
+    assert fingerprint(tmp_path / "data") == fingerprint(Path(small_dataset.root))
+    assert read_episodes(open_dataset(tmp_path / "data")).length.tolist() == [
+        int(length) for length in small_dataset.meta.episodes["length"]
+    ]
+
+
+def test_the_folder_that_one_is_in_is_a_dataset(small_dataset, tmp_path, monkeypatch):
+    monkeypatch.chdir(small_dataset.root)
+    assert DatasetSource(root=".").open().num_episodes == small_dataset.num_episodes
+    advice = edit_advice(".", "remove_feature", {"operation.feature_names": ["next.success"]})
+    assert f"--root={small_dataset.root} " in advice
+    assert f"--new_root={small_dataset.root}_edited" in advice
+    with pytest.raises(FieldError, match=r"^dataset\.root=: no dataset is named; give `dataset\.root` or"):
+        DatasetSource().open()
+
+
+def test_actions_that_are_no_vectors_are_refused(small_dataset):
+    dataset = open_dataset(small_dataset.root)
+    dataset.meta.info.features["action"]["shape"] = (2, 3)
+    with pytest.raises(FieldError, match=r"action has the shape \(2, 3\), which is no vector"):
+        read_episodes(dataset)

@@ -89,6 +89,11 @@ def test_depth_stored_as_images_is_read_in_its_unit(dtype, unit, tmp_path, monke
     dataset.finalize()
     stored = LeRobotDataset("local/stored", root=tmp_path / "stored")
     np.testing.assert_allclose(cached_depth(stored, [CAMERA], GRID), squares(maps), atol=1e-3)
+    described = stored.features[f"{CAMERA}_depth"]["info"]
+    described["depth_unit"] = {"mm": "m", "m": "mm"}[described["depth_unit"]]  # corrected afterwards
+    factor = 1000 if described["depth_unit"] == "m" else 1 / 1000
+    found = cached_depth(stored, [CAMERA], GRID)
+    np.testing.assert_allclose(found, factor * unit / 1000 * squares(maps) * (1000 / unit), rtol=1e-3)
 
 
 def test_cameras_may_have_depth_of_different_sizes():
