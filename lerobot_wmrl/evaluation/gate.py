@@ -65,6 +65,7 @@ class Outcomes:
         held: median of the frames for which successes hold at the end of their episodes. It is that of all
             episodes, also of a part of them.
         cut: episodes of which only the first frames are looked at, (E,) bool; by default none.
+        limit: frames that an episode may have, None if as many as it likes: no success can hold beyond.
     """
 
     episodes: np.ndarray
@@ -72,6 +73,7 @@ class Outcomes:
     done: np.ndarray
     held: float | None = None
     cut: np.ndarray = field(default_factory=lambda: np.array(False))
+    limit: int | None = None
 
     def __post_init__(self) -> None:
         if self.held is None:
@@ -106,7 +108,12 @@ class Outcomes:
     def where(self, kept: np.ndarray) -> "Outcomes":
         """Return the episodes where `kept` (E,) is True."""
         return Outcomes(
-            self.episodes[kept], self.probability[kept], self.done[kept], self.held, self.cut[kept]
+            self.episodes[kept],
+            self.probability[kept],
+            self.done[kept],
+            self.held,
+            self.cut[kept],
+            self.limit,
         )
 
     def within(self, frames: int | None) -> "Outcomes":
@@ -116,7 +123,7 @@ class Outcomes:
             return self
         return Outcomes(
             self.episodes, self.probability[:, :frames], self.done[:, :frames], self.held,
-            self.cut | (self.length > frames),
+            self.cut | (self.length > frames), frames,
         )  # fmt: skip
 
     def as_taught(self, table: EpisodeTable) -> "Outcomes":
@@ -160,16 +167,16 @@ class Outcomes:
         """Return the predicted probabilities. (E, T')
 
         Where episodes end at success, the prediction for the last frame is repeated, in failures as well, so
-        that it can hold for `frames` frames; not in episodes that go on.
+        that it can hold for `frames` frames; not in episodes that go on, and not beyond the `limit`, at which
+        an imagined episode ends too.
         """
         if not self.ends_at_success(frames):
             return self.probability
         probability = np.pad(self.probability, ((0, 0), (0, frames - 1)), constant_values=np.nan)
         for row, end in enumerate(self.length):
-            if self.cut[row]:
-                continue
-            probability[row, end : end + frames - 1] = probability[row, end - 1]
-        return probability
+            if not self.cut[row]:
+                probability[row, end : end + frames - 1] = probability[row, end - 1]
+        return probability[:, : self.limit]
 
     def scores(self, frames: int) -> np.ndarray:
         """Return the highest threshold at which the model predicts success for `frames` frames. (E,)
@@ -285,19 +292,18 @@ def seen_outcomes(
     Returns:
         Their outcomes as the gate has them; None for a model without such a classifier, or without labels.
     """
-    done, table, length = model.dynamics.network.done, recording.table, model.config.clip_length
+    done, table = model.dynamics.network.done, recording.table
     if not isinstance(done, PredictedSuccess) or not table.done_known:
         return None
     features = cached_features(table.dataset, model.config.tokenizer.camera_keys, model.tokenizer)
 
     def judged(episode: int) -> PredictedDone:
-        whole = recording.rows(episode)
-        rows = slice(whole.start, min(whole.stop, whole.start + length))
+        rows = recording.rows(episode)
         seen = torch.from_numpy(np.array(features[rows])).to(model.state_mean.device)
         probability = done.head(seen, model.success_weights([table.instructions[episode]], 1)).sigmoid()
         return PredictedDone(episode, torch.cat([probability[1:], probability[-1:]]), table.done[rows])
 
-    return Outcomes.stack(judged(int(episode)) for episode in episodes)
+    return Outcomes.stack(judged(int(episode)) for episode in episodes).within(model.config.clip_length)
 
 
 def gate_at(outcomes: Outcomes, threshold: float, frames: int) -> Gate:

@@ -242,8 +242,11 @@ def gate_lines(gate: Gate, best: Gate | None) -> str:
         f"{'passed' if gate.passed else 'not passed'}.",
         f"False positives (failures predicted as successes): {gate.false_positives}.",
         f"Recall (successes predicted as successes): {gate.recall}.",
-        f"AUC of successes against failures, over all thresholds: {gate.auc:.2f} (0.5 is chance).",
     ]
+    if not math.isnan(gate.auc):
+        lines.append(
+            f"AUC of successes against failures, over all thresholds: {gate.auc:.2f} (0.5 is chance)."
+        )
     if gate.cut_short:
         lines.append(
             f"{gate.cut_short} of the successes end before they have held for {gate.frames} frames. "
@@ -278,7 +281,7 @@ def task_table(gates: Mapping[str, Gate], best: Mapping[str, Gate | None]) -> st
     """
     rows = [
         (
-            task, gate.false_positives, gate.recall, f"{gate.auc:.2f}", "yes" if gate.passed else "no",
+            task, gate.false_positives, gate.recall, "–" if math.isnan(gate.auc) else f"{gate.auc:.2f}", "yes" if gate.passed else "no",
             "–" if not gate.recall.n or not gate.false_positives.n
             else f"{point.threshold}, {point.frames}: {point.recall}" if (point := best[task]) else "none",
         )

@@ -33,8 +33,8 @@ def plan_knots(
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Search the best knots by the cross-entropy method, B searches at once.
 
-    The mean that a search begins at, and that of each iteration but the last, is among the evaluated
-    sequences, so the best is no worse.
+    The mean that a search begins at, within the bounds, and that of each iteration but the last, is among
+    the evaluated sequences, so the best is no worse; of equally good ones it is the first mean.
 
     Args:
         objective: value of action sequences.
@@ -47,7 +47,8 @@ def plan_knots(
         the next; (B, N, A) each.
     """
     searches, first, deviation = len(mean), std, std.expand_as(mean)
-    best, best_value = mean, mean.new_full((searches,), -torch.inf)
+    mean = mean.clamp(low, high)
+    best, best_value = mean, None
     for _ in range(iterations):
         noise = torch.randn(searches, samples, *mean.shape[1:], generator=generator, device=mean.device)
         knots = (mean[:, None] + deviation[:, None] * noise).clamp(low, high)  # (B, K, N, A)
@@ -56,6 +57,7 @@ def plan_knots(
         top = value.topk(elites, 1)
         rows = torch.arange(searches, device=mean.device)[:, None]
         elite = knots[rows, top.indices]  # (B, elites, N, A)
+        best_value = value[:, 0] if best_value is None else best_value
         better = top.values[:, 0] > best_value
         best = torch.where(better[:, None, None], elite[:, 0], best)
         best_value = torch.where(better, top.values[:, 0], best_value)

@@ -89,7 +89,7 @@ class WmMpcPolicy(PreTrainedPolicy):
         if self._context is None:
             self._context = model.tokenizer.context(images)
         tokens = model.tokenizer.encode(images, self._context)
-        state = batch.get(OBS_STATE, tokens.new_zeros(len(tokens), 0, dtype=torch.float32))
+        state = self._state(batch, tokens)
         instructions = list(batch.get("task", []))
         weights = model.success_weights(instructions, len(tokens))
         frames = Frames(tokens, state, self._context, success_weights=weights)
@@ -97,6 +97,25 @@ class WmMpcPolicy(PreTrainedPolicy):
         if self.proposal is not None:
             proposed = self.proposal.actions(frames, batch, images, self.config.horizon)
         return self.planner.plan(frames, instructions, proposed)
+
+    def _state(self, batch: Observation, tokens: Tensor) -> Tensor:
+        """Return the robot's state (B, P), of no component where the world model has none.
+
+        Raises:
+            FieldError: it is missing, or has another number of components than the world model has learnt.
+        """
+        size = self.planner.model.config.state_size
+        if not size:
+            return tokens.new_zeros(len(tokens), 0, dtype=torch.float32)
+        state: Tensor | None = batch.get(OBS_STATE)
+        if state is None or state.shape[-1] != size:
+            shown = "is missing" if state is None else f"has {state.shape[-1]} components"
+            raise FieldError(
+                "world_model_path", self.config.world_model_path,
+                f"has learnt a state of {size} components, and {OBS_STATE} {shown}",
+                "plan where the world model's dataset was recorded, or train one without a state",
+            )  # fmt: skip
+        return state
 
 
 class Proposal:

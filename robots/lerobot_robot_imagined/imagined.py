@@ -127,9 +127,9 @@ class ImaginedRobot(Robot):
         if not self.is_connected:
             raise ConnectionError("the imagined robot is not connected")
         components = {name.removesuffix(self.config.suffix): float(value) for name, value in action.items()}
-        if "delta_x" in components:
-            components = self._displaced(components)
         names = self.model.embodiment.action_names
+        if "delta_x" in components and "delta_x" not in names:
+            components = self._displaced(components)
         if missing := [name for name in names if name not in components]:
             raise FieldError(
                 "teleop.type", ", ".join(action), f"the world model's actions need {', '.join(missing)} too",

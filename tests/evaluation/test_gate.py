@@ -132,17 +132,40 @@ def test_what_is_cut_where_imagination_ends_does_not_last():
     """Episodes end at success here, and a failure goes on after a frame that looks like one."""
     probability = np.array([[0.1, 0.9, np.nan, np.nan], [0.1, 0.9, 0.1, 0.1]])
     done = np.array([[False, True, False, False], [False] * 4])
-    for outcomes in (whole := Outcomes(np.arange(2), probability, done), whole.within(2)):
-        gate = gate_at(outcomes, 0.5, 3)
-        assert (gate.recall.k, gate.false_positives.k) == (1, 0)
+    whole = Outcomes(np.arange(2), probability, done)
+    for frames, recall in (
+        (None, 1),
+        (4, 1),
+        (3, 0),
+        (2, 0),
+    ):  # a success needs three frames, from the second on
+        gate = gate_at(whole.within(frames), 0.5, 3)
+        assert (gate.recall.k, gate.false_positives.k) == (recall, 0)
     assert gate_at(whole.within(2).where(np.array([False, True])), 0.5, 3).false_positives.k == 0
+
+
+@pytest.mark.parametrize("recorded", [4, 5])
+def test_a_failure_that_looks_solved_when_imagination_ends_is_none(recorded):
+    """Whether it was recorded just so long, as where an environment ends there, or a frame longer."""
+    probability = np.full((2, recorded), np.nan)
+    probability[0, :2] = 0.1, 0.9
+    probability[1, :4] = 0.1, 0.1, 0.1, 0.9
+    probability[1, 4:] = 0.1
+    done = np.zeros((2, recorded), bool)
+    done[0, 1] = True
+    found = Outcomes(np.arange(2), probability, done).within(4)
+    gate = gate_at(found, 0.5, 3)
+    assert (gate.recall.k, gate.false_positives.k) == (1, 0)
+    assert gate.auc == 1
 
 
 def test_auc_is_the_share_of_pairs_in_the_right_order(outcomes):
     """Scores over three frames: successes 0.9, 0.8, 0.1; failures 0.7, 0.1. One pair ties."""
     assert outcomes.scores(3).tolist() == [0.9, 0.8, 0.1, 0.7, 0.1]
     assert outcomes.auc(3) == pytest.approx((2 + 2 + 0.5) / 6)
-    assert math.isnan(Outcomes(np.arange(2), np.ones((2, 4)), np.ones((2, 4), bool)).auc(3))
+    wins = Outcomes(np.arange(2), np.ones((2, 4)), np.ones((2, 4), bool))
+    assert math.isnan(wins.auc(3))
+    assert not any("AUC" in line for line in gate_lines(gate_at(wins, 0.5, 3), None))
     below = np.array([[-0.3, -0.2, np.nan], [-0.3, -0.2, -0.1]])
     labels = np.array([[False, True, False], [False] * 3])
     assert Outcomes(np.arange(2), below, labels).auc(1) == 0, "a shorter episode has no frame of 0"

@@ -13,6 +13,7 @@ from lerobot_policy_cnn.modeling_cnn import CnnPolicy
 from lerobot_policy_wm_mpc import modeling_wm_mpc
 from lerobot_policy_wm_mpc.configuration_wm_mpc import WmMpcConfig
 from lerobot_policy_wm_mpc.modeling_wm_mpc import WmMpcPolicy
+from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.policies import load_processors, read_policy_config
 from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.maniskill.embodiment import ACTION_HIGH, ACTION_LOW
@@ -76,6 +77,25 @@ def test_the_planner_keeps_to_the_box_and_never_returns_worse_than_it_was_given(
     assert torch.cat(asked).max() <= high + 1e-6
 
 
+def test_where_all_is_equally_good_the_first_mean_is_kept_within_the_bounds():
+    mean = torch.tensor([[[0.0], [2.0]]])
+    found, _ = plan_knots(
+        lambda actions: torch.zeros(len(actions)), mean, torch.ones(1), -torch.ones(1), torch.ones(1),
+        horizon=4, samples=16, elites=4, iterations=3, generator=torch.Generator().manual_seed(0),
+    )  # fmt: skip
+    assert torch.equal(found, mean.clamp(max=1))
+
+
+@pytest.mark.parametrize(("state", "shown"), [(None, "is missing"), (torch.zeros(1, 9), "has 9 components")])
+def test_a_state_that_the_world_model_has_not_learnt_is_named(trained_models, state, shown):
+    policy = WmMpcPolicy(WmMpcConfig(world_model_path=str(trained_models["action_world_model"]), **SMALL))
+    batch = {IMAGE: torch.rand(1, 3, 32, 32), "task": ["push"]}
+    if state is not None:
+        batch["observation.state"] = state
+    with pytest.raises(FieldError, match=rf"world_model_path=.*a state of 8 components, and .*state {shown}"):
+        policy.select_action(batch)
+
+
 def test_a_search_changes_the_proposed_actions_by_a_few_deviations(trained_models):
     """One sample is the proposal itself, at every step, not at knots alone."""
     model = load_model(trained_models["action_world_model"], "action_world_model").eval()
@@ -100,9 +120,12 @@ def test_done_counts_as_long_as_it_holds():
     assert success_logit(logits, 3).tolist() == [-9, 1]
 
 
-@pytest.mark.parametrize(("left", "best"), [(None, 1.0), (8, 1.0), (4, -1.0), (1, -1.0)])
+@pytest.mark.parametrize(("left", "best"), [(None, 1.0), (8, 1.0), (4, -1.0), (1, 0.0)])
 def test_success_after_the_end_of_the_episode_does_not_count(left, best):
-    """Positive actions succeed surely at the eighth step, negative ones less surely at the third."""
+    """Positive actions succeed surely at the eighth step, negative ones less surely at the third.
+
+    Where neither is in time, nothing is changed.
+    """
 
     class Model(SimpleNamespace):
         def open_loop(self, frames, actions, with_tokens):

@@ -279,6 +279,15 @@ def test_a_keyboard_moves_it_and_its_gripper(make_robot):
     assert closed["gripper"] == ACTION_LOW[6]
 
 
+def test_actions_that_are_called_as_a_keyboards_are_taken_as_they_are(make_robot):
+    """LeRobot's gym_manipulator records actions of these names, in the dataset's units."""
+    robot = make_robot()
+    names = ["delta_x", "delta_y", "delta_z", *robot.model.embodiment.action_names[3:]]
+    robot.model.embodiment.action_names = names
+    wanted = dict.fromkeys(names, 0.0) | {"delta_x": ACTION_HIGH[0] / 2}
+    assert robot.send_action(wanted) == pytest.approx(wanted)
+
+
 def test_what_cannot_be_is_refused(make_robot, trained_models):
     robot = make_robot()
     with pytest.raises(FieldError, match=r"need dy, dz, .* too; use a teleoperator whose actions are dx, dy"):

@@ -14,7 +14,7 @@ from lerobot_wmrl.data.clips import MOST_WEIGHT, SUCCESS_SHARE, ClipSampler, Fra
 from lerobot_wmrl.data.dataset import TrainingData
 from lerobot_wmrl.data.episodes import EpisodeTable, read_episodes
 from lerobot_wmrl.data.frame_cache import cached_features, cached_frames, frames_to_tensor
-from lerobot_wmrl.evaluation.gate import seen_outcomes
+from lerobot_wmrl.evaluation.gate import Outcomes, predict_done, seen_outcomes
 from lerobot_wmrl.evaluation.replay import Recording
 from lerobot_wmrl.scripts.train_world_model import TrainWorldModelConfig, train_world_model
 from lerobot_wmrl.world_models.checkpoint import load_model
@@ -51,14 +51,14 @@ def test_recorded_frames_are_judged_by_the_classifier(models, trained_models, sm
     found = seen_outcomes(model, recording, [1, 4])
     start = recording.rows(4).start
     rows = slice(start, start + model.config.clip_length)
-    frames = frames_to_tensor(recording.frames[rows])
+    frames = frames_to_tensor(recording.frames[start : rows.stop + 1])  # the last action leads to one more
     with torch.no_grad():
         features = model.tokenizer.success_features(frames[:1].expand_as(frames), frames)
         seen = model.tokenizer.success.head(features).sigmoid().numpy()
-    judged = found.probability[1, : len(seen)]
-    assert np.allclose(judged[:-1], seen[1:], atol=1e-5)
-    assert judged[-1] == judged[-2]
-    assert found.done[1, : len(seen)].tolist() == recording.table.done[rows].tolist()
+    assert found.probability.shape[1] == model.config.clip_length
+    assert np.allclose(found.probability[1], seen[1:], atol=1e-5)
+    assert found.done[1].tolist() == recording.table.done[rows].tolist()
+    assert found.held == Outcomes.stack(predict_done(model, recording)).where(np.isin(range(6), [1, 4])).held
     assert seen_outcomes(without, recording, [1, 4]) is None
     monkeypatch.setattr(EpisodeTable, "done_known", False)
     assert seen_outcomes(model, recording, [1, 4]) is None
