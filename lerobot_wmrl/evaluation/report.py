@@ -281,7 +281,8 @@ def task_table(gates: Mapping[str, Gate], best: Mapping[str, Gate | None]) -> st
     """
     rows = [
         (
-            task, gate.false_positives, gate.recall, "–" if math.isnan(gate.auc) else f"{gate.auc:.2f}", "yes" if gate.passed else "no",
+            task, gate.false_positives, gate.recall,
+            "–" if math.isnan(gate.auc) else f"{gate.auc:.2f}", "yes" if gate.passed else "no",
             "–" if not gate.recall.n or not gate.false_positives.n
             else f"{point.threshold}, {point.frames}: {point.recall}" if (point := best[task]) else "none",
         )
