@@ -156,6 +156,17 @@ def test_the_readme_compares_on_the_same_recordings() -> None:
     known, unseen = (f"{', '.join(each[:-1])} and {each[-1]}" for each in over)
     said = f"by seed {known} points more than BC in known scenes, {unseen} in unseen ones"
     assert said in (ROOT / "docs" / "objections.md").read_text()
+    (more,) = [
+        json.loads(path.read_text())["methods"]
+        for path in (ROOT / "docs/results/value_same_recordings").glob("*25*.json")
+    ]
+    rates = {
+        method: "/".join(f"{100 * row[domain]['share']:.0f}" for domain in ("ind", "ood"))
+        for method, row in more.items()
+    }
+    for said in ("best BC {filtered}, PPO {imagined_ppo}", "distilled {ppo_distilled}."):
+        assert said.format(**rates) in text
+    assert max(BASELINES, key=lambda name: more[name]["ind"]["k"] if name in more else 0) == "filtered"
     (simulated,) = (ROOT / "docs/results/value_four_tasks_simulator").glob("*.json")
     for path, method, words in (
         (simulated, "simulated_ppo", "and {} after PPO in ManiSkill"),
