@@ -11,11 +11,21 @@ LONGEST_WAIT = timedelta(hours=6)
 """Time that the other processes wait while the first one encodes a large dataset or measures a policy."""
 
 
+PROCESS_STRIDE = 1_000_003
+"""Distance between the seeds of processes that train together."""
+
+
 def rank_and_size() -> tuple[int, int]:
     """Return this process's index and the number of processes; (0, 1) outside `torchrun`."""
     if dist.is_available() and dist.is_initialized():
         return dist.get_rank(), dist.get_world_size()
     return 0, 1
+
+
+def process_seed(seed: int) -> int:
+    """Return the seed of this process in a run of this seed: far from those of runs with other seeds."""
+    rank, _ = rank_and_size()
+    return seed + PROCESS_STRIDE * rank
 
 
 def hidden_progress() -> bool | None:

@@ -25,7 +25,7 @@ from lerobot.configs.default import WandBConfig
 from lerobot.configs.rewards import RewardModelConfig
 
 from lerobot_wmrl.common.command_line import RunConfig, run_command
-from lerobot_wmrl.common.distributed import LONGEST_WAIT, is_first_process
+from lerobot_wmrl.common.distributed import LONGEST_WAIT, is_first_process, process_seed
 from lerobot_wmrl.common.errors import FieldError, renamed, require_at_least, require_choice, within
 from lerobot_wmrl.common.files import write_json
 from lerobot_wmrl.common.output_folders import CONFIG_FILE, Claim
@@ -208,8 +208,7 @@ def run_training(
 
     with ExitStack() as held:
         with processes.main_process_first():
-            seed = cfg.seed + processes.process_index
-            sampler = make_joint_sampler(model, table, cfg.dataset, cfg.batch_size, seed)
+            sampler = make_joint_sampler(model, table, cfg.dataset, cfg.batch_size, process_seed(cfg.seed))
             if is_first_process():
                 held.enter_context(claim.held())
         train(model, sampler, cfg, cfg.save_pretrained, make_wandb(cfg))

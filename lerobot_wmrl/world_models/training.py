@@ -28,7 +28,7 @@ from tqdm import tqdm
 from lerobot_wmrl.common.checkpoints import latest_checkpoint, should_save_checkpoint
 from lerobot_wmrl.common.constants import HUMAN_LIKE, KINDS, START_KIND
 from lerobot_wmrl.common.cuda_graphs import cuda_graphs
-from lerobot_wmrl.common.distributed import is_first_process, mean_over_processes
+from lerobot_wmrl.common.distributed import is_first_process, mean_over_processes, process_seed
 from lerobot_wmrl.common.errors import FieldError, renamed
 from lerobot_wmrl.common.precision import compute_in, training_dtype
 from lerobot_wmrl.common.tracking import log_metrics
@@ -275,7 +275,7 @@ def train(
     """
     device = model.config.device
     processes = PartialState(cpu=torch.device(device).type == "cpu")
-    set_seed(settings.seed + processes.process_index)
+    set_seed(process_seed(settings.seed))
     preset: Any = model.config.get_optimizer_preset()
     optimizer = preset.build([p for p in model.parameters() if p.requires_grad])
     scheduler = cosine_schedule(preset.lr, settings.steps).build(optimizer, settings.steps)

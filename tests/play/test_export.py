@@ -22,10 +22,12 @@ from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.wait import WebDriverWait
 
 from lerobot_wmrl.common.errors import FieldError
-from lerobot_wmrl.data.dataset import DatasetSource
+from lerobot_wmrl.data.dataset import DatasetSource, open_dataset
+from lerobot_wmrl.data.episodes import read_episodes
 from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.envs.configuration_wmrl_maniskill import WmrlManiSkillEnv
 from lerobot_wmrl.envs.configuration_world_model import WorldModelEnv
+from lerobot_wmrl.evaluation.replay import Recording
 from lerobot_wmrl.play.export import export_page
 from lerobot_wmrl.play.graphs import ExportedWorldModel, export_graphs
 from lerobot_wmrl.play.world import World, load_world
@@ -177,6 +179,8 @@ def test_a_page_reads_the_instruction_that_it_is_given(make_synthetic_dataset, t
     export_page(world, folder, STARTS)
     pictures, state, actions = first_frame(folder, 0)
     exported, chances = ExportedWorldModel(folder, CLIP_LENGTH), []
+    model = world.models.model
+    frames = Recording.read(read_episodes(open_dataset(root)), model).starts(model, np.array([0]))
     with served(folder) as address:
         page = Page(chromium, address)
         for given in ({}, {"instruction": PULL}, {"instruction": "zieh das Stück"}):
@@ -186,6 +190,11 @@ def test_a_page_reads_the_instruction_that_it_is_given(make_synthetic_dataset, t
             expected = exported.step(actions[:1])["done_probability"]
             assert shown == pytest.approx(float(expected[0]), abs=1e-3)
             chances.append(shown)
+            asked = replace(
+                frames, success_weights=model.success_weights([given.get("instruction", PUSH)], 1)
+            )
+            imagined = model.step(model.start(asked), torch.from_numpy(actions[:1])).done_logit.sigmoid()
+            assert shown == pytest.approx(float(imagined), abs=0.02)
         for text, wrong in ((" ", "is empty"), ("x" * 600, "has 600 bytes; at most 511")):
             assert f"instruction: {wrong}" in ask(
                 page, {"do": "begin", "episode": 0, "frame": 0, "instruction": text}

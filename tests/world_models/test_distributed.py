@@ -10,6 +10,7 @@ import torch
 from lerobot.utils.random_utils import get_rng_state, set_rng_state, set_seed
 from safetensors.torch import load_file
 
+from lerobot_wmrl.common.distributed import PROCESS_STRIDE
 from lerobot_wmrl.common.errors import FieldError
 from lerobot_wmrl.common.tracking import read_metrics
 from lerobot_wmrl.data.dataset import open_dataset
@@ -67,8 +68,10 @@ def averaged_training(cfg: TrainWorldModelConfig) -> tuple[dict[str, torch.Tenso
     scheduler = cosine_schedule(preset.lr, cfg.steps).build(optimizer, cfg.steps)
     samplers, states, losses = [], [], []
     for rank in range(PROCESSES):
-        samplers.append(make_joint_sampler(model, table, cfg.dataset, cfg.batch_size, cfg.seed + rank))
-        set_seed(cfg.seed + rank)
+        samplers.append(
+            make_joint_sampler(model, table, cfg.dataset, cfg.batch_size, cfg.seed + PROCESS_STRIDE * rank)
+        )
+        set_seed(cfg.seed + PROCESS_STRIDE * rank)
         states.append(get_rng_state())
     for step in range(cfg.steps):
         optimizer.zero_grad()

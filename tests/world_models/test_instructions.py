@@ -18,7 +18,7 @@ from lerobot_wmrl.data.frames import Frames
 from lerobot_wmrl.envs.configuration_world_model import StartFrames, WorldModelEnv
 from lerobot_wmrl.evaluation.gate import predict_done, seen_outcomes
 from lerobot_wmrl.evaluation.replay import Recording, replay_episodes
-from lerobot_wmrl.play.graphs import ExportedWorldModel, export_graphs, instruction_bytes
+from lerobot_wmrl.play.graphs import instruction_bytes
 from lerobot_wmrl.rewards.configuration_rewards import GeneralConfig
 from lerobot_wmrl.world_models.checkpoint import load_model
 from lerobot_wmrl.world_models.configuration_frame_tokenizer import TokenizerConfig
@@ -272,23 +272,6 @@ def test_a_text_world_model_reads_success_by_its_instruction_too(two_tasks, trai
     text = load_model(path, "text_world_model")
     assert text.encode_instructions([PUSH, PULL], 2).success_weights.shape[:2] == (2, 1)
     assert text.config.reads_instructions
-
-
-def test_graphs_of_a_page_read_the_instruction_as_the_model_does(model, two_tasks, tmp_path):
-    """From its bytes: a page has no tokenizer."""
-    export_graphs(model, tmp_path)
-    exported = ExportedWorldModel(tmp_path, CLIP_LENGTH)
-    recording = Recording.read(read_episodes(two_tasks), model)
-    pictures = recording.images(0, torch.device("cpu"))[:1].numpy()
-    state = recording.table.state[:1]
-    chances = []
-    for text in (PUSH, PULL):
-        exported.begin(pictures, state, text)
-        chances.append(exported.step(np.zeros((1, 7), np.float32))["done_probability"])
-    logits = torch.from_numpy(np.concatenate(chances)).logit()
-    expected = model.step(model.start(first_frames(model, two_tasks, [PUSH, PULL])), torch.zeros(2, 7))
-    torch.testing.assert_close(logits, expected.done_logit, atol=0.1, rtol=0.05)
-    assert abs(logits[0] - logits[1]) > 1
 
 
 def test_bytes_of_an_instruction_are_those_of_byt5():
