@@ -98,13 +98,12 @@ def compare(world: World, row: int, folder: Path) -> str:
     Returns:
         How far the pictures and probabilities of success are apart.
     """
-    assert world.table is not None
     model, exported = world.models.model, ExportedWorldModel(folder, world.model.clip_length)
     drive = world.begin({"episode": row, "frame": 0}, None)
     assert drive.recorded is not None, "it begins in a recorded frame"
     frames = drive.env.newest_frames()
     pictures = drive.recorded.images[:1].transpose(0, 1, 4, 2, 3).astype(np.float32) / 255
-    exported.begin(pictures, frames.state.numpy(), world.table.instructions[row])
+    exported.begin(pictures, frames.state.numpy(), drive.instruction)
     colours, chances = [], []
     wanted = world.model.clip_length + FRAMES_BEYOND
     actions = np.resize(drive.recorded.actions, (wanted, drive.recorded.actions.shape[1]))

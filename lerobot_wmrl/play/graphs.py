@@ -1,9 +1,8 @@
 """A world model as three ONNX graphs, which a page without a server runs in the visitor's browser.
 
 `start` reads the pictures and the state in which an episode begins, and its instruction if success depends
-on it. `scene` encodes a frame, from which
-`step` then imagines one action after the other; after as many steps as a training clip has, `scene` is run
-again on the newest frame. All shapes are constant.
+on it. `scene` encodes a frame, from which `step` then imagines one action after the other; after as many
+steps as a training clip has, `scene` is run again on the newest frame. All shapes are constant.
 
 What one graph returns and another needs has the same name in both. An output `next_…` is an input of the same
 graph's next run.

@@ -171,7 +171,8 @@ def train_world_model(cfg: TrainWorldModelConfig) -> None:
     claim.check()
     if is_first_process():
         link_latest(cfg.output_dir)
-    decide_on_instructions(cfg.model, table, cfg.dataset)
+    if checkpoint is None:
+        decide_on_instructions(cfg.model, table, cfg.dataset)
     model: Any = build_model(cfg.model, table, cfg.output_dir)
     if checkpoint is not None and int(checkpoint.name) >= cfg.steps:
         print(f"{cfg.output_dir}: already trained for {cfg.steps} steps")

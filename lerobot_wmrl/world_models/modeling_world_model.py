@@ -184,11 +184,10 @@ class WorldModelRewardModel(HubCard, ImaginationMixin, PreTrainedRewardModel):
             return None
         check_one_each(instructions, batch)
         classifier: Any = self.tokenizer.success
-        row_of = {text: row for row, text in enumerate(dict.fromkeys(instructions))}
-        for text in row_of.keys() - self._success_weights.keys():  # the tokenizer is fixed
+        for text in set(instructions) - self._success_weights.keys():  # the tokenizer is fixed
             self._success_weights[text] = classifier.instructions([text])[0]
-        rows = torch.stack([self._success_weights[text].to(self.state_mean.device) for text in row_of])
-        return rows[[row_of[text] for text in instructions]]
+        device = self.state_mean.device
+        return torch.stack([self._success_weights[text].to(device) for text in instructions])
 
     def condition(self, clip: Clip) -> Condition:
         """Return the condition (eq. 1's c) of every row of a clip, tokens (B, T or 1, M, D)."""
